@@ -258,7 +258,7 @@ class MultiDeadlineExecutor(BareExecutor):
         return is_over(self.context)
 
     def _context_ends(self) -> None:
-        """Take note of who ends the context: one of this executor's callbacks, or not."""
+        """Note whether a callback of this executor ends the context."""
         running = current.running
         self._ended_by_callback = (
             running is not None and running.engine is self._engine
@@ -495,7 +495,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if self._notifier is not None:
             self._notifier.start()
         self._miss_log.write()
-        self._names.look(self._engine.is_judging)
+        self._names.check(self._engine.is_judging)
 
     def _was_ended(self) -> bool:
         """
@@ -506,7 +506,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if not is_over(self.context):
             return False
         with suppress(InvalidHandle):
-            self.context.ok()  # it has a lock, so whoever is just ending it has noted that now
+            self.context.ok()  # waits for the thread that is just ending it
         if not self._ended_by_callback:
             raise ExternalShutdownException()
         return True
@@ -677,7 +677,7 @@ class MultiDeadlineExecutor(BareExecutor):
         return finished and reported
 
     def _end_run(self) -> None:
-        """Judge what is open and close the trace, once; whoever comes second waits for that."""
+        """Judge what is open and close the trace, once; a second thread waits for that."""
         with self._ending:
             if not self._finished:
                 self._finished = True

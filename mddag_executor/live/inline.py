@@ -125,24 +125,24 @@ class Delivery:
     Takes from some subscriptions what was published for them.
 
     :param on_miss: called when a message is not there that was published.
-    :param leave: has another thread call ``deliver`` with a begin; it waits for no lock.
+    :param defer: has another thread call ``deliver`` with a begin; it waits for no lock.
     """
 
-    __slots__ = ('_directs', '_receiver', '_on_miss', '_leave')
+    __slots__ = ('_directs', '_receiver', '_on_miss', '_defer')
 
     def __init__(
         self, directs: Iterable[Direct], receiver: Receiver, on_miss: Callable[[], None],
-        leave: Callable[[Delivery, int], None],
+        defer: Callable[[Delivery, int], None],
     ) -> None:
         self._directs = sorted(directs, key=id)  # so no two threads wait for each other's locks
         self._receiver = receiver
         self._on_miss = on_miss
-        self._leave = leave
+        self._defer = defer
 
     def published(self, begin: int) -> None:
         """Deliver what was just published, in the calling thread unless it is the main one."""
         if threading.get_ident() == threading.main_thread().ident:
-            self._leave(self, begin)
+            self._defer(self, begin)
         else:
             self.deliver(begin)
 
@@ -195,7 +195,7 @@ class InlineDelivery:
         self._thread: threading.Thread | None = None
         self._bell = Bell()
         # what the main thread has published
-        self._left_to_thread: deque[tuple[Delivery, int]] = deque()
+        self._deferred: deque[tuple[Delivery, int]] = deque()
 
     def choose(self, entities: EntitySet) -> EntitySet:
         """
@@ -238,8 +238,8 @@ class InlineDelivery:
             self._thread.start()
         return self._rest(entities, chosen)
 
-    def _leave(self, delivery: Delivery, begin: int) -> None:
-        self._left_to_thread.append((delivery, begin))
+    def _defer(self, delivery: Delivery, begin: int) -> None:
+        self._deferred.append((delivery, begin))
         self._bell.ring()
 
     def _look_after(self, stopping: threading.Event) -> None:
@@ -249,8 +249,8 @@ class InlineDelivery:
             if stopping.is_set() or self._over():
                 self._bell.ring()  # for the next thread
                 return
-            while self._left_to_thread:
-                delivery, begin = self._left_to_thread.popleft()
+            while self._deferred:
+                delivery, begin = self._deferred.popleft()
                 delivery.deliver(begin)
             if time.monotonic() >= next_look:
                 next_look = time.monotonic() + LOOK_S
@@ -275,7 +275,7 @@ class InlineDelivery:
                 self._delivery([direct]).deliver(0)
 
     def _delivery(self, directs: list[Direct]) -> Delivery:
-        return Delivery(directs, self._receiver, self._on_change, self._leave)
+        return Delivery(directs, self._receiver, self._on_change, self._defer)
 
     def stop(self) -> threading.Thread | None:
         """
@@ -286,7 +286,7 @@ class InlineDelivery:
         self._set_takes({}, {})
         self._stopping.set()
         self._bell.ring()
-        self._left_to_thread.clear()
+        self._deferred.clear()
         thread, self._thread = self._thread, None
         self._stopping = threading.Event()
         self._known = {}

@@ -79,15 +79,15 @@ class RemotePublisher:
     A publisher in another process, which is counted there.
 
     :ivar offset: from this count to the middleware's number.
-    :ivar unlike: that of the last message if it was another one, and the publication in whose
-        window that message was; None: it was this one.
+    :ivar other_offset: the offset of the last message, if it differs, and the count of the
+        publication in whose window that message was; else None.
     """
 
-    __slots__ = ('offset', 'unlike')
+    __slots__ = ('offset', 'other_offset')
 
     def __init__(self) -> None:
         self.offset = 0
-        self.unlike: tuple[int, int] | None = None
+        self.other_offset: tuple[int, int] | None = None
 
     def learn(self, count: int, number: int) -> bool:
         """
@@ -95,10 +95,10 @@ class RemotePublisher:
 
         To be asked only for messages that lie in no other publication's window.
         """
-        before, self.unlike = self.unlike, (number - count, count)
+        before, self.other_offset = self.other_offset, (number - count, count)
         if before is None or before[0] != number - count or before[1] == count:
             return False
-        self.offset, self.unlike = number - count, None
+        self.offset, self.other_offset = number - count, None
         return True
 
 
@@ -288,7 +288,7 @@ class Jobs:
             if sequence is None:
                 return publication.origin
             if sequence - count == publisher.offset:
-                publisher.unlike = None
+                publisher.other_offset = None
                 return publication.origin
             if count != _NO_NUMBER and publisher.learn(count, sequence):
                 return publication.origin

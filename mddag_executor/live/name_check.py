@@ -55,7 +55,7 @@ class NameCheck:
         self._begin: float | None = None
         self._done = task_set is None
 
-    def look(self, is_judging: bool) -> None:
+    def check(self, is_judging: bool) -> None:
         """Warn if it is time to; to be called now and then by the thread that spins."""
         if self._done or not is_judging or not self._registry.by_id:
             return

@@ -61,8 +61,8 @@ class Registry:
     """
     What is kept for all entities of the executor's nodes.
 
-    The executor refreshes it under a lock of its own; other threads look entities up, and ask for
-    counts at any time.
+    The executor refreshes it under a lock of its own; other threads find entities in it, and ask
+    for counts at any time.
 
     :ivar by_id: what is kept for each entity of rclpy, by the ``id`` of that.
     :param passed: called with each execution that a callback group has let through (see
