@@ -232,7 +232,7 @@ class MultiDeadlineExecutor(BareExecutor):
         return is_over(self.context)
 
     def _context_ends(self) -> None:
-        """Take note of who ends the context: one of this executor's callbacks, or not."""
+        """Note whether a callback of this executor ends the context."""
         running = current.running
         self._ended_by_callback = (
             running is not None and running.engine is self._engine
@@ -432,6 +432,23 @@ class MultiDeadlineExecutor(BareExecutor):
                 return
             time.sleep(0.001)
 
+<<<<<<< HEAD:mddag_executor/executor/executor.py
+=======
+    def _look_after(self) -> None:
+        """Do what is to be done now and then while somebody spins."""
+        self._submit_tasks()
+        if self._rates.look() and self._registry.is_stale():
+            self._upkeep.change()
+        if self._announcements is not None:
+            self._announcements.look()
+        if self._diagnostics is not None:
+            self._diagnostics.start()
+        if self._notifier is not None:
+            self._notifier.start()
+        self._miss_log.write()
+        self._names.check(self._engine.is_judging)
+
+>>>>>>> live:mddag_executor/live/executor.py
     def _was_ended(self) -> bool:
         """
         Return whether a callback has ended the context.
@@ -441,7 +458,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if not is_over(self.context):
             return False
         with suppress(InvalidHandle):
-            self.context.ok()  # it has a lock, so whoever is just ending it has noted that now
+            self.context.ok()  # waits for the thread that is just ending it
         if not self._ended_by_callback:
             raise ExternalShutdownException()
         return True
@@ -601,7 +618,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._at_once.loop.close()
 
     def _end_run(self) -> None:
-        """Judge what is open and close the trace, once; whoever comes second waits for that."""
+        """Judge what is open and close the trace, once; a second thread waits for that."""
         with self._ending:
             if not self._finished:
                 self._finished = True

@@ -11,7 +11,8 @@ Theory of operation
     ``statistics()`` and ``/diagnostics``, and a warning in the log names them.
 3.  What the handler raises, also ``SystemExit``, comes out of ``spin``; later misses are reported.
 4.  At the end the waiting misses are still reported, but the handler is called no more after
-    ``REPORT_S``, and not waited for after ``END_S``: it may wait for what nobody does any more.
+    ``REPORT_S``, and not waited for after ``END_S``: it may call a service that is no longer
+    answered.
 """
 
 from __future__ import annotations
@@ -54,14 +55,14 @@ class MissNotifier:
         self._starting = threading.Lock()
         self._ends_at: float | None = None
         self._did_not_fit = 0
-        self._left_at_end = 0
+        self._too_late = 0
         self._warned = 0
         self._warn_at = 0.0
 
     @property
     def unreported(self) -> int:
         """Return how many misses the handler was not called with."""
-        return self._did_not_fit + self._left_at_end
+        return self._did_not_fit + self._too_late
 
     def post(self, miss: DeadlineMiss) -> None:
         """Have a miss reported; it never waits, and the caller may hold a lock."""
@@ -105,7 +106,7 @@ class MissNotifier:
             if miss is None:
                 break
             if self._ends_at is not None and time.monotonic() > self._ends_at:
-                self._left_at_end += 1
+                self._too_late += 1
                 continue
             try:
                 self._handler(miss)
