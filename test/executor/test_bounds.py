@@ -126,7 +126,7 @@ def test_few_messages_of_keep_all_wait_in_python_and_none_is_lost(
 ):
     if not from_here:  # as from another process: a worker takes them
         monkeypatch.setattr(
-            'mddag_executor.executor.publishing.subscribe', lambda topic, subscription: None)
+            'mddag_executor.executor.publishing.replace_delivery', lambda *args: None)
     node, go_on = make_node(), threading.Event()
     got: list[int] = []
     most: list[int] = []

@@ -117,8 +117,8 @@ nodes:
         on_miss=reported.append, record=lambda *event: recorded.append(event))
     entity = entity_of(engine, task_set, 0, 0)
     for release in (0, 100_000):
-        engine.timer_due(Work(None, print, entity=entity), release, release)
-    first, second = engine.dispatch(100_000), engine.dispatch(100_000)
+        engine.timer_due(Work(entity, print), release, release)
+    first, second = engine.dispatch(0, 100_000), engine.dispatch(1, 100_000)
     assert first is not None and second is not None
     engine.judge_overdue(150_000)
     engine.finished(first, 0, 90_000, 151_000, 0, 0)

@@ -68,7 +68,10 @@ class Bodies:
 
 
 @pytest.mark.parametrize('holds, at_once', [('true', 1), ('false', 4)])
-def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, holds, at_once):
+def test_as_many_run_at_once_as_the_declaration_says(
+    make_executor, make_node, monkeypatch, holds, at_once,
+):
+    monkeypatch.setattr(gil, 'IDLE_SHARE', -1.0)  # starving on a busy machine is no waiting
     node = make_node()
     gate = threading.Barrier(4) if at_once == 4 else None
 
@@ -334,7 +337,7 @@ def beside(request, make_executor, make_node, monkeypatch) -> Any:
     """Give these callbacks; messages come from threads of this process, or as from elsewhere."""
     monkeypatch.setattr(gil, 'IDLE_SHARE', -1.0)  # starving on a busy machine is no waiting
     if request.param == 'elsewhere':
-        monkeypatch.setattr(publishing, 'subscribe', lambda topic, subscription: None)
+        monkeypatch.setattr(publishing, 'replace_delivery', lambda *args: None)
     executor = make_executor(msg_graph.loads(BESIDE, 'g.yaml'))
     found = Beside(executor, make_node())
     with Spinning(executor):

@@ -110,7 +110,7 @@ def tables(executor: Any) -> dict[str, int]:
         found |= {f'{name}.{key}': size for key, size in sizes(loop).items()}
     found |= {f'at_once.{key}': size for key, size in sizes(at_once.timers).items()}
     return found | {
-        'subscriptions': sum(map(len, publishing._subscriptions.values())),
+        'deliveries': sum(map(len, publishing._deliveries.values())),
         'events': len(waitables._known), 'descriptors': len(os.listdir('/proc/self/fd'))}
 
 

@@ -66,8 +66,7 @@ def test_statistics_have_the_declared_types(
     trace = tmp_path / 'run.mcap'
     with MultiDeadlineExecutor(
             loads(GRAPH), context=ros_context, trace=trace,
-            worker_cpus=list(os.sched_getaffinity(0)),
-            preempt=sys.version_info >= (3, 12)) as executor:
+            worker_cpus=list(os.sched_getaffinity(0))) as executor:
         assert isinstance(executor, MultiDeadlineExecutor)
         check(executor.statistics(), Statistics, 'statistics')
         node = make_node('n')
