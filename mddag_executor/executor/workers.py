@@ -460,9 +460,10 @@ class WorkerPool:
             if me.is_polling:
                 me.is_polling = False
                 self._polling -= 1
-                self._bell_rings = False
                 if not self._polling:
                     self._all_left.set()
+            if events:  # whoever got them: a thread that only looked may have heard the bell
+                self._bell_rings = False
             if ended is not None:
                 self._report_end(me, ended, now)
             for source in sources:
@@ -780,7 +781,6 @@ class WorkerPool:
         me.begin()
         with self.lock:
             self._visitors.append(me)
-            self._bell_rings = False  # the caller has just been woken, or has looked
         try:
             work = self._turn(me, None, events)
             while work is not None:
