@@ -383,7 +383,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._submit_tasks()
                 if self._diagnostics is not None:
                     self._diagnostics.start()
-                self._names.look(self._engine.is_judging)
+                self._names.check(self._engine.is_judging)
                 rest = self._upkeep.rest_s()
                 if rest == 0.0:
                     self._upkeep.refresh()
@@ -432,23 +432,6 @@ class MultiDeadlineExecutor(BareExecutor):
                 return
             time.sleep(0.001)
 
-<<<<<<< HEAD:mddag_executor/executor/executor.py
-=======
-    def _look_after(self) -> None:
-        """Do what is to be done now and then while somebody spins."""
-        self._submit_tasks()
-        if self._rates.look() and self._registry.is_stale():
-            self._upkeep.change()
-        if self._announcements is not None:
-            self._announcements.look()
-        if self._diagnostics is not None:
-            self._diagnostics.start()
-        if self._notifier is not None:
-            self._notifier.start()
-        self._miss_log.write()
-        self._names.check(self._engine.is_judging)
-
->>>>>>> live:mddag_executor/live/executor.py
     def _was_ended(self) -> bool:
         """
         Return whether a callback has ended the context.

@@ -55,15 +55,11 @@ class NameCheck:
         self._begin: float | None = None
         self._done = task_set is None
 
-<<<<<<< HEAD:mddag_executor/executor/name_check.py
     def rest_s(self) -> float | None:
-        """Return after how many seconds to ``look`` again; None: never."""
+        """Return after how many seconds to ``check`` again; None: never."""
         return None if self._done else LEAST_S
 
-    def look(self, is_judging: bool) -> None:
-=======
     def check(self, is_judging: bool) -> None:
->>>>>>> live:mddag_executor/live/name_check.py
         """Warn if it is time to; to be called now and then by the thread that spins."""
         if self._done or not is_judging or not self._registry.by_id:
             return

@@ -44,12 +44,8 @@ class Registry:
     """
     What is kept for all entities of the executor's nodes.
 
-<<<<<<< HEAD:mddag_executor/executor/registry.py
-    All methods are called under the engine's lock; other threads only look entities up.
-=======
-    The executor refreshes it under a lock of its own; other threads find entities in it, and ask
-    for counts at any time.
->>>>>>> live:mddag_executor/live/registry.py
+    It is refreshed under the engine's lock; other threads find entities in it, and ask for counts
+    at any time.
 
     :ivar by_id: what is kept for each entity of rclpy, by the ``id`` of that.
     :param passed: called with each execution that a callback group has let through (see
