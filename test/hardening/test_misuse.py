@@ -31,7 +31,6 @@ WRONG = [
     *(('policy', value) for value in (None, 5, 'x', [], {})),
     *(('default_deadline', value) for value in (
         None, 1.5, -5, 0, True, [], 10**30, Duration(seconds=-1))),
-    *(('intake', value) for value in (None, 5, 'x')),
     *(('max_active_jobs', value) for value in ('x', 0, -1, 1.5, None, True)),
     *(('on_deadline_miss', value) for value in (5, 'x', [])),
     *(('worker_policy', value) for value in (5, 'x', '__class__', 'sched_yield')),
