@@ -212,7 +212,8 @@ class Upkeep:
         events = [e for e in present if e.kind == WAITABLE and is_qos_event(e.rclpy)]
         if any(e.kind == WAITABLE and is_qos_event(e.rclpy) for e in (*added, *gone)):
             if self._events is not None:
-                self._drop(self._events)
+                dropped, self._events = self._events, None
+                self._drop(dropped)
             self._events = self._listen_to(events, EventsSource) if events else None
         left = [e for e in self._unlistened if e in present]
         for entity in added:

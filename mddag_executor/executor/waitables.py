@@ -119,7 +119,10 @@ class WaitableSource:
         :raises ListenerError: when it cannot.
         :raises InvalidHandle: when one of them has been destroyed.
         """
-        self._set.parts(lambda kind, address: set_listener(kind, address, self.fd))
+        with self._lock:  # what is announced meanwhile must not fill the wait set, too
+            self._set.parts(lambda kind, address: set_listener(kind, address, self.fd))
+        if self._has_more:
+            self.collect()
 
     def ignore(self) -> bool:
         """End what ``listen`` has begun, and wait until nobody collects from it."""
