@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 from mddag_executor.lazy import on_first_use
 
 if TYPE_CHECKING:
-    from mddag_executor.live.executor import MultiDeadlineExecutor
-    from mddag_executor.live.verdicts import DeadlineMiss
+    from mddag_executor.executor.executor import MultiDeadlineExecutor
+    from mddag_executor.executor.verdicts import DeadlineMiss
 
 __all__ = ['DeadlineMiss', 'MultiDeadlineExecutor', '__version__']
 __version__ = '1.0.0'
 
 __getattr__, __dir__ = on_first_use(__name__, {
-    'DeadlineMiss': 'mddag_executor.live',
-    'MultiDeadlineExecutor': 'mddag_executor.live',
+    'DeadlineMiss': 'mddag_executor.executor',
+    'MultiDeadlineExecutor': 'mddag_executor.executor',
 })

@@ -343,7 +343,7 @@ def test_the_names_of_synthetic_nodes_are_those_of_the_declaration(
 def test_two_workers_are_a_bound(graph: Path, mddag: Mddag) -> None:
     process = mddag(
         'run', graph, '--synthetic', 'sleep', '--utilisation', '0.9', '--workers', '2',
-        '--duration', '1s', '--json', '-', '--intake', 'waitset')
+        '--duration', '1s', '--json', '-')
     result = json.loads(process.stdout)
     assert result['workers'] == 2
     assert result['measured']['utilisation'] == pytest.approx(0.9, abs=0.001)
