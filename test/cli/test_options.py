@@ -117,6 +117,6 @@ def test_the_limit_of_workers_is_the_same_everywhere(tmp_path: Path) -> None:
             ['generate', '--workers', str(workers), '--utilisation', '0.001', '-o',
              str(tmp_path / 'made.yaml')]) == status
         with refused:
-            resolve(str(graph), workers, 1, 'auto')
+            resolve(str(graph), workers, 1)
         with refused:
             check(Settings(workers=workers))

@@ -129,7 +129,7 @@ def test_empty_files_and_other_results_are_replaced(
     assert call(capsys, 'replay', run, '--json', '/dev/null', '--junit', '/dev/null')[0] == 0
 
 
-@pytest.mark.parametrize('there', ['run.p.mcap', 'run.q.2.mcap'])
+@pytest.mark.parametrize('there', ['run.p.mcap', 'run.q.mcap'])
 def test_several_processes_replace_no_trace(
     folder: Path, capsys: pytest.CaptureFixture[str], there: str
 ) -> None:
