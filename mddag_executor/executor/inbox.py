@@ -46,6 +46,8 @@ class Inbox:
         self._recorder = recorder
         self.failed = fail
         self.now = 0
+        #: sets and returns the time
+        self.tick: Callable[[], int] = clock.now
         self.announcements: Announcements | None = None
 
     def message(
@@ -59,7 +61,8 @@ class Inbox:
         engine = self._engine
         work = Work(entity, entity.rclpy.callback, args)
         if self._recorder is not None:
-            self._recorder.taken(entity, args[0], info['source_timestamp'])
+            now = self.tick()  # it becomes ready right after it was taken
+            self._recorder.taken(entity, args[0], info['source_timestamp'], now)
         if entity.callback is None:
             engine.ready_message(work, self.now)
             return

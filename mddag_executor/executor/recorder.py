@@ -114,9 +114,11 @@ class Recorder:
         if group is not None:
             self._say(f'callback_group_add_{entity.kind}', id(group), handle)
 
-    def taken(self, entity: Entity, message: Any, source_timestamp: int) -> None:
-        """Record that a message was taken."""
-        self._say('rmw_take', id(entity.rclpy), id(message), source_timestamp, True)
+    def taken(self, entity: Entity, message: Any, source_timestamp: int, now: int) -> None:
+        """Record that a message was taken; ``now``: when, which is not after it became ready."""
+        self.record(
+            'rmw_take', now, threading.get_native_id(), id(entity.rclpy), id(message),
+            source_timestamp, True)
 
     def close(self, now: int, end: int | None = None) -> None:
         """

@@ -166,6 +166,7 @@ class WorkerPool:
         self._deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
         self.inbox = inbox
+        inbox.tick = self.tick
         self.timers = TimerQueue(self._jumped, lambda: self.entities_changed(), fail)
         self.running = False
         self.stopped_at = 0

@@ -287,7 +287,7 @@ class Messages:
             if stamp < 0:
                 stamp = now  # a job of its own
         if self._recorder is not None:
-            self._recorder.taken(entity, message, source_stamp)
+            self._recorder.taken(entity, message, source_stamp, now)
         engine.arrived(work, origin, release, stamp, now)
 
     def _release(self, entity: Entity, message: Any, source_stamp: int) -> tuple[int, int]:
