@@ -13,6 +13,7 @@ from typing import Any
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.executor.announcements import Announcements
+from mddag_executor.executor.compat import RCL_ERRORS
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import (
@@ -25,7 +26,6 @@ from mddag_executor.executor.jobs import (
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.timers import Fired
 from mddag_executor.executor.work import Work
-from rclpy.exceptions import InvalidHandle
 
 
 class Inbox:
@@ -110,6 +110,6 @@ class Inbox:
         if missed:
             try:
                 period = source.period()
-            except InvalidHandle:
+            except RCL_ERRORS:
                 return  # destroyed meanwhile
             self._engine.timer_missed(source.entity, due, period, missed, self.now)

@@ -320,7 +320,7 @@ class Beside:
             compute(1)
         self.ran.append('ends')
 
-    def round(self, *names: str) -> list[str]:
+    def order(self, *names: str) -> list[str]:
         """Publish some while the long one computes; return the order of all."""
         self.ran.clear()
         self.begun.clear()
@@ -350,13 +350,13 @@ def beside(request, make_executor, make_node, monkeypatch) -> Any:
 def test_an_arrival_with_an_earlier_deadline_starts_beside_a_long_callback(beside):
     beside.meanwhile = lambda: 'urgent' in beside.ran
     for _ in range(3):
-        assert beside.round('urgent') == ['begins', 'urgent', 'ends']
+        assert beside.order('urgent') == ['begins', 'urgent', 'ends']
 
 
 def test_it_does_so_at_once(beside):
     """The long one does not wait for it."""
     for _ in range(20):  # on a busy machine the long one may have ended before
-        order = beside.round('urgent')
+        order = beside.order('urgent')
         if order == ['begins', 'urgent', 'ends']:
             break
     assert order == ['begins', 'urgent', 'ends']
@@ -369,14 +369,14 @@ def test_an_arrival_with_a_later_deadline_is_collected_after_a_long_callback(bes
     As nobody is to be woken for it, it may only be taken then; so it must not be overlooked.
     """
     for _ in range(3):
-        assert beside.round('patient') == ['begins', 'ends', 'patient']
+        assert beside.order('patient') == ['begins', 'ends', 'patient']
     assert beside.executor.statistics()['dropped'] == {}
 
 
 def test_of_two_arrivals_beside_a_long_callback_one_overtakes(beside):
     beside.meanwhile = lambda: 'urgent' in beside.ran
     for names in (('patient', 'urgent'), ('urgent', 'patient')):
-        assert beside.round(*names) == ['begins', 'urgent', 'ends', 'patient']
+        assert beside.order(*names) == ['begins', 'urgent', 'ends', 'patient']
 
 
 @pytest.mark.parametrize('beside', ['elsewhere'], indirect=True)
@@ -393,7 +393,7 @@ def test_what_cannot_start_is_left_in_the_middleware(beside):
                  if each.callback is not None and each.callback.name == 'long')
     for _ in range(20):  # on a busy machine it may take longer than usual
         habit.mean_ns = 50 * MS
-        assert beside.round('patient') == ['begins', 'ends', 'patient']
+        assert beside.order('patient') == ['begins', 'ends', 'patient']
         if queued[-1] == 0:
             break
     assert queued[-1] == 0
@@ -411,7 +411,7 @@ def test_a_callback_that_releases_the_gil_starts_beside_a_long_one(make_executor
         assert wait_for(lambda: len(beside.ran) == 4), beside.ran
         beside.meanwhile = lambda: 'patient' in beside.ran
         for _ in range(3):
-            assert beside.round('patient') == ['begins', 'patient', 'ends']
+            assert beside.order('patient') == ['begins', 'patient', 'ends']
 
 
 def test_a_timer_that_is_due_beside_a_long_callback_runs_after_it(
