@@ -33,6 +33,7 @@ LEVELS = {
     'mddag_executor.core': 4,
     'mddag_executor.trace': 4,
     'mddag_executor.generate': 4,
+    'mddag_executor.recording': 5,
     'mddag_executor.analysis': 5,
     'mddag_executor.simulate': 5,  # below replay, which reschedules with its engine
     'mddag_executor.assign': 6,

@@ -47,12 +47,7 @@ def main(args: argparse.Namespace) -> int:
     verdicts.check(args)
     recorded.check(args)
     with recorded.opened(args) as (path, name, task_set):
-        watch = None
-        if args.report is not None:
-            from mddag_executor.report.html import Watch
-            watch = Watch()
-        outcome = recorded.outcome_of(
-            args, path, name, task_set, args.reschedule, None if watch is None else watch.of)
+        outcome = recorded.outcome_of(args, path, name, task_set, args.reschedule)
         drift = outcome.drift() if isinstance(outcome, Replay) else []
     warn(*outcome.warnings)
     result = outcome.result()
@@ -61,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
     status = verdicts.judge(args, outcome.tally, result)
     if args.report is not None:
         from mddag_executor.report.html import of_outcome
-        common.write_report(args.report, lambda: of_outcome(outcome, watch))
+        common.write_report(args.report, lambda: of_outcome(outcome))
     common.show(args, result, _lines(args, result))
     return status
 

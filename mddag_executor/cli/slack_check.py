@@ -121,9 +121,8 @@ def _entries(node: Any) -> dict[str, Any]:
 def _misses(trace: str) -> tuple[int, int]:
     """Return how many deadlines were missed, and how many more through disturbances."""
     from mddag_executor.replay import replay
-    explainer = replay(trace, skip=WARM_UP_NS, jobs=True).explainer
-    assert explainer is not None
-    count = [is_counted(job) for job in explainer.result()['jobs']]
+    jobs = replay(trace, skip=WARM_UP_NS).explanation.result()['jobs']
+    count = [is_counted(job) for job in jobs]
     return sum(count), len(count) - sum(count)
 
 

@@ -36,8 +36,7 @@ from typing import Any
 
 from mddag_executor.core import legs_of, NEVER
 from mddag_executor.errors import UsageError
-from mddag_executor.replay import clocks
-from mddag_executor.replay.recording import (
+from mddag_executor.recording.head import (
     declared,
     Head,
     is_declared,
@@ -46,6 +45,7 @@ from mddag_executor.replay.recording import (
     ReplayError,
     TASK_SET,
 )
+from mddag_executor.replay import clocks
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceFile, TraceReader
 from mddag_executor.trace.errors import renamed

@@ -110,11 +110,17 @@ def _shifted(tile: list[Event], number: int, jobs: list[int]) -> Iterator[Event]
 
 
 def _tile(task_set: TaskSet, load: Load, workers: int) -> list[Event]:
-    """Return the events of a simulated run, with those of its messages, in the order of time."""
+    """
+    Return the events of a simulated run, with those of its messages, as they are recorded live.
+
+    What belongs to an execution is recorded when it ends, one after the other.
+    """
     run = simulate(task_set, load, Settings(
         workers=workers, duration_ns=_TILE + _PAUSE, judge='completions'), log=True)
-    found: list[Event] = []
+    found: list[Event] = []     # messages
+    recorded: list[tuple[int, Event]] = []
     publishes: dict[int, bool] = {}     # by thread
+    begun: dict[int, list[Event]] = {}
 
     def add(name: str, when: int, thread: int, *fields: Any) -> None:
         if name not in _KINDS:
@@ -129,10 +135,17 @@ def _tile(task_set: TaskSet, load: Load, workers: int) -> list[Event]:
         elif name == 'callback_end' and publishes[thread]:
             found.append(('rclcpp_publish', when, thread, address + 3, address + 4, when))
             found.append(('rcl_publish', when, thread, address + 3, address + 4))
-        found.append((name, when, thread, *fields))
+        event = name, when, thread, *fields
+        if name in ('dispatch', 'callback_start'):
+            begun.setdefault(thread, []).append(event)
+        else:
+            if name == 'callback_end':
+                recorded.extend((when, each) for each in begun.pop(thread))
+            recorded.append((when, event))
 
     write_events(task_set, load, run, add)
-    return sorted(found, key=lambda event: event[1])
+    recorded.extend((event[1], event) for event in found)
+    return [event for _, event in sorted(recorded, key=lambda entry: entry[0])]
 
 
 # --- readers -------------------------------------------------------------------------------------
@@ -146,8 +159,8 @@ def _read_sorted(path: str, limit: int) -> int:
 
 
 def _link(path: str, limit: int) -> int:
-    from mddag_executor.replay.run import open_run
-    open_run(path).play([])
+    from mddag_executor.replay.run import open_recording
+    open_recording(path)
     return TraceReader(path).message_count or 0
 
 

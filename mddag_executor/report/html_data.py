@@ -15,7 +15,7 @@ import json
 from typing import Any, NamedTuple
 
 from mddag_executor.core import Tables, Tally
-from mddag_executor.replay.chains import Chains
+from mddag_executor.recording.tables import Ints
 from mddag_executor.replay.usage import Usage
 from mddag_executor.report.tables import short_names
 from mddag_executor.report.text import format_ns, printable
@@ -25,7 +25,6 @@ from mddag_executor.report.timeline import (
     END,
     EXPIRED,
     FAILED,
-    Ints,
     JOB,
     OVERDUE,
     READY,
@@ -52,6 +51,7 @@ class ReportData(NamedTuple):
     """
     What a report is about.
 
+    :ivar breakdown: by sink where the times of its jobs went, as in the result of a replay.
     :ivar facts: what stands below the title: pairs of a word and a text.
     :ivar duration_ns: from the first release to the end of the run.
     :ivar paths: end-to-end times of the declared paths, as in the result of a replay.
@@ -65,7 +65,7 @@ class ReportData(NamedTuple):
     task_set: TaskSet
     tables: Tables
     tally: Tally
-    chains: Chains
+    breakdown: Mapping[int, Any]
     usage: Usage
     timeline: Timeline
     workers: int

@@ -102,22 +102,20 @@ def worst_html(data: ReportData) -> str:
     """Return a table with a bar for each sink: where the time of its worst job went."""
     short = short_names(vertex.name for vertex in data.task_set.vertices)
     rows = []
+    worst_of = {vertex: each['worst'] for vertex, each in data.breakdown.items()}
     longest = max((
-        (times.worst.completed - times.worst.release) / data.tables.sink_deadline[vertex]
-        for vertex, times in data.chains.sinks.items() if times.worst is not None), default=0.0)
-    used = [any(times.worst is not None and times.worst.breakdown[i]
-                for times in data.chains.sinks.values()) for i in range(len(_PARTS))]
-    for vertex, times in data.chains.sinks.items():
-        worst = times.worst
-        if worst is None:
-            continue
+        (worst['completed_ns'] - worst['release_ns']) / data.tables.sink_deadline[vertex]
+        for vertex, worst in worst_of.items()), default=0.0)
+    used = [any(worst[name] for worst in worst_of.values()) for name in Breakdown._fields]
+    for vertex, worst in worst_of.items():
         one = data.task_set.vertices[vertex]
-        response = worst.completed - worst.release
+        response = worst['completed_ns'] - worst['release_ns']
         deadline = data.tables.sink_deadline[vertex]
+        split = [worst[name] for name in Breakdown._fields]
         rows.append((
             data.task_set.dags[one.dag].name, short[one.name],
-            _stack(worst.breakdown, deadline, max(1.0, longest)), worst.job, format_ns(response),
-            *(format_ns(part, 3) for part, shown in zip(worst.breakdown, used) if shown),
+            _stack(split, deadline, max(1.0, longest)), worst['job'], format_ns(response),
+            *(format_ns(part, 3) for part, shown in zip(split, used) if shown),
             format_ns(deadline)))
     parts = [part for part, shown in zip(_PARTS, used) if shown]
     legend = ''.join(f'<span><i style="background:{colour}"></i>{name}</span>'
@@ -129,7 +127,7 @@ def worst_html(data: ReportData) -> str:
             f'<div class="wide">{html_table(header, rows, 3)}</div>')
 
 
-def _stack(parts: Breakdown, deadline: int, longest: float) -> Html:
+def _stack(parts: Sequence[int], deadline: int, longest: float) -> Html:
     """Return a bar on a scale from 0 to ``longest``, in parts of the deadline."""
     whole = max(1, deadline) * longest
     bars = ''.join(

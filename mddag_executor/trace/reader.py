@@ -163,6 +163,10 @@ class TraceReader:
         """Yield what ``events`` yields in the order of time, many at once."""
         return self._read(Channels(set(names), True), Reading.by_time)
 
+    def chunks(self, names: Iterable[str]) -> Iterator[Events]:
+        """Yield the same in the order of the file, chunk by chunk."""
+        return self._read(Channels(set(names), True), Reading.by_file)
+
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the messages of some topics, in the order of the file; they are not decoded."""
         return self._read(Channels(set(), True), partial(

@@ -13,12 +13,9 @@ import subprocess
 import sys
 from typing import Any
 
-from mcap.reader import make_reader
 from mddag_executor.cli import main as program
-from mddag_executor.replay import caret_events
-from mddag_executor.replay.for_caret import CARET_EVENTS
-from mddag_executor.trace import read_events, TraceFile, TraceReader
-from mddag_executor.trace.schema import EventType
+from mddag_executor.recording.tables import TABLES
+from mddag_executor.replay import open_recording
 import pytest
 
 from .helpers import caller
@@ -213,77 +210,35 @@ def test_diff(
         == 0
 
 
-def test_a_file_for_foxglove_and_its_layout(
+def test_the_tables_of_a_recording(
     trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / 'run.foxglove.mcap'
-    assert call(capsys, 'export', trace, '-o', out) == (0, f'exported: {out}\n', '')
-    topics: dict[str, list[Any]] = {}
-    times = []
-    with out.open('rb') as file:
-        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
-            assert schema is not None
-            assert (schema.encoding, channel.message_encoding) == ('jsonschema', 'json')
-            assert (schema.name == 'foxglove.Log') == (channel.topic == '/misses')
-            topics.setdefault(channel.topic, []).append(json.loads(message.data))
-            times.append(message.log_time)
-    assert times == sorted(times)
-    assert list(topics) == ['/workers/0', '/sinks/n/s', '/misses']
-    # each callback runs 10 times: it begins, and the worker is idle again
-    states = [message['state'] for message in topics['/workers/0']]
-    assert [states.count(state) for state in ('/n:t', '/n:s', 'idle')] == [10, 10, 20]
-    assert topics['/sinks/n/s'][0] == {
-        'job': 0, 'verdict': 'late', 'missed': 1, 'deadline_ms': 5.0, 'response_ms': 6.0,
-        'margin_ms': -1.0}
-    assert topics['/misses'][0] == {
-        'timestamp': {'sec': 0, 'nsec': 6_000_000}, 'level': 3,
-        'message': 'job 0 of /n late by 1 ms', 'name': '/n:s', 'file': '', 'line': 0}
-    layout = json.loads((tmp_path / 'run.foxglove.json').read_text())
-    shown = json.dumps(layout['layout'])
-    assert all(panel in shown for panel in layout['configById'])
-    paths = [path['value'] for panel in layout['configById'].values()
-             for path in panel.get('paths', ())]
-    assert all(path.rpartition('.')[0] in topics for path in paths)
-
-
-@pytest.mark.needs('babeltrace2')
-@pytest.mark.parametrize('recorded', [False, True])
-def test_a_session_that_is_imported_again_has_the_same_events(
-    recorded: bool, trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    trace = DEMO if recorded else trace
-    out, back = tmp_path / 'session', tmp_path / 'back.mcap'
-    assert call(capsys, 'export', trace, '-o', f'{out}/') == (0, f'exported: {out}/\n', '')
-    assert call(capsys, 'import', 'ctf', out, '-o', back)[0] == 0
-    before, after = (list(TraceReader(path).events(sorted=True)) for path in (trace, back))
-    assert after.pop(0)[0] == 'ros2:rcl_init'       # what tracetools_analysis asks for
-    assert before == after
-    status, _, error = call(capsys, 'export', trace, '-o', f'{out}/')
+    parquet = pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
+    out = tmp_path / 'tables'
+    assert call(capsys, 'export', DEMO, '-o', f'{out}/') == (0, f'exported: {out}/\n', '')
+    recording = open_recording(DEMO)
+    assert {path.stem for path in out.iterdir()} == set(TABLES)
+    for name in TABLES:
+        table = parquet.read_table(out / f'{name}.parquet')
+        assert table.num_rows == len(getattr(recording, name))
+        assert table.schema.metadata[b'mddag.tables'] == b'1'
+    executions = parquet.read_table(out / 'executions.parquet')
+    assert executions.schema.field('start').metadata == {b'unit': b'ns'}
+    assert executions['start'].to_pylist() == recording.executions['start'].tolist()
+    names = {vertex.name for vertex in recording.task_set.vertices}
+    assert set(executions['vertex'].to_pylist()) - {None} <= names
+    keys = {callback.key for callback in recording.task_set.callbacks}
+    assert {row['callback'] for row in executions.to_pylist() if row['vertex']} <= keys
+    status, _, error = call(capsys, 'export', DEMO, '-o', f'{out}/')
     assert (status, error) == (
-        2, f'error: {out}: is there already: name another folder\n')
-
-
-@pytest.mark.needs('babeltrace2')
-def test_a_session_for_caret_has_what_its_tracer_sees(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out, back = tmp_path / 'session', tmp_path / 'back.mcap'
-    assert call(capsys, 'export', DEMO, '-o', f'{out}/', '--caret')[0] == 0
-    assert call(capsys, 'import', 'ctf', out, '-o', back)[0] == 0
-    wanted = {'ros2_caret:dds_write', 'ros2:dispatch_subscription_callback', 'ros2:callback_start'}
-    names = [event['_name'] for event in read_events(back)]
-    assert wanted <= set(names) <= CARET_EVENTS
-    expected = list(caret_events(DEMO))
-    assert len(names) == len(expected)
-    found = [event for event in read_events(back) if event['_name'] in wanted]
-    assert found == [event for event in expected if event['_name'] in wanted]
+        2, f'error: {out}/: it is there already: name a new folder, or remove this one\n')
 
 
 @pytest.mark.parametrize(('arguments', 'error'), [
-    (('--caret', '-o', 'x.csv'), "--caret: it is for a folder: let the name of -o end in '/'"),
-    (('--rows', 'jobs', '-o', 'x/'), 'leave GRAPH, --reschedule and --rows out'),
-    (('--rows', 'jobs', '-o', 'x.foxglove.mcap'), 'a .mcap gets both')])
-def test_options_of_sessions_and_foxglove(
+    (('--rows', 'jobs', '-o', 'x/'), 'the tables are both'),
+    (('-o', 'x.mcap'), 'it is not known what to write'),
+    (('-o', 'nowhere/x/'), 'there is no directory nowhere')])
+def test_outputs_that_cannot_be(
     arguments: tuple[str, ...], error: str, trace: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, _, said = call(capsys, 'export', trace, *arguments)

@@ -38,7 +38,7 @@ def run(graph: Path, capsys: pytest.CaptureFixture[str]) -> Path:
 
 @pytest.mark.parametrize('command', [
     'export run.mcap -o run.mcap',
-    'export run.mcap -o ./run.mcap --overwrite',
+    'export run.mcap -o ./run.mcap',
     'export run.mcap -o link.csv',
     'replay run.mcap --json run.mcap',
     'replay run.mcap graph.yaml --json graph.yaml',

@@ -54,17 +54,13 @@ class Page(HTMLParser):
 
 
 def report(path: Path) -> Page:
-    watch = html.Watch()
-    outcome = replay(path, more=watch.of)
     file = io.BytesIO()
-    html.write(file, html.of_outcome(outcome, watch))
+    html.write(file, html.of_outcome(replay(path)))
     return Page(file.getvalue().decode())
 
 
 def test_what_stands_in_the_file_is_what_ran(tmp_path: Path) -> None:
-    watch = html.Watch()
-    outcome = replay(runs.by_hand(tmp_path / 'run.mcap'), more=watch.of)
-    prepared = prepare(html.of_outcome(outcome, watch))
+    prepared = prepare(html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap'))))
     found = prepared.executions
     assert prepared.origin == runs.START + 10 * runs.MS
     assert found['left'] == pytest.approx([0, 0.002, 0.010, 0.013, 0.020, 0.027, 0.031])
@@ -157,9 +153,8 @@ def test_markup_is_only_what_says_so() -> None:
 
 def test_end_to_end_times_of_declared_paths(tmp_path: Path) -> None:
     page = report(runs.by_hand(tmp_path / 'run.mcap'))
-    watch = html.Watch()
-    outcome = replay(runs.by_hand(tmp_path / 'run.mcap'), more=watch.of)
-    data = html.of_outcome(outcome, watch)
+    outcome = replay(runs.by_hand(tmp_path / 'run.mcap'))
+    data = html.of_outcome(outcome)
     assert data.paths == outcome.result()['paths']
     text = ' '.join(' '.join(page.texts).split())
     assert ('worst-with-external-latency' in text) is bool(data.paths)

@@ -30,15 +30,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence, Set
+from dataclasses import replace
 from typing import NamedTuple
 
 from mddag_executor.core import legs_of
-from mddag_executor.replay.entities import Callback, Entities, Node
-from mddag_executor.replay.recording import ReplayError
+from mddag_executor.recording.entities import Callback, Entities, Node
+from mddag_executor.recording.head import ReplayError
+from mddag_executor.recording.tables import Recording, Table
 from mddag_executor.text import counted, listed
 from msg_graph import Callback as Declared
 from msg_graph import Dag, format_duration, NO_GRAPH, TaskSet, Vertex
 from msg_graph.binding import Binder, entities_of, Entity, meant
+import numpy as np
 
 
 class Mapping:
@@ -102,6 +105,57 @@ class Mapping:
             self.warnings.append(
                 f'{self.task_set.file}: {counted(len(missing), "DAG")} without jobs, because the '
                 f'source is no source in the recording: {listed(missing)}')
+
+
+def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
+    """
+    Return a recording in terms of the declaration that judges.
+
+    :param judge: None: the recorded one.
+    :raises ReplayError: when the recording has none of its callbacks.
+    """
+    mapping = Mapping(recording.name, recording.recorded_set, judge)
+    warnings = [*recording.warnings, *mapping.warnings]
+    if mapping.task_set is recording.task_set or mapping.same:
+        return replace(
+            recording, task_set=mapping.task_set, same=recording.same, warnings=warnings)
+    dag = np.array([*mapping.dag, -1])
+    flat = [v if legs else -1 for vertices, of_legs in zip(mapping.vertex, mapping.leg)
+            for v, legs in zip(vertices, of_legs)]
+    vertex = np.array([*flat, -1])
+    n_legs = max((len(legs) for of_dag in mapping.leg for legs in of_dag), default=1)
+    leg = np.array([[*legs, *[-1] * (n_legs - len(legs))]
+                    for of_dag in mapping.leg for legs in of_dag] + [[-1] * n_legs])
+
+    def moved(table: Table) -> Table:
+        table = table.copy()
+        of = table['vertex'].copy()
+        if 'leg' in (table.dtype.names or ()):
+            known = (table['leg'] >= 0) & (table['leg'] < n_legs)
+            table['leg'][known] = leg[of[known], table['leg'][known]]
+        table['vertex'] = vertex[of]
+        if 'dag' in (table.dtype.names or ()):
+            table['dag'] = np.where(vertex[of] >= 0, dag[table['dag']], -1)
+        if 'completes' in (table.dtype.names or ()):
+            table['completes'][vertex[of] < 0] = 0
+        return table
+
+    def of_dags(table: Table) -> Table:
+        table = table.copy()
+        table['dag'] = dag[table['dag']]
+        if 'vertex' in (table.dtype.names or ()):
+            failed = table['vertex'] >= 0
+            table['vertex'] = np.where(failed, vertex[table['vertex']], -1)
+            table = table[~failed | (table['vertex'] >= 0)]
+        return table[table['dag'] >= 0]
+
+    hosted = [(order, mapping.dag[of], frozenset(int(vertex[v]) for v in vertices) - {-1})
+              for order, of, vertices in recording.hosted if mapping.dag[of] >= 0]
+    return replace(
+        recording, task_set=mapping.task_set, same=False, warnings=warnings, hosted=hosted,
+        executions=moved(recording.executions), publications=moved(recording.publications),
+        drops=moved(recording.drops), misses=moved(recording.misses),
+        releases=of_dags(recording.releases), job_ends=of_dags(recording.job_ends))
 
 
 def _first_vertices(task_set: TaskSet) -> list[int]:
