@@ -38,7 +38,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mddag_executor.core.state import SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_LATE
-from mddag_executor.recording.tables import Ints, Table
+from mddag_executor.recording.tables import Ints, Mask, Table
 from mddag_executor.replay.spans import Spans
 import numpy as np
 

@@ -214,7 +214,8 @@ class ImportedRun(LinkObserver):
             imported=self._imported, same=False, releases=self._releases.table(),
             executions=executions, publications=self._sent.table(), job_ends=self._ends.table(),
             takes=self._taken.table(), start=self.start, end=self.end,
-            judged_until=self._judged_until(), lost=self.lost, workers_each=self.head.workers, links=True,
+            judged_until=self._judged_until(), lost=self.lost,
+            workers_each=self.head.workers, links=True,
             callback_vertex=self._vertex, unjudged=self.unjudged, warnings=self.warnings)
 
     def _judged_until(self) -> int:
