@@ -45,6 +45,7 @@ from mddag_executor.recording.tables import (
     Mask,
     MISSES,
     NOTHING,
+    pick,
     PUBLICATIONS,
     Recording,
     RELEASES,
@@ -325,7 +326,9 @@ class _Source:
         more, more_at, more_seen = self._completions(table, dispatch_at, complete_at, seen)
         _pieces(table, end_at)
         if len(more):
-            table = np.concatenate([table, more])
+            del table       # which is in the memory that grows
+            self._executions.add(more)
+            table = self._executions.table()
             complete_at = np.concatenate([complete_at, more_at])
             seen = np.concatenate([seen, more_seen])
         return table, complete_at, seen
@@ -386,31 +389,21 @@ class _Source:
         mine = np.flatnonzero(good)
         mine = mine[np.argsort(of[mine], kind='stable')]
         begins, until = groups(of[mine])
-        of_one = until - begins == 1
-        first = np.zeros(len(complete), dtype=np.bool_)
-        first[mine[begins[of_one]]] = True
-        several = []
-        for begin, end in zip(begins[~of_one].tolist(), until[~of_one].tolist()):
-            several.append(mine[begin:end])
-        first[first] = complete_at[of[first]] < 0
-        one = np.flatnonzero(first)
-        changed = table[of[one]]
-        self._complete(changed, complete[one])
-        table[of[one]] = changed
-        complete_at[of[one]], seen[of[one]] = at[one], complete['timestamp'][one]
-        taken = first
-        for legs in several:
-            row, last_leg = int(of[legs[0]]), legs[-1]
-            n_legs = self._numbering.n_legs[table['vertex'][row]]
-            if complete_at[row] < 0:
-                changed = table[row:row + 1]
-                self._complete(changed, complete[last_leg:last_leg + 1])
-                complete_at[row], seen[row] = at[last_leg], complete['timestamp'][last_leg]
-                if sorted(complete['leg'][legs].tolist()) == list(range(n_legs)):
-                    changed['leg'] = ALL_LEGS
-                    taken[legs] = True
-                else:
-                    taken[last_leg] = True
+        taken = np.zeros(len(complete), dtype=np.bool_)
+        if len(mine):
+            row, last_leg = of[mine[begins]], mine[until - 1]
+            changed = pick(table, row)
+            self._complete(changed, complete[last_leg])
+            legs = np.add.reduceat(1 << np.clip(complete['leg'][mine], 0, 62).astype(np.int64),
+                                   begins)
+            n_legs = np.array(self._numbering.n_legs)[changed['vertex']]
+            every = (until - begins > 1) & (until - begins == n_legs) & (
+                legs == (1 << np.minimum(n_legs, 62)) - 1)
+            changed['leg'][every] = ALL_LEGS
+            table[row] = changed
+            complete_at[row], seen[row] = at[last_leg], complete['timestamp'][last_leg]
+            taken[last_leg] = True
+            taken[mine] |= np.repeat(every, until - begins)
         rest = np.flatnonzero(~taken)
         known = dag[rest] >= 0
         if not known.all():

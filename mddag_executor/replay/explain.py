@@ -21,7 +21,7 @@ from mddag_executor.core import POLICIES
 from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.recording.tables import Ints, Recording, Table, VERTEX
+from mddag_executor.recording.tables import Ints, pick, Recording, Table, VERTEX
 from mddag_executor.replay.causes import (
     behind,
     CAUSES,
@@ -141,8 +141,7 @@ class Explanation:
     def _started(self) -> Table:
         """Return the executions of declared callbacks that were started."""
         table = self._recording.executions
-        started: Table = table[(table['vertex'] >= 0) & (table['start'] >= 0)]
-        return started
+        return pick(table, (table['vertex'] >= 0) & (table['start'] >= 0))
 
     def _stops(self) -> list[tuple[int, int]]:
         """Return the stops of the machine, from the last event before each on."""

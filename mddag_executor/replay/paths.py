@@ -174,14 +174,13 @@ class Paths:
                 self._message(table['job'][by], table['vertex'][by], topic), NONE)
             time = sent['time']
         else:       # what is published is not recorded
-            ended = np.flatnonzero((table['end'] >= 0) & (table['start'] >= 0)
-                                   & (table['vertex'] >= 0))
             parts = []
-            for v, vertex_of in enumerate(self._task_set.vertices):
-                mine = ended[table['vertex'][ended] == v]
-                parts += [(mine, self._topics[topic]) for topic in vertex_of.callback.publishes
+            for callback in self._task_set.callbacks:
+                mine = self._of_place[self._places[callback.key]]
+                mine = mine[(self._end[mine] >= 0) & (self._start[mine] >= 0)]
+                parts += [(mine, self._topics[topic]) for topic in callback.publishes
                           if topic in self._topics]
-            by = np.concatenate([mine for mine, _ in parts] or [ended[:0]])
+            by = np.concatenate([mine for mine, _ in parts] or [self._first[:0]])
             topic = np.repeat(np.array([topic for _, topic in parts], dtype=np.int64),
                               [len(mine) for mine, _ in parts])
             vertex, node = self._vertex[by], np.full(len(by), NONE)
