@@ -46,7 +46,9 @@ LEVELS = {
     'mddag_executor.__main__': 10,
 }
 # What mddag_executor/__init__.py passes on belongs to the part that it comes from.
-PASSED_ON = {'mddag_executor.DeadlineMiss', 'mddag_executor.MultiDeadlineExecutor'}
+PASSED_ON = {'mddag_executor.DeadlineMiss': 'mddag_executor.live',
+             'mddag_executor.MultiDeadlineExecutor': 'mddag_executor.live',
+             'mddag_executor.open_recording': 'mddag_executor.replay'}
 # The core takes events with their times and answers with decisions; it asks nobody.
 NOT_IN_CORE = {
     'asyncio', 'concurrent', 'datetime', 'io', 'logging', 'multiprocessing', 'os', 'pathlib',
@@ -63,7 +65,7 @@ MAY_USE_ROS = {'mddag_executor.live', 'mddag_executor.hosting', 'mddag_executor.
 def part_of(module: str) -> str | None:
     """Return the part of the program that a module belongs to; None for foreign ones."""
     if module in PASSED_ON:
-        return 'mddag_executor.live'
+        return PASSED_ON[module]
     names = module.split('.')
     if names[0] not in ('msg_graph', 'mddag_executor'):
         return None

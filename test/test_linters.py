@@ -46,7 +46,6 @@ THIRD_PARTY: dict[str, tuple[str | None, str | None]] = {
     'nav_msgs': ('nav_msgs', None),
     'numba': (None, 'numba'),  # of the extra `batch`
     'numpy': ('python3-numpy', 'numpy'),
-    'perfetto': (None, 'perfetto'),  # of the extra `export`
     'pyarrow': (None, 'pyarrow'),  # of the extra `export`
     'rcl_interfaces': ('rcl_interfaces', None),
     'rclpy': ('rclpy', None),

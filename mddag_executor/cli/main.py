@@ -70,7 +70,7 @@ VERBS = {
         'check', 'draw', 'schema', 'fmt', 'from-caret', 'from-trace', 'from-ros', 'analyse',
         'assign-deadlines', 'place')),
     'import': Verb('import', 'turn a CARET or ros2_tracing recording into a trace', ('ctf',)),
-    'export': Verb('export', 'turn a trace into a file for Perfetto, Foxglove or spreadsheets'),
+    'export': Verb('export', 'turn a recording into files for Perfetto or for data frames'),
     'diff': Verb('diff', 'compare two recorded runs sink by sink'),
     'top': Verb('top', 'show the deadlines and workers of running executors, live'),
     'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator', (

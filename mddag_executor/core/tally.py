@@ -40,7 +40,7 @@ VERDICTS = {
     SINK_ABORTED: 'aborted', SINK_FAILED: 'failed', SINK_OVERDUE: 'overdue'}
 """What a verdict of the core is called."""
 OUTCOMES = {COMPLETED: 'completed', LATE: 'late', ABORTED: 'aborted', EXPIRED: 'expired',
-             FAILED: 'failed'}
+            FAILED: 'failed'}
 
 
 def quantile(ordered: Sequence[int], q: float) -> int:

@@ -104,7 +104,7 @@ class _Kind:
         self.rows.append(found)
         self.places.append(places)
 
-    def all(self) -> tuple[Table | None, Ints]:
+    def joined(self) -> tuple[Table | None, Ints]:
         """Return them, as the first ones are typed; None: there are none."""
         if not self.rows:
             return None, np.empty(0, dtype=np.int64)
@@ -284,16 +284,16 @@ class _Source:
         executions, complete_at, seen = self._all_executions()
         found.executions = executions
         found.publications = self._publications(executions)
-        released, released_at = self._kind(_RELEASE).all()
+        released, released_at = self._kind(_RELEASE).joined()
         found.releases, released_at = self._releases(released, released_at)
         found.job_ends, ends_at = self._job_ends()
         found.misses = self._misses()
-        stops, _ = self._kind(_STOP).all()
+        stops, _ = self._kind(_STOP).joined()
         if stops is not None:
             found.stops = rows(
                 STOPS, len(stops), start=stops['begin'], end=stops['end'])
             found.notices_stops = int(stops['end'].min())
-        lost, _ = self._kind(_LOST).all()
+        lost, _ = self._kind(_LOST).joined()
         found.lost = 0 if lost is None else int(sum(lost['count'].tolist()))
         self._set_end(found)
         self._put_in_order(found, [
@@ -335,7 +335,7 @@ class _Source:
 
     def _by_thread(self) -> tuple[Table, Ints, Ints]:
         """Return executions whose events do not stand together, and where begins and ends are."""
-        found = [self._kind(kind).all() for kind in (_DISPATCH, _START, _END)]
+        found = [self._kind(kind).joined() for kind in (_DISPATCH, _START, _END)]
         dispatch = found[0][0]
         if dispatch is None:
             none = np.empty(0, dtype=np.int64)
@@ -366,7 +366,7 @@ class _Source:
         self, table: Table, dispatch_at: Ints, complete_at: Ints, seen: Ints
     ) -> tuple[Table, Ints, Ints]:
         """Give executions the completions that do not follow them; return those of none."""
-        complete, at = self._kind(_COMPLETE).all()
+        complete, at = self._kind(_COMPLETE).joined()
         if complete is None:
             return rows(EXECUTIONS), at, at
         ended = np.flatnonzero((table['end'] >= 0) & (complete_at < 0))
@@ -418,7 +418,7 @@ class _Source:
         return more, at[rest], complete['timestamp'][rest].astype(np.int64)
 
     def _publications(self, executions: Table) -> Table:
-        published, _ = self._kind(_PUBLISH).all()
+        published, _ = self._kind(_PUBLISH).joined()
         if published is None:
             return rows(PUBLICATIONS)
         time = published['timestamp'].astype(np.int64)
@@ -461,7 +461,7 @@ class _Source:
     def _job_ends(self) -> tuple[Table, Ints]:
         tables, places = [rows(JOB_ENDS)], [np.empty(0, dtype=np.int64)]
         for kind, reason in _JOB_ENDS.items():
-            found, at = self._kind(kind).all()
+            found, at = self._kind(kind).joined()
             if found is None:
                 continue
             good = (found['dag'] >= 0) & (found['dag'] < len(self._task_set.dags))
@@ -477,7 +477,7 @@ class _Source:
         return np.concatenate(tables), np.concatenate(places)
 
     def _misses(self) -> Table:
-        found, at = self._kind(_DEADLINE).all()
+        found, at = self._kind(_DEADLINE).joined()
         if found is None:
             return rows(MISSES)
         dag, vertex = self._numbering.of(found['dag'], found['vertex'])
@@ -488,11 +488,11 @@ class _Source:
         """Find out when the run ended, and take in the events that come singly."""
         last = 0
         for kind in _CORE:
-            each, _ = self._kind(kind).all() if kind != _COMPLETE else (None, None)
+            each, _ = self._kind(kind).joined() if kind != _COMPLETE else (None, None)
             if each is not None and len(each):
                 last = max(last, int(each['timestamp'].max()))
         last = max([last, *(int(each.max()) for each in self._seen if len(each))])
-        left, _ = self._kind(_COMPLETE).all()
+        left, _ = self._kind(_COMPLETE).joined()
         if left is not None:
             last = max(last, int(left['timestamp'].max()))
         drops, reasons, hosted = [], dict[str, int](), []
@@ -510,7 +510,7 @@ class _Source:
         vertex, job, time, reason = zip(*drops) if drops else ((), (), (), ())
         found.drops = rows(DROPS, len(drops), vertex=vertex, job=job, time=time, reason=reason)
         found.drop_reasons = tuple(reasons)
-        judging, judging_at = self._kind(_JUDGE_FROM).all()
+        judging, judging_at = self._kind(_JUDGE_FROM).joined()
         changes = []
         if judging is not None:
             last = max(last, int(judging['timestamp'].max()))
@@ -523,7 +523,7 @@ class _Source:
         self._changes, self._hosting = sorted(changes), sorted(hosted, key=lambda h: h[:2])
         found.end = found.judged_until = last
         self._shutdown_at: tuple[int, int] | None = None
-        shutdown, shutdown_at = self._kind(_SHUTDOWN).all()
+        shutdown, shutdown_at = self._kind(_SHUTDOWN).joined()
         if shutdown is not None:
             now, judged = int(shutdown['timestamp'][0]), int(shutdown['end'][0])
             if last <= now < NEVER and 0 <= judged <= now:

@@ -316,4 +316,3 @@ def medians(numbers: Any, times: Ints, count: int) -> Ints:
     below = np.cumsum(counts, axis=1)
     middle = (2 * below >= below[:, -1:]).argmax(axis=1)
     return np.where(below[:, -1] > 0, np.exp2((middle + 0.5) / _STEPS), 0).astype(np.int64)
-

@@ -17,7 +17,7 @@ from msg_graph import loads
 import pytest
 
 from ..cli.helpers import caller
-from .helpers import (
+from ..replay.helpers import (
     begin_trace,
     Chances,
     declarations,
