@@ -187,18 +187,11 @@ def arrow_table(columns: Sequence[Column]) -> Any:
         fields.append(pyarrow.field(column.name, array.type, nullable=column.known is not None))
     return pyarrow.table(arrays, schema=pyarrow.schema(fields))
 
-    def abandon(self) -> None:
-        """Leave the file to its owner, without what is buffered."""
-
 
 def write_parquet(file: BinaryIO, columns: Sequence[Column]) -> None:
     """Write Parquet."""
     import pyarrow.parquet
     pyarrow.parquet.write_table(arrow_table(columns), file, compression='zstd')
-
-    def abandon(self) -> None:
-        """Keep pyarrow from writing a footer when it is collected: the file is closed by then."""
-        self._writer.is_open = False
 
 
 def check_available(form: str) -> None:

@@ -8,7 +8,6 @@ from contextlib import redirect_stdout
 import io
 import json
 from pathlib import Path
-import re
 import subprocess
 import sys
 from typing import Any
@@ -257,18 +256,3 @@ def test_a_parquet_export_that_fails_is_one_line(
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr.startswith('error: ') and done.stderr.count('\n') == 1
     assert not (tmp_path / 'out.parquet').exists()
-
-
-def test_a_session_has_the_names_that_were_imported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A trace calls an event's own field `timestamp` otherwise; a session does not."""
-    kind = EventType('my_app', 'frame', (
-        ('timestamp_', 'int64'), ('other_', 'int64'), ('vpid_', 'int64'), ('vtid__', 'int64'),
-        ('vtid_', 'int64')))
-    with TraceFile(tmp_path / 'a.mcap', extra_events=[kind]) as file:
-        file.add('my_app:frame', 1, 2, 3, 4, 5, 6, 7, 8)
-    assert call(capsys, 'export', tmp_path / 'a.mcap', '-o', f'{tmp_path}/s/')[0] == 0
-    metadata = (tmp_path / 's' / 'ust' / 'metadata').read_text()
-    line = next(line for line in metadata.splitlines() if 'my_app:frame' in line)
-    assert re.findall(r'} _(\w+);', line) == ['timestamp', 'other_', 'vpid', 'vtid__', 'vtid']
