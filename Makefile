@@ -43,7 +43,7 @@ test: env
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 # The tests that run ROS, in an environment with ROS 2 Kilted instead of Jazzy.
-LIVE_TESTS := test/live test/rerun test/examples test/hardening/test_misuse.py \
+LIVE_TESTS := test/executor test/hosting test/rerun test/examples test/hardening/test_misuse.py \
 	test/replay/test_live_replay.py \
 	$(addprefix test/cli/test_,$(addsuffix .py,demo graph_systems rerun run top))
 
@@ -71,7 +71,7 @@ soak: env
 STRESS_SECONDS ?= 20
 
 stress: env
-	@MISS_STRESS_SECONDS=$(STRESS_SECONDS) $(BIN)/python -m pytest -q test/live/test_misses.py
+	@MISS_STRESS_SECONDS=$(STRESS_SECONDS) $(BIN)/python -m pytest -q test/executor/test_misses.py
 
 lint: env
 	@$(BIN)/python -m pytest -q -m linter test/test_linters.py test/test_layers.py

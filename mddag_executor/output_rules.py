@@ -9,12 +9,15 @@ What an output may replace: the one rule for all verbs and for the Python API.
 2. An output is never an input of the same command, and no two outputs are the same file.
 3. Other results (tables, pictures, declarations) replace what was there, as with every tool.
 4. Pipes, devices and empty files hold nothing that could be lost.
+5. A folder of results replaces a folder that is empty or holds files with the names of such
+   results only: those of an earlier command, or what a killed one left. Other folders stay.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 import os
+from pathlib import Path
 import stat
 from typing import BinaryIO, cast
 
@@ -41,9 +44,9 @@ def check_replaced(path: str, *, recording: bool, overwrite: bool = False) -> No
         raise InputError(path, 'this file is a recording', 'name another file for the result')
 
 
-def open_recording(path: str, overwrite: bool = False) -> BinaryIO:
+def create_recording(path: str, overwrite: bool = False) -> BinaryIO:
     """
-    Open a new recording, unbuffered (rule 1).
+    Open a new recording for writing, unbuffered (rule 1).
 
     :raises FileExistsError: when a file is there and must not be replaced
     """
@@ -53,6 +56,33 @@ def open_recording(path: str, overwrite: bool = False) -> BinaryIO:
         if not overwrite and holds_data(path):
             raise
         return cast(BinaryIO, open(path, 'wb', buffering=0))
+
+
+def check_results(folder: Path, names: Collection[str]) -> None:
+    """
+    Find out whether a folder of results may take the place of what is there (rule 5).
+
+    :param names: of the files that such a folder holds
+    :raises mddag_executor.errors.InputError: when it may not
+    """
+    if not os.path.lexists(folder):
+        return
+    if not folder.is_dir():
+        raise InputError(str(folder), EXISTS, 'name a new folder, or remove this file')
+    others = sorted(set(os.listdir(folder)).difference(names))
+    if others:
+        raise InputError(
+            str(folder), f'this folder holds other files, for instance {others[0]}',
+            'name a new folder, or remove this one')
+
+
+def remove_results(folder: Path, names: Collection[str]) -> None:
+    """Remove a folder of results, if one is there; see ``check_results``."""
+    check_results(folder, names)
+    if folder.exists():
+        for file in list(folder.iterdir()):
+            file.unlink()
+        folder.rmdir()
 
 
 def check_distinct(inputs: Sequence[tuple[str, str]], outputs: Sequence[tuple[str, str]]) -> None:

@@ -40,7 +40,7 @@ HERE = Path(__file__).resolve().parent
 
 # Fast and basic ones first, so that a mistake shows early; whatever starts ROS comes last.
 ORDER = ('msg_graph', 'core', 'trace', 'simulate', 'analysis', 'replay', 'report', 'cli', 'launch',
-         '', 'live', 'rerun', 'bench')
+         '', 'executor', 'hosting', 'rerun', 'benchmarks')
 # Domains above 101 collide with the ephemeral ports of Linux; low ones are what people use.
 DOMAINS = range(40, 102)
 
@@ -66,6 +66,7 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ['ROS_DOMAIN_ID'] = str(_claim_domain())
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     os.environ.pop('ROS_STATIC_PEERS', None)
+    os.environ.setdefault('MDDAG_DEBUG', 'engine')  # of programs that tests start, too
     # What pytest itself keeps stays where it is.
     os.environ.setdefault('PYTEST_DEBUG_TEMPROOT', tempfile.gettempdir())
     folder = _session.enter_context(
@@ -136,9 +137,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 # What runs ROS, or waits as time passes. Side by side (`make test`) a process takes whole files of
 # these, which come first: most of their time they wait, so that both take what is left then.
 ROS = (
-    'live', 'bench', 'launch', 'examples', 'hardening/test_misuse.py', 'cli/test_run.py',
-    'cli/test_demo.py', 'cli/test_top.py', 'cli/test_bench_replay.py', 'cli/test_graph_systems.py',
-    'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py', 'endurance/test_soak.py')
+    'executor', 'hosting', 'benchmarks', 'launch', 'examples', 'hardening/test_misuse.py',
+    'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph_systems.py',
+    'replay/test_known_causes.py', 'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py',
+    'endurance/test_soak.py')
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -173,7 +175,7 @@ def _rank(item: pytest.Item) -> tuple[bool, int]:
     except ValueError:
         parts = ()
     folder = parts[0] if len(parts) > 1 else ''
-    place = ORDER.index(folder) if folder in ORDER else ORDER.index('live')
+    place = ORDER.index(folder) if folder in ORDER else ORDER.index('executor')
     return item.get_closest_marker('slow') is not None, place
 
 

@@ -23,51 +23,6 @@ from .doc_blocks import Block, blocks, Folder, pages, REASONS, TOP
 
 PAGES = pages()
 LARGEST_IMAGE = 150_000
-# What a page takes for granted: nodes of the reader's own robot.
-NODES = """
-from rclpy.node import Node
-from std_msgs.msg import Header
-
-
-class Camera(Node):
-
-    def __init__(self):
-        super().__init__('camera')
-        self.images = self.create_publisher(Header, '/image', 1)
-        self.timer = self.create_timer(0.1, self.capture)
-
-    def capture(self):
-        self.images.publish(Header(stamp=self.get_clock().now().to_msg()))
-
-
-class Detector(Node):
-
-    def __init__(self):
-        super().__init__('detector')
-        self.objects = self.create_publisher(Header, '/objects', 1)
-        self.create_subscription(Header, '/image', self.objects.publish, 1)
-
-
-class Tracker(Node):
-
-    def __init__(self, name='tracker'):
-        super().__init__(name)
-        self.create_subscription(Header, '/objects', self.take, 1)
-        self.seen = 0
-
-    def take(self, objects):
-        self.seen += 1
-
-
-class Brake(Tracker):
-
-    def __init__(self):
-        super().__init__('brake')
-
-    def take(self, objects):
-        super().take(objects)
-        print('seen', self.seen, flush=True)
-"""
 COMMON = """
 mddag: 1
 nodes:
@@ -75,21 +30,23 @@ nodes:
     callbacks:
       - {name: report, timer: 20ms, publishes: [/vehicle/twist], deadline: 20ms}
 """
+# The declaration of the first page, which others use.
+VISION = next(block.text for block in blocks('docs/start.md')
+              if block.mark('file') == 'graph.yaml')
 FILES = {
-    'README.md': {'my_robot.py': NODES},
-    'docs/graphs.md': {'common.yaml': COMMON},
+    'docs/declare.md': {'common.yaml': COMMON},
+    'docs/laboratory.md': {'graph.yaml': VISION},
+    'docs/model.md': {'graph.yaml': VISION},
 }
 
 # What its commands need besides what every installation has.
 EXTRAS = {
     'README.md': ('rclpy',),
-    'docs/gil.md': ('rclpy',),
-    'docs/measurements.md': ('matplotlib',),
-    'docs/real_time.md': ('rclpy',),
-    'docs/report.md': ('bokeh',),
+    'docs/judge.md': ('bokeh',),
+    'docs/laboratory.md': ('matplotlib', 'distributed'),
+    'docs/figures.md': ('matplotlib',),
     'docs/run.md': ('rclpy',),
     'docs/start.md': ('rclpy',),
-    'docs/sweeps.md': ('matplotlib', 'distributed'),
 }
 
 

@@ -3,11 +3,11 @@
 """
 The parts of the program know one another in one direction only.
 
-    cli -> report, rerun -> hosting -> (live | replay | assign | simulate | analysis)
+    cli -> rerun -> report, hosting -> (executor | replay | assign | simulate | analysis)
         -> trace, core, generate -> msg_graph
 
 Imports are read from the sources, those inside functions and for type checkers included. So are
-the names that only ``live.compat`` may use of rclpy.
+the names of rclpy that only the modules in ``COMPAT`` may use.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ LEVELS = {
     'mddag_executor.core': 4,
     'mddag_executor.trace': 4,
     'mddag_executor.generate': 4,
+    'mddag_executor.recording': 5,
     'mddag_executor.analysis': 5,
     'mddag_executor.simulate': 5,  # below replay, which reschedules with its engine
     'mddag_executor.assign': 6,
-    'mddag_executor.live': 6,
+    'mddag_executor.executor': 6,
     'mddag_executor.replay': 6,
     'mddag_executor.report': 7,
     'mddag_executor.hosting': 7,
@@ -45,7 +46,9 @@ LEVELS = {
     'mddag_executor.__main__': 10,
 }
 # What mddag_executor/__init__.py passes on belongs to the part that it comes from.
-PASSED_ON = {'mddag_executor.DeadlineMiss', 'mddag_executor.MultiDeadlineExecutor'}
+PASSED_ON = {'mddag_executor.DeadlineMiss': 'mddag_executor.executor',
+             'mddag_executor.MultiDeadlineExecutor': 'mddag_executor.executor',
+             'mddag_executor.open_recording': 'mddag_executor.replay'}
 # The core takes events with their times and answers with decisions; it asks nobody.
 NOT_IN_CORE = {
     'asyncio', 'concurrent', 'datetime', 'io', 'logging', 'multiprocessing', 'os', 'pathlib',
@@ -55,14 +58,14 @@ NOT_IN_CORE = {
 # Offline parts work on a machine without ROS.
 ROS = {'rclpy', 'rcl_interfaces', 'std_msgs', 'diagnostic_msgs', 'builtin_interfaces', 'launch',
        'launch_ros', 'ament_index_python', 'rosidl_parser'}
-MAY_USE_ROS = {'mddag_executor.live', 'mddag_executor.hosting', 'mddag_executor.rerun',
+MAY_USE_ROS = {'mddag_executor.executor', 'mddag_executor.hosting', 'mddag_executor.rerun',
                'mddag_executor.cli'}
 
 
 def part_of(module: str) -> str | None:
     """Return the part of the program that a module belongs to; None for foreign ones."""
     if module in PASSED_ON:
-        return 'mddag_executor.live'
+        return PASSED_ON[module]
     names = module.split('.')
     if names[0] not in ('msg_graph', 'mddag_executor'):
         return None
@@ -134,19 +137,19 @@ def test_every_folder_has_its_level() -> None:
     ('msg_graph.model', 'import mddag_executor'),
     ('msg_graph.model', 'from mddag_executor.core import Tables'),
     ('mddag_executor.core.tables', 'from mddag_executor.trace import TraceReader'),
-    ('mddag_executor.core.tables', 'from ..live import executor'),
-    ('mddag_executor.core.tables', 'from .. import live'),
+    ('mddag_executor.core.tables', 'from ..executor import executor'),
+    ('mddag_executor.core.tables', 'from .. import executor'),
     ('mddag_executor.core.tables', 'def f():\n    import time'),
     ('mddag_executor.core.tables', 'from threading import Lock'),
     ('mddag_executor.trace.reader', 'from mddag_executor import core'),
     ('mddag_executor.trace.reader', 'import rclpy'),
     ('mddag_executor.simulate.run', 'from mddag_executor.replay.run import replay'),
-    ('mddag_executor.replay.load', 'from mddag_executor.live.verdicts import Verdicts'),
+    ('mddag_executor.replay.load', 'from mddag_executor.executor.verdicts import Verdicts'),
     ('mddag_executor.simulate.run', 'def f():\n    from std_msgs.msg import Header'),
-    ('mddag_executor.live.executor', 'from mddag_executor.cli.common import write_json'),
+    ('mddag_executor.executor.executor', 'from mddag_executor.cli.common import write_json'),
     ('mddag_executor.report.html', 'import mddag_executor.cli.text'),
     ('mddag_executor.errors', 'from mddag_executor.resources import find'),
-    ('mddag_executor', 'from mddag_executor.live.executor import Worker'),
+    ('mddag_executor', 'from mddag_executor.executor.executor import Worker'),
     ('mddag_executor.trace.reader', 'from mddag_executor import DeadlineMiss'),
 ])
 def test_a_wrong_import_is_found(module: str, text: str) -> None:
@@ -156,7 +159,7 @@ def test_a_wrong_import_is_found(module: str, text: str) -> None:
 @pytest.mark.parametrize(('module', 'text'), [
     ('mddag_executor.core.tables', 'from msg_graph import TaskSet'),
     ('mddag_executor.core.tables', 'from .rules import release\nfrom . import rules'),
-    ('mddag_executor.live.executor', 'import rclpy\nfrom mddag_executor.core import Tables'),
+    ('mddag_executor.executor.executor', 'import rclpy\nfrom mddag_executor.core import Tables'),
     ('mddag_executor.cli.run', 'from mddag_executor.report.table import sinks'),
     ('mddag_executor.replay.load', 'from mddag_executor.simulate.engine import Load'),
     ('mddag_executor.trace.reader', 'from mddag_executor.errors import MddagError'),
@@ -168,7 +171,10 @@ def test_a_right_import_is_none(module: str, text: str) -> None:
 
 # --- rclpy's private names -----------------------------------------------------------------------
 
-COMPAT = 'mddag_executor.live.compat'
+COMPAT = ('mddag_executor.executor.compat', 'mddag_executor.executor.listeners',
+          'mddag_executor.executor.waitsets')
+# A rerun takes the middleware's place, so it replaces what is private, too.
+USES_RCLPY = ('mddag_executor.executor', 'mddag_executor.hosting')
 BASES = frozenset(('BareExecutor', 'BareTask', 'Executor', 'Task', 'Future', 'Waitable'))
 
 
@@ -190,7 +196,8 @@ def rclpys_private_names() -> frozenset[str]:
     handles = {name for kind in vars(rclpy_implementation).values()
                if hasattr(kind, 'destroy_when_not_in_use')
                for name in vars(kind) if not name.startswith('_')}
-    return frozenset(private | handles - public - {'name', 'qos'})
+    # others hand a handle's pointer on to the listeners
+    return frozenset(private | handles - public - {'name', 'qos', 'pointer'})
 
 
 def derived(texts: list[str]) -> frozenset[str]:
@@ -257,11 +264,11 @@ def test_only_compat_uses_what_is_private_in_rclpy() -> None:
     private = rclpys_private_names()
     assert {'_guard', '_callback_type', 'take_message', 'call_timer', '_rclpy'} <= private
     texts = {module: path.read_text(encoding='utf-8') for module, path in modules()
-             if module.startswith('mddag_executor.live') and not module.startswith(COMPAT)}
+             if module.startswith(USES_RCLPY) and module not in COMPAT}
     bases = derived(list(texts.values()))
     assert 'MultiDeadlineExecutor' in bases
     assert not [
-        f'{module}:{line} uses {name} of rclpy: only {COMPAT} does'
+        f'{module}:{line} uses {name} of rclpy: only {", ".join(COMPAT)} do'
         for module, text in texts.items() for line, name in private_uses(text, private, bases)]
 
 

@@ -17,7 +17,9 @@ import pytest
 pytestmark = pytest.mark.linter
 
 TOP = Path(__file__).resolve().parent.parent
-NAMES = ('setup.py', 'mddag_executor', 'msg_graph', 'launch', 'config', 'examples', 'test')
+NAMES = (
+    'setup.py', 'mddag_executor', 'msg_graph', 'benchmarks', 'launch', 'config', 'examples',
+    'test')
 ROOTS = [name for name in NAMES if (TOP / name).exists()]
 SOURCES = sorted(path for root in ROOTS
                  for path in ((TOP / root).rglob('*.py') if (TOP / root).is_dir()
@@ -46,7 +48,6 @@ THIRD_PARTY: dict[str, tuple[str | None, str | None]] = {
     'nav_msgs': ('nav_msgs', None),
     'numba': (None, 'numba'),  # of the extra `batch`
     'numpy': ('python3-numpy', 'numpy'),
-    'perfetto': (None, 'perfetto'),  # of the extra `export`
     'pyarrow': (None, 'pyarrow'),  # of the extra `export`
     'rcl_interfaces': ('rcl_interfaces', None),
     'rclpy': ('rclpy', None),

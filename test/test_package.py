@@ -12,8 +12,8 @@ import pytest
 
 
 def test_the_public_names_are_those_of_the_live_executor() -> None:
-    from mddag_executor.live.executor import MultiDeadlineExecutor
-    from mddag_executor.live.verdicts import DeadlineMiss
+    from mddag_executor.executor.executor import MultiDeadlineExecutor
+    from mddag_executor.executor.verdicts import DeadlineMiss
     assert mddag_executor.MultiDeadlineExecutor is MultiDeadlineExecutor
     assert mddag_executor.DeadlineMiss is DeadlineMiss
     assert {'MultiDeadlineExecutor', 'DeadlineMiss'} <= set(dir(mddag_executor))

@@ -37,7 +37,7 @@ def test_it_is_one_page() -> None:
 
 def test_every_command_exists() -> None:
     verbs = set(re.findall(r'\bmddag ([a-z]+)\b', TEXT))
-    assert {'graph', 'replay'} <= verbs
+    assert {'run', 'replay'} <= verbs
     assert verbs - set(program.VERBS) == set()
 
 
@@ -51,7 +51,7 @@ def test_set_up_is_two_commands() -> None:
 
 
 def test_launch_arguments_exist() -> None:
-    text = (TOP / 'docs' / 'workspace.md').read_text(encoding='utf-8')
+    text = (TOP / 'docs' / 'start.md').read_text(encoding='utf-8')
     line, *_ = re.findall(r'^ros2 launch mddag_executor (.*)', text, re.MULTILINE)
     file, *arguments = line.split()
     launch_file = (TOP / 'launch' / file).read_text(encoding='utf-8')

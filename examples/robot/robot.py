@@ -4,7 +4,7 @@
 A robot of ordinary nodes, which mix numpy and Python as nodes do.
 
     python examples/robot/robot.py --seconds 5
-    mddag bench live --load robot
+    python -m benchmarks live --load robot
 
 The camera's images go through a detector to a brake.  The lidar's points are segmented, fused
 with the detections that are closest in time, and planned around; a controller follows the path at

@@ -7,7 +7,7 @@ Theory of operation: each step is a process of its own, one after the other, so 
 another's threads, caches or nodes beside it: `mddag run --synthetic sleep`, which records; two
 times `mddag replay`; and rclpy's own MultiThreadedExecutor with the same nodes, seed and number of
 threads.  Both executors are measured by the nodes themselves, in the same way
-(`mddag_executor.live.measure`), so the figures side by side mean the same.
+(`mddag_executor.hosting.measure`), so the figures side by side mean the same.
 
 With `--processes N` callbacks compute in Python, in N processes.  The steps are `graph place`;
 `run --synthetic spin` of what that wrote, which records; `replay` of all traces; and rclpy's
@@ -31,7 +31,6 @@ from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, format_ns, printable, Progress, run_program, table
 from mddag_executor.core.tally import counts, total
 from mddag_executor.errors import MddagError
-from mddag_executor.live.bench.campaign import Spec
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.live_runs import summary
 from mddag_executor.report.tables import (
@@ -111,7 +110,7 @@ def _in_one_process(
         say(f'{line} (mddag explain {output / "demo.mcap"})')
     say(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), "
         f'{args.baseline_seconds:g} s ==')
-    baseline = _measured(args, graph, 'multi', args.utilisation)
+    baseline = _peer(args, graph, 'multi', args.utilisation)
     say(side_by_side(live['measured'], baseline))
     return {'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': baseline,
             'trace': str((output / 'demo.mcap').absolute())}
@@ -149,11 +148,16 @@ def _in_several(
                replayed=recorded['dags']))
     say(f'mddag replay {" ".join(traces)} --report {output / "demo.html"}')
     say(f'\n== Side by side, {args.baseline_seconds:g} s each ==')
-    runs = [(what, executor, _measured(args, path, executor, utilisation)) for what, path in (
-        (f'{args.processes} processes', placed), ('one process', graph))
-        for executor in ('rad-events', 'events')]
+    runs = []
+    for what, path in ((f'{args.processes} processes', placed), ('one process', graph)):
+        ours = json_of(mddag(
+            'run', str(path), '--synthetic', 'spin', *load, '--duration',
+            f'{args.baseline_seconds:.3f}s', '--diagnostics', 'off', '--json', '-'),
+            'measuring', args.baseline_seconds + 3, quiet=True)
+        runs += [(what, 'rad', measured(ours)),
+                 (what, 'events', _peer(args, path, 'events', utilisation))]
     say(table(['', 'executor', 'due', 'in time', 'share'], [
-        [what, 'this' if executor == 'rad-events' else 'EventsExecutor', run['sink_jobs_due'],
+        [what, 'this' if executor == 'rad' else 'EventsExecutor', run['sink_jobs_due'],
          run['on_time'], percent(run['on_time'], run['sink_jobs_due'])]
         for what, executor, run in runs]))
     return {'placement': placement, 'live': live, 'recorded': recorded, 'traces': traces,
@@ -161,21 +165,20 @@ def _in_several(
                          for what, executor, run in runs]}
 
 
-def _measured(
+def _peer(
     args: argparse.Namespace, graph: Path, executor: str, utilisation: float
 ) -> dict[str, Any]:
-    """Run the same nodes on an executor; return what they measured."""
-    from mddag_executor.live.bench.campaign import measure
-    spec = Spec(
-        load='autoware', executor=executor, workers=WORKERS, seconds=args.baseline_seconds,
-        seed=args.seed, graph=str(graph), utilisation=utilisation,
-        bodies='sleep' if args.processes is None else 'spin')
+    """Run the same nodes on an executor of rclpy; return what they measured."""
+    from mddag_executor.hosting.peers import measure_peer
     with Progress('measuring', args.baseline_seconds + 3) as progress:
-        return measure(spec, progress.update)
+        return measure_peer(
+            executor, str(graph), WORKERS, seconds=args.baseline_seconds, seed=args.seed,
+            utilisation=utilisation, mode='sleep' if args.processes is None else 'spin',
+            tick=progress.update)
 
 
 def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
-    from mddag_executor.live.measure import ExecutionPlan
+    from mddag_executor.hosting.measure import ExecutionPlan
     from msg_graph import load
     task_set = load(graph)
     plan = ExecutionPlan(task_set, args.seed, args.utilisation, WORKERS)
@@ -204,9 +207,16 @@ def run_live(args: argparse.Namespace, graph: Path, output: Path) -> dict[str, A
         '--seed', str(args.seed), '--workers', str(WORKERS), '--duration', f'{seconds:.3f}s',
         '--trace', str(output / 'demo.mcap'), '--overwrite', '--json', '-']
     result = json_of(mddag(*command), 'running', seconds + 3)
-    if result['measured'] is None:
-        raise DemoError('mddag run: it ended before it measured anything: run the demo again')
+    measured(result)
     return result
+
+
+def measured(result: dict[str, Any]) -> dict[str, Any]:
+    """Return what the nodes of a run measured."""
+    found: dict[str, Any] | None = result['measured']
+    if found is None:
+        raise DemoError('mddag run: it ended before it measured anything: run the demo again')
+    return found
 
 
 def run_replays(graph: Path, output: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -224,8 +234,14 @@ def mddag(*arguments: str) -> list[str]:
     return [sys.executable, '-m', 'mddag_executor', *arguments]
 
 
-def json_of(command: list[str], what: str, seconds: float | None = None) -> dict[str, Any]:
-    """Run a program that prints JSON, with progress on a terminal meanwhile."""
+def json_of(
+    command: list[str], what: str, seconds: float | None = None, quiet: bool = False
+) -> dict[str, Any]:
+    """
+    Run a program that prints JSON, with progress on a terminal meanwhile.
+
+    :param quiet: leave out its warnings.
+    """
     # Of this machine only: the demo must not find another one's nodes, nor be found by them.
     done = run_program(command, what, seconds, environment={
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ})
@@ -234,7 +250,8 @@ def json_of(command: list[str], what: str, seconds: float | None = None) -> dict
         lines = errors.strip().splitlines() or [f'it ended with status {done.returncode}']
         name = ' '.join(command[2:4]).replace('mddag_executor ', 'mddag ')
         raise DemoError(f'{name}: {lines[-1].removeprefix("error: ")}')
-    sys.stderr.write(errors)
+    if not quiet:
+        sys.stderr.write(errors)
     result: dict[str, Any] = json.loads(done.stdout)
     return result
 

@@ -24,10 +24,10 @@ from mddag_executor.cli import common, options, recorded, verdicts
 from mddag_executor.cli.text import warn
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.run import Recording
+    from mddag_executor.replay.run import Given
     from msg_graph import TaskSet
 
-    Trace = tuple[Recording, str]     # its path, and what messages call it
+    Trace = tuple[Given, str]     # its path, and what messages call it
 
 EXAMPLE = """\
 mddag diff before.mcap after.mcap
@@ -88,8 +88,8 @@ def _results(
     if task_set is None and not _has_declaration(first):
         # without one of its own it is judged by the other's, and that must have one
         if not _has_declaration(second):
-            recorded.check_declared(*first)
-            recorded.check_declared(*second)
+            recorded.check_deadlines(*first)
+            recorded.check_deadlines(*second)
         after, declared = _result(second, task_set, args, args.reschedule)
         return _result(first, declared, args, False)[0], after
     before, declared = _result(first, task_set, args, False)

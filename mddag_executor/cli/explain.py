@@ -18,7 +18,6 @@ from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay
-    from mddag_executor.replay.explain import Explainer
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -37,24 +36,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='only jobs of this sink: /node:callback, or the end of its name, as tables show it')
     add('--job', type=options.or_zero(options.positive_int), metavar='K',
         help='only the job of this number')
-    options.add(parser, '--skip', '--json')
+    options.add(parser, '--from', '--to', '--skip', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Explain the misses of a trace."""
     common.recording_and_graph(args)
+    span = recorded.span_of(args)
     with recorded.opened(args) as (path, name, task_set):
         if task_set is None or recorded.is_bag(path):
-            recorded.check_declared(path, name)
+            recorded.check_deadlines(path, name)
         outcome = recorded.as_recorded(
-            path, name, task_set, doing='explaining', skip=args.skip, jobs=True)
+            path, name, task_set, doing='explaining', skip=args.skip, span=span)
     sink = None if args.sink is None else _sink(args.sink, outcome.task_set)
     warn(*outcome.warnings)
-    explainer = outcome.explainer
-    assert explainer is not None
-    result = explainer.result(sink, args.job)
+    result = outcome.explanation.result(sink, args.job)
     every = sink is None and args.job is None
-    common.show(args, result, _lines(outcome, explainer) if every else _job_lines(result['jobs']))
+    common.show(args, result, _lines(outcome) if every else _job_lines(result['jobs']))
     return 0
 
 
@@ -71,7 +69,7 @@ def _sink(name: str, task_set: TaskSet) -> int:
     return sinks[meant[0]]
 
 
-def _lines(outcome: Replay, explainer: Explainer) -> Iterator[str]:
+def _lines(outcome: Replay) -> Iterator[str]:
     from mddag_executor.report.explained import (
         causes_line,
         causes_table,
@@ -80,14 +78,15 @@ def _lines(outcome: Replay, explainer: Explainer) -> Iterator[str]:
         stalls_table,
     )
     from mddag_executor.report.tables import verdicts_line
-    summary = explainer.summary()
+    explanation = outcome.explanation
+    summary = explanation.summary()
     if summary['missed']:
         yield causes_table(summary)
         yield 'Where that time went:'
-        yield sinks_table(explainer.mostly())
+        yield sinks_table(explanation.mostly())
         if summary['stalls']:
-            yield stalls_table(summary['stalls'], outcome.run.start or 0)
-        worst = explainer.worst()
+            yield stalls_table(summary['stalls'], outcome.recording.start or 0)
+        worst = explanation.worst()
         if worst is not None:
             yield from job_lines(worst)
     yield verdicts_line(outcome.tally.result()['dags'])

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Write the declaration."""
     from mddag_executor.cli.systems import write_declaration
-    from mddag_executor.live.graph_probe import draft_of, probe
+    from mddag_executor.hosting.graph_probe import draft_of, probe
     from msg_graph.draft import declaration_of
     with Progress('looking at the nodes', args.timeout) as line:
         found = probe(args.timeout, line.update)

@@ -70,11 +70,9 @@ VERBS = {
         'check', 'draw', 'schema', 'fmt', 'from-caret', 'from-trace', 'from-ros', 'analyse',
         'assign-deadlines', 'place')),
     'import': Verb('import', 'turn a CARET or ros2_tracing recording into a trace', ('ctf',)),
-    'export': Verb('export', 'turn a trace into a file for Perfetto, Foxglove or spreadsheets'),
+    'export': Verb('export', 'turn a recording into files for Perfetto or for data frames'),
     'diff': Verb('diff', 'compare two recorded runs sink by sink'),
     'top': Verb('top', 'show the deadlines and workers of running executors, live'),
-    'bench': Verb('bench', 'measure the executor, the core, the replayer and the simulator', (
-        'live', 'core', 'replay', 'evaluate')),
 }
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
@@ -150,11 +148,14 @@ def run(argv: Sequence[str]) -> int:
     return status
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(
+    argv: Sequence[str] | None = None, run: Callable[[Sequence[str]], int] = run
+) -> int:
     """
     Run the program.
 
     :param argv: the arguments after the program's name; those of the process when None
+    :param run: does what they say
     :returns: the exit status
     """
     try:

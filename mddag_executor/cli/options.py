@@ -215,6 +215,13 @@ _SHARED: dict[str, dict[str, Any]] = {
         'type': or_zero(duration), 'default': 0, 'metavar': 'TIME',
         'help': 'leave out a warm-up: jobs released less than this after the first one, for '
         'instance 1s, are not judged', 'otherwise': 'all jobs are judged'},
+    '--from': {
+        'type': or_zero(duration), 'metavar': 'TIME', 'dest': 'begin',
+        'help': 'only jobs that were released from this time on, counted from the first release, '
+        'for instance 90s', 'otherwise': 'from the start'},
+    '--to': {
+        'type': duration, 'metavar': 'TIME', 'dest': 'end',
+        'help': 'only jobs that were released before this time', 'otherwise': 'to the end'},
     '--offset': {
         'type': _offset, 'action': 'append', 'default': [], 'metavar': 'NAME=TIME',
         'help': 'for recordings of several machines: how far the clock of process NAME (the one '

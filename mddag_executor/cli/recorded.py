@@ -21,8 +21,7 @@ from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.replay import Replay, Reschedule
-    from mddag_executor.replay.happenings import Observer
-    from mddag_executor.replay.run import Recording
+    from mddag_executor.replay.run import Given
     from msg_graph import Process, TaskSet
 
 _WITH = 'with --reschedule: '
@@ -49,7 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
         'none, or a time for each dispatch (50us); of a bag: none (default) or a time')
     options.add(parser, '--execution-times', '--seed',
                 only='with --reschedule of an ordinary bag: ')
-    parser.set_defaults(skip=0)     # for verbs without --skip
+    # for verbs without --skip, --from and --to
+    parser.set_defaults(skip=0, begin=None, end=None)
 
 
 def _overheads(text: str) -> int:
@@ -60,6 +60,7 @@ def _overheads(text: str) -> int:
 
 def check(args: argparse.Namespace) -> None:
     """Check the arguments."""
+    span_of(args)
     if args.processes == '0':
         raise UsageError('--processes 0: give 1 or more, or a file')
     if args.execution_times is not None and args.seed is not None:
@@ -80,7 +81,7 @@ def check(args: argparse.Namespace) -> None:
 
 
 @contextmanager
-def opened(args: argparse.Namespace) -> Iterator[tuple[Recording, str, TaskSet | None]]:
+def opened(args: argparse.Namespace) -> Iterator[tuple[Given, str, TaskSet | None]]:
     """Give the recording that TRACE… names, what messages call it, and GRAPH's task set."""
     from mddag_executor.replay.bags import opened_trace
     task_set = None if args.graph is None else common.load_graph(args.graph)
@@ -89,18 +90,18 @@ def opened(args: argparse.Namespace) -> Iterator[tuple[Recording, str, TaskSet |
         yield trace or path, name, task_set
 
 
-def is_bag(path: Recording) -> bool:
+def is_bag(path: Given) -> bool:
     """Return whether a recording is an ordinary bag, which can only be rescheduled."""
     from mddag_executor.replay.bags import is_ordinary
     return isinstance(path, str) and is_ordinary(path)
 
 
-def check_declared(path: Recording, name: str) -> None:
+def check_deadlines(path: Given, name: str) -> None:
     """Find out whether a recording says which deadlines there are, where no graph is given."""
     if is_bag(path):
         raise _no_graph(name)
-    from mddag_executor.replay.run import open_run
-    open_run(path, None, name, needs_declaration=True)
+    from mddag_executor.replay.run import check_declared
+    check_declared(path, name)
 
 
 def _no_graph(name: str) -> UsageError:
@@ -110,36 +111,43 @@ def _no_graph(name: str) -> UsageError:
 
 
 def as_recorded(
-    path: Recording, name: str, task_set: TaskSet | None,
-    more: Callable[[Replay], Sequence[Observer]] | None = None, doing: str = 'replaying',
-    skip: int = 0, jobs: bool = False,
+    path: Given, name: str, task_set: TaskSet | None, doing: str = 'replaying', skip: int = 0,
+    span: tuple[int, int] | None = None,
 ) -> Replay:
-    """
-    Replay a recorded run.
-
-    :param more: makes further observers.
-    :param jobs: whether to keep of each miss why.
-    """
+    """Replay a recorded run."""
     from mddag_executor.replay import replay
     with Progress(doing) as line:
-        return replay(
-            path, task_set, name=name, progress=line.events, more=more, skip=skip,
-            jobs=jobs)
+        return replay(path, task_set, name=name, progress=line.events, skip=skip, span=span)
+
+
+def span_of(args: argparse.Namespace) -> tuple[int, int] | None:
+    """Return the part of the recording that `--from` and `--to` name, None for all of it."""
+    if args.begin is None and args.end is None:
+        return None
+    if args.skip:
+        raise UsageError('--skip: the part begins with --from: leave one of them out')
+    if getattr(args, 'reschedule', False):
+        raise UsageError(
+            f'--{"to" if args.begin is None else "from"}: the scheduler runs over whole '
+            'recordings: leave it or --reschedule out')
+    begin, end = args.begin or 0, args.end or 2 ** 62
+    if begin >= end:
+        raise UsageError('--to: the part ends before it begins: give a time after --from')
+    return begin, end
 
 
 def outcome_of(
-    args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None,
-    reschedule: bool, more: Callable[[Replay], Sequence[Observer]] | None = None,
+    args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None, reschedule: bool,
     doing: str = 'replaying',
 ) -> Replay | Reschedule:
     """Reschedule a recording if that is wanted or it is a bag; else replay it as recorded."""
     if reschedule or is_bag(path):
         return _rescheduled(args, path, name, task_set)
-    return as_recorded(path, name, task_set, more, doing, args.skip)
+    return as_recorded(path, name, task_set, doing, args.skip, span_of(args))
 
 
 def _rescheduled(
-    args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None
+    args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None
 ) -> Reschedule:
     """Run the scheduler over a recording of any kind."""
     if is_bag(path):
@@ -158,7 +166,7 @@ def _rescheduled(
 
 
 def _rescheduled_bag(
-    args: argparse.Namespace, path: Recording, name: str, task_set: TaskSet | None
+    args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None
 ) -> Reschedule:
     from mddag_executor.replay.bags_reschedule import reschedule_bag
     from mddag_executor.simulate import read_execution_times

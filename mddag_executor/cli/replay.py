@@ -23,6 +23,7 @@ EXAMPLE = """\
 mddag replay run.mcap
 mddag replay run.mcap graph.yaml --fail-on-miss
 mddag replay run.mcap --reschedule --workers 2 --policy fifo --json result.json
+mddag replay run.mcap --from 90s --to 100s --report part.html
 mddag replay drive/ graph.yaml --reschedule --execution-times measured.json
 mddag replay run.mcap --fail-on-miss --tolerate-ratio 0.01 --tolerate-burst 2 --junit junit.xml"""
 
@@ -37,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser, 'run the scheduler over the recorded releases and execution times')
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
     verdicts.add_arguments(parser)
-    options.add(parser, '--skip', '--report', '--json')
+    options.add(parser, '--from', '--to', '--skip', '--report', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -47,12 +48,7 @@ def main(args: argparse.Namespace) -> int:
     verdicts.check(args)
     recorded.check(args)
     with recorded.opened(args) as (path, name, task_set):
-        watch = None
-        if args.report is not None:
-            from mddag_executor.report.html import Watch
-            watch = Watch()
-        outcome = recorded.outcome_of(
-            args, path, name, task_set, args.reschedule, None if watch is None else watch.of)
+        outcome = recorded.outcome_of(args, path, name, task_set, args.reschedule)
         drift = outcome.drift() if isinstance(outcome, Replay) else []
     warn(*outcome.warnings)
     result = outcome.result()
@@ -61,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
     status = verdicts.judge(args, outcome.tally, result)
     if args.report is not None:
         from mddag_executor.report.html import of_outcome
-        common.write_report(args.report, lambda: of_outcome(outcome, watch))
+        common.write_report(args.report, lambda: of_outcome(outcome))
     common.show(args, result, _lines(args, result))
     return status
 
@@ -71,7 +67,7 @@ def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
         comparison_table,
         recorded_tables,
         summary,
-        times_table,
+        times_tables,
     )
     from mddag_executor.report.tables import drift_lines, sink_table
     if result['rescheduled'] and result['recorded'] is None:
@@ -84,8 +80,7 @@ def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
         yield comparison_table(result['dags'], result['recorded']['dags'])
     elif result['dags'] or 'recorded_callbacks' not in result:
         yield sink_table(result['dags'])
-        yield 'Where the response times went: means, and the worst job of each sink:'
-        yield times_table(result['dags'])
+        yield from times_tables(result['dags'])
     yield from recorded_tables(result, args.callbacks)
     yield from summary(result)
     yield from drift_lines(result.get('drift', ()))

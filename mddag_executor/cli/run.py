@@ -40,12 +40,12 @@ from mddag_executor.report.text import listed
 from msg_graph import loads, NO_GRAPH
 
 if TYPE_CHECKING:
+    from mddag_executor.executor.executor import MultiDeadlineExecutor
     from mddag_executor.hosting.host import Host
     from mddag_executor.hosting.loading import Program
-    from mddag_executor.live.executor import MultiDeadlineExecutor
-    from mddag_executor.live.measure import ExecutionPlan, Ledger
-    from mddag_executor.live.processes import Supervisor
-    from mddag_executor.live.session import Session
+    from mddag_executor.hosting.measure import ExecutionPlan, Ledger
+    from mddag_executor.hosting.processes import Supervisor
+    from mddag_executor.hosting.session import Session
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -83,13 +83,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='end after this time, for instance 20s, with --synthetic after a warm-up of 1 s '
         '(default: run until Ctrl-C)')
     options.add_policy(parser)
-    add('--cpu-order', action='store_true',
-        help='give the CPUs to the workers with the most urgent callbacks, by nice levels: for '
-        'more processes than CPUs, where the user has the permission')
-    add('--preempt', action='store_true',
-        help='pause callbacks that compute in Python for more urgent ones (Python 3.12 and newer)')
-    add('--intake', choices=('auto', 'events', 'waitset'), default='auto',
-        help='how the executor learns what is ready (default: auto)')
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
         help="how often to publish the executor's state on /diagnostics, for mddag top and other "
         "tools; 'off': never (default: 1s)")
@@ -102,9 +95,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--process', metavar='NAME',
         help='run only the nodes of this declared process, for a launch file that starts each '
         'process; give the --node options of these nodes only')
-    add('--on-exit', choices=('end', 'continue', 'restart'), default='end',
-        help='if one of several processes ends by itself: end the run, continue without it, or '
-        'start it again (default: end)')
+    add('--on-exit', choices=('end', 'continue'), default='end',
+        help='if one of several processes ends by itself: end the run, or continue without it '
+        '(default: end)')
     add('--part', help=argparse.SUPPRESS)  # the folder of a run of several processes
     parser.add_argument(
         'graph', metavar='GRAPH', nargs='?', type=options.Input,
@@ -138,7 +131,7 @@ def main(args: argparse.Namespace) -> int:
 
 def part(args: argparse.Namespace) -> int:
     """Run one process of several, and leave what came of it in the folder of the run."""
-    from mddag_executor.live.processes import belong_to_parent, Part
+    from mddag_executor.hosting.processes import belong_to_parent, Part
     the_part = Part.read(args.part)
     belong_to_parent(the_part.parent)
     task_set = loads(the_part.text, name=args.graph)
@@ -170,7 +163,7 @@ def run_here(
     host: Host | None = None
     programs: list[Program] = []
     if args.synthetic is not None:
-        from mddag_executor.live.measure import ExecutionPlan
+        from mddag_executor.hosting.measure import ExecutionPlan
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     with dump_when_stuck() as ends, Signals(
             _PART_ENDS_S if args.part else 0) as signals, _rclpy(
@@ -180,11 +173,11 @@ def run_here(
             from mddag_executor.hosting.loading import ros_arguments
             host = stack.enter_context(Host())
             programs = host.load(args.node, ros_arguments(args.ros_args))
-        from mddag_executor.live.executor import MultiDeadlineExecutor
+        from mddag_executor.executor.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, trace=args.trace,
-            intake=args.intake, freeze_gc=True, preempt=args.preempt, cpu_order=args.cpu_order,
-            diagnostics_period=args.diagnostics, process=args.process, overwrite=args.overwrite)
+            freeze_gc=True, diagnostics_period=args.diagnostics, process=args.process,
+            overwrite=args.overwrite)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr
         try:
@@ -217,7 +210,7 @@ def _end(error: BaseException | None) -> int:
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
-    from mddag_executor.live.settings import diagnostics_period_ns
+    from mddag_executor.executor.settings import diagnostics_period_ns
     diagnostics_period_ns(args.diagnostics)
     if args.processes is not None and args.processes.isdecimal() and not int(args.processes):
         raise UsageError('--processes 0: give 1 or more, or a file')
@@ -292,9 +285,9 @@ def _run(
     ends: Callable[[], None],
 ) -> tuple[dict[str, Any], BaseException | None]:
     """Run until the end; see ``run_here``."""
-    from mddag_executor.live.measure import measure
-    from mddag_executor.live.session import Session
-    from mddag_executor.live.statistics import Watch
+    from mddag_executor.executor.statistics import Watch
+    from mddag_executor.hosting.measure import measure
+    from mddag_executor.hosting.session import Session
 
     def end_begins() -> None:
         ends()
@@ -329,8 +322,8 @@ def _run_synthetic(
     args: argparse.Namespace, session: Session, task_set: TaskSet, plan: ExecutionPlan,
     seconds: float | None, progress: Progress,
 ) -> Ledger | None:
-    from mddag_executor.live import current_job
-    from mddag_executor.live.synthetic import SyntheticWorkload
+    from mddag_executor.executor import current_job
+    from mddag_executor.hosting.synthetic import SyntheticWorkload
     workload = SyntheticWorkload(
         task_set, plan, current_job=current_job, process=args.process)
     for node in workload.nodes:
@@ -346,8 +339,8 @@ def _run_synthetic(
 
 def _begin(args: argparse.Namespace, task_set: TaskSet) -> Callable[..., int | None]:
     """Return what waits until publishers and subscriptions have met, and for other processes."""
-    from mddag_executor.live.processes import Part
-    from mddag_executor.live.session import Session
+    from mddag_executor.hosting.processes import Part
+    from mddag_executor.hosting.session import Session
     if args.part is None:
         return Session.wait_until_matched
     return partial(Part.read(args.part).start_together, args.process,
@@ -359,7 +352,7 @@ def _run_programs(
     programs: list[Program], seconds: float | None,
 ) -> None:
     from mddag_executor.hosting.loading import ros_arguments
-    from mddag_executor.live.session import SessionError
+    from mddag_executor.hosting.session import SessionError
     executor: Any = session.executor
     executor.set_judging(False)
     try:

@@ -14,7 +14,6 @@ import argparse
 from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
-import re
 import subprocess
 import sys
 import tempfile
@@ -58,8 +57,8 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
     from mddag_executor.hosting.loading import ros_arguments
-    from mddag_executor.live.measure import ExecutionPlan
-    from mddag_executor.live.processes import left, Part, Run, Supervisor, together
+    from mddag_executor.hosting.measure import ExecutionPlan
+    from mddag_executor.hosting.processes import left, Part, Run, Supervisor, together
     plan = None
     if args.synthetic is not None:
         workers = defaults.workers(args.workers, task_set)
@@ -75,10 +74,9 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         if plan is not None:
             warn_of(plan, args.ros_args, len(names))
 
-        def command(name: str, nth: int, since: float) -> list[str]:
-            Part.starts(folder, name)
-            trace = _trace(args.trace, name, nth)
-            return [*_command(args, folder, specs.get(name, ()), since), '--process', name,
+        def command(name: str) -> list[str]:
+            trace = _trace(args.trace, name)
+            return [*_command(args, folder, specs.get(name, ())), '--process', name,
                     *(() if trace is None else ('--trace', trace)), *ros_arguments(args.ros_args)]
 
         out = sys.stdout if common.wants_tables(args) else sys.stderr
@@ -88,7 +86,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
             if run.died:
                 warn(f'process {run.name} {run.how}: {run.said}')
 
-        supervisor = Supervisor(command, args.on_exit, out, sys.stderr, ended)
+        supervisor = Supervisor(command, args.on_exit == 'continue', out, sys.stderr, ended)
         signals.end_of(supervisor)
         supervisor.run(names, None if args.duration is None else args.duration / 1e9)
         parts = [left(folder, run.process.pid) for run in supervisor.runs]
@@ -102,7 +100,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
                 p.nodes for p in task_set.processes if p.name == run.name),
             'pid': run.process.pid, 'status': run.status, 'died': run.died, 'how': run.how,
             'said': run.said if run.died else None,
-            'trace': _trace_of_dead(_trace(args.trace, run.name, run.nth)) if part is None
+            'trace': _trace_of_dead(_trace(args.trace, run.name)) if part is None
             else part['trace']}
             for run, part in zip(supervisor.runs, parts)]}
     if report(args, result):
@@ -113,7 +111,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
 
 
 def _warn_of_contested(task_set: TaskSet) -> None:
-    from mddag_executor.live.other_processes import contested, divided
+    from mddag_executor.executor.other_processes import contested, divided
     dags = divided(task_set)
     topics = {t for v in task_set.vertices if v.dag in dags for t in v.callback.publishes}
     for topic in sorted(contested(task_set) & topics):
@@ -180,7 +178,7 @@ def _probe(
 ) -> Mapping[str, Sequence[str]]:
     """Return the names of the nodes that each SPEC brings."""
     from mddag_executor.hosting.loading import ros_arguments
-    from mddag_executor.live.processes import left, ProcessError
+    from mddag_executor.hosting.processes import left, ProcessError
     # Nobody is to hear of these nodes.
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
     with subprocess.Popen(
@@ -203,49 +201,40 @@ def _probe(
     return dict(zip(specs, names))
 
 
-def _command(
-    args: argparse.Namespace, folder: str, specs: Sequence[str], since: float = 0
-) -> list[str]:
-    """Return the command line of a part, up to its name, so many seconds after the begin."""
+def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> list[str]:
+    """Return the command line of a part, up to its name."""
     command = [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
-               '--policy', args.policy, '--intake', args.intake,
+               '--policy', args.policy,
                '--diagnostics', f'{args.diagnostics}ns' if args.diagnostics else 'off']
-    command += [option for option, asked in (
-        ('--preempt', args.preempt), ('--cpu-order', args.cpu_order),
-        ('--overwrite', args.overwrite)) if asked]
+    if args.overwrite:
+        command.append('--overwrite')
     if args.synthetic is None:
         for spec in specs:
             command += ['--node', spec]
     else:
         command += ['--synthetic', args.synthetic, '--seed', str(args.seed)]
-    left = args.duration and f'{max(1000, args.duration - round(since * 1e9))}ns'
+    duration = None if args.duration is None else f'{args.duration}ns'
     for option, value in (('--utilisation', args.utilisation), ('--workers', args.workers),
-                          ('--duration', left)):
+                          ('--duration', duration)):
         if value is not None:
             command += [option, str(value)]
     return command
 
 
 def _check_traces(args: argparse.Namespace, name: str) -> None:
-    """Find out whether a process can record, also when it is started again."""
-    given = _trace(args.trace, name)
-    common.check_output(given, recording=True, overwrite=args.overwrite)
-    if given is None:
-        return
-    path = Path(given)
-    again = re.compile(rf'{re.escape(path.stem)}\.\d+{re.escape(path.suffix)}')
-    for found in sorted(each for each in path.parent.iterdir() if again.fullmatch(each.name)):
-        common.check_output(str(found), recording=True, overwrite=args.overwrite)
+    """Find out whether a process can record."""
+    common.check_output(
+        _trace(args.trace, name), recording=True, overwrite=args.overwrite)
 
 
-def _trace(given: str | None, name: str, nth: int = 1) -> str | None:
-    """Return where a process records to; one that was started again has a trace of its own."""
+def _trace(given: str | None, name: str) -> str | None:
+    """Return where a process records to."""
     if given is None:
         return None
-    path, label = Path(given), name if nth == 1 else f'{name}.{nth}'
+    path = Path(given)
     if path.is_dir():
-        return str(path / f'{label}.mcap')
-    return str(path.with_name(f'{path.stem}.{label}{path.suffix}'))
+        return str(path / f'{name}.mcap')
+    return str(path.with_name(f'{path.stem}.{name}{path.suffix}'))
 
 
 def _trace_of_dead(path: str | None) -> dict[str, Any] | None:

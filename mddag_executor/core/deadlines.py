@@ -10,6 +10,7 @@ entry may be too early for the slot's next job: it is then replaced when its tim
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from heapq import heappop, heappush
 
 from mddag_executor.core.jobs import announce_overdue, next_deadline
@@ -51,6 +52,16 @@ class Deadlines:
                 self._judged[slot] = now - 1
                 self._add(slot, now - 1)
         self.next = heap[0][0] if heap else NEVER
+
+    def broken_invariants(self) -> Iterator[str]:
+        """Yield a sentence for each invariant that does not hold; for debugging."""
+        if self.next != (self._heap[0][0] if self._heap else NEVER):
+            yield f'the next deadline is not {self.next}'
+        for slot, judged in self._judged.items():
+            if self._state.job_state[slot] == OPEN:
+                time = next_deadline(*self._rule, slot, judged)
+                if self._entry.get(slot, NEVER) > time:
+                    yield f'nobody watches the deadline {time} of the job in slot {slot}'
 
     def _add(self, slot: int, after: int) -> None:
         time = next_deadline(*self._rule, slot, after)

@@ -12,7 +12,6 @@ from __future__ import annotations
 from mddag_executor.core.state import (
     ABORTED,
     ELSEWHERE,
-    ENDS_HERE,
     EXPIRED,
     FAILED,
     FREE,
@@ -20,6 +19,7 @@ from mddag_executor.core.state import (
     IDLE,
     JOB_END,
     JUDGE_FROM,
+    LEADS_OUT,
     NOT_JUDGED,
     OPEN,
     SINK_ABORTED,
@@ -91,24 +91,16 @@ def expect(t: Tables, s: State, dag: int, here: list[int]) -> None:
     :param here: by local index, 1 for a vertex that runs here and 0 for one that does not.
     """
     first = t.first_vertex[dag]
-    leads_on = [0] * len(here)
-    changed = True
-    while changed:  # backwards along the edges, until nothing new is found
-        changed = False
-        for i in range(len(here)):
-            for e in range(t.first_successor[first + i], t.first_successor[first + i + 1]):
-                after = t.successors[e] - first
-                if leads_on[i] == 0 and (here[after] != 0 or leads_on[after] != 0):
-                    leads_on[i] = 1
-                    changed = True
     s.partial[dag] = 0
     for i in range(len(here)):
         s.expected[first + i] = HERE
         if here[i] == 0:
             s.expected[first + i] = ELSEWHERE
             s.partial[dag] = 1
-        elif leads_on[i] == 0 and t.sink_deadline[first + i] < 0:
-            s.expected[first + i] = ENDS_HERE
+            continue
+        for e in range(t.first_successor[first + i], t.first_successor[first + i + 1]):
+            if here[t.successors[e] - first] == 0:
+                s.expected[first + i] = LEADS_OUT
 
 
 def _leave_out(t: Tables, s: State, slot: int) -> None:
@@ -120,7 +112,7 @@ def _leave_out(t: Tables, s: State, slot: int) -> None:
             s.x_pending[s.job_base[slot] + t.region_offset[vertex]] = -1
             if t.sink_deadline[vertex] >= 0:
                 s.job_sinks_left[slot] -= 1
-        elif s.expected[vertex] == ENDS_HERE:
+        elif s.expected[vertex] == LEADS_OUT:
             s.job_sinks_left[slot] += 1
 
 
@@ -180,10 +172,11 @@ def withdraw_job(s: State, slot: int, end: int) -> None:
     s.n_open[dag] -= 1
     s.job_state[slot] = end
     if s.job_active[slot] == 0:
-        _free(s, slot)
+        free_slot(s, slot)
 
 
-def _free(s: State, slot: int) -> None:
+def free_slot(s: State, slot: int) -> None:
+    """Make the slot of an ended job free for the next one of its DAG."""
     dag = s.job_dag[slot]
     s.job_state[slot] = FREE
     s.job_next[slot] = s.free_slot[dag]
@@ -288,4 +281,4 @@ def deactivate(s: State, slot: int) -> None:
     """Count one waiting or running execution of a job less; free the slot of an ended job."""
     s.job_active[slot] -= 1
     if s.job_active[slot] == 0 and s.job_state[slot] != OPEN:
-        _free(s, slot)
+        free_slot(s, slot)

@@ -59,8 +59,9 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     turn comes.  There is no preemption.
 10. **Several processes.**  Of a DAG whose callbacks run in several processes (live), a job has in
     each of them the vertices that are *expected here*.  The others count as done before it begins:
-    they are not judged here and keep no job open.  A job ends when all that ends here has: the
-    sinks that are here, and the vertices after which nothing of the DAG runs here.
+    they are not judged here and keep no job open.  A job ends when the sinks that are here have
+    completed, and the vertices that *lead out*, to one that is not here: what these publish goes
+    to another process, and belongs to the job as long as they run.
 11. **The interpreter.**  Python's lock lets one thread compute at a time.  An execution that holds
     the interpreter (the driver says so, ``State.x_holds``) starts only if none on a worker whose
     priority is the same or smaller holds it; until then it is held back, and others go past it.
@@ -78,7 +79,16 @@ from __future__ import annotations
 
 from heapq import heappop, heappush
 
-from mddag_executor.core.jobs import abort_job, close_job, deactivate, fail_job, judge, overdue
+from mddag_executor.core.jobs import (
+    abort_job,
+    close_job,
+    deactivate,
+    fail_job,
+    free_slot,
+    judge,
+    open_undeclared,
+    overdue,
+)
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import (
     add_stale,
@@ -91,14 +101,15 @@ from mddag_executor.core.queues import (
 )
 from mddag_executor.core.state import (
     ABORTED,
+    add_slot,
     COMPLETED,
     DISPATCH_OVERHEAD,
     DONE,
     DROP,
     DROPPED,
-    ENDS_HERE,
     EXPIRED,
     LATE,
+    LEADS_OUT,
     N_HOLDING,
     N_IDLE,
     N_STALE,
@@ -134,6 +145,24 @@ def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
         heappush(s.ready, entry)
     else:
         wait_for_poll(t, s, entry)
+
+
+def ready_undeclared(
+    t: Tables, s: State, key: KeyFunction, job: int, group: int, holds: int, now: int
+) -> int:
+    """
+    Make a callback ready that no DAG declares, as the one execution of a job of its own.
+
+    :param job: the job's index; ``group`` and ``holds``: see ``State.x_group``, ``x_holds``.
+    :return: the execution.
+    """
+    if s.free_slot[t.n_dags] < 0:
+        add_slot(t, s, t.n_dags)
+    x = s.job_base[open_undeclared(s, t.n_dags, job, now)]
+    s.x_group[x] = group
+    s.x_holds[x] = holds
+    make_ready(t, s, key, x, now)
+    return x
 
 
 def edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int) -> None:
@@ -352,12 +381,15 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     s.x_state[x] = DONE
     group = s.x_group[x]
     if group >= 0 and s.group_owner[group] == x:
-        _release_group(s, group)
+        if s.group_heap[group]:
+            _release_group(s, group)
+        else:
+            s.group_owner[group] = -1
     slot = s.x_slot[x]
     vertex = s.x_vertex[x]
-    if vertex == t.n_vertices:  # no DAG declares it
-        s.job_state[slot] = COMPLETED
-        deactivate(s, slot)
+    if vertex == t.n_vertices:  # no DAG declares it, so its job has nothing else
+        s.job_active[slot] = 0
+        free_slot(s, slot)
         return True
     head = s.job_base[slot] + t.region_offset[vertex]
     whole = True
@@ -411,7 +443,7 @@ def _complete_vertex(
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
         elif late and t.on_miss[dag] == ABORT:
             abort_job(t, s, slot, now)
-    elif s.expected[vertex] == ENDS_HERE:
+    elif s.expected[vertex] == LEADS_OUT:
         s.job_sinks_left[slot] -= 1
         if s.job_sinks_left[slot] == 0:
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)

@@ -37,6 +37,8 @@ class Scheduler:
     :param policy_name: a row of ``core.policies``; PolicyError when there is none.
     :param preemptive: see ``core.state.new_state``, as the remaining ones.
     :ivar ready: ``ready(x, now)`` makes an execution ready.
+    :ivar ready_undeclared: ``ready_undeclared(job, group, holds, now)`` makes a callback ready
+        that no DAG declares, and returns its execution.
     :ivar take: ``take(worker, now)`` dispatches the next execution on an idle worker and returns
         it; -1 when there is none to run.
     :ivar schedule: ``schedule(now)`` dispatches one execution where the rules want it; -1 when
@@ -71,6 +73,8 @@ class Scheduler:
         rule = self.tables, self.state
         self.ready: Callable[[int, int], None] = partial(
             rules.make_ready, *rule, self.policy.key)
+        self.ready_undeclared: Callable[[int, int, int, int], int] = partial(
+            rules.ready_undeclared, *rule, self.policy.key)
         self.take: Callable[[int, int], int] = partial(rules.take, *rule)
         self.schedule: Callable[[int], int] = partial(rules.schedule, *rule, self.policy.key)
         self.complete: Callable[[int, int], bool] = partial(
@@ -104,14 +108,6 @@ class Scheduler:
     def source(self, slot: int) -> int:
         """Return the execution of the source of the job in a slot."""
         return self.execution(slot, self.tables.source[self.state.job_dag[slot]])
-
-    def undeclared(self, job: int, now: int) -> int:
-        """Return an execution for a callback that no DAG declares; to be made ready at once."""
-        slot = jobs.open_undeclared(self.state, self.tables.n_dags, job, now)
-        if slot < 0:
-            add_slot(self.tables, self.state, self.tables.n_dags)
-            slot = jobs.open_undeclared(self.state, self.tables.n_dags, job, now)
-        return self.state.job_base[slot]
 
     def start(self, x: int, worker: int, now: int) -> None:
         """Start what began on an idle worker before all that waits, and is known of only now."""

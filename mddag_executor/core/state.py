@@ -22,8 +22,8 @@ IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
 # States of a job.  Of the last five every ended job is in exactly one.
 FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED = range(7)
 
-# Where a vertex is expected to run; ENDS_HERE: here, is no sink, and nothing after it runs here.
-ELSEWHERE, HERE, ENDS_HERE = range(3)
+# Where a vertex is expected to run; LEADS_OUT: here, and one right after it is not.
+ELSEWHERE, HERE, LEADS_OUT = range(3)
 
 # Columns of ``scalars``.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,

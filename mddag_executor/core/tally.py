@@ -39,8 +39,8 @@ VERDICTS = {
     SINK_IN_TIME: 'in_time', SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
     SINK_ABORTED: 'aborted', SINK_FAILED: 'failed', SINK_OVERDUE: 'overdue'}
 """What a verdict of the core is called."""
-_OUTCOMES = {COMPLETED: 'completed', LATE: 'late', ABORTED: 'aborted', EXPIRED: 'expired',
-             FAILED: 'failed'}
+OUTCOMES = {COMPLETED: 'completed', LATE: 'late', ABORTED: 'aborted', EXPIRED: 'expired',
+            FAILED: 'failed'}
 
 
 def quantile(ordered: Sequence[int], q: float) -> int:
@@ -236,7 +236,7 @@ class Tally:
         self._tables = tables
         self._dags = task_set.dags if task_set is not None else ()
         self.jobs = [0] * tables.n_dags
-        self.ends = [dict.fromkeys(_OUTCOMES, 0) for _ in range(tables.n_dags)]
+        self.ends = [dict.fromkeys(OUTCOMES, 0) for _ in range(tables.n_dags)]
         self.sinks = {v: SinkTally(tables.sink_deadline[v], keep) for v in tables.sinks}
         self.dropped = 0
         #: By vertex and job: the deadlines of sinks that are overdue and have no verdict yet.
@@ -338,7 +338,7 @@ class Tally:
         for dag in self._dags:
             dags[dag.name] = {
                 'jobs': self.jobs[dag.index],
-                'ends': {_OUTCOMES[e]: n for e, n in self.ends[dag.index].items()},
+                'ends': {OUTCOMES[e]: n for e, n in self.ends[dag.index].items()},
                 'sinks': {self.vertex_name(v): sink.result()
                           for v, sink in self.sinks_of(dag).items()}}
         return {'deadline_missed': self.missed, 'first_miss': self._first_of_all(),

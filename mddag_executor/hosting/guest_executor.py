@@ -17,7 +17,7 @@ from functools import cache
 import threading
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.live.compat import is_called_by_spin
+from mddag_executor.executor.compat import is_called_by_spin
 from rclpy.executors import Executor
 from rclpy.node import Node
 

@@ -42,10 +42,11 @@ import time
 from typing import Any
 import weakref
 
+from mddag_executor.executor.compat import executor_kept
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
 from mddag_executor.hosting.guest_signals import GuestSignals
 from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
-from mddag_executor.live.compat import executor_kept, instead, Replacements
+from mddag_executor.replacements import instead, Replacements
 import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle

@@ -7,11 +7,11 @@ Replay of recorded runs: as recorded, and rescheduled through the core.
 the scheduler core would have done with its releases and execution times.
 """
 
+from mddag_executor.recording.head import ReplayError
 from mddag_executor.replay.as_recorded import Replay, replay
-from mddag_executor.replay.for_caret import caret_events
-from mddag_executor.replay.recording import ReplayError
 from mddag_executor.replay.reschedule import Reschedule, reschedule
-from mddag_executor.replay.run import Traces
+from mddag_executor.replay.run import open_recording, Traces
 
 __all__ = [
-    'Replay', 'ReplayError', 'Reschedule', 'Traces', 'caret_events', 'replay', 'reschedule']
+    'Replay', 'ReplayError', 'Reschedule', 'Traces', 'open_recording', 'replay',
+    'reschedule']

@@ -27,7 +27,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, Tables
-from mddag_executor.replay.happenings import Ints
+from mddag_executor.recording.tables import Ints
 from mddag_executor.simulate import END, Load, schedule, Settings
 from mddag_executor.simulate.schedule import prepare
 import numpy as np

@@ -4,78 +4,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
-from mddag_executor.replay.beside import pays, play_beside
-from mddag_executor.replay.communications import Communications
-from mddag_executor.replay.drift import DriftObserver
-from mddag_executor.replay.explain import Explainer
-from mddag_executor.replay.happenings import Observer
-from mddag_executor.replay.judge import Judge
-from mddag_executor.replay.own import OwnRun
+from mddag_executor.memory import give_back
+from mddag_executor.recording.tables import Recording
+from mddag_executor.replay.chains import Chains
+from mddag_executor.replay.communications import communications, recorded_callbacks
+from mddag_executor.replay.deadlines import Judged
+from mddag_executor.replay.drift import drift_of
+from mddag_executor.replay.explain import Explanation
 from mddag_executor.replay.paths import Paths
-from mddag_executor.replay.run import open_run, Recording, Run
-from mddag_executor.replay.usage import GroupWaits, share, Usage
+from mddag_executor.replay.run import Given, open_recording, Progress
+from mddag_executor.replay.usage import group_waits, share, Usage
 from mddag_executor.text import counted
 from msg_graph import TaskSet
-from msg_graph.derive import no_garbage
 from msg_graph.drift import Drift
-
-Progress = Callable[[int], None]
 
 
 class Replay:
     """
-    Plays a recorded run, and says what came of it.
+    A recording, and what came of it.
 
-    :param more: makes further observers, who come after the judge.
-    :param paths: whether to follow the declared paths, to look for drift, and to count why
-        deadlines were missed.
-    :param jobs: whether to keep of each miss why.
-    :ivar explainer: knows why; None without ``paths``.
+    :param skip: how long after the first release jobs are not judged (a warm-up), ns.
+    :ivar judged: the verdicts; ``tally`` has their sums.
     :ivar warnings: what is missing or doubtful, one line each.
     """
 
-    def __init__(
-        self, run: Run, skip: int = 0, progress: Progress | None = None,
-        more: Callable[[Replay], Sequence[Observer]] | None = None, paths: bool = True,
-        jobs: bool = False,
-    ) -> None:
-        self.run = run
-        self.task_set = run.task_set
-        waits = GroupWaits(run.who)
-        self.judge = Judge(run.task_set, run.same, waits, skip)
-        self.usage = Usage(run.task_set, waits)
-        self.tally = self.judge.tally
-        self._seen = Communications(run.who) if run.imported else None
-        self._paths = Paths(run) if paths else None
-        self._drift = DriftObserver(run) if paths else None
-        self.explainer = Explainer(run, self.judge, jobs) if paths else None
-        with no_garbage():
-            if paths and not jobs and more is None and isinstance(run, OwnRun) and pays(run):
-                self.run, self._paths, self._drift = play_beside(
-                    run, waits, [self.judge, self.usage, *filter(None, [self.explainer])],
-                    progress)
-            else:
-                observers = [waits, self.judge, self.usage, self._paths, self._drift, self._seen,
-                             self.explainer, *(more(self) if more is not None else ())]
-                run.play([each for each in observers if each is not None], progress)
-            if self.explainer is not None:
-                self.explainer.finish()
-        run = self.run
-        self.warnings = run.warnings
-        if self.judge.contradictions:
+    def __init__(self, recording: Recording, skip: int = 0) -> None:
+        self.recording, self.task_set = recording, recording.task_set
+        self.judged = Judged(recording, skip)
+        give_back()
+        self.tally = self.judged.tally
+        self.warnings = list(recording.warnings)
+        if self.judged.contradictions:
             self.warnings.append(
-                f'{run.name}: left out: {counted(self.judge.contradictions, "event")} that '
+                f'{recording.name}: left out: {counted(self.judged.contradictions, "event")} that '
                 'contradict earlier ones')
-        differences = self.judge.differences() if run.shut_down else None
+        differences = self.judged.differences() if recording.shut_down else None
         if differences is not None:
-            self.warnings.append(f'{run.name}: {differences}')
+            self.warnings.append(f'{recording.name}: {differences}')
+
+    @cached_property
+    def chains(self) -> Chains:
+        """Return the critical chains of jobs."""
+        return Chains(self.judged, self.recording.executions, self._waited)
+
+    @cached_property
+    def usage(self) -> Usage:
+        """Return what callbacks and workers used."""
+        found = Usage(self.recording, self._waited)
+        give_back()
+        return found
+
+    @cached_property
+    def explanation(self) -> Explanation:
+        """Return why deadlines were missed."""
+        found = Explanation(self.recording, self.judged, self.chains)
+        give_back()
+        return found
+
+    @cached_property
+    def _waited(self) -> Any:
+        return group_waits(self.recording)
 
     def drift(self) -> list[Drift]:
         """Return where the run and the declaration disagree."""
-        return [] if self._drift is None else self._drift.drift(self.task_set)
+        return drift_of(self.recording)
 
     @property
     def duration_ns(self) -> int:
@@ -84,40 +79,41 @@ class Replay:
 
         Of a run without jobs it is that of the recording.
         """
-        run = self.run
-        start = run.head.time if run.start is None else run.start
-        return max(0, run.end - (start if run.jobs else min(start, run.head.time)))
+        recording, begun = self.recording, self.recording.head.time
+        start = begun if recording.start is None else recording.start
+        return max(0, recording.end - (
+            start if len(recording.releases) else min(start, begun)))
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``."""
-        head = self.run.head
-        duration = self.duration_ns
+        recording, head, duration = self.recording, self.recording.head, self.duration_ns
         result = {
             'policy': head.policy, 'workers': head.workers, 'preemptive': head.preemptive,
             'duration_ns': duration,
             'utilisation': share(self.usage.busy, head.workers, duration),
             **self.tally.result()}
+        breakdown = self.chains.breakdown()
         for dag in self.task_set.dags:
             sinks = result['dags'][dag.name]['sinks']
-            first = self.judge.tables.first_vertex[dag.index]
+            first = self.judged.tables.first_vertex[dag.index]
             for local in dag.sinks:
                 sink = sinks[dag.vertices[local].name]
-                sink['breakdown'] = self.judge.chains.result(self.task_set, first + local)
+                sink['breakdown'] = breakdown.get(first + local)
                 sink['slack_ns'] = slack(sink)
-            if not isinstance(self.run, OwnRun):
-                result['dags'][dag.name]['unjudged'] = self.run.unjudged.get(dag.index, 0)
+            if recording.unjudged is not None:
+                result['dags'][dag.name]['unjudged'] = recording.unjudged.get(dag.index, 0)
         return {
-            **result, 'rescheduled': False, 'skip_ns': self.judge.skip,
+            **result, 'rescheduled': False, 'skip_ns': self.judged.skip,
             'callbacks': self.usage.callbacks(),
             'undeclared': self.usage.undeclared(),
             'worker_use': self.usage.workers(head.workers, duration),
-            'dropped': dict(sorted(self.run.dropped.items())),
-            'misses': None if self.explainer is None else self.explainer.summary(),
-            'paths': {} if self._paths is None else self._paths.book.results(),
-            **({} if self._seen is None else {
-                'recorded_callbacks': self._seen.callbacks(),
-                'communications': self._seen.communications()}),
-            'recording': recording_result(self.run),
+            'dropped': dict(sorted(recording.dropped.items())),
+            'misses': self.explanation.summary(),
+            'paths': Paths(recording).results(),
+            **({} if not recording.imported else {
+                'recorded_callbacks': recorded_callbacks(recording),
+                'communications': communications(recording)}),
+            'recording': recording_result(recording),
             'warnings': self.warnings}
 
 
@@ -134,7 +130,7 @@ def slack(sink: dict[str, Any]) -> dict[str, int] | None:
         ('min', 'max'), ('p1', 'p99'), ('median', 'median'), ('max', 'min'))}
 
 
-def recording_result(run: Run) -> dict[str, Any]:
+def recording_result(run: Recording) -> dict[str, Any]:
     """Return the part of a result about the trace itself."""
     return {
         'trace': run.name, 'declaration': run.head.file, 'start_ns': run.start,
@@ -142,30 +138,14 @@ def recording_result(run: Run) -> dict[str, Any]:
 
 
 def replay(
-    path: Recording,
-    task_set: TaskSet | None = None,
-    *,
-    name: str | None = None,
-    progress: Progress | None = None,
-    more: Callable[[Replay], Sequence[Observer]] | None = None,
-    skip: int = 0,
-    jobs: bool = False,
+    path: Given, task_set: TaskSet | None = None, *, name: str | None = None,
+    progress: Progress | None = None, skip: int = 0, span: tuple[int, int] | None = None,
 ) -> Replay:
     """
-    Replay a trace as recorded.
+    Replay a trace as recorded; see ``open_recording`` and ``Replay``.
 
-    Memory depends on the jobs that are open at one time and on the number of sinks' completions
-    (their response times are kept).
-
-    :param path: a trace of this executor, or an imported one.
-    :param task_set: the declaration that judges; None: the one in the trace, if it has one.
-    :param name: what messages call the trace, where that is not its path.
-    :param progress: called now and then with the number of events read so far.
-    :param more: makes further observers; see ``Replay``.
     :param skip: how long after the first release jobs are not judged (a warm-up), ns.
-    :param jobs: whether to keep of each miss why.
-    :raises mddag_executor.trace.TraceError: when it is no trace.
-    :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, or none of
-        the declaration's callbacks.
+    :param span: begin and end of the part to replay, ns after the start; see ``Recording.cut``.
     """
-    return Replay(open_run(path, task_set, name), skip, progress, more, jobs=jobs)
+    recording = open_recording(path, task_set, name, progress)
+    return Replay(recording if span is None else recording.cut(*span), skip)

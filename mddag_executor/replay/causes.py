@@ -8,7 +8,7 @@ Theory of operation
 The time of a job, from its release to its completion at the sink (or until it was given up), goes
 along its critical chain (see ``chains``).  Each piece of it is split:
 
-* what overlaps a stall (see ``stalls``) is the *machine*'s;
+* what overlaps a recorded stop of the machine is the *machine*'s;
 * before the source is ready the job is *released late*;
 * a callback that is ready waits: for its *group*, as far as another of the group ran; else it
   *waited* as far as all workers were busy; else, with a free worker, for the *interpreter* as far
@@ -38,24 +38,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mddag_executor.core.state import SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_LATE
-from mddag_executor.replay.chains import (
-    L_CPU,
-    L_END,
-    L_GROUP,
-    L_READY,
-    L_START,
-    L_VERTEX,
-    M_AT,
-    M_JOB,
-    M_KIND,
-    M_LENGTH,
-    M_RELEASE,
-    M_SINK,
-    M_UNTIL,
-    Misses,
-)
-from mddag_executor.replay.happenings import Ints
-from mddag_executor.replay.stalls import Spans
+from mddag_executor.recording.tables import Ints, Mask, Table
+from mddag_executor.replay.spans import Spans
 import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
@@ -79,9 +63,22 @@ REMEDIES = {
     'failed': 'mend what the callback raises'}
 _NOTHING_NS = 1_000_000
 _ABOUT_BITS = 4     # up to a 16th more is usual, too
-# Columns of parts.
-P_MISS, P_VERTEX, P_CAUSE, P_BEGIN, P_END, P_NS, N_PART = range(7)
 _WAITS = (WAITED, INTERPRETER, GROUP)
+
+MISSED = np.dtype([
+    ('kind', 'i8'), ('sink', 'i8'), ('job', 'i8'), ('release', 'i8'), ('until', 'i8'),
+    ('at', 'i8'), ('length', 'i8')])
+"""Columns of a miss: ``at`` is the vertex that the job came to, ``length`` that of its chain."""
+PARTS_OF = np.dtype([
+    ('miss', 'i8'), ('vertex', 'i8'), ('cause', 'i8'), ('begin', 'i8'), ('end', 'i8'),
+    ('ns', 'i8')])
+"""Columns of a part of the time of a miss; ``cause`` is an index of ``PARTS``."""
+# A span of time of a miss, at a vertex; of a wait how much of it was for the group, of a run its
+# CPU time.
+_SPAN = np.dtype([
+    ('miss', 'i8'), ('vertex', 'i8'), ('kind', 'i8'), ('begin', 'i8'), ('end', 'i8'),
+    ('more', 'i8')])
+_LAG, _BEFORE, _WAIT, _RUN, _TRANSPORT, _PENDING = range(6)
 
 
 class Pool(NamedTuple):
@@ -120,18 +117,19 @@ class Never(NamedTuple):
     What is known of what never ran.
 
     :ivar dropped: by vertex and job, why its execution was dropped.
-    :ivar started: executions that were started: vertex, job, ready, start.
+    :ivar started: executions that were started, with vertex, job, ready and start.
     """
 
     dropped: dict[tuple[int, int], str]
-    started: Ints
+    started: Table
 
     def waiting(self, vertices: Ints, times: Ints) -> Ints:
         """Return of each vertex the job whose execution waited at the time beside it, or -1."""
         jobs = np.full(len(vertices), -1)
         for vertex in np.unique(vertices).tolist():
-            mine = self.started[self.started[:, 0] == vertex, 1:]
-            job, ready, start = mine[mine[:, 1].argsort()].T
+            mine = self.started[self.started['vertex'] == vertex]
+            mine = mine[mine['ready'].argsort(kind='stable')]
+            job, ready, start = mine['job'], mine['ready'], mine['start']
             latest = np.maximum.accumulate(start)
             asked = np.flatnonzero(vertices == vertex)
             before = np.searchsorted(ready, times[asked], 'right') - 1
@@ -144,40 +142,41 @@ class Never(NamedTuple):
 
 class Found(NamedTuple):
     """
-    Misses (rows as in ``Misses``), their causes, and the parts of their times in order.
+    Misses (a table of ``MISSED``), their causes, and the parts of their times in order.
 
     :ivar too_short: of which misses the deadline is too short for what is usual.
     """
 
-    misses: Ints
+    misses: Table
     causes: Ints
-    parts: Ints
-    too_short: Any
+    parts: Table
+    too_short: Mask
 
 
 def find(
-    misses: Misses, pool: Pool, usual: Usual, never: Never, dag_of: Ints, deadline: Ints,
-    is_source: Any,
+    rows: Table, chain: Table, pool: Pool, usual: Usual, never: Never, dag_of: Ints,
+    deadline: Ints, is_source: Any,
 ) -> Found:
     """
     Find the causes of misses.
 
+    :param rows: a table of ``MISSED``; ``chain``: the links of their chains (``chains.LINKS``),
+        one after the other, ends first.
     :param dag_of: by global vertex its DAG; ``deadline``: its relative deadline as a sink.
     :param is_source: by global vertex whether it is its DAG's source.
     """
-    rows, chain = misses
     spans = _spans(rows, chain, is_source)
-    kinds, of = spans[:, _S_KIND], spans[:, _S_MISS]
+    kinds, of = spans['kind'], spans['miss']
     begins, ends = np.array(pool.stalls, dtype=np.int64).reshape(-1, 2).T
     stalls = Spans(begins, ends)
-    stood = stalls.within(spans[:, _S_BEGIN], spans[:, _S_END])
-    left = spans[:, _S_END] - spans[:, _S_BEGIN] - stood
+    stood = stalls.within(spans['begin'], spans['end'])
+    left = spans['end'] - spans['begin'] - stood
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
     times[:, MACHINE] = stood
     for kind, part in ((_LAG, RELEASED_LATE), (_TRANSPORT, TRANSPORT), (_BEFORE, UNKNOWN)):
         times[kinds == kind, part] = left[kinds == kind]
     runs = kinds == _RUN
-    normal = usual.runs[spans[:, _S_VERTEX]]
+    normal = usual.runs[spans['vertex']]
     usually = np.where(left <= normal + (normal >> _ABOUT_BITS), left, normal)
     times[runs, RAN_USUALLY] = usually[runs]
     times[runs] += _ran_long(spans[runs], (left - usually)[runs], usual, pool)
@@ -187,82 +186,80 @@ def find(
         times[waits] += _waits(spans[waits], left[waits], pool)
     total = np.zeros((len(rows), len(PARTS)), dtype=np.int64)
     np.add.at(total, of, times)
-    sinks = rows[:, M_SINK]
+    sinks = rows['sink']
     unusual = _unusual(total, usual.lags[dag_of[sinks]])
     short = _too_short(rows, unusual.sum(axis=1), deadline[sinks])
     amounts = np.where(short[:, np.newaxis], total[:, :len(CAUSES)], unusual)
     amounts[short, RAN_LONG] += total[short, RAN_USUALLY]
     causes = _causes(rows, total, amounts, pool, never, is_source)
     which, cause = np.nonzero(times)
-    parts = np.column_stack((
-        spans[which][:, [_S_MISS, _S_VERTEX]], cause, spans[which][:, [_S_BEGIN, _S_END]],
-        times[which, cause]))
+    parts = np.zeros(len(which), dtype=PARTS_OF)
+    for name in ('miss', 'vertex', 'begin', 'end'):
+        parts[name] = spans[name][which]
+    parts['cause'], parts['ns'] = cause, times[which, cause]
     return Found(rows, causes, parts, short)
 
 
-# A span of time of a miss, at a vertex; of a wait how much of it was for the group, of a run its
-# CPU time.
-_S_MISS, _S_VERTEX, _S_KIND, _S_BEGIN, _S_END, _S_MORE = range(6)
-_LAG, _BEFORE, _WAIT, _RUN, _TRANSPORT, _PENDING = range(6)
-
-
-def _spans(rows: Ints, chain: Ints, is_source: Any) -> Ints:
+def _spans(rows: Table, chain: Table, is_source: Any) -> Table:
     """Return the spans of time that misses went through, each in order."""
-    n, lengths = len(rows), rows[:, M_LENGTH]
+    n, lengths = len(rows), rows['length']
     first = np.cumsum(lengths) - lengths
     of = np.repeat(np.arange(n), lengths)
     is_last = np.zeros(len(chain), dtype=np.bool_)      # of its chain: it stands first
     is_last[first[lengths > 0]] = True
-    until = rows[of, M_UNTIL]
-    ready, start, end = chain[:, L_READY], chain[:, L_START], chain[:, L_END]
+    until = rows['until'][of]
+    ready, start, end = chain['ready'], chain['start'], chain['end']
     after = np.where(is_last, until, np.r_[0, ready[:-1]])
     done = np.maximum(start, np.minimum(end, after))
-    at = chain[:, L_VERTEX]
-    after_vertex = np.where(is_last, rows[of, M_AT], np.r_[0, at[:-1]])
+    at = chain['vertex']
+    after_vertex = np.where(is_last, rows['at'][of], np.r_[0, at[:-1]])
     onward = np.where(is_last & (after_vertex != at), _PENDING, _TRANSPORT)
     some = lengths > 0
     begins = (first + lengths - 1)[some]
     whole = is_source[at[begins]]
-    everyone, nothing = np.arange(n), np.zeros(n, dtype=np.int64)
+    everyone = np.arange(n)
 
-    def columns(*each: Any) -> Ints:
-        return np.column_stack(np.broadcast_arrays(*each))
+    def columns(*each: Any) -> Table:
+        table = np.zeros(len(each[0]), dtype=_SPAN)
+        for name, values in zip(_SPAN.names or (), each):
+            table[name] = values
+        return table
 
     spans = np.concatenate([
         columns(everyone[some], at[begins], np.where(whole, _LAG, _BEFORE),
-                rows[some, M_RELEASE], ready[begins], 0),
-        columns(everyone[~some], rows[~some, M_AT], _PENDING, rows[~some, M_RELEASE],
-                rows[~some, M_UNTIL], nothing[~some]),
-        columns(of, at, _WAIT, ready, start, chain[:, L_GROUP]),
-        columns(of, at, _RUN, start, done, chain[:, L_CPU]),
+                rows['release'][some], ready[begins], 0),
+        columns(everyone[~some], rows['at'][~some], _PENDING, rows['release'][~some],
+                rows['until'][~some], 0),
+        columns(of, at, _WAIT, ready, start, chain['group']),
+        columns(of, at, _RUN, start, done, chain['cpu']),
         columns(of, after_vertex, onward, done, after, 0)])
-    spans = spans[spans[:, _S_END] > spans[:, _S_BEGIN]]
-    return spans[np.lexsort((spans[:, _S_BEGIN], spans[:, _S_MISS]))]
+    spans = spans[spans['end'] > spans['begin']]
+    return spans[np.lexsort((spans['begin'], spans['miss']))]
 
 
-def _ran_long(spans: Ints, more: Ints, usual: Usual, pool: Pool) -> Ints:
+def _ran_long(spans: Table, more: Ints, usual: Usual, pool: Pool) -> Ints:
     """Split the time for which callbacks ran longer than usual."""
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
-    cpu, vertex = spans[:, _S_MORE], spans[:, _S_VERTEX]
+    cpu, vertex = spans['more'], spans['vertex']
     computed = np.maximum(0, cpu - usual.cpu[vertex])
     starved = (cpu >= 0) & (2 * usual.cpu[vertex] >= usual.runs[vertex]) & (2 * computed < more)
     idle = np.where(starved, more - computed, 0)
     times[:, RAN_LONG] = more - idle
     times[:, INTERPRETER] = np.minimum(
-        idle, pool.shared.within(spans[:, _S_BEGIN], spans[:, _S_END]))
+        idle, pool.shared.within(spans['begin'], spans['end']))
     times[:, MACHINE] = idle - times[:, INTERPRETER]
     return times
 
 
-def _waits(spans: Ints, left: Ints, pool: Pool) -> Ints:
+def _waits(spans: Table, left: Ints, pool: Pool) -> Ints:
     """Split the time for which callbacks waited, but for stalls."""
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
-    times[:, GROUP] = np.minimum(spans[:, _S_MORE], left)
+    times[:, GROUP] = np.minimum(spans['more'], left)
     left = left - times[:, GROUP]
     if not pool.knows_workers:
         times[:, WAITED] = left
         return times
-    begins, ends = spans[:, _S_BEGIN], spans[:, _S_END]
+    begins, ends = spans['begin'], spans['end']
     times[:, WAITED] = np.minimum(left, pool.full.within(begins, ends))
     left = left - times[:, WAITED]
     some = pool.some.within(begins, ends) - times[:, WAITED] - times[:, GROUP]
@@ -275,21 +272,22 @@ def _waits(spans: Ints, left: Ints, pool: Pool) -> Ints:
 
 
 def _pending(
-    rows: Ints, spans: Ints, times: Ints, left: Ints, never: Never, pool: Pool
+    rows: Table, spans: Table, times: Ints, left: Ints, never: Never, pool: Pool
 ) -> None:
     """Find out what became of the callbacks that never ran; they wait or are lost."""
-    open_ones = np.flatnonzero(spans[:, _S_KIND] == _PENDING).tolist()
+    open_ones = np.flatnonzero(spans['kind'] == _PENDING).tolist()
     started = never.started if open_ones else never.started[:0]
-    ready = dict(zip(zip(*started[:, :2].T.tolist()), started[:, 2].tolist()))
+    ready = dict(zip(zip(started['vertex'].tolist(), started['job'].tolist()),
+                     started['ready'].tolist()))
     for i in open_ones:
-        miss, vertex, _, begin, end, _ = spans[i].tolist()
-        key = vertex, int(rows[miss, M_JOB])
+        miss, vertex, _, begin, end, _ = spans[i].item()
+        key = vertex, int(rows['job'][miss])
         waits = never.dropped.get(key) == 'aborted' or ready.get(key, end) < end
-        if not waits and key not in never.dropped and rows[miss, M_KIND] != SINK_EXPIRED:
+        if not waits and key not in never.dropped and rows['kind'][miss] != SINK_EXPIRED:
             full, = pool.full.within(*(np.array([each]) for each in (begin, end)))
             waits = pool.knows_workers and 2 * int(full) >= end - begin
         if waits:
-            spans[i, _S_KIND] = _WAIT
+            spans['kind'][i] = _WAIT
         else:
             times[i, LOST] = left[i]
 
@@ -301,20 +299,20 @@ def _unusual(total: Ints, lags: Ints) -> Ints:
     return amounts
 
 
-def _too_short(rows: Ints, unusual: Ints, deadline: Ints) -> Any:
+def _too_short(rows: Table, unusual: Ints, deadline: Ints) -> Any:
     """Return of which misses the deadline is too short for what is usual."""
-    lateness = rows[:, M_UNTIL] - rows[:, M_RELEASE] - deadline
-    return (unusual == 0) | ((rows[:, M_KIND] == SINK_LATE) & (unusual < lateness))
+    lateness = rows['until'] - rows['release'] - deadline
+    return (unusual == 0) | ((rows['kind'] == SINK_LATE) & (unusual < lateness))
 
 
-def delayed_by(rows: Ints, stall: tuple[int, int]) -> Any:
+def delayed_by(rows: Table, stall: tuple[int, int]) -> Any:
     """Return which misses a stall, or the backlog after it, may have delayed."""
     begin, end = stall
-    return (rows[:, M_RELEASE] < 2 * end - begin) & (rows[:, M_UNTIL] > begin)
+    return (rows['release'] < 2 * end - begin) & (rows['until'] > begin)
 
 
 def _causes(
-    rows: Ints, total: Ints, amounts: Ints, pool: Pool, never: Never, is_source: Any
+    rows: Table, total: Ints, amounts: Ints, pool: Pool, never: Never, is_source: Any
 ) -> Ints:
     """Return the cause of each miss; ``amounts`` are the times that count for it."""
     credit = np.zeros(len(rows), dtype=np.int64)    # what the machine may have delayed
@@ -327,9 +325,9 @@ def _causes(
         amounts[:, MACHINE] += moved
         credit -= moved
     causes: Ints = amounts.argmax(axis=1)
-    causes[rows[:, M_KIND] == SINK_FAILED] = FAILED
+    causes[rows['kind'] == SINK_FAILED] = FAILED
     given_up = np.flatnonzero(
-        np.isin(rows[:, M_KIND], (SINK_EXPIRED, SINK_ABORTED))
+        np.isin(rows['kind'], (SINK_EXPIRED, SINK_ABORTED))
         & ((total[:, LOST] > 0) | (amounts.max(axis=1) == 0)))
     causes[given_up] = _given_up(
         rows, given_up, causes, np.where(after_stall, MACHINE, RELEASED_LATE), never, is_source)
@@ -337,7 +335,7 @@ def _causes(
 
 
 def _given_up(
-    rows: Ints, which: Ints, causes: Ints, skipped: Ints, never: Never, is_source: Any
+    rows: Table, which: Ints, causes: Ints, skipped: Ints, never: Never, is_source: Any
 ) -> Ints:
     """
     Return the causes of some misses whose jobs were given up.
@@ -346,7 +344,7 @@ def _given_up(
     :param skipped: their causes if their releases were skipped, and nothing waited.
     """
     found = causes[which]
-    kind, job, at, until = rows[which][:, [M_KIND, M_JOB, M_AT, M_UNTIL]].T
+    kind, job, at, until = (rows[name][which] for name in ('kind', 'job', 'at', 'until'))
     dropped = np.array(
         [key in never.dropped for key in zip(at.tolist(), job.tolist())], dtype=np.bool_)
     skips = is_source[at] & ~dropped
@@ -354,15 +352,17 @@ def _given_up(
     found[skips] = skipped[which[skips]]
     before = never.waiting(at, until)
     waits = skips & (before >= 0) & (found != MACHINE)
-    raised = rows[:, M_KIND] == SINK_FAILED     # which does not say why something waited
-    of = dict(zip(zip(*rows[~raised][:, [M_SINK, M_JOB]].T.tolist()), causes[~raised].tolist()))
+    raised = rows['kind'] == SINK_FAILED     # which does not say why something waited
+    of = dict(zip(
+        zip(rows['sink'][~raised].tolist(), rows['job'][~raised].tolist()),
+        causes[~raised].tolist()))
     found[waits] = [of.get(key, WAITED) for key in zip(
-        rows[which[waits], M_SINK].tolist(), before[waits].tolist())]
+        rows['sink'][which[waits]].tolist(), before[waits].tolist())]
     return found
 
 
 def behind(
-    parts: Ints, chosen: Ints, runs: dict[int, Spans], on_workers: dict[int, Spans],
+    parts: Table, chosen: Ints, runs: dict[int, Spans], on_workers: dict[int, Spans],
     same_group: Any,
 ) -> dict[int, list[tuple[int, int]]]:
     """
@@ -376,15 +376,15 @@ def behind(
     if not len(chosen) or not runs:
         return found
     names = list(runs)
-    begins, ends = parts[chosen, P_BEGIN], parts[chosen, P_END]
+    begins, ends = parts['begin'][chosen], parts['end'][chosen]
     times = np.array([each.within(begins, ends) for each in runs.values()])
-    waited = parts[chosen, P_CAUSE] == WAITED
+    waited = parts['cause'][chosen] == WAITED
     times[:, waited] = [
         each.within(begins[waited], ends[waited]) for each in on_workers.values()]
-    grouped = np.flatnonzero(parts[chosen, P_CAUSE] == GROUP)
-    for vertex in np.unique(parts[chosen[grouped], P_VERTEX]).tolist():
+    grouped = np.flatnonzero(parts['cause'][chosen] == GROUP)
+    for vertex in np.unique(parts['vertex'][chosen[grouped]]).tolist():
         others = [i for i, callback in enumerate(names) if not same_group(vertex, callback)]
-        mine = grouped[parts[chosen[grouped], P_VERTEX] == vertex]
+        mine = grouped[parts['vertex'][chosen[grouped]] == vertex]
         times[np.ix_(others, mine)] = 0
     for part, column in zip(chosen.tolist(), times.T):
         order = np.argsort(-column, kind='stable')[:MOST_BEHIND].tolist()
@@ -398,6 +398,6 @@ MOST_BEHIND = 5
 def to_explain(found: Found) -> Ints:
     """Return the parts for which to find what they waited behind."""
     parts, rows = found.parts, found.misses
-    share = 10 * parts[:, P_NS] >= (rows[:, M_UNTIL] - rows[:, M_RELEASE])[parts[:, P_MISS]]
-    which: Ints = np.flatnonzero(np.isin(parts[:, P_CAUSE], _WAITS) & share)
+    share = 10 * parts['ns'] >= (rows['until'] - rows['release'])[parts['miss']]
+    which: Ints = np.flatnonzero(np.isin(parts['cause'], _WAITS) & share)
     return which

@@ -6,8 +6,8 @@ Where the time of a job went, along its critical chain.
 Theory of operation
 -------------------
 The critical chain of a sink's completion is found backwards: the sink's vertex became ready when
-the last message that it needed was there, which the vertex before it published; and so on up to
-the source.  Along the chain the response time, completion minus release, splits without rest into
+the last message that it needed arrived, which the vertex before it published; and so on up to the
+source.  Along the chain the response time, completion minus release, splits without rest into
 
 * release lag: from the release until the source was ready (a timer noticed late, or, with
   `release_from: header_stamp`, the way of the sensor's message);
@@ -15,27 +15,25 @@ the source.  Along the chain the response time, completion minus release, splits
   part while another callback of the group ran);
 * executing: from the start until the next vertex was ready, or the execution's end, whichever
   was first;
-* suspended: in between, where a coroutine waited;
+* suspended: in between, while a coroutine waited;
 * transport: from the end of an execution until the next vertex was ready;
-* unknown: what came before the part of the chain that is in the trace.
+* unknown: what came before the part of the chain that is in the recording.
 
-A callback that publishes early may still run when the sink completes: then it has executed until
-its message was there, and which of its legs it was is not known.
+A callback that publishes early may still run when the sink completes.  Then it has executed until
+its message arrived, and which of its legs it was is not known.
+
+All chains of a DAG are followed at once, step by step.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from mddag_executor.core import legs_of, NEVER, Tables
-from mddag_executor.core.state import SINK_LATE
-from mddag_executor.replay.happenings import (
-    Batch,
-    COMPLETED,
-    Ints,
-    STARTED,
-    sums,
-)
+from mddag_executor.core import legs_of, NEVER
+from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
+from mddag_executor.recording.tables import EXECUTIONS, Ints, Mask, pick, rows, sort_by, Table
+from mddag_executor.replay.deadlines import Judged
 from msg_graph import TaskSet
 import numpy as np
 
@@ -51,244 +49,280 @@ class Breakdown(NamedTuple):
     unknown_ns: int = 0
 
 
-# Columns of a link, a step of a chain: the leg that completed its vertex (-1: it still ran); of
-# the execution ready, first start, last end and the time that its pieces took, how much of its
-# waiting was for its callback group, and its CPU time, ns.
-L_VERTEX, L_LEG, L_READY, L_START, L_END, L_BUSY, L_GROUP, L_CPU, N_LINK = range(9)
+LINKS = np.dtype([
+    ('of', 'i8'), ('vertex', 'i8'), ('leg', 'i8'), ('ready', 'i8'), ('start', 'i8'),
+    ('end', 'i8'), ('busy', 'i8'), ('group', 'i8'), ('cpu', 'i8')])
+"""
+Columns of a link, a step of a chain.
+
+``of`` is whose chain it is; ``leg`` the leg that completed the vertex (-1: it still ran); of the
+execution readiness, first start, last end and the time that its pieces took, how much of its
+waiting was for its callback group, and its CPU time (-1: not known), ns.
+"""
 
 
-# Columns of a miss; ``M_AT`` is the vertex that the job came to, ``M_LENGTH`` of how many links.
-M_KIND, M_SINK, M_JOB, M_RELEASE, M_UNTIL, M_AT, M_LENGTH, N_MISS = range(8)
+class _Dag(NamedTuple):
+    """The vertices of a DAG: which vertex each leg's message comes from, by local number."""
 
-
-class Misses(NamedTuple):
-    """Missed deadlines of a batch; the links of their chains one after the other, end first."""
-
-    rows: Ints
-    chains: Ints
-
-
-class Worst(NamedTuple):
-    """The job with a sink's longest response time; `chain` has its links."""
-
-    job: int
-    release: int
-    completed: int
-    chain: list[list[int]]
-    breakdown: Breakdown
-
-
-class SinkTimes:
-    """Where the time of a sink's completed jobs went: sums, and the worst job."""
-
-    __slots__ = ('completed', 'sums', 'group', 'longest', 'worst')
-
-    def __init__(self) -> None:
-        self.completed = 0
-        self.sums = [0] * len(Breakdown._fields)
-        self.group = 0
-        self.longest = -1
-        self.worst: Worst | None = None
+    first: int
+    before: Ints
+    n_legs: Ints
+    is_source: Mask
 
 
 class Chains:
     """
-    The chains of open jobs, and what came of those of completed ones.
+    The chains of a recording that was judged.
 
-    Links are counted in a batch: those that were kept of the batches before, then what completed,
-    then what was started.
-
-    :param tables: tables of the task set, with legs.
+    :param waited: by execution how long its first piece waited for its group, ns.
     """
 
-    def __init__(self, task_set: TaskSet, tables: Tables) -> None:
-        #: By global vertex and leg: the vertex whose message it is.
-        self.before = [
-            [first + before for _, before in legs_of(vertex, dag.vertices)]
-            for dag, first in zip(task_set.dags, tables.first_vertex) for vertex in dag.vertices]
-        self._offset = tables.region_offset
-        self._region = tables.n_region
-        self._is_source = np.array([not each for each in self.before])
-        self.sinks = {vertex: SinkTimes() for vertex in tables.sinks}
-        #: As the core's columns of executions: the link of each vertex of the open jobs, or -1.
-        self.links: list[int] = []
-        self._kept = np.empty((0, N_LINK), dtype=np.int64)
-        # of the sinks that have completed in this batch: vertex, job, release, completion; and
-        # their chains one after the other, from the end on, and how long each is
-        self._sinks: list[tuple[int, int, int, int]] = []
-        self._chains: list[int] = []
-        self._lengths: list[int] = []
-        #: Whether to keep the chains of sinks that missed their deadlines, for ``misses``.
-        self.keeps_misses = False
-        # of these sinks in this batch the columns of a miss; as above, their chains
-        self._missed: list[tuple[int, ...]] = []
-        self._of_missed: list[int] = []
-        self.misses = Misses(
-            np.empty((0, N_MISS), dtype=np.int64), np.empty((0, N_LINK), dtype=np.int64))
+    def __init__(self, judged: Judged, executions: Table, waited: Ints) -> None:
+        if not len(executions):     # a row that -1 may stand for
+            executions, waited = rows(EXECUTIONS, 1), np.zeros(1, dtype=np.int64)
+        self._judged, self._executions, self._waited = judged, executions, waited
+        self._dags = [self._dag(dag, first) for dag, first in zip(
+            judged.task_set.dags, judged.tables.first_vertex)]
+        self._started: dict[int, tuple[Ints, Ints, Ints]] = {}
 
-    def begin_batch(self, batch: Batch) -> None:
-        """Begin with what completes and starts."""
-        completed, started = batch.columns(COMPLETED), batch.columns(STARTED)
-        first = self.first = len(self._kept)
-        running = self.first_started = first + len(completed)
-        columns = np.zeros((N_LINK, running + len(started)), dtype=np.int64)
-        columns[:, :first] = self._kept.T
-        for link, column in zip((*range(L_GROUP), L_CPU), (1, 3, 6, 7, 8, 9, 11)):
-            columns[link, first:running] = completed[:, column]
-        for link, more in ((L_VERTEX, started[:, 1]), (L_LEG, -1), (L_READY, started[:, 3]),
-                           (L_START, started[:, 4]), (L_END, NEVER), (L_BUSY, NEVER), (L_CPU, -1)):
-            columns[link, running:] = more
-        self._table = columns.T
-        # the few that are looked at become numbers one by one
-        self._columns = tuple(memoryview(column) for column in columns[:L_BUSY])
-        self.ready = self._columns[L_READY]
-        self.waited: dict[int, int] = {}
+    @staticmethod
+    def _dag(dag: Any, first: int) -> _Dag:
+        legs = [[before for _, before in legs_of(vertex, dag.vertices)] for vertex in dag.vertices]
+        width = max(1, *map(len, legs))
+        return _Dag(
+            first, np.array([each + [-1] * (width - len(each)) for each in legs]),
+            np.array(list(map(len, legs))), np.array([not each for each in legs]))
 
-    def begin(self, base: int, dag: int) -> None:
-        """Begin a job whose executions have these numbers; the last one there is forgotten."""
-        links, n = self.links, self._region[dag]
-        if len(links) < base + n:
-            links.extend([-1] * (base + n - len(links)))
-        links[base:base + n] = [-1] * n
+    # --- links -----------------------------------------------------------------------------------
 
-    def sink(self, base: int, vertex: int, job: int, release: int, completed: int) -> None:
-        """Note the chain of a sink that has completed."""
-        length = len(self._chains)
-        self._follow(base, self.links[base + self._offset[vertex]], self._chains)
-        self._sinks.append((vertex, job, release, completed))
-        self._lengths.append(len(self._chains) - length)
+    def link(
+        self, dag: int, row: Ints, vertex: Ints, order: Ints, time: Ints
+    ) -> tuple[Ints, Mask]:
+        """
+        Return the executions of (local) vertices of jobs as of places in the order.
 
-    def _follow(self, base: int, link: int, chain: list[int]) -> None:
-        """Add a link and those before it."""
-        links, offset, before = self.links, self._offset, self.before
-        at, legs, ready, start, end = self._columns
-        while link >= 0:
-            chain.append(link)
-            publishers = before[at[link]]
-            if not publishers:
+        :param time: of these places, ns.
+        :return: rows of executions, -1 where there is none, and whether they had not completed.
+        """
+        jobs = self._judged.jobs[dag]
+        found = np.where(jobs.done_order[row, vertex] < order, jobs.done[row, vertex], -1)
+        found[found >= 0] = np.where(
+            self._executions['start'][found[found >= 0]] >= 0, found[found >= 0], -1)
+        running = found < 0
+        if running.any():
+            found[running] = self._running(dag, row[running], vertex[running], time[running])
+        return found, running
+
+    def _running(self, dag: int, row: Ints, vertex: Ints, time: Ints) -> Ints:
+        """Return the executions that had started last, -1 where none had."""
+        cells, starts, links = self._starts(dag)
+        cell = row * len(self._dags[dag].n_legs) + vertex
+        at = np.searchsorted(cells, cell, 'right') - 1
+        while True:
+            late = (at >= 0) & (starts[at] > time) if len(cells) else np.zeros(
+                len(at), dtype=np.bool_)
+            late &= cells[at] == cell if len(cells) else False
+            if not late.any():
                 break
-            since, leg = ready[link], legs[link]
-            if leg >= 0:
-                link = links[base + offset[publishers[leg]]]
-                if link >= 0 and start[link] > since:
-                    break
-                continue
-            link = -1
-            for publisher in publishers:
-                other = links[base + offset[publisher]]
-                if other >= 0 and start[other] <= since and (link < 0 or end[other] > end[link]):
-                    link = other
+            at[late] -= 1
+        if not len(cells):
+            return np.full(len(row), -1)
+        there = (at >= 0) & (cells[at] == cell)
+        return np.where(there, links[at], -1)
 
-    def missed(
-        self, kind: int, base: int, vertex: int, job: int, release: int, until: int
-    ) -> None:
+    def _starts(self, dag: int) -> tuple[Ints, Ints, Ints]:
         """
-        Note the chain of a sink that has missed its deadline, as far as the job came.
+        Return by job and vertex when what started, and the rows of these executions.
 
-        :param until: when it completed or was given up, ns.
+        The row of a piece that goes on where nothing else has started is that of the first.
         """
-        if not self.keeps_misses:
-            return
-        links, offset, end = self.links, self._offset, self._columns[-1]
-        at = vertex
-        if kind != SINK_LATE:
-            while True:
-                missing = [v for v in self.before[at] if links[base + offset[v]] < 0]
-                if not missing:
-                    break
-                at = missing[0]
-        link = links[base + offset[at]]
-        if link < 0 and self.before[at]:    # the last message that it waited for
-            link = max((links[base + offset[v]] for v in self.before[at]), key=end.__getitem__)
-        length = len(self._of_missed)
-        self._follow(base, link, self._of_missed)
-        self._missed.append(
-            (kind, vertex, job, release, until, at, len(self._of_missed) - length))
+        found = self._started.get(dag)
+        if found is None:
+            table, of = self._executions, self._dags[dag]
+            mine = np.flatnonzero((table['dag'] == dag) & (table['start'] >= 0))
+            row = self._judged.jobs[dag].rows_of(table['job'][mine])
+            mine, row = mine[row >= 0], row[row >= 0]
+            cell = row * len(of.n_legs) + table['vertex'][mine] - of.first
+            start = table['start'][mine].astype(np.int64)
+            order = sort_by(cell, start)
+            cell, start, mine = cell[order], start[order], mine[order]
+            ready = table['ready'][mine]
+            goes_on = np.zeros(len(mine), dtype=np.bool_)
+            goes_on[1:] = (cell[1:] == cell[:-1]) & (ready[1:] == ready[:-1])
+            first = np.maximum.accumulate(np.where(goes_on, 0, np.arange(len(mine))))
+            found = self._started[dag] = cell, start, mine[first]
+        return found
 
-    def end_batch(self) -> None:
-        """Add up where the time went, and keep what open jobs have."""
-        table = self._table
-        for link, waited in self.waited.items():
-            table[link, L_GROUP] = waited
-        if self._sinks:
-            self._split(table)
-            self._sinks, self._chains, self._lengths = [], [], []
-        self.misses = Misses(
-            np.array(self._missed, dtype=np.int64).reshape(-1, N_MISS),
-            table[np.array(self._of_missed, dtype=np.int64)])
-        self._missed, self._of_missed = [], []
-        links = np.array(self.links, dtype=np.int64)
-        held = np.flatnonzero(links >= 0)
-        self._kept = table[links[held]]
-        links[held] = np.arange(len(held))
-        self.links = links.tolist()
+    def links(self, dag: int, link: Ints, running: Mask) -> Table:
+        """Return executions as links; of those that run it is not known when they end."""
+        table = pick(self._executions, link)
+        found = np.zeros(len(link), dtype=LINKS)
+        found['vertex'], found['ready'] = table['vertex'], table['ready']
+        n_legs = self._dags[dag].n_legs[found['vertex'] - self._dags[dag].first]
+        found['leg'] = np.where(running, -1, np.where(
+            table['leg'] < 0, np.maximum(n_legs, 1) - 1, table['leg']))
+        found['start'] = np.where(running, table['start'], table['began'])
+        for name in ('end', 'busy'):
+            found[name] = np.where(running, NEVER, table[name])
+        found['cpu'] = np.where(running, -1, table['cpu'])
+        found['group'] = np.where(running, 0, self._waited[link])
+        return found
 
-    def _split(self, table: Ints) -> None:
-        vertex, job, release, completed = np.array(self._sinks, dtype=np.int64).T
-        lengths = np.array(self._lengths, dtype=np.int64)
-        chain = table[np.array(self._chains, dtype=np.int64)]
-        first = np.cumsum(lengths) - lengths
-        of = np.repeat(np.arange(len(lengths)), lengths)
-        at, leg, ready, start, end, busy, group, _ = chain.T
-        is_last = np.zeros(len(chain), dtype=np.bool_)      # of its chain: it stands first
-        is_last[first[lengths > 0]] = True
-        after = np.r_[0, ready[:-1]]
-        published = np.where(is_last, completed[of], np.minimum(end, after))
-        # Where in the execution a pause was is not kept: it counts as far as there is room.
-        # Of what still runs nothing more is known.
-        pause = np.where(
-            leg < 0, 0, np.maximum(0, np.minimum(end - start - busy, published - start)))
-        parts = np.zeros((len(Breakdown._fields) + 1, len(lengths)), dtype=np.int64)
-        for part, times in enumerate((
-                start - ready, published - start - pause, pause,
-                np.where(is_last, 0, after - published)), 1):
-            np.add.at(parts[part], of, times)
-        np.add.at(parts[-1], of, group)
-        # what was before the chain
-        parts[5] = completed - release
-        some = lengths > 0
-        begin = (first + lengths - 1)[some]
-        lag = ready[begin] - release[some]
-        whole = self._is_source[at[begin]]
-        parts[0, some], parts[5, some] = np.where(whole, lag, 0), np.where(whole, 0, lag)
-        sinks, place = np.unique(vertex, return_inverse=True)
-        totals = [sums(place, part, len(sinks)) for part in parts]
-        response = completed - release
-        for number, sink in enumerate(sinks.tolist()):
-            times = self.sinks[sink]
-            mine = np.flatnonzero(place == number)
-            times.completed += len(mine)
-            times.sums = [before + more[number] for before, more in zip(times.sums, totals)]
-            times.group += totals[-1][number]
-            worst = int(mine[response[mine].argmax()])
-            if response[worst] > times.longest:
-                times.longest = int(response[worst])
-                times.worst = Worst(
-                    int(job[worst]), int(release[worst]), int(completed[worst]),
-                    chain[first[worst]:first[worst] + lengths[worst]][::-1].tolist(),
-                    Breakdown(*parts[:-1, worst].tolist()))
+    def follow(
+        self, dag: int, row: Ints, order: Ints, time: Ints, link: Ints, running: Mask
+    ) -> Iterator[tuple[Ints, Table]]:
+        """
+        Yield the links of chains, the last ones first: whose they are, and the links.
 
-    def result(self, task_set: TaskSet, vertex: int) -> dict[str, Any] | None:
-        """Return a sink's part of the result: means over completed jobs, and the worst job."""
-        times = self.sinks[vertex]
-        worst = times.worst
-        if worst is None:
-            return None
-        means = [round(total / times.completed) for total in times.sums]
+        :param link: rows of the executions with which the chains end, -1: there is no chain.
+        """
+        of, which = self._dags[dag], np.flatnonzero(link >= 0)
+        link, running = link[which], running[which]
+        while len(which):
+            links = self.links(dag, link, running)
+            links['of'] = which
+            yield which, links
+            local = links['vertex'] - of.first
+            known = ~of.is_source[local]
+            which, links, local = which[known], links[known], local[known]
+            since, leg = links['ready'], links['leg']
+            publisher = of.before[local, np.maximum(leg, 0)]
+            link, running = self.link(dag, row[which], publisher, order[which], time[which])
+            started = self._start(link, running)
+            good = (link >= 0) & (started <= since)
+            for i in np.flatnonzero(leg < 0).tolist():      # it is not known whose message it was
+                link[i], running[i] = self._latest(
+                    dag, row[which[i]], of.before[local[i], :of.n_legs[local[i]]],
+                    order[which[i]], time[which[i]], since[i])
+                good[i] = link[i] >= 0
+            which, link, running = which[good], link[good], running[good]
+
+    def _start(self, link: Ints, running: Mask) -> Ints:
+        found: Ints = np.where(
+            running, self._executions['start'][link], self._executions['began'][link])
+        return found
+
+    def _latest(
+        self, dag: int, row: Any, publishers: Ints, order: Any, time: Any, since: Any
+    ) -> tuple[int, bool]:
+        """Return which publisher, of those that had started, ended last."""
+        n = len(publishers)
+        link, running = self.link(dag, np.full(n, row), publishers, np.full(n, order),
+                                  np.full(n, time))
+        end = np.where(running, NEVER, self._executions['end'][link])
+        end[(link < 0) | (self._start(link, running) > since)] = -1
+        best = int(end.argmax()) if n else 0
+        if not n or end[best] < 0:
+            return -1, False
+        return int(link[best]), bool(running[best])
+
+    # --- misses ----------------------------------------------------------------------------------
+
+    def of_misses(self, dag: int, missed: Table) -> tuple[Ints, Table]:
+        """
+        Return the chains of misses of a DAG, as far as their jobs came.
+
+        :param missed: verdicts.
+        :return: the vertex that each job came to, and the links, ``of`` being the place in
+            ``missed``.
+        """
+        of, row = self._dags[dag], missed['row']
+        # as of right after a completion, and right before a job was given up
+        order = missed['order'] + (missed['kind'] == SINK_LATE)
+        time, n, size = missed['until'], len(missed), len(of.n_legs)
+        every, running = self.link(
+            dag, np.repeat(row, size), np.tile(np.arange(size), n), np.repeat(order, size),
+            np.repeat(time, size))
+        end = np.where(running, NEVER, self._executions['end'][every])
+        every, end = every.reshape(n, size), end.reshape(n, size)
+        running = running.reshape(n, size)
+        everyone, at = np.arange(n), missed['sink'] - of.first
+        back = np.flatnonzero(missed['kind'] != SINK_LATE)
+        while len(back):
+            publishers = of.before[at[back]]
+            missing = (publishers >= 0) & (every[back[:, None], publishers] < 0)
+            some = missing.any(axis=1)
+            back, first = back[some], missing[some].argmax(axis=1)
+            at[back] = publishers[some, first]
+        link, runs = every[everyone, at], running[everyone, at]
+        # the last message that it waited for
+        publishers = of.before[at]
+        ends = np.where(publishers >= 0, end[everyone[:, None], publishers], -1)
+        ends[(publishers >= 0) & (every[everyone[:, None], publishers] < 0)] = -1
+        last = publishers[everyone, ends.argmax(axis=1)]
+        waits = (link < 0) & ~of.is_source[at]
+        link = np.where(waits, every[everyone, last], link)
+        runs = np.where(waits, running[everyone, last], runs)
+        found = [links for _, links in self.follow(dag, row, order, time, link, runs)]
+        return at + of.first, np.concatenate(found) if found else np.empty(0, dtype=LINKS)
+
+    # --- breakdown -------------------------------------------------------------------------------
+
+    def breakdown(self) -> dict[int, dict[str, Any]]:
+        """Return by sink where the time of its completed jobs went: means, and the worst job."""
+        found: dict[int, dict[str, Any]] = {}
+        judged = self._judged
+        for sink, verdicts in zip(judged.tables.sinks, judged.by_sink()):
+            done = verdicts[verdicts['kind'] <= max(SINK_COMPLETED)]
+            if len(done):
+                found[sink] = self._of_sink(sink, done)
+        return found
+
+    def _of_sink(self, sink: int, done: Table) -> dict[str, Any]:
+        dag = int(done['dag'][0])
+        worst = int((done['completed'] - done['release']).argmax())
+        parts, group, links = self._split(dag, sink, done)
+        chain = np.concatenate([each[each['of'] == worst] for each in links] or [
+            np.empty(0, dtype=LINKS)])[::-1]
+        n = len(done)
         return {
-            'mean': {**dict(zip(Breakdown._fields, means)),
-                     'waiting_group_ns': round(times.group / times.completed)},
+            'mean': {**{name: round(int(part.sum()) / n) for name, part in parts.items()},
+                     'waiting_group_ns': round(int(group.sum()) / n)},
             'worst': {
-                'job': worst.job, 'release_ns': worst.release, 'completed_ns': worst.completed,
-                **worst.breakdown._asdict(),
-                'waiting_group_ns': sum(link[L_GROUP] for link in worst.chain),
-                'chain': [_step_result(task_set, link) for link in worst.chain]}}
+                'job': int(done['job'][worst]), 'release_ns': int(done['release'][worst]),
+                'completed_ns': int(done['completed'][worst]),
+                **{name: int(part[worst]) for name, part in parts.items()},
+                'waiting_group_ns': int(group[worst]),
+                'chain': [_step_result(self._judged.task_set, link) for link in chain]}}
+
+    def _split(
+        self, dag: int, sink: int, done: Table
+    ) -> tuple[dict[str, Ints], Ints, list[Table]]:
+        """Return the parts of response times, of these what was for groups, and the links."""
+        of = self._dags[dag]
+        n = len(done)
+        parts = {name: np.zeros(n, dtype=np.int64) for name in Breakdown._fields}
+        lag, waiting, executing, suspended, transport, unknown = parts.values()
+        group = np.zeros(n, dtype=np.int64)
+        row, order, completed = done['row'], done['order'], done['completed']
+        # as of right after its completion
+        link, running = self.link(dag, row, np.full(n, sink - of.first), order + 1, completed)
+        until, release = completed.copy(), done['release']
+        begun = np.zeros(n, dtype=np.bool_)     # whether the chain reaches to the source
+        kept: list[Table] = []
+        for which, links in self.follow(dag, row, order + 1, completed, link, running):
+            ready, start, end = links['ready'], links['start'], links['end']
+            published = until[which] if not kept else np.minimum(end, until[which])
+            # Where in the execution a pause was is not kept: it counts as far as there is room.
+            pause = np.where(links['leg'] < 0, 0, np.maximum(
+                0, np.minimum(end - start - links['busy'], published - start)))
+            waiting[which] += start - ready
+            executing[which] += published - start - pause
+            suspended[which] += pause
+            transport[which] += until[which] - published
+            group[which] += links['group']
+            until[which] = ready
+            begun[which] = of.is_source[links['vertex'] - of.first]
+            kept.append(links)
+        rest = until - release
+        lag[begun], unknown[~begun] = rest[begun], rest[~begun]
+        return parts, group, kept
 
 
-def _step_result(task_set: TaskSet, link: list[int]) -> dict[str, Any]:
-    vertex, leg, ready, start, end, busy, group, _ = link
-    known = leg >= 0
+def _step_result(task_set: TaskSet, link: Any) -> dict[str, Any]:
+    known = link['leg'] >= 0
     return {
-        'vertex': task_set.vertices[vertex].name, 'ready_ns': ready, 'start_ns': start,
-        'end_ns': end if known else None, 'busy_ns': busy if known else None,
-        'waiting_group_ns': group if known else None}
+        'vertex': task_set.vertices[int(link['vertex'])].name, 'ready_ns': int(link['ready']),
+        'start_ns': int(link['start']), 'end_ns': int(link['end']) if known else None,
+        'busy_ns': int(link['busy']) if known else None,
+        'waiting_group_ns': int(link['group']) if known else None}

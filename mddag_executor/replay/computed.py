@@ -1,19 +1,20 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A schedule that was computed, played to observers as if it had been recorded.
+A schedule that was computed, as the recording of the run that it stands for.
 
 Theory of operation
 -------------------
 The simulator and the rescheduler keep a log: which worker began, ended or preempted what, and
 when.  Together with the load and with the ends of jobs that the core decided that is all that a
-recording has, so every observer finds the same verdicts again and, as with a recording,
-where the time went.
+recording has, so every analysis finds the same verdicts again and, as with a recording, where the
+time went.
 
 At one instant the ends of executions come first, each with the job that it aborts, then other jobs
 that are given up, then releases, then starts.  A vertex is ready when the last message that it
 needs has arrived: at the end of the execution that publishes it, or as much later (or earlier) as
-``delays`` says.
+``delays`` says.  An execution that was preempted has several pieces, as a coroutine that was
+suspended.  A sync callback runs once for all of its legs.
 """
 
 from __future__ import annotations
@@ -21,18 +22,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from mddag_executor.core import legs_of, NEVER
+from mddag_executor.core import DEFAULT_DEADLINE_NS, legs_of, NEVER
 from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END, SINK_LATE
-from mddag_executor.replay.happenings import (
-    Batches,
-    COMPLETED,
-    ENDED,
-    FAILED,
-    Observer,
-    RAN,
-    RELEASED,
-    STARTED,
-)
+from mddag_executor.recording import tables
+from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.head import Head
+from mddag_executor.recording.tables import Recording, Rows, UNKNOWN
 from mddag_executor.simulate import END, Load, LogEntry, SimulatedRun, START
 from mddag_executor.simulate.load import as_lists, FAILS
 from msg_graph import TaskSet
@@ -74,9 +69,13 @@ class ComputedRun(NamedTuple):
         judged = run.settings.judge == 'horizon' and not stopped
         return cls(task_set, load, run.log, run.decisions, horizon, run.ended_ns, judged)
 
-    def play(self, observers: Sequence[Observer]) -> None:
-        """Give the observers everything."""
-        _Player(self, observers).run()
+    def recording(self, workers: int = 0) -> Recording:
+        """
+        Return the schedule as a recording.
+
+        :param workers: how many there are.
+        """
+        return _Player(self).recording(workers)
 
 
 class _Running(NamedTuple):
@@ -86,21 +85,28 @@ class _Running(NamedTuple):
     ready: int
     first: int
     busy: int
+    piece: int
 
 
 class _Player:
     """Goes through a schedule once."""
 
-    def __init__(self, schedule: ComputedRun, observers: Sequence[Observer]) -> None:
+    def __init__(self, schedule: ComputedRun) -> None:
         task_set = schedule.task_set
         self._schedule = schedule
         self._load = as_lists(schedule.load)
-        self._batches = Batches(observers)
-        self._add = self._batches.add
+        self._releases = Rows(tables.RELEASES, 'dag', 'job', 'release', 'noticed', 'order')
+        self._executions = Rows(
+            tables.EXECUTIONS, 'callback', 'dag', 'vertex', 'job', 'leg', 'piece', 'thread',
+            'worker', 'ready', 'began', 'start', 'end', 'busy', 'completes', 'order', 'cpu',
+            'message')
+        self._ends = Rows(
+            tables.JOB_ENDS, 'dag', 'vertex', 'job', 'time', 'reason', 'order')
+        self._order = 0
         self._vertices = task_set.vertices
-        self._last_leg = [
-            max(1, len(legs_of(vertex, task_set.dags[vertex.dag].vertices))) - 1
-            for vertex in self._vertices]
+        self._leg = [
+            0 if len(legs_of(vertex, task_set.dags[vertex.dag].vertices)) < 2
+            else tables.ALL_LEGS for vertex in self._vertices]
         self._n_dags = len(task_set.dags)
         self._first = [0]
         for dag in task_set.dags:
@@ -108,13 +114,13 @@ class _Player:
         self._sources = [self._first[dag.index] + dag.source for dag in task_set.dags]
         self._callback = [place + 1 for place in task_set.places_of_vertices()]
         self._next = 0
-        self._ends = self._job_ends()
-        self._next_end = next(self._ends, None)
+        self._ends_of_jobs = self._job_ends()
+        self._next_end = next(self._ends_of_jobs, None)
         self._ready: dict[Id, int] = {}
-        self._running: dict[Id, _Running] = {}
-        self._finished = 0      # executions
+        self._running: dict[Id, tuple[_Running, int]] = {}
+        self._begun: dict[Id, _Running] = {}
 
-    def run(self) -> None:
+    def recording(self, workers: int) -> Recording:
         schedule = self._schedule
         for entry in schedule.log:
             # what ends at an instant does so before anything is released or given up there
@@ -123,9 +129,28 @@ class _Player:
             now, kind, _, dag, v, job = entry
             if kind == END and self._next_end == (now, dag, job, True, v):
                 self._end_job()     # what else of it ends at that instant comes too late
-            self._batches.flush_if_full()
         self._until(schedule.end)
-        self._batches.finish(schedule.end, schedule.judged)
+        for what, (ran, worker) in self._running.items():
+            self._row(what, ran, worker, UNKNOWN, tables.NOTHING)
+        task_set = schedule.task_set
+        who = Entities(by_address=True)
+        who.note('ros2:rclcpp_callback_register', {
+            '_timestamp': 0, '_vpid': 0, 'callback': 0, 'symbol': 'undeclared callbacks'})
+        found = Recording(
+            task_set.file, Head(0, task_set.text, task_set.file, '', workers,
+                                DEFAULT_DEADLINE_NS, 0, False),
+            task_set, task_set, who, same=False, releases=self._releases.table(),
+            executions=self._executions.table(), job_ends=self._ends.table(),
+            end=schedule.end, judged=schedule.judged, judged_until=schedule.end,
+            workers_each=workers,
+            judge_from=() if schedule.judge_from == -NEVER else [(-1, schedule.judge_from)])
+        begun = [found.releases['release'], found.executions['ready']]
+        found.start = min((int(each.min()) for each in begun if len(each)), default=None)
+        return found
+
+    def _next_order(self) -> int:
+        self._order += 1
+        return self._order
 
     def _number(self, dag: int, job: int) -> int:
         numbers = self._schedule.numbers
@@ -142,7 +167,7 @@ class _Player:
                 yield time, dag, job, how == ABORTED, vertex
 
     def _until(self, now: int) -> None:
-        """Report what is released and given up to an instant."""
+        """Note what is released and given up to an instant."""
         load, schedule = self._load, self._schedule
         while True:
             release = load.times[self._next] if self._next < len(load.times) else now + 1
@@ -160,8 +185,9 @@ class _Player:
     def _end_job(self) -> None:
         assert self._next_end is not None
         now, dag, job, aborted, _ = self._next_end
-        self._add(ENDED, dag, self._number(dag, job), int(aborted), now)
-        self._next_end = next(self._ends, None)
+        self._ends.add(dag, -1, self._number(dag, job), now,
+                       tables.ABORTED if aborted else tables.EXPIRED, self._next_order())
+        self._next_end = next(self._ends_of_jobs, None)
 
     def _release(self, i: int, now: int) -> None:
         load = self._load
@@ -171,7 +197,7 @@ class _Player:
             return
         self._ready[dag, self._sources[dag], job] = now
         release = load.releases[i] if load.releases else now
-        self._add(RELEASED, dag, self._number(dag, job), release, now)
+        self._releases.add(dag, self._number(dag, job), release, now, self._next_order())
 
     def _change(self, entry: LogEntry) -> None:
         now, kind, worker, dag, v, job = entry
@@ -179,48 +205,48 @@ class _Player:
             what = (dag, ~v, job)
             self._ready[what] = max(now, self._ready.get(what, now))
             return
-        declared = dag < self._n_dags
-        number = self._number(dag, job)
         what = (dag, v, job)
-        before = self._running.get(what)
         if kind == START:
+            before = self._begun.pop(what, None)
             if before is None:
                 ready = min(now, self._ready.pop(what, now))
-                before = _Running(now, ready, now, 0)
-            self._running[what] = before._replace(since=now)
-            if declared:
-                self._add(STARTED, dag, v, number, before.ready, now, self._callback[v], worker)
+                before = _Running(now, ready, now, 0, 0)
+            self._running[what] = before._replace(since=now), worker
             return
-        assert before is not None, 'what ends has begun'
-        busy = before.busy + now - before.since
-        self._running[what] = before._replace(busy=busy)
-        if kind == END and declared and self._fails(dag, v, job):
-            self._add(FAILED, dag, v, number, now)
-        last = self._last_leg[v] if kind == END and declared else 0
-        for leg in range(last):     # they took no time: the execution is the last one's
-            self._add(COMPLETED, dag, v, number, leg, 0, now, -1, -1, -1, -1, -1, -1, 0)
-        self._add(
-            RAN, self._callback[v] if declared else 0, dag if declared else -1,
-            v if declared else -1, number, worker, before.ready, before.since, now,
-            int(before.busy == 0))
-        if kind == END:
-            del self._running[what]
-            if declared:
-                self._complete(what, last, before, now, busy)
+        ran, worker = self._running.pop(what)
+        busy = ran.busy + now - ran.since
+        ended = kind == END and dag < self._n_dags
+        if ended and self._fails(dag, v, job):
+            self._ends.add(
+                dag, v, self._number(dag, job), now, tables.FAILED, self._next_order())
+        self._row(what, ran, worker, now, tables.VERTEX if ended else tables.NOTHING)
+        if kind != END:
+            self._begun[what] = ran._replace(busy=busy, piece=ran.piece + 1)
+        elif ended:
+            self._complete(what, ran, now)
+
+    def _row(self, what: Id, ran: _Running, worker: int, end: int, completes: int) -> None:
+        """Add a row of an execution."""
+        dag, v, job = what
+        declared = dag < self._n_dags
+        self._executions.add(
+            self._callback[v] if declared else 0, dag if declared else -1,
+            v if declared else -1,
+            self._number(dag, job), self._leg[v] if completes else 0, ran.piece, worker + 1,
+            worker, ran.ready, ran.first, ran.since, end,
+            UNKNOWN if end < 0 else ran.busy + end - ran.since, completes,
+            self._next_order() if completes else UNKNOWN, UNKNOWN, UNKNOWN)
 
     def _fails(self, dag: int, v: int, job: int) -> bool:
         load = self._load
         return len(load.fates) > 0 and load.fates[
             load.cost_base[dag] + job * load.cost_stride[dag] + v - self._first[dag]] == FAILS
 
-    def _complete(self, what: Id, leg: int, ran: _Running, now: int, busy: int) -> None:
+    def _complete(self, what: Id, ran: _Running, now: int) -> None:
+        """Let the messages of an execution that has ended arrive."""
         dag, v, job = what
-        vertex, number = self._vertices[v], self._number(dag, job)
-        self._finished += 1
-        self._add(COMPLETED, dag, v, number, leg, 1, now, ran.ready, ran.first, now, busy,
-                  self._finished, -1, 0)
         delay = self._schedule.delay
-        for local in vertex.successors:
+        for local in self._vertices[v].successors:
             after = (dag, self._first[dag] + local, job)
             arrival = now if delay is None else \
                 max(ran.first, now + delay(dag, job, v, after[1]))

@@ -20,59 +20,39 @@ One that holds the interpreter had to wait for its turn: for the end of the last
 
 from __future__ import annotations
 
-from array import array
 from typing import Any
 
+from mddag_executor.recording.tables import Ints
 from mddag_executor.simulate.machine import WARM_NS
+import numpy as np
 
 
 class Dispatches:
     """
-    Collects executions, in the order of their ends on each worker, and says how late they were.
+    Says how late executions were dispatched.
+
+    All are given by columns, in the order of their ends; times in ns.
 
     :param n_workers: how many there were in each process.
+    :param worker: which one ran it, -1 where that is not known.
+    :param group: what identifies its mutually exclusive callback group, or -1.
     """
 
-    def __init__(self, n_workers: int) -> None:
+    def __init__(
+        self, n_workers: int, worker: Ints, group: Ints, ready: Ints, start: Ints, end: Ints,
+        process: Ints,
+    ) -> None:
         self._n_workers = n_workers
-        self._worker_free: dict[int, int] = {}
-        self._group_free: dict[int, int] = {}
+        self._start, self._end, self._process = start, end, process
         # from when it was free, and from when its worker was, too
-        self._free, self._worker = array('q'), array('q')
-        self._start, self._end = array('q'), array('q')
-        self._process, self._warm = array('q'), array('b')
-
-    def add(
-        self, worker: int, group: int | None, ready: int, start: int, end: int,
-        process: int = 1,
-    ) -> int:
-        """
-        Add an execution; times in ns.
-
-        :param worker: which one ran it, -1 where that is not known.
-        :param group: what identifies its mutually exclusive callback group, or None.
-        :return: its number.
-        """
-        could, ended = ready, 0
-        if group is not None:
-            could = max(could, self._group_free.get(group, 0))
-            self._group_free[group] = end
-        self._free.append(could)
-        if worker >= 0:
-            ended = self._worker_free.get(worker, 0)
-            could = max(could, ended)
-            self._worker_free[worker] = end
-        self._worker.append(could)
-        self._start.append(start)
-        self._end.append(end)
-        self._process.append(process)
-        self._warm.append(start - ended <= WARM_NS)
-        return len(self._start) - 1
+        self._free = np.maximum(ready, _end_before(group, end))
+        ended = _end_before(worker, end)
+        self._worker = np.maximum(self._free, ended)
+        self._warm = start - ended <= WARM_NS
 
     def warm(self) -> Any:
         """Return by number whether its worker had only just ended another, as an array."""
-        import numpy as np
-        return np.array(self._warm, dtype=np.bool_)
+        return self._warm
 
     def late(self, holding: Any = ()) -> Any:
         """
@@ -80,11 +60,8 @@ class Dispatches:
 
         :param holding: the numbers of those that hold their interpreter.
         """
-        import numpy as np
-        free, start, end, worker = (
-            np.array(column, dtype=np.int64) for column in (
-                self._free, self._start, self._end, self._worker))
-        process = np.array(self._process, dtype=np.int64)
+        free, start, end, worker = self._free, self._start, self._end, self._worker
+        process = self._process
         could = worker.copy()
         for number in np.unique(process).tolist():
             here = process == number
@@ -98,3 +75,13 @@ class Dispatches:
             place = np.searchsorted(ended, start[mine], 'right') - 1
             could[mine] = np.maximum(could[mine], np.where(place >= 0, ended[place], 0))
         return np.maximum(0, start - could)
+
+
+def _end_before(of: Ints, end: Ints) -> Ints:
+    """Return when what has the same number had ended before, 0 for the first and of -1."""
+    found = np.zeros(len(of), dtype=np.int64)
+    order = np.argsort(of, kind='stable')
+    number = of[order]
+    again = np.flatnonzero((number[1:] == number[:-1]) & (number[1:] >= 0)) + 1
+    found[order[again]] = end[order[again - 1]]
+    return found

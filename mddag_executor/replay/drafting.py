@@ -33,7 +33,14 @@ from typing import Any
 
 from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
-from mddag_executor.replay.entities import Callback, Entities, Event, INIT_EVENTS, KINDS, Publisher
+from mddag_executor.recording.entities import (
+    Callback,
+    Entities,
+    Event,
+    INIT_EVENTS,
+    KINDS,
+    Publisher,
+)
 from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
 from msg_graph import ExecutionTime, GraphError, loads, TaskSet

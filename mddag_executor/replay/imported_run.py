@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-An imported recording as a run: releases, executions, completions, ends of jobs.
+An imported recording: releases, executions, completions and ends of jobs as tables.
 
 Theory of operation
 -------------------
@@ -32,27 +32,27 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable as Function
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, legs_of, NEVER
-from mddag_executor.replay.doubts import Doubts
-from mddag_executor.replay.entities import Callback, Entities, Event, INIT_EVENTS
-from mddag_executor.replay.happenings import (
-    Batches,
-    BEGAN,
-    COMPLETED,
-    ENDED,
-    Observer,
-    OVER,
-    PUBLISHED,
-    RAN,
-    RELEASED,
-    SENT,
-    STARTED,
-    TOOK,
+from mddag_executor.recording.entities import Callback, Entities, Event, INIT_EVENTS
+from mddag_executor.recording.head import Head, named_errors, no_run
+from mddag_executor.recording.mapping import Matching, Target
+from mddag_executor.recording.tables import (
+    EXECUTIONS,
+    EXPIRED,
+    JOB_ENDS,
+    LEG,
+    PUBLICATIONS,
+    Recording,
+    RELEASES,
+    Rows,
+    TAKES,
+    UNKNOWN,
+    VERTEX,
     WITHDRAWN,
 )
+from mddag_executor.replay.doubts import Doubts
 from mddag_executor.replay.linker import (
     Execution,
     Linker,
@@ -60,8 +60,6 @@ from mddag_executor.replay.linker import (
     Losses,
     Publication,
 )
-from mddag_executor.replay.mapping import Matching, Target
-from mddag_executor.replay.recording import Head, named_errors, no_run
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import renamed
@@ -79,11 +77,11 @@ class Ended(NamedTuple):
     """
     What has ended with a run of a callback in a thread.
 
-    :ivar first: whether it was the first piece of an execution, ``last``: whether the last.
+    :ivar piece: how many pieces of the execution were before; ``last``: whether it is the last.
     :ivar start: of the execution; ``busy``: how long it ran.
     """
 
-    first: bool
+    piece: int
     last: bool
     start: int
     busy: int
@@ -91,17 +89,13 @@ class Ended(NamedTuple):
 
 class ImportedRun(LinkObserver):
     """
-    A recorded run of another executor.
+    A recorded run of another executor, which ``read`` turns to tables.
 
     :param reader: of the trace, which no declaration is in.
     :param task_set: the declaration that judges; None: there is none.
     :param head: of a trace of this executor; None: another one recorded it.
     :param linker: links its events.
     """
-
-    declared = False
-    same = False
-    imported = True
 
     def __init__(
         self, reader: TraceReader, name: str, task_set: TaskSet | None, head: Head | None = None,
@@ -130,6 +124,7 @@ class ImportedRun(LinkObserver):
         # What another executor goes by is not recorded; it takes the place of the pool.
         self.head = head or Head(
             first, '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
+        self._imported = head is None
         self._matching = Matching(name, self.who, threads, task_set)
         #: The declaration that judges; none is recorded.
         self.task_set = self.recorded_set = self._matching.task_set
@@ -138,15 +133,21 @@ class ImportedRun(LinkObserver):
         self.start: int | None = None
         #: The last event's time, ns.
         self.end = min(max(0, first), NEVER - 1)
-        self.shut_down = False
         self.jobs = 0
-        self.dropped: Counter[str] = Counter()
+        self._order = 0
         self._doubts = Doubts(self.task_set.dags)
         self._linker = linker(self.who, self)
         self._workers: dict[tuple[int, int], int] = {}
         self._timers = _Timers()
         self._fallbacks: Counter[str] = Counter()
-        self._number = self._messages = 0
+        self._releases = Rows(RELEASES, 'dag', 'job', 'release', 'noticed', 'order')
+        self._executions = Rows(
+            EXECUTIONS, 'callback', 'thread', 'ready', 'start', 'dag', 'vertex', 'job', 'leg',
+            'worker', 'end', 'completes', 'message', 'order', 'piece', 'began', 'busy')
+        self._sent = Rows(PUBLICATIONS, 'publisher', 'execution', 'vertex', 'time',
+                          'source_timestamp')
+        self._taken = Rows(TAKES, 'execution', 'message', 'time')
+        self._ends = Rows(JOB_ENDS, 'dag', 'job', 'time', 'reason', 'order')
         self._graph()
 
     def _graph(self) -> None:
@@ -191,32 +192,39 @@ class ImportedRun(LinkObserver):
         """Return by DAG for how many jobs it is not known what they did."""
         return self._doubts.withdrawn
 
-    def play(
-        self, observers: Sequence[Observer], progress: Function[[int], None] | None = None
-    ) -> None:
-        """Give the observers everything, with the numbers of callbacks in place of addresses."""
-        self._batches = Batches(observers)
-        self._add = self._batches.add
-        count = 0
-        take = self._linker.take
+    def read(self, progress: Function[[int], None] | None = None) -> Recording:
+        """Return the recording; ``progress`` is called now and then with a number of events."""
+        count, take = 0, self._linker.take
         with named_errors(self._reader.path, self.name):
             for event in self._reader.layout_events(self._linker.events):
                 take(event)
                 count += 1
                 if event[1] > self.end:
                     self.end = event[1]
-                self._batches.flush_if_full()
                 if progress is not None and count % _PROGRESS_STEP == 0:
                     progress(count)
         self._linker.finish()
         for dag, jobs in enumerate(self._open):
             for release, job in jobs:
                 self._close(dag, job, release)
-        self._batches.finish(self._judged_until())
+        executions = self._executions.table()
+        executions['cpu'] = UNKNOWN
+        return Recording(
+            self.name, self.head, self.task_set, self.recorded_set, self.who, declared=False,
+            imported=self._imported, same=False, releases=self._releases.table(),
+            executions=executions, publications=self._sent.table(), job_ends=self._ends.table(),
+            takes=self._taken.table(), start=self.start, end=self.end,
+            judged_until=self._judged_until(), lost=self.lost,
+            workers_each=self.head.workers, links=True,
+            callback_vertex=self._vertex, unjudged=self.unjudged, warnings=self.warnings)
 
     def _judged_until(self) -> int:
         """Return up to when what is open is judged."""
         return self.end
+
+    def _next_order(self) -> int:
+        self._order += 1
+        return self._order
 
     # --- executions ------------------------------------------------------------------------------
 
@@ -228,19 +236,13 @@ class ImportedRun(LinkObserver):
             self._assign(run, target, message)
         if self.start is None or run.ready < self.start:
             self.start = run.ready
-        run.number = self._number = self._number + 1
-        callback = run.callback.number
-        number = publisher = time = -1
-        if message is not None:
-            number = message.number
-            if message.publisher is not None and message.time:
-                publisher, time = message.publisher.number, message.time
-        self._add(BEGAN, callback, self._vertex.get(callback, -1), run.number, run.start, number,
-                  publisher, time)
-        if target is not None and run.of is not None:
-            dag, vertex, job = run.of
+        dag, vertex, job = run.of or (-1, -1, -1)
+        number = UNKNOWN if message is None else message.number
+        run.number = self._executions.add(
+            run.callback.number, run.thread[1], run.ready, run.start, dag, vertex, job, run.leg,
+            UNKNOWN, UNKNOWN, 0, number, UNKNOWN, 0, run.start, UNKNOWN)
+        if run.of is not None:
             self._active[(dag, job)] += 1
-            self._add(STARTED, dag, vertex, job, run.ready, run.start, callback, -1)
 
     def _ready(self, run: Execution, message: Publication | None) -> int:
         if run.callback.kind == 'timer':
@@ -265,7 +267,7 @@ class ImportedRun(LinkObserver):
             self._open[dag].append((release, job))
             if self.start is None or release < self.start:
                 self.start = release
-            self._add(RELEASED, dag, job, release, run.start)
+            self._releases.add(dag, job, release, run.start, self._next_order())
         elif message is None or message.run is None:
             self._doubts.ran_for_unknown(key, run.start, message is not None or run.stamp != 0)
         elif message.run.of is not None:
@@ -291,28 +293,28 @@ class ImportedRun(LinkObserver):
         return min(run.taken or run.start, run.start)
 
     def over(self, run: Execution) -> None:
-        """Report an execution that has ended, and of what it completes."""
-        callback = run.callback.number
-        self._add(OVER, callback, self._vertex.get(callback, -1), run.number, run.end)
-        dag, vertex, job = run.of if run.of is not None else (-1, -1, -1)
-        worker = self._workers.setdefault(run.thread, len(self._workers))
+        """Note when an execution ended, and what it completed."""
+        columns = self._executions.columns
+        columns['end'][run.number] = run.end
+        columns['worker'][run.number] = self._workers.setdefault(run.thread, len(self._workers))
         ended = self._ended(run)
-        self._add(RAN, callback, dag, vertex, job, worker, run.ready, run.start,
-                  run.end, int(ended.first))
-        if dag < 0:
+        columns['piece'][run.number] = ended.piece
+        columns['began'][run.number], columns['busy'][run.number] = ended.start, ended.busy
+        if run.of is None:
             return
+        dag, vertex, job = run.of
         self._active[(dag, job)] -= 1
         if not ended.last:
             return
         whole = self._is_whole(vertex, job, run.leg)
         if whole:
             self._doubts.done(dag, vertex, job)
-        self._add(COMPLETED, dag, vertex, job, run.leg, int(whole), run.end, run.ready,
-                  ended.start, run.end, ended.busy, run.number, -1, 0)
+        columns['completes'][run.number] = VERTEX if whole else LEG
+        columns['order'][run.number] = self._next_order()
 
     def _ended(self, run: Execution) -> Ended:
         """Return what has ended with a run of a callback: one piece is all of an execution."""
-        return Ended(True, True, run.start, run.end - run.start)
+        return Ended(0, True, run.start, run.end - run.start)
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
         """Return whether an execution completes its vertex: of a sync's legs the last one does."""
@@ -337,14 +339,14 @@ class ImportedRun(LinkObserver):
                     continue
                 del self._active[(dag, job)]
                 if not self._close(dag, job, release):
-                    self._add(ENDED, dag, job, 0, now)
+                    self._ends.add(dag, job, now, EXPIRED, self._next_order())
             jobs.extendleft(reversed(running))
 
     def _close(self, dag: int, job: int, release: int) -> bool:
         """Take a job that cannot be judged out of the run; return whether it is one."""
         doubted = self._doubts.close(dag, job, release)
         if doubted:
-            self._add(WITHDRAWN, dag, job)
+            self._ends.add(dag, job, UNKNOWN, WITHDRAWN, self._next_order())
         return doubted
 
     def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
@@ -362,25 +364,22 @@ class ImportedRun(LinkObserver):
         of = None if message.run is None else message.run.of
         if of is not None and (message.stamp or message.within):
             self._doubts.sent(of[0], of[2], message.topic)
-        message.number = self._messages = self._messages + 1
         publisher, run = message.publisher, message.run
-        if publisher is None:
-            return
-        callback, ready, vertex, number = -1, -1, -1, -1
+        vertex = number = UNKNOWN
         if run is not None:
-            callback, ready, number = run.callback.number, run.ready, run.number
-            target = self.targets.get(callback)
-            if target is not None and publisher.node is not None and (
+            number = run.number
+            target = self.targets.get(run.callback.number)
+            if target is not None and publisher is not None and publisher.node is not None and (
                     target.callback.node == publisher.node.name):
-                vertex = self._vertex[callback]
-        self._add(PUBLISHED, publisher.number, callback, *(of or (-1, -1, -1)), ready,
-                  message.time)
-        self._add(SENT, publisher.number, vertex, number, message.number, message.time)
+                vertex = self._vertex[run.callback.number]
+        message.number = self._sent.add(
+            UNKNOWN if publisher is None else publisher.number, number, vertex, message.time,
+            message.stamp)
 
     def took(self, run: Execution, message: Publication) -> None:
-        """Report that a callback took a message itself."""
-        callback = run.callback.number
-        self._add(TOOK, callback, self._vertex.get(callback, -1), run.number, message.number)
+        """Note that a callback took a message itself."""
+        if run.number >= 0:
+            self._taken.add(run.number, message.number, run.start)
 
     # --- what to say -----------------------------------------------------------------------------
 

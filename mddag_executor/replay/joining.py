@@ -1,11 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The traces of several processes as the trace of one run.
+The traces of several processes as the recording of one run.
 
 Theory of operation
 -------------------
-The joined trace has the events of all in the order of time, and is replayed like any other.
+Each trace becomes a recording; the tables of all are put together in the order of time.
 
 1. *Clocks.*  Each process counts its trace's time from the steady clock of the machine, by an
    offset that is recorded (``caret_init``).  So the times of one machine are put on the first
@@ -30,41 +30,59 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-import heapq
 import os
 from typing import Any
 
 from mddag_executor.core import legs_of, NEVER
 from mddag_executor.errors import UsageError
-from mddag_executor.replay import clocks
-from mddag_executor.replay.recording import (
+from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.head import (
     declared,
     Head,
     is_declared,
     named_errors,
     read_head,
     ReplayError,
-    TASK_SET,
 )
+from mddag_executor.recording.own import end_lines, read_process
+from mddag_executor.recording.tables import (
+    ALL_LEGS,
+    groups,
+    Ints,
+    JobNumbers,
+    Mask,
+    NOTHING,
+    pick,
+    Recording,
+    RowNumbers,
+    sort_by,
+    Table,
+    TABLES,
+    UNKNOWN,
+)
+from mddag_executor.replay import clocks
 from mddag_executor.text import counted, listed
-from mddag_executor.trace import TraceFile, TraceReader
-from mddag_executor.trace.errors import renamed
+from mddag_executor.trace import TraceReader
 from mddag_executor.trace.numbers import Numbers
 from mddag_executor.trace.schema import EVENTS
 from msg_graph import Dag, Process
+import numpy as np
 
 SAME_RELEASE = 100_000
 _KEPT = 1024
 _BITS = 48
-_INIT, _SHUTDOWN = 'ros2_caret:caret_init', 'mddag:shutdown'
-_JUDGE_FROM, _HOSTED, _RELEASE = 'mddag:judge_from', 'mddag:hosted', 'mddag:job_release'
-_COMPLETE, _DISPATCH = 'mddag:complete', 'mddag:dispatch'
-_ENDS = ('mddag:expire', 'mddag:abort', 'mddag:fail')
-_OF_DAG = ('mddag:deadline', 'mddag:drop', _DISPATCH, _COMPLETE, *_ENDS)
-_TIMES = {'release', 'ready', 'reference_deadline', 'completed', 'deadline', 'begin', 'end'}
+_INIT, _SHUTDOWN, _JUDGE_FROM = 'ros2_caret:caret_init', 'mddag:shutdown', 'mddag:judge_from'
 _NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
+_TIMES = {
+    'releases': ('release', 'noticed'), 'executions': ('ready', 'began', 'start', 'end'),
+    'publications': ('time', 'source_timestamp'), 'job_ends': ('time',), 'drops': ('time',),
+    'misses': ('deadline', 'completed'), 'stops': ('start', 'end')}
+_HAPPENED = {
+    'releases': 'noticed', 'executions': 'end', 'publications': 'time', 'job_ends': 'time',
+    'drops': 'time', 'stops': 'end'}
 
 Event = tuple[Any, ...]
+Progress = Callable[[int], None]
 
 
 def label_of(path: str) -> str:
@@ -110,58 +128,107 @@ class _Part:
                     self.judges_from = event[4]
         self.shift = 0
         self.label = label_of(name)
-        # by DAG and vertex: when it ran first, and last
-        self.ran: dict[tuple[int, int], tuple[int, int]] = {}
+        # by vertex: when it ran first, and last
+        self.ran: dict[int, tuple[int, int]] = {}
         self.first_worker = 0
         self.first_spare = 0
         self.last = 0
-        # by DAG the vertices that are here, where not all are; by job what is to complete here
-        self.hosted: dict[int, set[int]] = {}
-        self.open: dict[tuple[int, int], int] = {}
-        self.numbers: dict[tuple[int, int], int] = {}
+        #: By DAG the vertices that are here, where not all are.
+        self.hosted: dict[int, frozenset[int]] = {}
+        # of each release: the number of its job, whether no other process had it before, and how
+        # many legs are to complete here
+        self.number = self.expected = np.empty(0, dtype=np.int64)
+        self.is_first: Mask = np.empty(0, dtype=np.bool_)
+        #: DAGs and numbers of the jobs that are open at the end.
+        self.open_jobs: list[tuple[int, int]] = []
+        self.recording: Recording
+        self.seen_at = self.number
 
     @property
     def first(self) -> int:
         """Return when it begins, by the clock of the whole."""
         return self.head.time + self.shift
 
-    def events(self) -> Iterator[tuple[_Part, Event]]:
-        """Yield itself with each event, by the clock and with the addresses of the whole."""
-        edits = {}
-        with named_errors(self.reader.path, self.name):
-            for event in self.reader.events(set(EVENTS), sorted=True):
-                if None in event:
-                    continue
-                if event[0] not in edits:
-                    edits[event[0]] = self._edits(event[0])
-                changed = list(event)
-                changed[1] += self.shift
-                for column, edit in edits[event[0]]:
-                    changed[column] = edit(changed[column])
-                self.last = changed[1]
-                yield self, tuple(changed)
+    def read(
+        self, who: Entities, threads: Numbers, count: int, progress: Progress | None
+    ) -> None:
+        """Read its tables, by the clock and with the addresses of the whole (rules 1 and 2)."""
+        found, self.seen_at = read_process(
+            self.reader, self.name, self.head, who, self._edited,
+            None if progress is None else lambda more: progress(count + more))
+        self.recording = found
+        if self.shift:
+            self.seen_at = self.seen_at + self.shift
+            for name, columns in _TIMES.items():
+                for column in columns:
+                    times = getattr(found, name)[column]
+                    times[times > 0] += self.shift
+            if found.notices_stops is not None:
+                found.notices_stops += self.shift
+        for addresses in (found.executions['callback'], found.publications['publisher']):
+            addresses[(addresses > 0) & (addresses < 1 << _BITS)] |= self.place << _BITS
+        worker = found.executions['worker']
+        worker += np.where(worker < 0, 0, np.where(      # else it was lent
+            worker < self.head.workers, self.first_worker, self.first_spare)).astype(worker.dtype)
+        thread = found.executions['thread']
+        numbers, of = np.unique(thread, return_inverse=True)
+        thread[:] = np.array([threads.of(self.place, each) for each in numbers.tolist()],
+                             dtype=np.int64)[of]
+        self.last = max(self.first, int(self.seen_at.max(initial=0)), *(
+            int(getattr(found, name)[column].max(initial=0))
+            for name, column in _HAPPENED.items()))
 
-    def _edits(self, name: str) -> list[tuple[int, Callable[[int], int]]]:
-        """Return which columns of an event change, and how."""
-        found: list[tuple[int, Callable[[int], int]]] = []
-        for column, (field, kind) in enumerate(EVENTS[name].fields, 4):
-            if kind == 'uint64' and field not in _NO_ADDRESSES:
-                found.append((column, self._address))
-            elif kind == 'int64' and field in _TIMES and self.shift and name != _INIT:
-                found.append((column, lambda time: time + self.shift if time > 0 else time))
-            elif field == 'worker':
-                found.append((column, self._worker))
-        return found
+    def _edited(self, event: Event) -> Event:
+        """Return an event that says who is who with the addresses of the whole."""
+        kinds = EVENTS[event[0]].fields
+        return (*event[:4], *(
+            value | self.place << _BITS if kind == 'uint64' and field not in _NO_ADDRESSES
+            and 0 < value < 1 << _BITS else value
+            for value, (field, kind) in zip(event[4:], kinds)))
 
-    def _address(self, address: int) -> int:
-        return address | self.place << _BITS if 0 < address < 1 << _BITS else address
+    def renumber(self, legs: Ints) -> RowNumbers:
+        """
+        Give all tables the jobs of the whole, and leave out what belongs to none of them.
 
-    def _worker(self, worker: int) -> int:
-        if worker < 0:      # it was lent
-            return worker
-        if worker < self.head.workers:
-            return self.first_worker + worker
-        return self.first_spare + worker
+        :param legs: by vertex how many it has.
+        :return: the new numbers of executions.
+        """
+        found = self.recording
+        jobs = JobNumbers(found.releases)
+        rows = np.full(jobs.none + 1, UNKNOWN)
+        rows[jobs.of(found.releases)] = np.arange(len(found.releases))
+        table = found.executions
+        row = rows[jobs.of(table)]
+        kept = (row >= 0) | (table['vertex'] < 0)
+        done = np.flatnonzero((table['completes'] != NOTHING) & (row >= 0))
+        is_open = self.expected > np.bincount(row[done], np.where(
+            table['leg'][done] == ALL_LEGS, legs[table['vertex'][done]], 1),
+            minlength=len(self.number))
+        ended = rows[jobs.of(found.job_ends)]
+        is_open[ended[ended >= 0]] = False
+        self.open_jobs = list(zip(
+            found.releases['dag'][is_open].tolist(), self.number[is_open].tolist()))
+        self._note_ran(pick(table, (row >= 0) & (table['vertex'] >= 0) & (table['start'] >= 0)))
+        known = row >= 0
+        table['job'][known] = self.number[row[known]]
+        for name in ('job_ends', 'misses'):
+            table = getattr(found, name)
+            row = rows[jobs.of(table)]
+            table['job'] = self.number[row] if len(self.number) else UNKNOWN
+            setattr(found, name, pick(table, row >= 0))
+        new = RowNumbers(kept)
+        found.executions = pick(found.executions, kept)
+        found.releases['job'] = self.number
+        found.releases = pick(found.releases, self.is_first)
+        return new
+
+    def _note_ran(self, started: Table) -> None:
+        """Note when vertices ran first, and last."""
+        started = pick(started, sort_by(started['vertex'], started['start']))
+        ran = [(int(started['start'][begin]), int(started['vertex'][begin]),
+                int(started['start'][until - 1]))
+               for begin, until in zip(*groups(started['vertex']))]
+        self.ran = {vertex: (first, last) for first, vertex, last in sorted(ran)}
 
 
 class Joined:
@@ -171,7 +238,6 @@ class Joined:
     :param files: path of each, and what messages call it.
     :param offsets: how far clocks of other machines are ahead of the first trace's, ns, by the
         last word of a trace's name, or its path.
-    :ivar warnings: what is to be said of them beside what the joined trace says, once written.
     :raises mddag_executor.trace.TraceError: when one is no trace.
     :raises ReplayError: when they are not of one run.
     """
@@ -208,8 +274,12 @@ class Joined:
         self._releases: list[deque[tuple[int, int, set[int]]]] = [
             deque(maxlen=_KEPT) for _ in self.task_set.dags]
         self._next = [0] * len(self.task_set.dags)
-        self._legs = [[max(1, len(legs_of(v, dag.vertices))) for v in dag.vertices]
-                      for dag in self.task_set.dags]
+        #: By vertex how many legs it has, and by DAG its vertices.
+        self._legs = np.array([max(1, len(legs_of(vertex, dag.vertices)))
+                               for dag in self.task_set.dags for vertex in dag.vertices])
+        first_of = np.cumsum([0, *(len(dag.vertices) for dag in self.task_set.dags)]).tolist()
+        self._vertices = [range(*each) for each in zip(first_of, first_of[1:])]
+        self._hosted: list[tuple[int, int, int, frozenset[int]]] = []
 
     def _given(self, offsets: Mapping[str, int]) -> dict[int, int]:
         """Return the offsets that are given, by machine."""
@@ -251,144 +321,146 @@ class Joined:
                     f'{self._parts[0].name}: '
                     + clocks.said(known.get(machine), ways.get((0, machine)), parts[0].label))
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def recording(self, progress: Callable[[int], None] | None = None) -> Recording:
         """
-        Write the joined trace.
+        Return the recording of the whole run.
 
-        :raises mddag_executor.trace.TraceError: when that cannot be, or one cannot be read.
+        :param progress: called now and then with the number of events read so far.
+        :raises mddag_executor.trace.TraceError: when one cannot be read.
         :raises ReplayError: when they are of several runs.
         """
-        head = self.head
-        begin = min(part.first for part in self._parts)
-        judges_from = max(self._judging(), default=0)
-        end = judged = 0
-        processes, threads = Numbers(), Numbers()
-        with TraceFile(path) as file:
-            file.add(TASK_SET, begin, 0, 0, head.yaml, head.file, head.policy, self._workers,
-                     head.default_deadline, head.max_active_jobs, head.preemptive, head.cpus)
-            file.add(_INIT, begin, 0, 0, self._parts[0].clock, 'jazzy')
-            if judges_from:
-                file.add(_JUDGE_FROM, begin, 0, 0, judges_from)
-            streams = [part.events() for part in self._parts]
-            for part, event in heapq.merge(*streams, key=lambda each: int(each[1][1])):
-                if event[0] == _SHUTDOWN:
-                    judged = max(judged, event[4])
-                elif event[0] not in (TASK_SET, _INIT, _JUDGE_FROM, clocks.HOST):
-                    joined = self._of_whole_run(part, event)
-                    if joined is not None:
-                        end = max(end, event[1])
-                        name, time, process, thread, *fields = joined
-                        file.add(name, time, processes.of(part.place, process),
-                                 threads.of(part.place, thread), *fields)
-            if any(part.end is not None for part in self._parts):
-                file.add(_SHUTDOWN, max(end, judged), 0, 0, judged)
-        self._check_run()
-        self._say(max(end, judged))
-
-    def _check_run(self) -> None:
-        """Refuse what several runs have left (rule 6)."""
-        runs: list[list[_Part]] = []
-        for part in sorted(self._parts, key=lambda part: part.first):
-            if not runs or part.first > max(each.last for each in runs[-1]):
-                runs.append([])
-            for other in runs[-1]:
-                for (dag, vertex), (first, last) in part.ran.items():
-                    began, ended = other.ran.get((dag, vertex), (0, -1))
-                    if max(first, began) <= min(last, ended):
-                        key = self.task_set.dags[dag].vertices[vertex].callback.key
-                        raise ReplayError(
-                            part.name, f'{key} ran in it and, at the same time, in {other.name}: '
-                            'these are of two runs', 'give the traces of one')
-            runs[-1].append(part)
-        if len(runs) > 1:
-            several = len(set(self._machines)) > 1
-            raise ReplayError(
-                runs[1][0].name, f'it is of another run than {runs[0][0].name}: no trace goes on '
-                'from one to the other', 'give the traces of one run: ' + ', or '.join(
-                    ' '.join(part.name for part in run) for run in runs)
-                + several * ' (or --offset, if clocks of machines differed)')
-
-    def _judging(self) -> Iterator[int]:
-        """Yield from when on processes judge; not of one started again, or that never did."""
-        labels = {part.label for part in self._parts}
+        who, threads, count = Entities(by_address=True), Numbers(), 0
         for part in self._parts:
-            if 0 < part.judges_from < NEVER and part.label.partition('.')[0] not in labels - {
-                    part.label}:
-                yield part.judges_from + part.shift
+            part.read(who, threads, count, progress)
+            count += part.reader.message_count or 0
+        self._number_jobs()
+        rows = [part.renumber(self._legs) for part in self._parts]
+        self._check_run()
+        head = self.head._replace(
+            time=min(part.first for part in self._parts), workers=self._workers)
+        found = Recording(
+            self.name, head, self.task_set, self.task_set, who, same=False,
+            processes=len(self._parts), workers_each=self.workers_each, placed=self._placed(),
+            worker_names=self.worker_names)
+        self._join(found, rows)
+        self._set_end(found)
+        found.warnings = [*self.warnings, *self._lines(found.end), *end_lines(found)]
+        return found
 
-    def placed(self) -> list[Process]:
-        """Return which nodes ran in which process, once the joined trace is written."""
-        if self.task_set.processes:
-            return list(self.task_set.processes)
-        return [
-            Process(part.label, tuple(dict.fromkeys(
-                self.task_set.dags[dag].vertices[vertex].callback.node
-                for dag, vertex in part.ran)))
+    def _join(self, found: Recording, rows: Sequence[RowNumbers]) -> None:
+        """Put the tables of all together; ``rows``: the new numbers of executions."""
+        parts = self._parts
+        ranks = self._ranks()
+        before = 0
+        reasons: dict[str, int] = {}
+        for part, rank in zip(parts, ranks):
+            of = part.recording
+            by = rows[part.place].new(of.publications['execution'])
+            of.publications['execution'] = np.where(by >= 0, by + before, UNKNOWN)
+            before += len(of.executions)
+            for table in (of.releases, of.executions, of.job_ends):
+                known = table['order'] >= 0
+                table['order'][known] = rank[table['order'][known]]
+            numbers = np.array([
+                reasons.setdefault(reason, len(reasons)) for reason in of.drop_reasons] or [0])
+            of.drops['reason'] = numbers[of.drops['reason']]
+            for name in TABLES:
+                table = getattr(of, name)
+                if 'process' in (table.dtype.names or ()):
+                    table['process'] = part.place
+        for name in TABLES:
+            setattr(found, name, np.concatenate([getattr(p.recording, name) for p in parts]))
+        found.releases = pick(found.releases, sort_by(found.releases['order']))
+        found.publications = pick(found.publications, sort_by(found.publications['time']))
+        found.drop_reasons = tuple(reasons)
+        found.hosted = [
+            (int(ranks[place][order]), dag, vertices)
+            for place, order, dag, vertices in self._hosted]
+
+    def _ranks(self) -> list[Ints]:
+        """Return by part the places in the order of all, by its own; 0 is before all."""
+        times = np.concatenate([part.seen_at for part in self._parts])
+        rank = np.empty(len(times), dtype=np.int64)
+        rank[np.argsort(times, kind='stable')] = np.arange(1, len(times) + 1)
+        return np.split(rank, np.cumsum([len(part.seen_at) for part in self._parts])[:-1])
+
+    def _set_end(self, found: Recording) -> None:
+        """Find out from when on the run is judged, and until when (rules 4 and 5)."""
+        judges_from = max(self._judging(), default=0)
+        if judges_from:
+            found.judge_from = [(0, judges_from)]
+        ends = [part.end + part.shift for part in self._parts if part.end is not None]
+        end = max(int(part.seen_at.max(initial=0)) for part in self._parts)
+        found.end = found.judged_until = min(end, NEVER - 1)
+        if ends:
+            found.end = max(max(part.last for part in self._parts), *ends)
+            found.judged_until, found.shut_down = max(ends), True
+        found.lost = sum(part.recording.lost for part in self._parts)
+        found.notices_stops = min(
+            (part.recording.notices_stops for part in self._parts
+             if part.recording.notices_stops is not None), default=None)
+        table = found.executions
+        begun = [found.releases['release'], table['ready'][
+            (table['end'] >= 0) & (table['start'] >= 0)]]
+        found.start = min((int(each.min()) for each in begun if len(each)), default=None)
+
+    # --- jobs ------------------------------------------------------------------------------------
+
+    def _number_jobs(self) -> None:
+        """Give jobs numbers (rule 3), and note which vertices are expected (rule 4)."""
+        events: list[tuple[int, int, int, int, Any]] = []
+        for part in self._parts:
+            of, seen_at = part.recording, part.seen_at
+            events += [
+                (int(seen_at[order]), part.place, order, row, None)
+                for row, order in enumerate(of.releases['order'].tolist())]
+            events += [(int(seen_at[order]), part.place, order, dag, vertices)
+                       for order, dag, vertices in of.hosted]
+        columns = [
+            [part.recording.releases[name].tolist() for name in ('dag', 'release', 'noticed')]
             for part in self._parts]
-
-    def _of_whole_run(self, part: _Part, event: Event) -> Event | None:
-        """Return an event as it is in the joined trace, None where it is not."""
-        name = event[0]
-        if name == _HOSTED:
-            return self._hosted(part, event)
-        if name == _RELEASE:
-            return self._released(part, event)
-        if name not in _OF_DAG:
-            return event
-        fields = [field for field, _ in EVENTS[name].fields]
-        at_dag, at_job = 4 + fields.index('dag'), 4 + fields.index('job')
-        number = part.numbers.get((event[at_dag], event[at_job]))
-        if number is None:
-            return event if event[at_dag] < 0 else None
-        job = event[at_dag], number
-        if name == _DISPATCH and 0 <= event[at_dag + 1] < len(self._legs[event[at_dag]]):
-            what = event[at_dag], event[at_dag + 1]
-            part.ran[what] = part.ran.get(what, (event[1],))[0], event[1]
-        if name == _COMPLETE and job in part.open:
-            part.open[job] -= 1
-            if part.open[job] <= 0:
-                del part.open[job]
-        elif name in _ENDS:
-            part.open.pop(job, None)
-        return (*event[:at_job], number, *event[at_job + 1:])
-
-    def _hosted(self, part: _Part, event: Event) -> Event | None:
-        dag, text = event[4:6]
-        if not 0 <= dag < len(self.task_set.dags):
-            return event
-        part.hosted[dag] = {int(word) for word in text.split(',') if word.isdecimal()}
-        vertices = set().union(*(each.hosted.get(dag, ()) for each in self._parts))
-        return (*event[:5], ','.join(map(str, sorted(vertices))))
-
-    def _released(self, part: _Part, event: Event) -> Event | None:
-        dag, job, release = event[4:7]
-        if not 0 <= dag < len(self.task_set.dags):
-            return event
-        if release < event[1]:      # else that of a stamp which was still to come there
-            release = self._by_source(self.task_set.dags[dag], release, part)
-        found = self._find(self.task_set.dags[dag], release, part.place)
-        joined = None
-        if found is None:
-            number = self._next[dag]
-            self._next[dag] += 1
-            self._releases[dag].append((release, number, {part.place}))
-            joined = (*event[:5], number, release)
-        else:
-            number = found[1]
-            found[2].add(part.place)
-        part.numbers[dag, job] = number
-        here = part.hosted.get(dag, range(len(self._legs[dag])))
-        part.open[dag, number] = sum(self._legs[dag][v] for v in here if v < len(self._legs[dag]))
-        return joined
+        for part in self._parts:
+            part.number = np.full(len(part.recording.releases), UNKNOWN)
+            part.is_first = np.zeros(len(part.number), dtype=np.bool_)
+            part.expected = np.zeros(len(part.number), dtype=np.int64)
+        events.sort(key=lambda event: event[:3])
+        legs_here: list[dict[int, int]] = [{} for _ in self._parts]
+        for _, place, order, which, vertices in events:
+            part = self._parts[place]
+            if vertices is not None:
+                part.hosted[which] = vertices
+                legs_here[place].pop(which, None)
+                every = frozenset().union(
+                    *(each.hosted.get(which, ()) for each in self._parts))
+                self._hosted.append((place, order, which, every))
+                continue
+            dag, release, noticed = (column[which] for column in columns[place])
+            if release < noticed:   # else that of a stamp which was still to come there
+                release = self._by_source(self.task_set.dags[dag], release, part)
+            known = self._find(self.task_set.dags[dag], release, place)
+            if known is None:
+                number = self._next[dag]
+                self._next[dag] += 1
+                self._releases[dag].append((release, number, {place}))
+                part.recording.releases['release'][which] = release
+                part.is_first[which] = True
+            else:
+                number = known[1]
+                known[2].add(place)
+            part.number[which] = number
+            if dag not in legs_here[place]:
+                legs_here[place][dag] = int(sum(
+                    self._legs[v] for v in part.hosted.get(dag, self._vertices[dag])))
+            part.expected[which] = legs_here[place][dag]
 
     def _by_source(self, dag: Dag, release: int, part: _Part) -> int:
         """Return a release from a stamp of another machine, by the clock of that."""
-        if dag.release_from != 'header_stamp' or dag.source in part.hosted.get(
-                dag.index, (dag.source,)):
+        if dag.release_from != 'header_stamp' or self._vertices[
+                dag.index][dag.source] in part.hosted.get(dag.index, self._vertices[dag.index]):
             return release
         machine, found = next(
             ((m, p) for m, p in zip(self._machines, self._parts)
-             if dag.source in p.hosted.get(dag.index, ())), (0, part))
+             if self._vertices[dag.index][dag.source] in p.hosted.get(dag.index, ())), (0, part))
         if machine == self._machines[part.place]:
             return release
         return release - part.shift + found.shift
@@ -409,15 +481,54 @@ class Joined:
                 break
         return best
 
-    def _say(self, end: int) -> None:
-        """Say what is missing of each trace, and what ended with its process (rule 5)."""
+    def _check_run(self) -> None:
+        """Refuse what several runs have left (rule 6)."""
+        runs: list[list[_Part]] = []
+        for part in sorted(self._parts, key=lambda part: part.first):
+            if not runs or part.first > max(each.last for each in runs[-1]):
+                runs.append([])
+            for other in runs[-1]:
+                for vertex, (first, last) in part.ran.items():
+                    began, ended = other.ran.get(vertex, (0, -1))
+                    if max(first, began) <= min(last, ended):
+                        key = self.task_set.vertices[vertex].callback.key
+                        raise ReplayError(
+                            part.name, f'{key} ran in it and, at the same time, in {other.name}: '
+                            'these are of two runs', 'give the traces of one')
+            runs[-1].append(part)
+        if len(runs) > 1:
+            several = len(set(self._machines)) > 1
+            raise ReplayError(
+                runs[1][0].name, f'it is of another run than {runs[0][0].name}: no trace goes on '
+                'from one to the other', 'give the traces of one run: ' + ', or '.join(
+                    ' '.join(part.name for part in run) for run in runs)
+                + several * ' (or --offset, if clocks of machines differed)')
+
+    def _judging(self) -> Iterator[int]:
+        """Yield from when on processes judge; not of one started again, or that never did."""
+        labels = {part.label for part in self._parts}
         for part in self._parts:
-            self.warnings += [
-                renamed(text, part.reader.path, part.name) for text in part.reader.warnings]
+            if 0 < part.judges_from < NEVER and part.label.partition('.')[0] not in labels - {
+                    part.label}:
+                yield part.judges_from + part.shift
+
+    def _placed(self) -> list[Process]:
+        """Return which nodes ran in which process."""
+        if self.task_set.processes:
+            return list(self.task_set.processes)
+        return [
+            Process(part.label, tuple(dict.fromkeys(
+                self.task_set.vertices[vertex].callback.node for vertex in part.ran)))
+            for part in self._parts]
+
+    def _lines(self, end: int) -> Iterator[str]:
+        """Yield what is missing of each trace, and what ended with its process (rule 5)."""
+        for part in self._parts:
+            yield from part.recording.warnings
             if part.end is not None:
                 continue
-            jobs = [f'{self.task_set.dags[dag].name} {number}' for dag, number in part.open]
-            self.warnings.append(
+            jobs = [f'{self.task_set.dags[dag].name} {number}' for dag, number in part.open_jobs]
+            yield (
                 f'{part.name}: its end is not recorded (the process was killed, or the trace is '
                 f'cut): it ends {max(0, end - part.last) / 1e9:.3f} s before the run; '
                 + (f'{counted(len(jobs), "job")} ended with it: {listed(jobs)}' if jobs

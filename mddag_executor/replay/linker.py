@@ -52,7 +52,7 @@ from collections.abc import Callable as Function
 from collections.abc import Mapping
 from typing import Any
 
-from mddag_executor.replay.entities import Callback, Entities, Publisher
+from mddag_executor.recording.entities import Callback, Entities, Publisher
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.channels import Layout
 

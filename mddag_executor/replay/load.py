@@ -43,28 +43,29 @@ indices that were recorded.
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.memory import give_back
+from mddag_executor.recording import tables as recorded_tables
+from mddag_executor.recording.tables import Ints, Recording, sort_by
 from mddag_executor.replay.alone import alone, colder, ENOUGH, Recorded
+from mddag_executor.replay.deadlines import look_up
 from mddag_executor.replay.dispatches import Dispatches
-from mddag_executor.replay.entities import Entities
-from mddag_executor.replay.happenings import Observer
 from mddag_executor.replay.noticed import Noticed
+from mddag_executor.replay.usage import ran
 from mddag_executor.simulate import Load
 from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.intakes import Costs
 from mddag_executor.simulate.load import edge_numbers, edges_of, FAILS, RUNS, SKIPPED
-from msg_graph import Dag, TaskSet
+from msg_graph import Dag
 from msg_graph.model import topological_order
 import numpy as np
 
 _UNKNOWN = -1
-_NO_GROUP, _UNTOLD = -1, -2
+_UNTOLD = -2
 
 
 class RecordedLoad(NamedTuple):
@@ -92,10 +93,10 @@ class RecordedLoad(NamedTuple):
 
 _JOB, _VERTEX, _EDGE = range(3)
 _COLUMNS = {
-    'release': (_JOB, 'q'), 'noticed': (_JOB, 'q'), 'round': (_JOB, 'q'),
-    'took': (_VERTEX, 'q'), 'start': (_VERTEX, 'q'), 'end': (_VERTEX, 'q'),
-    'cpu': (_VERTEX, 'q'), 'dispatch': (_VERTEX, 'i'), 'held': (_VERTEX, 'h'),
-    'arrived': (_EDGE, 'q'), 'sent': (_EDGE, 'b')}
+    'release': (_JOB, 'i8'), 'noticed': (_JOB, 'i8'), 'round': (_JOB, 'i8'),
+    'took': (_VERTEX, 'i8'), 'start': (_VERTEX, 'i8'), 'end': (_VERTEX, 'i8'),
+    'cpu': (_VERTEX, 'i8'), 'dispatch': (_VERTEX, 'i4'), 'held': (_VERTEX, 'i2'),
+    'arrived': (_EDGE, 'i8'), 'sent': (_EDGE, 'i1')}
 """What is known by job, by job and vertex, or by job and edge; ns, or unknown (``sent``: 1)."""
 
 
@@ -103,22 +104,17 @@ class _Jobs:
     """
     The jobs of one DAG.
 
-    Each of ``_COLUMNS`` is an attribute: flat, of array, and of numpy once all jobs are there (see
-    ``LoadBuilder._close``).
+    Each of ``_COLUMNS`` is an attribute, a flat array.
     """
 
-    def __init__(self, dag: Dag, n_edges: int) -> None:
-        for name, (_, code) in _COLUMNS.items():
-            setattr(self, name, array(code))
+    def __init__(self, dag: Dag, n_edges: int, numbers: Ints) -> None:
         self.size = len(dag.vertices)
         self.n_edges = n_edges
         self.publishers = [v.index for v in dag.vertices for _ in v.successors]     # by edge
-        self.numbers: list[int] = []
-        self.row: dict[int, int] = {}
-        self.new_row = [
-            (getattr(self, name), array(code, [_UNKNOWN]) * (
-                n_edges if by == _EDGE else self.size))
-            for name, (by, code) in _COLUMNS.items() if by != _JOB]
+        self.numbers = numbers
+        widths = {_JOB: 1, _VERTEX: self.size, _EDGE: n_edges}
+        for name, (by, kind) in _COLUMNS.items():
+            setattr(self, name, np.full(len(numbers) * widths[by], _UNKNOWN, dtype=kind))
 
     if TYPE_CHECKING:
         def __getattr__(self, name: str) -> Any:
@@ -126,175 +122,207 @@ class _Jobs:
 
     def rows(self, name: str) -> Any:
         """Return a column as an array with a row for each job."""
-        return np.asarray(getattr(self, name)).reshape(
+        return getattr(self, name).reshape(
             len(self.numbers), self.n_edges if _COLUMNS[name][0] == _EDGE else self.size)
 
-    def add(self, job: int, release: int, now: int, number: int) -> None:
-        """Add a job, and the round of timers that it was noticed in (or none)."""
-        self.row[job] = len(self.numbers)
-        self.numbers.append(job)
-        self.release.append(release)
-        self.noticed.append(max(release, now))
-        self.round.append(number)
-        for column, new in self.new_row:
-            column.extend(new)
 
-
-class LoadBuilder(Observer):
+class LoadBuilder:
     """
-    Collects a load from what happened.
+    Makes a load of a recording.
 
-    :param who: who is who, as far as the recording says.
     :param n_workers: how many workers each process was recorded with.
     :param cpus: how many there were; 0: not known.
-    :param recorded: by vertex the process that it ran in, from 1; None: all in one.
+    :param processes: by vertex the process that it ran in, from 1; None: all in one.
     """
 
     def __init__(
-        self, task_set: TaskSet, tables: Tables, who: Entities, n_workers: int, cpus: int = 0,
-        recorded: Sequence[int] | None = None,
+        self, recording: Recording, tables: Tables, n_workers: int, cpus: int = 0,
+        processes: Sequence[int] | None = None,
     ) -> None:
-        self._task_set = task_set
+        task_set = recording.task_set
+        self._task_set, self._recording, self._tables = task_set, recording, tables
         self._first = tables.first_vertex
-        self._declared_group = tables.group
-        self._who = who
-        self._tables = tables
-        self._process = [*(recorded or [1] * tables.n_vertices), 1]
+        self._process = [*(processes or [1] * tables.n_vertices), 1]
         self._callbacks = task_set.places_of_vertices()
         self._cpus = cpus
-        self._jobs = [_Jobs(dag, n) for dag, n in zip(task_set.dags, edges_of(tables))]
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
-        # when each round of timers ended, and the last one of each process
-        self._rounds = array('q')
-        self._last_round: dict[int, int] = {}
         # by global vertex and leg: the edge (number in its DAG) that its message makes true
         numbers = edge_numbers(tables)
         self._edges_into = [
             [numbers[first + before, first + vertex.index]
              for _, before in legs_of(vertex, dag.vertices)]
             for dag, first in zip(task_set.dags, tables.first_vertex) for vertex in dag.vertices]
-        # by global vertex and topic: the edges that a publication makes true
-        self._edges_from: dict[tuple[int, str], list[int]] = {}
-        for dag, first in zip(task_set.dags, tables.first_vertex):
-            for vertex in dag.vertices:
-                for place, before in legs_of(vertex, dag.vertices):
-                    self._edges_from.setdefault(
-                        (first + before, vertex.callback.topics[place]), []).append(
-                            numbers[first + before, first + vertex.index])
-        # (time when ready, what it took, its dispatch or -1): undeclared callbacks, and legs that
-        # completed nothing
-        self._others: list[tuple[int, int, int]] = []
-        self._leg: tuple[int, tuple[int, int, int]] | None = None
-        self._untaken: tuple[int, int, int] | None = None
-        self._dispatches = Dispatches(n_workers)
         self._failed: set[tuple[int, int]] = set()
         self._skipped: set[tuple[int, int]] = set()
+        releases = recording.releases[sort_by(recording.releases['order'])]
+        of_dag = [releases[releases['dag'] == dag.index] for dag in task_set.dags]
+        self._jobs = [_Jobs(dag, n, mine['job'].copy()) for dag, n, mine in zip(
+            task_set.dags, edges_of(tables), of_dag)]
+        for jobs, mine in zip(self._jobs, of_dag):
+            jobs.release[:] = mine['release']
+            jobs.noticed[:] = np.maximum(mine['release'], mine['noticed'])
+        self._find_rounds(of_dag)
+        self._job_ends()
+        table = recording.executions
+        dag = table['dag'].astype(np.int64)
+        # by execution the row of its job
+        self._row = np.full(len(table), _UNKNOWN)
+        for number, jobs in enumerate(self._jobs):
+            mine = np.flatnonzero(dag == number)
+            self._row[mine] = look_up(jobs.numbers, table['job'][mine])
+        self._take_pieces(n_workers)
+        self._take_completions()
+        self._take_publications()
+        del self._row
+
+    def _find_rounds(self, of_dag: Sequence[Any]) -> None:
+        """Find out which timers were noticed in one round."""
+        timers = [(number, place) for number, mine in enumerate(of_dag) if self._timer[number]
+                  for place in range(len(mine))]
+        columns = [np.concatenate([mine[name] for number, mine in enumerate(of_dag)
+                                   if self._timer[number]] or [np.empty(0, dtype=np.int64)])
+                   for name in ('release', 'noticed', 'order')]
+        process = np.array([self._process[self._tables.source[dag]] for dag, _ in timers],
+                           dtype=np.int64)
+        order = sort_by(process, columns[2])
+        release, noticed, process = columns[0][order], columns[1][order], process[order]
+        begins = np.ones(len(order), dtype=np.bool_)
+        begins[1:] = (process[1:] != process[:-1]) | (release[1:] > noticed[:-1])
+        number = np.cumsum(begins) - 1
+        #: When each round of timers ended.
+        self._rounds = noticed[np.r_[np.flatnonzero(begins)[1:] - 1, len(order) - 1]] \
+            if len(order) else noticed
+        rounds = np.empty(len(order), dtype=np.int64)
+        rounds[order] = number
+        at = 0
+        for dag, jobs in enumerate(self._jobs):
+            if self._timer[dag]:
+                jobs.round[:] = rounds[at:at + len(jobs.numbers)]
+                at += len(jobs.numbers)
+
+    def _job_ends(self) -> None:
+        """Keep what failed and what was skipped: it does so again."""
+        ends = self._recording.job_ends
+        for dag, jobs in enumerate(self._jobs):
+            mine = ends[ends['dag'] == dag]
+            row = look_up(jobs.numbers, mine['job'])
+            failed = (row >= 0) & (mine['reason'] == recorded_tables.FAILED)
+            self._failed |= set(zip(mine['vertex'][failed].tolist(), row[failed].tolist()))
+            skipped = (row >= 0) & (mine['reason'] == recorded_tables.EXPIRED)
+            skipped[skipped] = jobs.noticed[row[skipped]] == mine['time'][skipped]
+            self._skipped |= {(dag, each) for each in row[skipped].tolist()}
+
+    def _take_pieces(self, n_workers: int) -> None:
+        """Find out how late pieces were dispatched; keep what is undeclared."""
+        table, rows = self._recording.executions, ran(self._recording)
+        piece = table[rows]
+        vertex, row = piece['vertex'].astype(np.int64), self._row[rows]
+        first, ready = piece['piece'] == 0, piece['ready'].copy()
+        is_source = np.array([not each for each in self._edges_into] + [False])
+        source = np.flatnonzero((row >= 0) & is_source[vertex])
+        for dag, jobs in enumerate(self._jobs):
+            mine = source[piece['dag'][source] == dag]
+            number = jobs.round[row[mine]]
+            known = number >= 0
+            ready[mine[known]] = np.maximum(ready[mine[known]], self._rounds[number[known]])
+        process = np.array(self._process, dtype=np.int64)[vertex]
+        self._dispatches = Dispatches(
+            n_workers, piece['worker'].astype(np.int64), self._groups(piece['callback'], vertex),
+            np.where(first, ready, piece['start']), piece['start'], piece['end'], process)
+        numbers = np.arange(len(rows))
+        others = np.flatnonzero(vertex < 0)
+        # when ready, what it took, its dispatch or -1: undeclared callbacks, and legs that
+        # completed nothing
+        self._others = np.column_stack((
+            np.where(first, piece['ready'], piece['start']), piece['end'] - piece['start'],
+            numbers))[others]
+        declared = np.flatnonzero(vertex >= 0)
+        some, at = np.unique(vertex[declared], return_index=True)
         #: By global vertex: the address of the callback that ran as it.
-        self.callback_of: dict[int, int] = {}
+        self.callback_of: dict[int, int] = dict(zip(
+            some.tolist(), piece['callback'][declared[at]].tolist()))
+        mine = np.flatnonzero(first & (row >= 0) & (vertex >= 0))
+        for dag, jobs in enumerate(self._jobs):
+            those = mine[piece['dag'][mine] == dag]
+            jobs.dispatch[row[those] * jobs.size + vertex[those] - self._first[dag]] = those
 
-    def released(self, dag: int, job: int, release: int, now: int) -> None:
-        """Add a job."""
-        number = _UNKNOWN
-        if self._timer[dag]:
-            process = self._process[self._tables.source[dag]]
-            number = self._last_round.get(process, _UNKNOWN)
-            if number < 0 or release > self._rounds[number]:
-                number = self._last_round[process] = len(self._rounds)
-                self._rounds.append(now)
-            self._rounds[number] = now
-        self._jobs[dag].add(job, release, now, number)
+    def _groups(self, callback: Any, vertex: Ints) -> Ints:
+        """Return what identifies the mutually exclusive groups of pieces, or -1."""
+        different, which = np.unique(callback, return_inverse=True)
+        known = self._recording.who.groups
+        group = np.array([known.get(each, _UNTOLD) for each in different.tolist()],
+                         dtype=np.int64)[which]
+        declared = np.array([*self._tables.group[:self._tables.n_vertices], -1])[vertex]
+        unknown = (group == _UNTOLD) & (declared >= 0)
+        group[unknown] = max(0, *known.values(), 0) + 1 + declared[unknown]
+        return np.maximum(group, -1)
 
-    def ran(
-        self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,
-        end: int, first: int,
-    ) -> None:
-        """Find out how late a piece was dispatched; keep what is undeclared."""
-        row = -1 if vertex < 0 else self._jobs[dag].row.get(job, -1)
-        if row >= 0 and not self._edges_into[vertex]:
-            ready = max(ready, self._round_end(self._jobs[dag], row))
-        group: int | None = self._who.groups.get(callback, _UNTOLD)
-        if group == _UNTOLD and vertex >= 0 and self._declared_group[vertex] >= 0:
-            group = _UNTOLD - 1 - self._declared_group[vertex]
-        if group in (_NO_GROUP, _UNTOLD):
-            group = None
-        number = self._dispatches.add(worker, group, ready if first else start, start, end,
-                                      self._process[vertex])
-        if vertex < 0:
-            self._others.append((ready if first else start, end - start, number))
-            return
-        self.callback_of.setdefault(vertex, callback)
-        if first and row >= 0:
-            jobs = self._jobs[dag]
-            jobs.dispatch[row * jobs.size + vertex - self._first[dag]] = number
+    def _take_completions(self) -> None:
+        """Note what executions took that completed something."""
+        table = self._recording.executions
+        rows = np.flatnonzero(
+            (table['completes'] != recorded_tables.NOTHING) & (table['vertex'] >= 0)
+            & (self._row >= 0) & (table['start'] >= 0))
+        rows = rows[sort_by(table['order'][rows])]
+        n_legs = np.array([max(1, len(each)) for each in self._edges_into])
+        width = int(n_legs.max(initial=1))
+        edges = np.array([[*each, *[-1] * (width - len(each))] for each in self._edges_into]
+                         or [[-1]])
+        for dag, jobs in enumerate(self._jobs):
+            done = table[rows[table['dag'][rows] == dag]]
+            row = self._row[rows[table['dag'][rows] == dag]]
+            vertex = done['vertex'].astype(np.int64)
+            leg = np.where(done['leg'] < 0, n_legs[vertex] - 1, done['leg'])
+            edge = np.where(leg < width, edges[vertex, np.minimum(leg, width - 1)], -1)
+            known = edge >= 0
+            jobs.arrived[row[known] * jobs.n_edges + edge[known]] = done['ready'][known]
+            whole = done['completes'] == recorded_tables.VERTEX
+            if not whole.all():
+                part = done[~whole]
+                self._others = np.concatenate([self._others, np.column_stack((
+                    part['ready'], part['busy'], np.full(len(part), _UNKNOWN)))])
+            place = row[whole] * jobs.size + vertex[whole] - self._first[dag]
+            for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
+                                 ('start', 'began'), ('end', 'end')):
+                getattr(jobs, name)[place] = done[column][whole]
+            at_once = whole & (done['leg'] == recorded_tables.ALL_LEGS) & (n_legs[vertex] > 1)
+            for v in np.unique(vertex[at_once]).tolist():
+                self._all_at_once(jobs, row[at_once & (vertex == v)], self._edges_into[v])
+            source = whole & ~known
+            source[source] = done['ready'][source] >= jobs.release[row[source]]
+            jobs.noticed[row[source]] = done['ready'][source]
 
-    def _round_end(self, jobs: _Jobs, row: int) -> int:
-        number = jobs.round[row]
-        return _UNKNOWN if number < 0 else self._rounds[number]
-
-    def completed(
-        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
-        start: int, ended: int, busy: int, number: int, cpu: int, held: int,
-    ) -> None:
-        """Note an execution's times."""
-        jobs = self._jobs[dag]
-        row = jobs.row.get(job)
-        if number < 0 or row is None:
-            self._untaken = dag, vertex, job    # a leg that a simulator notes before it runs
-            return
-        same = self._leg is not None and self._leg[0] == number
-        several = same or self._untaken == (dag, vertex, job)
-        if self._leg is not None and not same:
-            self._others.append(self._leg[1])
-        self._leg = None
-        edges = self._edges_into[vertex]
-        if leg < len(edges):
-            jobs.arrived[row * jobs.n_edges + edges[leg]] = ready
-        if not whole:
-            self._leg = number, (ready, busy, -1)
-            return
-        place = row * jobs.size + vertex - self._first[dag]
-        jobs.took[place] = busy
-        jobs.cpu[place] = cpu
-        jobs.held[place] = held
-        jobs.start[place] = start
-        jobs.end[place] = ended
-        if several:
-            self._all_at_once(jobs, row, edges)
-        if not edges and ready >= jobs.release[row]:
-            jobs.noticed[row] = ready
-
-    def _all_at_once(self, jobs: _Jobs, row: int, edges: list[int]) -> None:
+    def _all_at_once(self, jobs: _Jobs, rows: Ints, edges: list[int]) -> None:
         """Where one execution stands for all legs, only the last message's time is known."""
-        ends = [jobs.end[row * jobs.size + jobs.publishers[edge]] for edge in edges]
-        for edge, end in zip(edges, ends):
-            if end < max(ends):
-                jobs.arrived[row * jobs.n_edges + edge] = end
+        ends = jobs.rows('end')[rows][:, [jobs.publishers[edge] for edge in edges]]
+        arrived = jobs.rows('arrived')
+        for edge, end in zip(edges, ends.T):
+            early = end < ends.max(axis=1)
+            arrived[rows[early], edge] = end[early]
 
-    def published(
-        self, publisher: int, callback: int, dag: int, vertex: int, job: int, ready: int, now: int
-    ) -> None:
-        """Note which edges a job's publication made true."""
-        known = self._who.every_publisher.get(publisher)
-        if vertex < 0 or known is None:
-            return
-        jobs = self._jobs[dag]
-        row = jobs.row.get(job)
-        if row is not None:
-            for edge in self._edges_from.get((vertex, known.topic), ()):
-                jobs.sent[row * jobs.n_edges + edge] = 1
-
-    def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
-        """Keep what was skipped."""
-        jobs = self._jobs[dag]
-        row = jobs.row.get(job)
-        if not aborted and row is not None and jobs.noticed[row] == now:
-            self._skipped.add((dag, row))
-
-    def failed(self, dag: int, vertex: int, job: int, now: int) -> None:
-        """Keep what failed: it does so again."""
-        row = self._jobs[dag].row.get(job)
-        if row is not None:
-            self._failed.add((vertex, row))
+    def _take_publications(self) -> None:
+        """Note which edges the publications of jobs made true."""
+        edges_from: dict[tuple[int, str], list[int]] = {}
+        numbers = edge_numbers(self._tables)
+        for dag, first in zip(self._task_set.dags, self._first):
+            for vertex in dag.vertices:
+                for place, before in legs_of(vertex, dag.vertices):
+                    edges_from.setdefault(
+                        (first + before, vertex.callback.topics[place]), []).append(
+                            numbers[first + before, first + vertex.index])
+        table, sent = self._recording.executions, self._recording.publications
+        by = sent['execution']
+        by, publisher = by[by >= 0], sent['publisher'][by >= 0]
+        row, vertex_of = self._row[by], table['vertex'][by]
+        known = (row >= 0) & (vertex_of >= 0)
+        row, vertex_of, publisher = row[known], vertex_of[known], publisher[known]
+        for number in np.unique(publisher).tolist():
+            found = self._recording.who.every_publisher.get(number)
+            mine = publisher == number
+            for v in np.unique(vertex_of[mine]).tolist() if found is not None else ():
+                jobs = self._jobs[self._tables.dag_of[v]]
+                for edge in edges_from.get((v, found.topic), ()) if found is not None else ():
+                    jobs.rows('sent')[row[mine & (vertex_of == v)], edge] = 1
 
     def times(self) -> list[list[int]]:
         """Return by DAG and vertex what an execution takes, 0 where nothing says it."""
@@ -314,9 +342,6 @@ class LoadBuilder(Observer):
         :param anew: whether intakes are to notice timers and messages anew, not as recorded; so
             they do only where CPU times say how long others computed.
         """
-        if self._leg is not None:
-            self._others.append(self._leg[1])
-            self._leg = None
         self._close()
         process = process or self._process
         anew = anew and bool((self._whole['cpu'] >= 0).any())
@@ -336,11 +361,11 @@ class LoadBuilder(Observer):
         if intakes is not None:     # who dispatches computes, too
             cpu[cpu >= 0] += late[cpu >= 0]
             took += intakes.send_ns * self._by_execution(self._sends(process))
-        others = sorted(self._others)
+        others = self._others[sort_by(*self._others.T)]
         more = np.zeros(len(others), dtype=np.int64)
-        costs = np.concatenate([took, np.array([
-            max(0, took) + (int(every[number]) if number >= 0 else 0)
-            for _, took, number in others], dtype=np.int64)])
+        number = others[:, 2]
+        costs = np.concatenate([took, np.maximum(0, others[:, 1]) + np.where(
+            number >= 0, every[number], 0)])
         bases = [0, *accumulate(len(jobs.numbers) * jobs.size for jobs in self._jobs)]
         columns: dict[str, Any] = {
             'holds': np.concatenate([held, more]) if held.any() else [],
@@ -350,21 +375,18 @@ class LoadBuilder(Observer):
             'delays': delays, 'delay_stride': [jobs.n_edges for jobs in self._jobs],
             'delay_base': [0, *accumulate(
                 len(jobs.numbers) * jobs.n_edges for jobs in self._jobs[:-1])]}
-        load = self._load(costs, bases, [ready for ready, _, _ in others],
+        load = self._load(costs, bases, others[:, 0],
                           overheads and not anew)._replace(
             fates=self._fates(bases, len(costs)), **columns)
         return RecordedLoad(
-            load, [jobs.numbers for jobs in self._jobs], demand, executions, estimated, unknown,
-            usual, transport, late if overheads else late[:0], intakes)
+            load, [jobs.numbers.tolist() for jobs in self._jobs], demand, executions, estimated,
+            unknown, usual, transport, late if overheads else late[:0], intakes)
 
     def _close(self) -> None:
         """Put the columns of all DAGs' jobs together, and leave each DAG its part of them."""
         self._whole: dict[str, Any] = {}
-        for jobs in self._jobs:
-            jobs.row.clear()
-            jobs.new_row.clear()
         for name in _COLUMNS:
-            parts = [np.asarray(getattr(jobs, name)) for jobs in self._jobs]
+            parts = [getattr(jobs, name) for jobs in self._jobs]
             whole = self._whole[name] = np.concatenate(parts)
             for jobs, part in zip(self._jobs, np.split(whole, np.cumsum([*map(len, parts)]))):
                 setattr(jobs, name, part)
@@ -526,14 +548,14 @@ class LoadBuilder(Observer):
                 ranks = (np.arange(len(those)) + 0.5) / len(those)
                 more = np.maximum(0, taken[those] - np.quantile(usual, ranks))
                 ends[those] -= np.rint(more).astype(np.int64)
-        self._rounds = array('q', ends.tobytes())
+        self._rounds = ends
         noticed[of] = np.minimum(noticed[of], ends[number[of]])
 
     def _when_due(self) -> tuple[Any, Any, Any]:
         """Return when each round of timers was due, and ended, and in which process it was."""
         number, release = self._whole['round'], self._whole['release']
         of = np.flatnonzero(number >= 0)
-        ends = np.array(self._rounds, dtype=np.int64)
+        ends = self._rounds.copy()
         due, home = np.full(len(ends), NEVER), np.zeros(len(ends), dtype=np.int64)
         np.minimum.at(due, number[of], release[of])
         home[number[of]] = np.repeat(
@@ -568,13 +590,12 @@ class LoadBuilder(Observer):
         return found
 
     def _load(
-        self, costs: Any, bases: list[int], others: list[int], overheads: bool
+        self, costs: Any, bases: list[int], others: Ints, overheads: bool
     ) -> Load:
         # time when ready, DAG, place of the job in its DAG, release
-        parts = [np.array(
-            [(ready, len(self._jobs), place, ready) for place, ready in enumerate(others)],
-            dtype=np.int64).reshape(-1, 4)]
-        rounds = np.array([*self._rounds, _UNKNOWN], dtype=np.int64)    # the last of none
+        parts = [np.column_stack((
+            others, np.full(len(others), len(self._jobs)), np.arange(len(others)), others))]
+        rounds = np.r_[self._rounds, _UNKNOWN]      # the last of none
         for dag, jobs in zip(self._task_set.dags, self._jobs):
             ideal = self._timer[dag.index] and not overheads
             ready: Any = jobs.release if ideal else np.maximum(jobs.noticed, rounds[jobs.round])

@@ -18,8 +18,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from mddag_executor.recording.tables import Ints
 from mddag_executor.replay.alone import ENOUGH, Flags, Recorded
-from mddag_executor.replay.happenings import Ints
 from mddag_executor.simulate.intakes import Costs
 from mddag_executor.simulate.machine import SWITCH_NS
 import numpy as np

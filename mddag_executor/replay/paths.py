@@ -3,14 +3,14 @@
 """
 End-to-end figures: how a path's data flows from its first callback to its last.
 
-Theory of operation
--------------------
+Theory of operation: flows
+--------------------------
 A path is a list of callbacks; from each to the next leads a *hop*:
 
 * trigger: the one publishes a topic that starts the other.  A flow goes on with the execution that
   the message started.
 * topic: the other takes the topic itself (queue edge).  A flow goes on with the executions that
-  took the message, where takes are recorded, else with those for which it was the latest.
+  took the message, if takes are recorded, else with those for which it was the latest.
 * variable: the other reads what the one left in a variable of their node (queue edge).  A flow
   goes on with the executions that began when it was the latest that had ended (CARET: variable
   passing, `left_use_latest`).
@@ -20,72 +20,60 @@ of executions, or by another leg of a sync callback, belongs to the execution th
 before it (CARET: use_latest_message).
 
 A *flow* is what became of one publication of the first callback; with each execution that reads a
-value again it branches.  A flow that arrives nowhere is left out where another branch of the same
+value again it branches.  A flow that arrives nowhere is left out if another branch of the same
 execution went on.
-
-By default, as in CARET, a path's time runs from the first publication to the start of the last
-callback's execution; ``whole`` figures run from the start of the first callback's execution to the
-end of the last one's.
 
 Which message an execution of a job ran for is known from the job: it is the one that the vertex
 before it published in the same job.  The topic that started a leg of a sync callback is its
 subscription's.  A simulated trace has no publications: there every topic is published when the
-callback ends.  In an imported recording the linker has found the messages.  An execution of
-several pieces (a coroutine) is one, from its first start to its last end.
+callback ends.  In an imported recording the tables say which message started what.  An execution
+of several pieces (a coroutine) is one, from its first start to its last end.
 
-A *place* is a position in a path, a *step* an execution or a publication there.  Steps are made
-for many events at once: place by place along each path, as what a place needs is known once the
-place before it is done.  Flows that are over are counted and forgotten (see ``path_flows``).
+A *step* is an execution or a publication at a position of a path; its parent is the step whose
+data it has.  A flow is a branch from a step without a parent to one without children.  All steps
+of a position are made at once.  What happened at the same instant is in the order: ends,
+publications, starts.
+
+Theory of operation: response times
+-----------------------------------
+By default, as in CARET, a path's time runs from the first publication (*start*) to the start of
+the last callback's execution (*end*); ``whole`` figures run from the start of the first callback's
+execution to the end of the last one's.  Source: caret_analyze, ``ResponseTime`` (0.5), and CARET's
+documentation of the response time's cases.
+
+* An input whose flow did not arrive takes the earliest of the ends of the inputs after it: that is
+  when something at least as new came out.  Of several outputs of an input the earliest counts.
+  The inputs of the earliest output are left out: what came before them is not known.
+* `all`: every input.  `best`: of the inputs with the same output the newest.  `worst`: the oldest.
+  `worst-with-external-latency`: the same, from the input before it on: what happened right after
+  that one had to wait for the next.  That is the *reaction time* to something outside.
+* The *data age* of an output is the time since the newest input that it is made of, for every
+  output, also if an earlier one was made of that input.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-from mddag_executor.replay.happenings import (
-    Batch,
-    BEGAN,
-    different,
-    Ints,
-    Observer,
-    OVER,
-    PUBLISHED,
-    RAN,
-    SENT,
-    STARTED,
-    TOOK,
-)
-from mddag_executor.replay.linker import KEEP
-from mddag_executor.replay.path_flows import (
-    END,
-    F_PATH,
-    Forest,
-    NEVER,
-    NONE,
-    PARENT,
-    PathFigures,
-)
-from mddag_executor.replay.run import Run
+from mddag_executor.recording.tables import EXECUTIONS, Ints, Mask, Recording, rows, sort_by, Table
+from mddag_executor.replay.spread import spread
 from msg_graph import Callback, Path, TaskSet
 import numpy as np
 
 HopKind = Literal['trigger', 'topic', 'variable']
+NONE = -1
+_NEVER = 2 ** 62
+_CASES = ('all', 'best', 'worst', 'worst_with_external_latency')
 
-SETTLE = 1 << 18
-"""Events from which on steps are made of them, and flows that are over are taken out."""
-KEPT = 1024
-"""Executions and messages of a place that may still be referred to, by default."""
-LAG_NS = 1_000_000_000
-"""Nothing comes later than this after it happened."""
-_ORDER = 40     # bits of an event's number in the order
-_JOB = 42   # bits: no execution is ready more than an hour before one of the job before it
 
-# Columns of the input; all begin with the place in the order and the callback's number.
-S_RUN, S_TIME, S_TOPIC, S_MESSAGE, S_VERTEX, _N_STARTED = range(2, 8)
-_E_RUN, _E_TIME, _N_ENDED = range(2, 5)
-_U_NODE, _U_RUN, _U_TOPIC, _U_MESSAGE, _U_TIME, _N_PUBLISHED = range(2, 8)
-_T_RUN, _T_MESSAGE, _N_TOOK = range(2, 5)
+STEPS = np.dtype([
+    ('parent', 'i8'), ('position', 'i4'), ('is_run', '?'), ('time', 'i8'), ('end', 'i8')])
+"""
+Columns of a step: its parent's number or -1, its position, whether it is an execution.
+
+``time`` is the start of an execution or the time of a publication (0: not recorded), ``end`` that
+of an execution (-1: not recorded), ns.
+"""
 
 
 class Hop(NamedTuple):
@@ -95,424 +83,426 @@ class Hop(NamedTuple):
     topics: frozenset[str]
 
 
-class _Place:
-    """A position in a path, and what is known there from one round to the next."""
-
-    def __init__(self, number: int, position: int, callback: int, node: int, sync: bool) -> None:
-        self.number = number
-        self.position = position
-        self.callback = callback
-        self.node = node
-        self.sync = sync
-        # by vertex of the callback: those of the callback before it that lead to it
-        self.before: dict[int, list[int]] = {}
-        self.hop: Hop | None = None             # to it
-        self.hop_topics: list[int] = []         # of it
-        self.topics: list[int] = []             # behind it
-        # the last steps that were started, done and published
-        self.last = np.full(3, NONE, dtype=np.int64)
-        # runs and messages with their steps
-        self.runs = np.empty((0, 2), dtype=np.int64)
-        self.messages = np.empty((0, 3), dtype=np.int64)    # message, place in the order, step
-
-
-class PathBook:
+class Executions(NamedTuple):
     """
-    Collects the flows along the declared paths from what happened, in order of time.
+    The executions of a callback, in order of their starts.
 
-    Callbacks, topics and nodes are given by their numbers, executions and messages by any
-    numbers that differ; -1 stands for none.
-
-    :param kept: how many executions and messages of a place may still be referred to.
-    :param by_job: whether executions come with their job in place of their message; the number of
-        a message is then ``message``.
+    ``runs`` are the rows of their first pieces, ``topics`` the numbers of the topics that started
+    them (-1: none, -2: one that no path leads over).
     """
 
-    def __init__(self, task_set: TaskSet, kept: int = KEPT, by_job: bool = False) -> None:
-        self._by_job, self._n_vertices = by_job, len(task_set.vertices)
+    runs: Ints
+    start: Ints
+    topics: Ints
+
+
+class Flows(NamedTuple):
+    """
+    The flows of a path, -1 where there is none.
+
+    The first publication (or the first start, where nothing is published), the start of the last
+    callback's execution, the begin of the first and the end of the last one's, ns.
+    """
+
+    first: Ints
+    arrival: Ints
+    begin: Ints
+    end: Ints
+
+
+class Paths:
+    """The flows along the declared paths of a recording."""
+
+    def __init__(self, recording: Recording) -> None:
+        task_set = recording.task_set
+        self._recording, self._task_set = recording, task_set
         self.paths: list[Path] = list(task_set.paths)
         self.hops = [hops(task_set, path) for path in self.paths]
-        self.callbacks = task_set.places()
-        self.nodes = {node: i for i, node in enumerate(
-            dict.fromkeys(c.node for c in task_set.callbacks))}
-        #: The topics that paths lead over; publications on others are not needed.
-        self.topics = {topic: i for i, topic in enumerate(sorted(
+        if not self.paths:
+            return
+        self._topics = {topic: i for i, topic in enumerate(sorted(
             {topic for path in self.hops for hop in path for topic in hop.topics}))}
-        self.on_path = {key for path in self.paths for key in path.callbacks}
-        # by vertex
-        self._topics_of = [[self.topics[topic] for topic in v.callback.topics
-                            if topic in self.topics] for v in task_set.vertices]
-        self._figures = [PathFigures() for _ in self.paths]
-        self._places = [self._place(task_set, number, position)
-                        for number, path in enumerate(self.paths)
-                        for position in range(len(path.callbacks))]
-        self._kept = kept
-        self._new_rows: list[list[Ints]] = [[], [], [], []]
-        self._order = 1     # 0: in a round before
-        self._waiting = 0
-        self._forest = Forest([len(path.callbacks) - 1 for path in self.paths])
-        self._results: dict[str, Any] | None = None
+        self._nodes = {node: i for i, node in enumerate(
+            dict.fromkeys(c.node for c in task_set.callbacks))}
+        self._places = task_set.places()
+        # by vertex the place of its callback, and of none
+        self._place = np.array([*task_set.places_of_vertices(), NONE], dtype=np.int32)
+        table = recording.executions
+        if not len(table):      # a row that -1 may stand for
+            table = rows(EXECUTIONS, 1, vertex=NONE, start=NONE, end=NONE)
+        self._table = table
+        self._vertex = table['vertex'].astype(np.int64)
+        if recording.callback_vertex:
+            self._add_vertices(recording.callback_vertex)
+        # by the place of a callback the rows of its executions
+        place = np.where(self._vertex >= 0, self._place[self._vertex], NONE).astype(np.int16)
+        order = np.argsort(place, kind='stable')
+        borders = np.searchsorted(place[order], np.arange(len(self._places) + 1))
+        self._of_place = np.split(order, borders)[1:-1]
+        self._first = _first_pieces(table)
+        self._start, self._end = table['start'].copy(), table['end'].copy()
+        self._published()
+        # the messages that running callbacks took themselves, by the execution
+        self._took = self._first[recording.takes['execution']], recording.takes['message']
 
-    def __bool__(self) -> bool:
-        """Return whether there is any path."""
-        return bool(self.paths)
+    def _add_vertices(self, of: dict[int, int]) -> None:
+        """Find out which declared callbacks executions of no job are."""
+        callbacks = np.array(sorted(of), dtype=np.int64)
+        unknown = np.flatnonzero(self._vertex < 0)
+        callback = self._recording.executions['callback'][unknown]
+        at = np.minimum(np.searchsorted(callbacks, callback), len(callbacks) - 1)
+        known = callbacks[at] == callback
+        self._vertex[unknown[known]] = np.array(
+            [of[each] for each in callbacks.tolist()])[at[known]]
 
-    def _place(self, task_set: TaskSet, number: int, position: int) -> _Place:
-        path_hops, key = self.hops[number], self.paths[number].callbacks[position]
-        callback = task_set.callback(key)
-        place = _Place(number, position, self.callbacks[key], self.nodes[callback.node],
-                       callback.kind == 'sync')
-        if position:
-            place.hop = path_hops[position - 1]
-            place.hop_topics = [self.topics[topic] for topic in place.hop.topics]
-            before = self.paths[number].callbacks[position - 1]
-            place.before = {
-                v: [v - vertex.index + p for p in vertex.predecessors
-                    if task_set.vertices[v - vertex.index + p].callback.key == before]
-                for v, vertex in enumerate(task_set.vertices) if vertex.callback.key == key}
-        if position < len(path_hops):
-            place.topics = [self.topics[topic] for topic in path_hops[position].topics]
-        return place
+    def _published(self) -> None:
+        """Collect what was published on the topics that paths lead over, in order of time."""
+        recording, table = self._recording, self._table
+        publishers = recording.who.every_publisher
+        if publishers or recording.links:
+            sent = recording.publications
+            different, which = np.unique(sent['publisher'], return_inverse=True)
+            known = [publishers.get(number) for number in different.tolist()]
+            topic, node = np.array(
+                [(NONE, NONE) if each is None else (
+                    self._topics.get(each.topic, NONE),
+                    self._nodes.get(each.node.name if each.node is not None else '', NONE))
+                 for each in known], dtype=np.int64).reshape(-1, 2)[which].T
+            by, vertex = sent['execution'], sent['vertex'].astype(np.int64)
+            message = np.arange(len(sent)) if recording.links else np.where(
+                (by >= 0) & (vertex >= 0),
+                self._message(table['job'][by], table['vertex'][by], topic), NONE)
+            time = sent['time']
+        else:       # what is published is not recorded
+            parts = []
+            for callback in self._task_set.callbacks:
+                mine = self._of_place[self._places[callback.key]]
+                mine = mine[(self._end[mine] >= 0) & (self._start[mine] >= 0)]
+                parts += [(mine, self._topics[topic]) for topic in callback.publishes
+                          if topic in self._topics]
+            by = np.concatenate([mine for mine, _ in parts] or [self._first[:0]])
+            topic = np.repeat(np.array([topic for _, topic in parts], dtype=np.int64),
+                              [len(mine) for mine, _ in parts])
+            vertex, node = self._vertex[by], np.full(len(by), NONE)
+            message = self._message(table['job'][by], vertex, topic)
+            time = table['end'][by]
+        place = np.where(vertex >= 0, self._place[vertex], NONE)
+        chosen = np.flatnonzero(topic != NONE)
+        chosen = chosen[sort_by(time[chosen])]
+        run = np.where(by >= 0, self._first[by], NONE)
+        # by topic what was published on it
+        columns = np.stack([each[chosen] for each in (place, node, run, message, time)])
+        of_topic = topic[chosen].astype(np.int16)
+        order = np.argsort(of_topic, kind='stable')
+        borders = np.searchsorted(of_topic[order], np.arange(len(self._topics) + 1))
+        self._sent = [columns[:, mine] for mine in np.split(order, borders)[1:-1]]
 
-    # --- input -----------------------------------------------------------------------------------
-
-    def add(
-        self, length: int, started: Ints, ended: Ints, published: Ints,
-        took: Ints | None = None,
-    ) -> None:
-        """
-        Collect a stretch of what happened; the first column has the places in its order.
-
-        :param length: how many places there are.
-        :param started: executions: callback, run, start, the topic that started it, the message
-            (or the job), the vertex.
-        :param ended: callback, run, end.
-        :param published: the callback (-1: outside of executions), its node, run, topic,
-            message, time.
-        :param took: messages that running callbacks took themselves: callback, run, message.
-        """
-        if took is None:
-            took = np.empty((0, _N_TOOK), dtype=np.int64)
-        for new_rows, rows in zip(self._new_rows, (started, ended, published, took)):
-            if len(rows):
-                rows = rows.copy()
-                rows[:, 0] += self._order
-                new_rows.append(rows)
-                self._waiting += len(rows)
-        self._order += length
-        if self._waiting >= SETTLE:
-            self._round()
-            self._settle(False)
-
-    def message(self, job: Ints, vertex: Ints | int, topic: Ints | int) -> Ints:
+    def _message(self, job: Any, vertex: Any, topic: Any) -> Ints:
         """Return the numbers of the messages that vertices publish in jobs."""
-        return (job * self._n_vertices + vertex) * (len(self.topics) + 1) + topic
+        number: Ints = (job * len(self._place) + vertex) * (len(self._topics) + 1) + topic
+        return number
 
-    def _messages_for(self, place: _Place, started: Ints) -> list[Ints]:
-        """Return what may have started executions at a place; what is known later counts."""
-        if not self._by_job:
-            return [started[:, S_MESSAGE]]
+    def _of_callback(self, key: str) -> Executions:
+        """Return the executions of a callback."""
+        table, mine = self._table, self._of_place[self._places[key]]
+        mine = mine[(self._first[mine] == mine) & (self._start[mine] >= 0)]
+        mine = mine[sort_by(self._start[mine])]
+        if not self._task_set.callback(key).topics:
+            topics = np.full(len(mine), NONE)
+        else:
+            different, which = np.unique(table['callback'][mine], return_inverse=True)
+            names = [self._recording.who.topic(callback) for callback in different.tolist()]
+            topics = np.array([self._topics.get(name, -2) if name else NONE
+                               for name in names], dtype=np.int64)[which]
+        return Executions(mine, self._start[mine], topics)
+
+    def flows(self, number: int) -> Flows:
+        """Return the flows of a path."""
+        return flows_of(self.steps(number), len(self.paths[number].callbacks) - 1)
+
+    def steps(self, number: int) -> Table:
+        """Return the steps of a path, a table of ``STEPS``."""
+        path, path_hops = self.paths[number], self.hops[number]
+        steps = _Steps()
+        before: tuple[_Timeline, _Timeline] | None = None
+        messages = np.empty((0, 3), dtype=np.int64)
+        for position, key in enumerate(path.callbacks):
+            callback = self._task_set.callback(key)
+            hop = path_hops[position - 1] if position else None
+            ran = self._of_callback(key)
+            if hop is not None and hop.kind == 'trigger':
+                # else another leg of a sync callback
+                fits = np.isin(ran.topics, [NONE, *(self._topics[t] for t in hop.topics)])
+                ran = Executions(*(each[fits] for each in ran))
+            parent = np.full(len(ran.runs), NONE)
+            if hop is not None and before is not None:
+                if hop.kind == 'trigger':
+                    for message in self._messages_for(path.callbacks[position - 1], key, ran):
+                        found = _as_of_each(messages, message, ran.start)
+                        parent = np.where(found != NONE, found, parent)
+                else:
+                    timeline = before[hop.kind == 'topic']
+                    parent = timeline.as_of(ran.start)
+            if hop is not None and hop.kind == 'topic':
+                taker, taken = self._took
+                at = _find(ran.runs, taker)
+                mine = at != NONE
+                parent[at[mine]] = _as_of_each(
+                    messages, taken[mine], np.full(int(mine.sum()), _NEVER))
+            step = steps.add(position, parent, True, ran.start)
+            topics = [self._topics[t] for t in path_hops[position].topics] \
+                if position < len(path_hops) else []
+            before = self._done(steps, callback, ran, step), _Timeline(
+                np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
+            if topics:
+                sent, messages = self._publish(steps, position, callback, ran, step, topics)
+                before = before[0], sent
+        return steps.table()
+
+    def _messages_for(self, before: str, key: str, ran: Executions) -> list[Ints]:
+        """Return what may have started executions; what is known later counts."""
+        table = self._table
+        if self._recording.links:
+            return [table['message'][ran.runs]]
         found: list[Ints] = []
-        for vertex in different(started[:, S_VERTEX]):
-            mine = started[:, S_VERTEX] == vertex
-            topics, job = started[:, S_TOPIC], started[:, S_MESSAGE]
-            for before in place.before.get(vertex, ()):
-                for topic in self._topics_of[vertex]:
-                    fits = mine & ((topics == topic) | (topics == NONE))
-                    found.append(np.where(fits, self.message(job, before, topic), NONE))
+        vertices, vertex, job = self._task_set.vertices, self._vertex[ran.runs], table['job'][
+            ran.runs]
+        for v in np.unique(vertex).tolist():
+            mine = vertex == v
+            for local in vertices[v].predecessors:
+                publisher = v - vertices[v].index + local
+                if vertices[publisher].callback.key != before:
+                    continue
+                for name in vertices[v].callback.topics:
+                    if name in self._topics:
+                        topic = self._topics[name]
+                        fits = mine & ((ran.topics == topic) | (ran.topics == NONE))
+                        found.append(np.where(
+                            fits, self._message(job, publisher, topic), -2))
         return found
 
-    # --- steps -----------------------------------------------------------------------------------
+    def _done(
+        self, steps: _Steps, callback: Callback, ran: Executions, step: Ints
+    ) -> _Timeline:
+        """Note when executions ended."""
+        ended = self._of_place[self._places[callback.key]]
+        ended = ended[(self._start[ended] >= 0) & (self._end[ended] >= 0)]
+        ended = ended[sort_by(self._end[ended])]
+        at = _find(ran.runs, self._first[ended])
+        of = np.where(at != NONE, step[at], NONE) if len(step) else np.full(len(at), NONE)
+        steps.end(of[of != NONE], self._end[ended][of != NONE])
+        counts = (of != NONE) | (callback.kind != 'sync')
+        return _Timeline(self._end[ended][counts], of[counts])
 
-    def _round(self) -> None:
-        """Make steps of the input."""
-        new_rows = [np.concatenate(each) if each else np.empty((0, width), dtype=np.int64)
-                    for each, width in zip(
-                        self._new_rows, (_N_STARTED, _N_ENDED, _N_PUBLISHED, _N_TOOK))]
-        self._new_rows = [[], [], [], []]
-        self._order, self._waiting = 1, 0
-        columns = (1, 1, _U_TOPIC, 1)
-        sorted_out = [by_column(rows, column) for rows, column in zip(new_rows, columns)]
-        before: list[tuple[Ints, Ints]] = []
-        for number, place in enumerate(self._places):
-            before = self._at(number, place, before, *(
-                [rows.get(key, none[:0]) for key in keys] for rows, none, keys in zip(
-                    sorted_out, new_rows, ([place.callback], [place.callback], place.topics,
-                                           [place.callback]))))
-
-    def _at(
-        self, number: int, place: _Place, before: list[tuple[Ints, Ints]],
-        started: list[Ints], ended: list[Ints], published: list[Ints], took: list[Ints],
-    ) -> list[tuple[Ints, Ints]]:
-        """
-        Make the steps of a place; return what was done and published there when.
-
-        :param before: the same of the place before it.
-        :param started: by the callback; so ``ended`` and ``took``, but ``published`` by topic.
-        """
-        rows, = started
-        if place.hop is not None and place.hop.kind == 'trigger':
-            # else another leg of a sync callback
-            fits = rows[:, S_TOPIC] == NONE
-            for topic in place.hop_topics:
-                fits |= rows[:, S_TOPIC] == topic
-            rows = rows[fits]
-        # a coroutine that goes on is started already
-        rows = rows[np.sort(np.unique(rows[:, S_RUN], return_index=True)[1])]
-        kept = np.sort(place.runs[:, 0])
-        at = np.searchsorted(kept, rows[:, S_RUN])
-        if len(kept):
-            rows = rows[kept[np.minimum(at, len(kept) - 1)] != rows[:, S_RUN]]
-        parent = np.full(len(rows), NONE, dtype=np.int64)
-        if place.hop is not None:
-            last = self._places[number - 1]
-            if place.hop.kind == 'trigger':
-                for messages in self._messages_for(place, rows):
-                    found = _message(last.messages, messages, rows[:, 0])
-                    parent = np.where(found != NONE, found, parent)
-            else:
-                which = int(place.hop.kind == 'topic')
-                parent = _as_of(*before[which], rows[:, 0])
-        steps = self._forest.add(
-            place.number, place.position, parent, True, rows[:, S_TIME])
-        begun = _timeline(place, 0, rows[:, 0], steps)
-        place.runs = np.concatenate([place.runs, np.column_stack((rows[:, S_RUN], steps))])
-        order = np.argsort(place.runs[:, 0], kind='stable')
-        runs = place.runs[order]
-        if place.hop is not None and place.hop.kind == 'topic':
-            rows, = took
-            step = _step_of(runs, rows[:, _T_RUN])
-            rows, step = rows[step != NONE], step[step != NONE]
-            self._forest.rows[step, PARENT] = _message(
-                self._places[number - 1].messages, rows[:, _T_MESSAGE], rows[:, 0])
-
-        rows, = ended
-        step = _step_of(runs, rows[:, _E_RUN])
-        self._forest.rows[step[step != NONE], END] = rows[step != NONE, _E_TIME]
-        counts = (step != NONE) | (not place.sync)
-        done = _timeline(place, 1, rows[counts, 0], step[counts])
-
-        if not published:
-            return [done]
-        rows = published[0] if len(published) == 1 else np.concatenate(published)
-        rows = rows[(rows[:, 1] == place.callback)
-                    | (rows[:, 1] == NONE) & (rows[:, _U_NODE] == place.node)]
-        if len(published) > 1:
-            rows = rows[np.argsort(rows[:, 0], kind='stable')]
-        parent = np.where(rows[:, 1] == NONE, NONE, _step_of(runs, rows[:, _U_RUN]))
-        latest = (parent == NONE) & (place.sync | (rows[:, 1] == NONE))
-        parent[latest] = _as_of(*begun, rows[latest, 0])
-        steps = self._forest.add(
-            place.number, place.position, parent, False, rows[:, _U_TIME])
-        sent = _timeline(place, 2, rows[:, 0], steps)
-        known = (steps != NONE) & (rows[:, _U_MESSAGE] != NONE)
-        place.messages = np.concatenate([place.messages, np.column_stack(
-            (rows[known, _U_MESSAGE], rows[known, 0], steps[known]))])
-        return [done, sent]
-
-    # --- flows -----------------------------------------------------------------------------------
-
-    def _settle(self, at_end: bool) -> None:
-        """Count the flows that are over, and forget their steps."""
-        forest, n_paths = self._forest, len(self.paths)
-        if not len(forest) and not at_end:
-            return
-        held = np.zeros(len(forest), dtype=np.bool_)
-        if not at_end:
-            for place in self._places:
-                place.runs = place.runs[-self._kept:]
-                place.messages = place.messages[-self._kept:]
-                for numbers in (place.last, place.runs[:, 1], place.messages[:, 2]):
-                    held[numbers[numbers != NONE]] = True
-        now = max(0, forest.latest - LAG_NS)
-        flows, numbers = forest.settle(held)
-        to_come = [(NEVER, NEVER, NEVER)] * n_paths if at_end else forest.bounds(now)
-        for number, figures in enumerate(self._figures):
-            figures.add(flows[flows[:, F_PATH] == number], to_come[number])
-        for place in self._places:
-            place.last = numbers[place.last]
-            place.runs[:, 1] = numbers[place.runs[:, 1]]
-            place.messages[:, 1] = 0
-            place.messages[:, 2] = numbers[place.messages[:, 2]]
+    def _publish(
+        self, steps: _Steps, position: int, callback: Callback, ran: Executions, step: Ints,
+        topics: list[int],
+    ) -> tuple[_Timeline, Ints]:
+        """Make the steps of what was published at a position; return when, and the messages."""
+        sent = np.concatenate([self._sent[topic] for topic in topics], axis=1)
+        if len(topics) > 1:
+            sent = sent[:, sort_by(sent[4])]
+        mine = (sent[0] == self._places[callback.key]) | (
+            (sent[0] == NONE) & (sent[1] == self._nodes[callback.node]))
+        place, _, run, message, time = sent[:, mine]
+        at = _find(ran.runs, run)
+        parent = np.where((place != NONE) & (at != NONE), step[at], NONE) if len(step) \
+            else np.full(len(at), NONE)
+        latest = (parent == NONE) & ((callback.kind == 'sync') | (place == NONE))
+        parent[latest] = _Timeline(ran.start, step).as_of(time[latest], before=True)
+        made = steps.add(position, parent, False, time)
+        known = (made != NONE) & (message != NONE)
+        return _Timeline(time, made), np.column_stack((message, time, made))[known]
 
     def results(self) -> dict[str, Any]:
         """
-        Return by path its figures, all times in ns, once all input is there.
+        Return by path its figures, all times in ns.
 
         ``flows`` counts the inputs and ``arrived`` those whose flow reached the last callback.
-        ``response_time`` has CARET's cases (see ``path_flows``) from the first publication to the
-        start of the last callback, ``whole`` those from the start of the first to the end of the
-        last.  ``reaction_time`` is the worst case with external latency, ``data_age`` that of
-        every output.  Median and p99 are exact up to 32,768 response times; where there are more,
-        ``quantiles_within`` says how exact they are, as a share.
+        ``response_time`` has CARET's cases from the first publication to the start of the last
+        callback, ``whole`` those from the start of the first to the end of the last.
+        ``reaction_time`` is the worst case with external latency, ``data_age`` that of every
+        output.
         """
-        if self._results is None:
-            self._round()
-            self._settle(True)
-            self._results = {
-                path.name: {'callbacks': list(path.callbacks), 'hops': [hop.kind for hop in hops],
-                            **figures.result()}
-                for path, hops, figures in zip(self.paths, self.hops, self._figures)}
-        return self._results
+        found = {}
+        for number, (path, path_hops) in enumerate(zip(self.paths, self.hops)):
+            flows = self.flows(number)
+            found[path.name] = {
+                'callbacks': list(path.callbacks), 'hops': [hop.kind for hop in path_hops],
+                'flows': len(flows.arrival), 'arrived': int((flows.arrival != NONE).sum()),
+                **figures(flows.first, flows.arrival), 'whole': figures(flows.begin, flows.end)}
+        return found
 
 
-class Paths(Observer):
+class _Timeline(NamedTuple):
+    """Which step was the last one from when on; in order of time."""
+
+    times: Ints
+    steps: Ints
+
+    def as_of(self, times: Ints, before: bool = False) -> Ints:
+        """Return the last steps at some times, or ``before`` them."""
+        if not len(self.times):
+            return np.full(len(times), NONE)
+        at = np.searchsorted(self.times, times, 'left' if before else 'right') - 1
+        found: Ints = np.where(at >= 0, self.steps[at], NONE)
+        return found
+
+
+class _Steps:
+    """The steps of a path."""
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._parts: list[tuple[int, Ints, bool, Ints]] = []
+        self._ends: list[tuple[Ints, Ints]] = []
+
+    def add(self, position: int, parent: Ints, is_run: bool, times: Ints) -> Ints:
+        """Add steps, if there is a parent or the path begins; return their numbers."""
+        wanted = (parent != NONE) | (position == 0)
+        numbers = np.where(wanted, self._n + np.cumsum(wanted) - 1, NONE)
+        self._n += int(wanted.sum())
+        self._parts.append((position, parent[wanted], is_run, times[wanted]))
+        return numbers
+
+    def end(self, steps: Ints, times: Ints) -> None:
+        """Note when steps ended."""
+        self._ends.append((steps, times))
+
+    def table(self) -> Table:
+        """Return the steps as a table of ``STEPS``."""
+        lengths = [len(parent) for _, parent, *_ in self._parts]
+        table = np.zeros(self._n, dtype=STEPS)
+        table['position'] = np.repeat([position for position, *_ in self._parts], lengths)
+        table['is_run'] = np.repeat([is_run for *_, is_run, _ in self._parts], lengths)
+        table['parent'] = np.concatenate([parent for _, parent, *_ in self._parts])
+        table['time'] = np.concatenate([times for *_, times in self._parts])
+        table['end'] = NONE
+        for steps, times in self._ends:
+            table['end'][steps] = times
+        return table
+
+
+def leaves(steps: Table, last: int) -> Ints:
     """
-    Tells a book what happens in a run.
+    Return the steps with which flows end: those without children that are no dead ends.
 
-    :param run: which knows who publishes and takes what.
-    :ivar book: has the figures of the paths.
+    :param last: the last position of the path.
     """
-
-    def __init__(self, run: Run) -> None:
-        task_set, self._who, self._by_job = run.task_set, run.who, run.declared
-        self.book = book = PathBook(task_set, KEPT if self._by_job else KEEP, self._by_job)
-        self._n_dags, self._n_vertices = max(1, len(task_set.dags)), len(task_set.vertices) + 1
-        # by vertex; the last stands for none
-        self._callback = np.array([
-            *(book.callbacks[v.callback.key] if v.callback.key in book.on_path else NONE
-              for v in task_set.vertices), NONE])
-        self._takes_topics = np.array(
-            [*(bool(v.callback.topics) for v in task_set.vertices), False])
-        self._publishes = [[book.topics[topic] for topic in v.callback.publishes
-                            if topic in book.topics] for v in task_set.vertices]
-
-    def take(self, batch: Batch) -> None:
-        """Tell it what callbacks on paths did."""
-        if self.book:
-            self.book.add(len(batch.order) + 1,
-                          *(self._of_jobs(batch) if self._by_job else self._of_links(batch)))
-
-    def _of_links(self, batch: Batch) -> tuple[Ints, ...]:
-        """Return what the linker of an imported recording found."""
-        began, ended, took = (self._on_paths(batch, kind, 1) for kind in (BEGAN, OVER, TOOK))
-        callback, vertex, run, start, message = began[:, 2:7].T
-        publisher, vertex_of, run_of, sent, time = batch.columns(SENT).T
-        return (
-            np.column_stack((began[:, :2], run, start, self._topics(vertex, callback), message,
-                             vertex)),
-            ended[:, [0, 1, 4, 5]],
-            self._sent(batch.places(SENT), publisher, vertex_of, run_of, lambda row, _: sent[row],
-                       time),
-            took[:, [0, 1, 4, 5]])
-
-    def _of_jobs(self, batch: Batch) -> tuple[Ints, ...]:
-        """Return what ran in jobs."""
-        started, ran = (
-            self._on_paths(batch, kind, column) for kind, column in ((STARTED, 1), (RAN, 2)))
-        dag, vertex, job, ready, start, callback, _ = started[:, 2:].T
-        begun = np.column_stack((
-            started[:, :2], self._run(vertex, job, ready), start, self._topics(vertex, callback),
-            job * self._n_dags + dag, vertex))
-        ended = np.column_stack((
-            ran[:, :2], self._run(ran[:, 4], ran[:, 5], ran[:, 7]), ran[:, 9]))
-        if not self._who.every_publisher:     # what is published is not recorded
-            return begun, ended, self._at_ends(ended, ran)
-        publisher, _, dag, vertex, job, ready, time = batch.columns(PUBLISHED).T
-
-        def message(row: Ints, topic: Ints) -> Ints:
-            return np.where(dag[row] < 0, NONE, self.book.message(
-                job[row] * self._n_dags + dag[row], vertex[row], topic))
-
-        return begun, ended, self._sent(
-            batch.places(PUBLISHED), publisher, vertex, self._run(vertex, job, ready), message,
-            time)
-
-    def _on_paths(self, batch: Batch, kind: int, column: int) -> Ints:
-        """Return the rows of a kind of vertices on paths, behind place and callback's number."""
-        rows = batch.columns(kind)
-        callback = self._callback[rows[:, column]]
-        chosen = np.flatnonzero(callback != NONE)
-        return np.column_stack((batch.places(kind)[chosen], callback[chosen], rows[chosen]))
-
-    def _run(self, vertex: Ints, job: Ints, ready: Ints) -> Ints:
-        """Return the numbers of executions: nearly ascending, which is quick to sort."""
-        return (ready + (job << _JOB)) * self._n_vertices + vertex
-
-    def _topics(self, vertex: Ints, callbacks: Ints) -> Ints:
-        """Return the numbers of callbacks' topics: -2 of one that no path leads over."""
-        different, which = np.unique(callbacks, return_inverse=True)
-        topics = [self._who.topic(callback) for callback in different.tolist()]
-        numbers = np.array([self.book.topics.get(topic, -2) if topic else NONE
-                            for topic in topics], dtype=np.int64)
-        return np.where(self._takes_topics[vertex], numbers[which], NONE)
-
-    def _at_ends(self, ended: Ints, ran: Ints) -> Ints:
-        """Return what is published when a callback ends, of which nothing is recorded."""
-        parts = [np.empty((0, _N_PUBLISHED), dtype=np.int64)]
-        for vertex, mine in by_column(np.column_stack((ended, ran[:, [3, 5, 4]])), 6).items():
-            place, callback, run, time, dag, job, _ = mine.T
-            parts += [np.column_stack(np.broadcast_arrays(
-                place, callback, NONE, run, topic,
-                self.book.message(job * self._n_dags + dag, vertex, topic), time))
-                for topic in self._publishes[vertex]]
-        found = np.concatenate(parts)
-        return found[np.argsort(found[:, 0], kind='stable')]
-
-    def _sent(
-        self, places: Ints, publisher: Ints, vertex: Ints, run: Ints,
-        message: Callable[[Ints, Ints], Ints], time: Ints,
-    ) -> Ints:
-        """
-        Return what is published on topics that paths lead over.
-
-        :param message: returns the numbers of the messages in some rows, of their topics.
-        """
-        different, which = np.unique(publisher, return_inverse=True)
-        known = [self._who.every_publisher.get(number) for number in different.tolist()]
-        topic, node = np.array(
-            [(NONE, NONE) if each is None else (
-                self.book.topics.get(each.topic, NONE),
-                self.book.nodes.get(each.node.name if each.node is not None else '', NONE))
-             for each in known], dtype=np.int64).reshape(-1, 2)[which].T
-        callback = self._callback[vertex]
-        row = np.flatnonzero((topic != NONE) & ((callback != NONE) | (vertex < 0)))
-        return np.column_stack((
-            places[row], callback[row], node[row], run[row], topic[row],
-            message(row, topic[row]), time[row]))
+    parent, is_run = steps['parent'], steps['is_run']
+    child = parent != NONE
+    inner = np.zeros(len(steps), dtype=np.bool_)
+    inner[parent[child]] = True
+    # a dead end: another execution that read the same step went on
+    went_on = np.zeros(len(steps), dtype=np.bool_)
+    went_on[parent[child & is_run & inner]] = True
+    dead = ~inner & child & is_run & (steps['position'] != last)
+    dead[dead] = went_on[parent[dead]]
+    return np.flatnonzero(~inner & ~dead)
 
 
-def by_column(rows: Ints, column: int) -> dict[int, Ints]:
-    """Return rows by what stands in a column, in order."""
-    if not len(rows):
-        return {}
-    rows = rows[np.argsort(rows[:, column].astype(np.int16), kind='stable')]
-    begins = np.flatnonzero(np.r_[True, rows[1:, column] != rows[:-1, column]])
-    return dict(zip(rows[begins, column].tolist(), np.split(rows, begins[1:])))
+def flows_of(steps: Table, last: int) -> Flows:
+    """Return the flows: the branches from steps without a parent to those without children."""
+    step = leaves(steps, last)
+    found = Flows(*(np.full(len(step), NONE) for _ in Flows._fields))
+    flow = np.arange(len(step))
+    while len(step):
+        of = steps[step]
+        run, begin, at_last = of['is_run'], of['position'] == 0, of['position'] == last
+        for chosen, into, values in (
+                (run & at_last, found.arrival, of['time']), (run & begin, found.begin, of['time']),
+                (run & at_last, found.end, of['end']),
+                (~run & begin & (of['time'] != 0), found.first, of['time'])):
+            into[flow[chosen]] = values[chosen]
+        more = of['parent'] != NONE
+        flow, step = flow[more], of['parent'][more]
+    return found._replace(first=np.where(found.first == NONE, found.begin, found.first))
 
 
-def _timeline(place: _Place, which: int, order: Ints, steps: Ints) -> tuple[Ints, Ints]:
-    """Return when which step was the last one, with that of the round before."""
-    steps = np.concatenate([place.last[which:which + 1], steps])
-    place.last[which] = steps[-1]
-    return np.concatenate([np.zeros(1, dtype=np.int64), order]), steps
+def figures(start: Ints, end: Ints) -> dict[str, Any]:
+    """
+    Return the figures of CARET's cases, of reaction time and data age.
+
+    :param start: of each flow, -1 where it has none: it is left out.
+    :param end: of each flow, -1 where it did not arrive.
+    """
+    times = {name: spread(each) for name, each in cases(start, end).items()}
+    data_age = times.pop('data_age')
+    return {'response_time': times, 'reaction_time': times['worst_with_external_latency'],
+            'data_age': data_age}
 
 
-def _as_of(order: Ints, steps: Ints, when: Ints) -> Ints:
-    """Return the last step before each place in the order."""
-    return steps[np.searchsorted(order, when) - 1]
+def cases(start: Ints, end: Ints) -> dict[str, Ints]:
+    """Return the response times of flows by case, and the data ages (see ``figures``), ns."""
+    known = (start != NONE) & ((end == NONE) | (end >= start))
+    start, end = start[known], end[known]
+    arrived = end != NONE
+    order = sort_by(end[arrived], start[arrived])
+    inputs, outputs = start[arrived][order], end[arrived][order]
+    newest = np.flatnonzero(np.r_[outputs[1:] != outputs[:-1], True][:len(outputs)])
+    found = {**{name: np.empty(0, dtype=np.int64) for name in _CASES},
+             'data_age': (outputs - inputs)[newest]}
+    order = sort_by(start)
+    start, end, arrived = start[order], end[order], arrived[order]
+    if not arrived.any():
+        return found
+    # each input has the earliest of its own ends, or else of those after it
+    earliest = np.minimum.accumulate(np.where(arrived, end, _NEVER)[::-1])[::-1]
+    first = np.flatnonzero(np.r_[True, start[1:] != start[:-1]])
+    own = np.minimum.reduceat(np.where(arrived, end, earliest), first)
+    inputs = start[first]
+    counted = (own < _NEVER) & (own != own.min())   # what came before the earliest is not known
+    inputs, own = inputs[counted], own[counted]
+    took = own - inputs
+    found['all'] = took
+    found['worst'] = took[np.unique(own, return_index=True)[1]]
+    found['best'] = took[::-1][np.unique(own[::-1], return_index=True)[1]]
+    after = np.unique(own[1:], return_index=True)[1]
+    found['worst_with_external_latency'] = own[1:][after] - inputs[after]
+    return found
 
 
-def _step_of(runs: Ints, wanted: Ints) -> Ints:
-    """Return the steps of runs, of which there is a sorted table."""
+def _first_pieces(table: Table) -> Ints:
+    """Return by row of ``executions`` the row of the first piece of that execution."""
+    found = np.arange(len(table))
+    later = np.flatnonzero(table['piece'] > 0)
+    if len(later):
+        names = ['callback', 'vertex', 'job', 'ready', 'began']
+        several = np.unique(table['callback'][later])
+        first = np.flatnonzero((table['piece'] == 0) & np.isin(table['callback'], several))
+        of = dict(zip(table[names][first].tolist(), first.tolist()))
+        found[later] = [of.get(key, row) for key, row in zip(
+            table[names][later].tolist(), later.tolist())]
+    return found
+
+
+def _find(runs: Ints, wanted: Ints) -> Ints:
+    """Return the places of runs, -1 of those that are not there."""
     if not len(runs):
-        return np.full(len(wanted), NONE, dtype=np.int64)
-    at = np.minimum(np.searchsorted(runs[:, 0], wanted), len(runs) - 1)
-    return np.where(runs[at, 0] == wanted, runs[at, 1], NONE)
+        return np.full(len(wanted), NONE)
+    order = np.argsort(runs, kind='stable')
+    at = np.minimum(np.searchsorted(runs[order], wanted), len(runs) - 1)
+    return np.where(runs[order][at] == wanted, order[at], NONE)
 
 
-def _message(table: Ints, wanted: Ints, when: Ints) -> Ints:
-    """Return the last step of each message before a place in the order."""
-    known, number = np.unique(table[:, 0], return_inverse=True)
-    if not len(known):
-        return np.full(len(wanted), NONE, dtype=np.int64)
-    place = number << _ORDER | table[:, 1]
-    order = np.argsort(place, kind='stable')
-    place, steps = place[order], table[order, 2]
-    of = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
-    at = np.searchsorted(place, of << _ORDER | when) - 1
-    return np.where((known[of] == wanted) & (at >= 0) & (place[at] >> _ORDER == of),
-                    steps[at], NONE)
+def _as_of_each(messages: Ints, wanted: Any, times: Ints) -> Ints:
+    """
+    Return the last step of each message up to a time, -1 where there is none.
+
+    :param messages: rows of message, time and step.
+    """
+    n = len(messages)
+    number = np.r_[messages[:, 0], wanted]
+    is_asked = np.r_[np.zeros(n, dtype=np.int64), np.ones(len(wanted), dtype=np.int64)]
+    order = sort_by(number, np.r_[messages[:, 1], times], is_asked)
+    places = np.arange(len(order))
+    is_message: Mask = order < n
+    last = np.maximum.accumulate(np.where(is_message, places, NONE))
+    good = ~is_message & (last >= 0)
+    good[good] = number[order[last[good]]] == number[order[good]]
+    found = np.full(len(wanted), NONE)
+    found[order[good] - n] = messages[order[last[good]], 2]
+    return found
 
 
 def hops(task_set: TaskSet, path: Path) -> list[Hop]:

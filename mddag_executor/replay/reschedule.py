@@ -19,12 +19,12 @@ from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, POLICIES, processes_of, 
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
-from mddag_executor.replay.as_recorded import Progress, recording_result, Replay
+from mddag_executor.recording.head import Head, ReplayError
+from mddag_executor.recording.tables import Recording
+from mddag_executor.replay.as_recorded import recording_result, Replay
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
-from mddag_executor.replay.own import OwnRun
-from mddag_executor.replay.recording import Head, ReplayError
-from mddag_executor.replay.run import open_run, Recording, Run
+from mddag_executor.replay.run import Given, open_recording, Progress, undeclared
 from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import LogEntry, schedule, Settings
@@ -134,14 +134,15 @@ class Reschedule:
                 'busy_ns': {str(w): took for w, took in enumerate(self.busy)},
                 'use': share(sum(self.busy), self.workers, duration)},
             'recorded': None if self.recorded is None else {
-                'policy': self.recorded.run.head.policy, 'workers': self.recorded.run.head.workers,
+                'policy': self.recorded.recording.head.policy,
+                'workers': self.recorded.recording.head.workers,
                 **self.recorded.tally.result()},
             'recording': self._about, **({'notes': self.notes} if self.notes else {}),
             'warnings': self.warnings}
 
 
 def reschedule(
-    path: Recording,
+    path: Given,
     task_set: TaskSet | None = None,
     *,
     policy: str | None = None,
@@ -182,9 +183,11 @@ def reschedule(
         find_policy(policy).mode(bool(preemptive))
     if workers is not None and not 1 <= workers <= MOST_WORKERS:
         raise UsageError(f'workers: {workers} is out of range: give 1 to {MOST_WORKERS}')
-    run = open_run(path, task_set, name, needs_declaration=True)
+    run = open_recording(path, task_set, name, progress)
+    if not run.declared and task_set is None:
+        raise undeclared(run.name)
     head = run.head
-    each, ran = (run.workers_each, run.placed) if isinstance(run, OwnRun) else (head.workers, ())
+    each, ran = run.workers_each, run.placed
     policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
     cpus = cpus or head.cpus or None
     if preemptive is None:
@@ -193,10 +196,9 @@ def reschedule(
     tables = Tables.build(
         run.task_set, default_deadline=head.default_deadline, max_active_jobs=bound,
         expire_after=EXPIRE_AFTER_NS)
-    builder = LoadBuilder(
-        run.task_set, tables, run.who, each, max(0, head.cpus), _processes(run, ran))
-    builders = [builder]
-    recorded = Replay(run, skip, progress, lambda _: builders, paths=False)
+    recorded = Replay(run, skip)
+    with no_garbage():
+        builder = LoadBuilder(run, tables, each, max(0, head.cpus), _processes(run, ran))
     give_back()
     placed = _placed(run, ran, builder) if processes is None else processes(
         run.task_set, builder.times())
@@ -216,8 +218,7 @@ def reschedule(
             'give a GRAPH that declares it')
     tables = with_groups(
         tables, builder.callback_of, run.who.groups, declared_first=not run.same)
-    builders.clear()    # what it holds, the load has too
-    del builder
+    del builder     # what it holds, the load has too
     give_back()
     warnings = recorded.warnings
     if cpus is not None and run.declared and len(work.load.computed) == 0:
@@ -226,7 +227,7 @@ def reschedule(
             'execution computes all the time')
     settings = Settings(
         policy, workers, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
-        judge_from=recorded.judge.judge_from, processes=max(1, len(placed)))
+        judge_from=recorded.judged.judge_from, processes=max(1, len(placed)))
     start = run.end if run.start is None else run.start
     with no_garbage():
         return Reschedule(
@@ -234,12 +235,12 @@ def reschedule(
             skip=skip, overheads=overheads, processes=placed, recorded=recorded)
 
 
-def _processes(run: Run, placed: Sequence[Process]) -> list[int]:
+def _processes(run: Recording, placed: Sequence[Process]) -> list[int]:
     return processes_of(replace(run.task_set, processes=tuple(placed)))
 
 
 def _placed(
-    run: Run, recorded: Sequence[Process], builder: LoadBuilder
+    run: Recording, recorded: Sequence[Process], builder: LoadBuilder
 ) -> Sequence[Process]:
     """
     Return the processes of a recording, or those of another declaration that judges it.

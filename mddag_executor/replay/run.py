@@ -1,35 +1,21 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded runs of every kind: one place that distinguishes them."""
+"""Recordings of every kind: one place that distinguishes them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 import os
-import shutil
-import tempfile
-from typing import TYPE_CHECKING, Union
-import weakref
 
-from mddag_executor.replay.own import OwnRun
-from mddag_executor.replay.recording import is_declared, named_errors, read_head, ReplayError
+from mddag_executor.recording.head import is_declared, named_errors, read_head, ReplayError
+from mddag_executor.recording.mapping import judged_by
+from mddag_executor.recording.own import read_own
+from mddag_executor.recording.tables import Recording
 from mddag_executor.trace import TraceReader
 from msg_graph import TaskSet
 
-if TYPE_CHECKING:
-    from mddag_executor.replay.imported_run import ImportedRun
-
-Run = Union[OwnRun, 'ImportedRun']
-"""
-What all have: ``play``, and
-
-* ``name`` of the recording, its ``head`` (policy, workers, …), the ``task_set`` that judges,
-  ``declared``: whether the recording itself says which deadlines there are, ``same``: whether
-  these judge, and ``imported``: whether another executor ran it;
-* once it has been played: ``start`` and ``end`` (ns), ``shut_down``: whether the end is recorded,
-  ``lost`` events, ``dropped`` messages by reason, and ``warnings``.
-"""
+Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -51,63 +37,65 @@ class Traces:
         return ', '.join(self.paths)
 
 
-Recording = str | os.PathLike[str] | Sequence[str] | Traces | TraceReader
+Given = str | os.PathLike[str] | Sequence[str] | Traces | TraceReader
 """A trace or its path, or the paths of the traces of all processes of one run."""
 
 
-def open_run(
-    path: Recording, task_set: TaskSet | None = None, name: str | None = None,
-    needs_declaration: bool = False,
-) -> Run:
+def open_recording(
+    path: Given, task_set: TaskSet | None = None, name: str | None = None,
+    progress: Progress | None = None,
+) -> Recording:
     """
-    Open a recorded run, of this executor or of another one.
+    Read a recording: a trace of this executor, an imported one, or the traces of one run.
 
     :param task_set: the declaration that judges; None: the one in the trace, if it has one.
-    :param needs_declaration: whether there must be one.
+    :param name: what messages call the recording, where that is not its path.
+    :param progress: called now and then with the number of events read so far.
+    :raises mddag_executor.trace.TraceError: when it is no trace.
+    :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, or none of
+        the declaration's callbacks.
     """
     if not isinstance(path, (str, os.PathLike, TraceReader)):
-        return _joined(path if isinstance(path, Traces) else Traces(path), task_set)
+        traces = path if isinstance(path, Traces) else Traces(path)
+        from mddag_executor.replay.joining import Joined
+        joined = Joined([(path, path) for path in traces.paths], traces.offsets)
+        return judged_by(joined.recording(progress), task_set)
     reader = path if isinstance(path, TraceReader) else None
     path = os.fspath(path) if not isinstance(path, TraceReader) else path.path
     with named_errors(path, name or path):
         reader = reader or TraceReader(path)
         head = read_head(reader)
         if head is not None and (task_set is None or is_declared(head)):
-            return OwnRun(reader, name or path, head, task_set)
+            return judged_by(read_own(reader, name or path, head, progress), task_set)
         if head is not None and task_set is not None:
             from mddag_executor.replay.undeclared_run import UndeclaredRun
-            return UndeclaredRun(reader, name or path, head, task_set)
+            return UndeclaredRun(reader, name or path, head, task_set).read(progress)
         from mddag_executor.replay.imported_run import ImportedRun
-        run = ImportedRun(reader, name or path, task_set)
-    if needs_declaration and task_set is None:
-        raise ReplayError(
-            run.name, 'it was imported, so nothing in it says which callbacks have which '
-            'deadlines', 'give the GRAPH')
-    return run
+        return ImportedRun(reader, name or path, task_set).read(progress)
 
 
-def _joined(traces: Traces, task_set: TaskSet | None) -> OwnRun:
-    """Return the run of several traces; it can be played once."""
-    from mddag_executor.replay.joining import Joined
-    joined = Joined([(path, path) for path in traces.paths], traces.offsets)
-    folder = tempfile.mkdtemp(prefix='mddag-')
-    path = os.path.join(folder, 'joined.mcap')
-    try:
-        joined.write(path)
-        with named_errors(path, joined.name):
-            reader = TraceReader(path)
-            head = read_head(reader)
-            assert head is not None
-            run = OwnRun(reader, joined.name, head, task_set)
-            run.processes, run.placed = len(traces.paths), joined.placed()
-            run.workers_each = joined.workers_each
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    run.when_played = weakref.finalize(run, shutil.rmtree, folder, ignore_errors=True)
-    run.same = False  # each process judged its own part of the jobs
-    run.notes, run.worker_names = joined.warnings, joined.worker_names
-    return run
+def check_declared(path: Given, name: str) -> None:
+    """
+    Find out whether a recording says which deadlines there are.
+
+    :raises ReplayError: when it does not.
+    """
+    if isinstance(path, (str, os.PathLike, TraceReader)):
+        reader = path if isinstance(path, TraceReader) else None
+        path = os.fspath(path) if not isinstance(path, TraceReader) else path.path
+        with named_errors(path, name):
+            reader = reader or TraceReader(path)
+            if read_head(reader) is None:
+                from mddag_executor.replay.imported_run import ImportedRun
+                ImportedRun(reader, name, None)     # unless it is none
+                raise undeclared(name)
+
+
+def undeclared(name: str) -> ReplayError:
+    """Return the error for a recording that is to be judged, but says nothing of deadlines."""
+    return ReplayError(
+        name, 'it was imported, so nothing in it says which callbacks have which deadlines',
+        'give the GRAPH')
 
 
 def has_declaration(path: str | os.PathLike[str], name: str | None = None) -> bool:

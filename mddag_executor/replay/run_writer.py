@@ -10,25 +10,30 @@ is its place in the declaration, from 1.  An execution that was preempted is rec
 a coroutine that was suspended.  A sync callback, which the simulator runs once, completes with all
 its legs at its end, and all of its time is the last one's.  Where executions shared CPUs or held
 the interpreter, their CPU time is recorded, which is their execution time, and whether they did.
+
+Events are in the order of time.  At one instant ends, completions and releases are in the order in
+which the core saw them, each with the verdicts that came of it; then comes what started.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 import os
 from typing import Any
 
-from mddag_executor.core import DEFAULT_DEADLINE_NS, rad_offsets
-from mddag_executor.core.state import Decision, DROP, JOB_END, SINK_IN_TIME
+from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, rad_offsets, Tables
+from mddag_executor.core.state import DROP
+from mddag_executor.recording import tables
 from mddag_executor.replay.computed import ComputedRun
-from mddag_executor.replay.happenings import Observer
-from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.deadlines import Judged
 from mddag_executor.simulate import Load, SimulatedRun
 from mddag_executor.trace import TraceFile
 from msg_graph import TaskSet
 
 PROCESS = 1
 _MOST = 2 ** 31 - 1
+_Entry = tuple[tuple[int, int, int], str, int, int, tuple[Any, ...]]
+"""Place in the order, name, time, thread, fields."""
 
 
 def write_trace(
@@ -50,92 +55,65 @@ def write_events(
     for place, callback in enumerate(task_set.callbacks, 1):
         add('rclcpp_callback_register', 0, 0, place, callback.key)
     computed = ComputedRun.of_run(task_set, load, run)
-    writer = RunWriter(computed, settings.cpus is not None, add)
-    computed.play([Judge(task_set, compare=False), writer])
-    writer.end(run.ended_ns)
+    knows_cpu = settings.cpus is not None or len(load.holds) > 0
+    events = sorted(_events(computed, knows_cpu), key=lambda event: event[0])
+    for _, name, time, thread, fields in events:
+        add(name, time, thread, *fields)
+    add('shutdown', run.ended_ns, 0, run.ended_ns)
 
 
-class RunWriter(Observer):
-    """
-    Gives out what happens as events; comes after the judge.
+def _events(run: ComputedRun, knows_cpu: bool) -> Iterator[_Entry]:
+    recording = run.recording()
+    judged = Judged(recording)
+    local = judged.tables.index_in_dag
+    release: dict[tuple[int, int], int] = {}
+    for row in recording.releases.tolist():
+        _, dag, job, released, now, order = row
+        release[dag, job] = released
+        yield (now, order, 0), 'job_release', now, 0, (dag, job, released)
+    yield from _executions(run, recording.executions, local, release, knows_cpu)
+    for _, dag, _, job, now, reason, order in recording.job_ends.tolist():
+        if reason != tables.FAILED:
+            name = 'abort' if reason == tables.ABORTED else 'expire'
+            yield (now, order, 0), name, now, 0, (dag, job)
+    missed = judged.missed
+    for _, dag, sink, job, _, deadline, completed, until, _, order in missed.tolist():
+        yield (until, min(order, NEVER), 1), 'deadline', until, 0, (
+            dag, local[sink], job, deadline, completed)
+    address = [place + 1 for place in run.task_set.places_of_vertices()]
+    for kind, dag, vertex, job, _, now in run.decisions:
+        if kind == DROP:
+            yield (now, NEVER - 2, 0), 'drop', now, 0, (
+                address[vertex], dag, local[vertex], job, 'aborted')
 
-    :param shares: whether executions shared CPUs.
-    """
 
-    def __init__(self, run: ComputedRun, shares: bool, add: Callable[..., object]) -> None:
-        self._add, self._load = add, run.load
-        self._knows_cpu = shares or len(run.load.holds) > 0
-        self._vertices = run.task_set.vertices
-        self._address = [place + 1 for place in run.task_set.places_of_vertices()]
-        self._rad = [offset for dag in run.task_set.dags for offset in rad_offsets(dag)]
-        self._drops = [each for each in run.decisions if each[0] == DROP][::-1]
-        self._decided: list[Decision] = []
-        # by job its release, and by vertex and job the worker that runs it
-        self._release: dict[tuple[int, int], int] = {}
-        self._worker: dict[tuple[int, int], int] = {}
-
-    def end(self, now: int) -> None:
-        """Write what is left, and the end."""
-        self._decisions(now)
-        self._add('shutdown', now, 0, now)
-
-    def released(self, dag: int, job: int, release: int, now: int) -> None:
-        """Write a release."""
-        self._release[dag, job] = release
-        self._add('job_release', now, 0, dag, job, release)
-        self._decisions(now)
-
-    def started(
-        self, dag: int, vertex: int, job: int, ready: int, start: int, callback: int, worker: int
-    ) -> None:
-        """Write a dispatch."""
-        self._decisions(start)
-        self._worker[vertex, job] = worker
-        self._add('dispatch', start, worker + 1, callback, dag, self._vertices[vertex].index, job,
-                  worker, ready, self._release[dag, job] + self._rad[vertex])
-        self._add('callback_start', start, worker + 1, callback, False)
-
-    def ran(
-        self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,
-        end: int, first: int,
-    ) -> None:
-        """Write the end of a piece."""
-        self._add('callback_end', end, worker + 1, callback)
-
-    def completed(
-        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
-        start: int, ended: int, busy: int, number: int, cpu: int, held: int,
-    ) -> None:
-        """Write a completion, and what it decided."""
-        of = self._vertices[vertex]
-        computed: tuple[Any, ...] = ()
-        if whole and self._knows_cpu:
-            load = self._load
-            place = load.cost_base[dag] + job * load.cost_stride[dag] + of.index
-            computed = load.costs[place], bool(load.holds and load.holds[place])
-        self._add('complete', end, self._worker[vertex, job] + 1, self._address[vertex], dag,
-                  of.index, job, bool(whole), end, leg, *computed)
-        if whole:
-            del self._worker[vertex, job]
-        self._decisions(end)
-
-    def ended(self, dag: int, job: int, aborted: bool, now: int) -> None:
-        """Write that a job was given up, and what that decided."""
-        self._add('abort' if aborted else 'expire', now, 0, dag, job)
-        self._decisions(now)
-
-    def decided(self, decisions: Sequence[Decision]) -> None:
-        """Keep verdicts, to write them after what they come of."""
-        self._decided += decisions
-
-    def _decisions(self, now: int) -> None:
-        """Write verdicts and what was dropped."""
-        for kind, dag, vertex, job, deadline, time in self._decided:
-            if kind not in (JOB_END, SINK_IN_TIME):
-                self._add('deadline', now, 0, dag, self._vertices[vertex].index, job, deadline,
-                          time)
-        self._decided.clear()
-        while self._drops and self._drops[-1][5] <= now:
-            _, dag, vertex, job, _, time = self._drops.pop()
-            self._add('drop', time, 0, self._address[vertex], dag, self._vertices[vertex].index,
-                      job, 'aborted')
+def _executions(
+    run: ComputedRun, executions: tables.Table, local: list[int],
+    release: dict[tuple[int, int], int], knows_cpu: bool,
+) -> Iterator[_Entry]:
+    load = run.load
+    rad = [offset for dag in run.task_set.dags for offset in rad_offsets(dag)]
+    n_legs = Tables.build(run.task_set, legs=True).n_legs
+    columns = ('callback', 'dag', 'vertex', 'job', 'leg', 'thread', 'worker', 'ready', 'start',
+               'end', 'completes', 'order')
+    for (callback, dag, vertex, job, leg, thread, worker, ready, start, end, completes,
+         order) in zip(*(executions[name].tolist() for name in columns)):
+        if vertex < 0:
+            continue    # the simulator has no undeclared callbacks of its own
+        yield (start, NEVER - 1, 0), 'dispatch', start, thread, (
+            callback, dag, local[vertex], job, worker, ready, release[dag, job] + rad[vertex])
+        yield (start, NEVER - 1, 1), 'callback_start', start, thread, (callback, False)
+        if end < 0:
+            continue
+        at = (end, order, -1) if completes and end > start else (
+            (end, -1, 0) if end > start else (end, NEVER - 1, 2))
+        yield at, 'callback_end', end, thread, (callback,)
+        for each in range(n_legs[vertex] if leg < 0 else 1) if completes else ():
+            whole = each == n_legs[vertex] - 1 or leg >= 0
+            computed: tuple[Any, ...] = ()
+            if whole and knows_cpu:
+                place = load.cost_base[dag] + job * load.cost_stride[dag] + local[vertex]
+                computed = load.costs[place], bool(len(load.holds) and load.holds[place])
+            at = (end, order, 0) if end > start else (end, NEVER - 1, 3)
+            yield at, 'complete', end, thread, (
+                callback, dag, local[vertex], job, whole, end, each, *computed)

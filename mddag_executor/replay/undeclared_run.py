@@ -27,11 +27,13 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_right
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-from mddag_executor.replay.entities import Address
-from mddag_executor.replay.happenings import Ints, Observer
+from mddag_executor.recording.entities import Address
+from mddag_executor.recording.head import Head, no_end
+from mddag_executor.recording.mapping import Target
+from mddag_executor.recording.tables import DROPS, Ints, Recording, rows, UNKNOWN
 from mddag_executor.replay.imported_run import Ended, ImportedRun
 from mddag_executor.replay.linker import (
     Event,
@@ -40,8 +42,6 @@ from mddag_executor.replay.linker import (
     Publication,
     Thread,
 )
-from mddag_executor.replay.mapping import Target
-from mddag_executor.replay.recording import Head, no_end
 from mddag_executor.trace import TraceReader
 from msg_graph import Dag, TaskSet
 import numpy as np
@@ -161,8 +161,6 @@ class UndeclaredRun(ImportedRun):
     :param task_set: the declaration that judges.
     """
 
-    imported = False
-
     def __init__(self, reader: TraceReader, name: str, head: Head, task_set: TaskSet) -> None:
         ready: dict[Address, array[int]] = {}
         for event in reader.events({_DISPATCH}, sorted=True):
@@ -181,23 +179,23 @@ class UndeclaredRun(ImportedRun):
             for time, count in zip(different[counts > 1].tolist(), counts[counts > 1].tolist()):
                 self._to_come[address, time] = count
 
-    def play(
-        self, observers: Sequence[Observer], progress: Callable[[int], None] | None = None
-    ) -> None:
-        """Give the observers everything."""
-        super().play(observers, progress)
+    def read(self, progress: Callable[[int], None] | None = None) -> Recording:
+        """Return the recording; ``progress`` is called now and then with a number of events."""
+        found = super().read(progress)
         assert isinstance(self._linker, _OwnLinker)
-        self.dropped = self._linker.dropped
-        self.shut_down = self._linker.ended is not None
+        found.shut_down = self._linker.ended is not None
+        if not found.shut_down:
+            found.warnings.append(no_end(self.name))
+        reasons = self._linker.dropped
+        found.drop_reasons = tuple(reasons)
+        found.drops = rows(
+            DROPS, reasons.total(), vertex=UNKNOWN, job=UNKNOWN, time=UNKNOWN,
+            reason=[number for number, n in enumerate(reasons.values()) for _ in range(n)])
+        return found
 
     def _judged_until(self) -> int:
         assert isinstance(self._linker, _OwnLinker)
         return self.end if self._linker.ended is None else self._linker.ended[1]
-
-    @property
-    def warnings(self) -> list[str]:
-        """Return what is missing or doubtful, one line each, once it has been played."""
-        return [*super().warnings, *([] if self.shut_down else [no_end(self.name)])]
 
     def _ready(self, run: Execution, message: Publication | None) -> int:
         return run.ready        # the executor says it
@@ -228,11 +226,12 @@ class UndeclaredRun(ImportedRun):
         if pieces is None:
             return super()._ended(run)
         self._to_come[key] -= 1
-        first = pieces.busy == 0
+        piece = pieces.count
+        pieces.count += 1
         pieces.busy += run.end - run.start
         if not self._to_come[key]:
             del self._to_come[key], self._pieces[key]
-        return Ended(first, key not in self._to_come, pieces.start, pieces.busy)
+        return Ended(piece, key not in self._to_come, pieces.start, pieces.busy)
 
 
 class _Pieces:
@@ -240,13 +239,13 @@ class _Pieces:
     What is known of a coroutine of which pieces are still to come.
 
     :ivar of: DAG, vertex and job; ``leg``: of a sync.
-    :ivar start: of the first piece; ``busy``: how long they ran so far.
+    :ivar start: of the first piece; ``count``: of them so far; ``busy``: how long these ran.
     """
 
-    __slots__ = ('of', 'leg', 'start', 'busy')
+    __slots__ = ('of', 'leg', 'start', 'count', 'busy')
 
     def __init__(self, of: tuple[int, int, int] | None, leg: int, start: int) -> None:
-        self.of, self.leg, self.start, self.busy = of, leg, start, 0
+        self.of, self.leg, self.start, self.count, self.busy = of, leg, start, 0, 0
 
 
 def _grid(ready: Ints, period: int) -> int | None:

@@ -1,81 +1,81 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""How much the callbacks ran and waited, and how busy the workers were."""
+"""
+What callbacks and workers used: executions, busy time, waiting, CPU time.
+
+An execution of a declared callback counts when it has completed; the time that it took so far
+counts in any case.
+"""
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from itertools import islice
 from typing import Any
 
-from mddag_executor.replay.entities import Entities
-from mddag_executor.replay.happenings import Batch, COMPLETED, Ints, Observer, RAN, sums
-from msg_graph import TaskSet
+from mddag_executor.recording.tables import groups, Ints, NOTHING, Recording, sort_by, Table
+from mddag_executor.replay.spans import Spans
 import numpy as np
 
-_KEEP = 256
-# Columns of what a callback used, ns: sums over all executions; of how many the CPU time is known,
-# what these took, and what they computed.
-(_EXECUTIONS, _BUSY, _LONGEST, _WAITING, _LONGEST_WAIT, _GROUP, _MEASURED, _MEASURED_BUSY, _CPU,
- _HELD) = range(10)
-_NAMES = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
-          'waiting_group_ns', 'measured', 'measured_busy_ns', 'cpu_ns', 'held_interpreter')
+NAMES = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
+         'waiting_group_ns', 'measured', 'measured_busy_ns', 'cpu_ns', 'held_interpreter')
+"""The figures of a callback; the last four are of the executions whose CPU time is known."""
+_MEASURED = NAMES.index('measured')
 
 
-class GroupWaits(Observer):
+def ran(recording: Recording) -> Ints:
+    """Return the rows of ``executions`` that have a start and an end, in order of their ends."""
+    table = recording.executions
+    rows = np.flatnonzero((table['start'] >= 0) & (table['end'] >= 0))
+    end = table['end'][rows]
+    if (end[1:] < end[:-1]).any():
+        rows = rows[sort_by(end)]
+    return rows
+
+
+def group_waits(recording: Recording) -> Ints:
     """
-    Finds out how much of each wait was for the callback group: while another of it ran.
+    Return by execution how long its group was busy while it waited, ns.
 
-    It observes before those that ask it.
-
-    :ivar found: of the last batch: by piece, how long its group was busy, ns.
+    Only callbacks of mutually exclusive groups wait for them.  The first piece of an execution
+    waits; the value is in all of its rows.
     """
-
-    def __init__(self, who: Entities) -> None:
-        self._who = who
-        # by group what ran in it last: start and end
-        self._busy: dict[int, deque[tuple[int, int]]] = {}
-        self.found: Ints = np.empty(0, dtype=np.int64)
-
-    def take(self, batch: Batch) -> None:
-        """Look how long pieces of executions waited."""
-        pieces = batch.columns(RAN)
-        self.found = np.zeros(len(pieces), dtype=np.int64)
-        number = self._who.groups
-        if not len(pieces) or not number:
-            return
-        callbacks, which = np.unique(pieces[:, 0], return_inverse=True)
-        group = np.array([number.get(callback, -1) for callback in callbacks.tolist()])[which]
-        rows = np.flatnonzero(group >= 0)
-        rows = rows[np.argsort(group[rows], kind='stable')]
-        begins = np.flatnonzero(np.r_[True, group[rows][1:] != group[rows][:-1]])
-        for mine in np.split(rows, begins[1:]) if len(rows) else ():
-            self._take_group(int(group[mine[0]]), mine, pieces[mine])
-
-    def _take_group(self, group: int, rows: Ints, pieces: Ints) -> None:
-        """Look at the pieces of a group, in order."""
-        before = self._busy.setdefault(group, deque(maxlen=_KEEP))
-        n = len(before)
-        busy = [*before, *zip(pieces[:, 6].tolist(), pieces[:, 7].tolist())]
-        ready = pieces[:, 5]
-        ended = np.r_[before[-1][1] if before else -1, pieces[:-1, 7]]
-        # only where the one before ended after this one was ready
-        for i in np.flatnonzero((ended > ready) & (pieces[:, 8] != 0)).tolist():
-            since, start, waited = int(ready[i]), busy[n + i][0], 0
-            for begun, end in islice(reversed(busy[max(0, n + i - _KEEP):n + i]), _KEEP):
-                if end <= since:
-                    break
-                waited += max(0, min(end, start) - max(begun, since))
-            self.found[rows[i]] = waited
-        before.extend(busy[max(n, len(busy) - _KEEP):])
+    table = recording.executions
+    waited = np.zeros(len(table), dtype=np.int64)
+    number = {callback: group for callback, group in recording.who.groups.items() if group >= 0}
+    if not number:
+        return waited
+    rows = ran(recording)
+    callbacks = np.array(sorted(number), dtype=np.int64)
+    at = np.minimum(np.searchsorted(callbacks, table['callback'][rows]), len(callbacks) - 1)
+    known = callbacks[at] == table['callback'][rows]
+    rows, group = rows[known], np.array([number[each] for each in callbacks.tolist()])[at[known]]
+    order = np.argsort(group, kind='stable')
+    rows, group = rows[order], group[order]
+    ready, start, end = (table[name][rows] for name in ('ready', 'start', 'end'))
+    for begin, until in zip(*groups(group)):
+        mine = slice(begin, until)
+        # only if the one before ended after this one was ready
+        late = np.flatnonzero(
+            (np.r_[-1, end[mine][:-1]] > ready[mine]) & (table['piece'][rows[mine]] == 0))
+        if len(late):
+            busy = Spans(start[mine], end[mine])
+            waited[rows[mine][late]] = busy.within(ready[mine][late], start[mine][late])
+    later = np.flatnonzero(table['piece'] > 0)
+    if len(later) and waited.any():
+        first = np.flatnonzero(waited)
+        of = {tuple(key): n for key, n in zip(
+            table[['callback', 'vertex', 'job', 'ready']][first].tolist(),
+            waited[first].tolist())}
+        waited[later] = [of.get(tuple(key), 0) for key in table[
+            ['callback', 'vertex', 'job', 'ready']][later].tolist()]
+    return waited
 
 
 class PoolUse:
     """
     How busy the pool was over time: in each step, how long all workers together ran callbacks.
 
-    Steps begin at multiples of their length; where there would be more than `MOST_STEPS`, it is
-    doubled.
+    Steps begin at multiples of their length.  If there are more than ``MOST_STEPS``, their length
+    is doubled.
 
     :param step: their length at first, ns.
     """
@@ -83,120 +83,93 @@ class PoolUse:
     FIRST_STEP_NS = 100_000_000
     MOST_STEPS = 600
 
-    def __init__(self, step: int = FIRST_STEP_NS) -> None:
+    def __init__(self, starts: Ints, ends: Ints, step: int = FIRST_STEP_NS) -> None:
+        some = starts < ends
+        starts, ends = starts[some], ends[some]
+        if len(starts):
+            first, last = int(starts.min()), int(ends.max()) - 1
+            while last // step - first // step >= self.MOST_STEPS:
+                step *= 2
         self.step = step
-        self._busy: dict[int, int] = {}
-
-    def add(self, starts: Ints, ends: Ints) -> None:
-        """Add executions, in the order of their ends."""
-        while len(starts) and int((ends // self.step - starts // self.step).max()
-                                  ) > self.MOST_STEPS:
-            self._double()
-        starts, ends = starts[starts < ends], ends[starts < ends]
-        while len(starts):
-            until = np.minimum(ends, (starts // self.step + 1) * self.step)
-            numbers, place = np.unique(starts // self.step, return_inverse=True)
-            busy = np.zeros(len(numbers), dtype=np.int64)
-            np.add.at(busy, place, until - starts)
-            for number, more in zip(numbers.tolist(), busy.tolist()):
-                self._busy[number] = self._busy.get(number, 0) + more
-            goes_on = until < ends
-            starts, ends = until[goes_on], ends[goes_on]
-        while len(self._busy) > self.MOST_STEPS:
-            self._double()
-
-    def _double(self) -> None:
-        self.step *= 2
-        merged: dict[int, int] = {}
-        for number, busy in self._busy.items():
-            merged[number // 2] = merged.get(number // 2, 0) + busy
-        self._busy = merged
+        self.start: int | None = None
+        self.busy: list[int] = []
+        if not len(starts):
+            return
+        number = int(starts.min()) // step
+        borders = (number + np.arange(int(ends.max() - 1) // step - number + 2)) * step
+        self.start = number * step
+        self.busy = Spans(starts, ends).within(borders[:-1], borders[1:]).tolist()
 
     def result(self) -> dict[str, Any]:
-        """Return the length of a step, the first's begin, and what each step was busy, ns."""
-        if not self._busy:
-            return {'step_ns': self.step, 'start_ns': None, 'busy_ns': []}
-        while max(self._busy) - min(self._busy) >= self.MOST_STEPS:
-            self._double()      # there are gaps
-        first = min(self._busy)
-        return {
-            'step_ns': self.step, 'start_ns': first * self.step,
-            'busy_ns': [self._busy.get(n, 0) for n in range(first, max(self._busy) + 1)]}
+        """Return the length of a step, the first's begin, and how long each step was busy, ns."""
+        return {'step_ns': self.step, 'start_ns': self.start, 'busy_ns': self.busy}
 
 
-class Usage(Observer):
+class Usage:
     """
-    Adds up what ran.
+    What ran in a recording.
 
-    ``waits``, which comes before, knows what was waited for.
-    An execution of a declared callback counts when it has completed; what it took so far counts
-    at once, also where it never completed.
+    :param waited: see ``group_waits``.
     """
 
-    def __init__(self, task_set: TaskSet, waits: GroupWaits | None = None) -> None:
-        self._waits = waits
+    def __init__(self, recording: Recording, waited: Ints) -> None:
+        task_set = recording.task_set
         self._places = task_set.places()
         # by global vertex the place of its callback, at last that of all undeclared ones
         self._place = np.array([*task_set.places_of_vertices(), len(self._places)])
-        # by place; Python's numbers, as sums of a damaged trace may be of any size
-        self._table = np.zeros((len(self._places) + 1, len(_NAMES)), dtype=object)
-        self.by_worker: Counter[int] = Counter()
-        self.pool = PoolUse()
-        self._counted = -1
+        self._table = np.zeros((len(NAMES), len(self._places) + 1), dtype=np.int64)
+        table, rows = recording.executions, ran(recording)
+        #: By worker how long it ran callbacks, ns.
+        self.by_worker: dict[int, int] = {}
+        if len(rows):
+            self._ran(table, rows, waited)
+            self._completed(table, rows)
+        self.pool = PoolUse(table['start'][rows], table['end'][rows])
 
-    def take(self, batch: Batch) -> None:
-        """Add what ran and what completed."""
-        pieces = batch.columns(RAN)
-        if len(pieces):
-            self._ran(pieces)
-        done = batch.columns(COMPLETED)
-        done = done[done[:, 10] >= 0]
-        if len(done):
-            numbers = done[:, 10]
-            done = done[np.r_[self._counted, numbers[:-1]] != numbers]   # not one leg more
-            self._counted = int(numbers[-1])
-            place = self._place[done[:, 1]]
-            self._add(_EXECUTIONS, place)
-            self._most(_LONGEST, place, done[:, 9])
-            known = done[:, 11] >= 0
-            place, done = place[known], done[known]
-            self._add(_MEASURED, place)
-            for column, field in ((_MEASURED_BUSY, 9), (_CPU, 11), (_HELD, 12)):
-                self._add(column, place, done[:, field])
+    def _ran(self, table: Table, rows: Ints, waited: Ints) -> None:
+        vertex, piece = table['vertex'][rows], table['piece'][rows]
+        start = table['start'][rows]
+        took, place = table['end'][rows] - start, self._place[vertex]
+        worker = table['worker'][rows]
+        for number in np.unique(worker).tolist():
+            self.by_worker[number] = int(took[worker == number].sum())
+        self._add('busy_ns', place, took)
+        first, undeclared = piece == 0, vertex < 0
+        self._add('executions', place[undeclared & first])
+        self._most('longest_ns', place[undeclared], took[undeclared])
+        place, wait = place[first], (start - table['ready'][rows])[first]
+        self._add('waiting_ns', place, wait)
+        self._most('longest_wait_ns', place, wait)
+        self._add('waiting_group_ns', place, waited[rows][first])
 
-    def _ran(self, pieces: Ints) -> None:
-        took, place = pieces[:, 7] - pieces[:, 6], self._place[pieces[:, 2]]
-        workers, which = np.unique(pieces[:, 4], return_inverse=True)
-        for worker, total in zip(workers.tolist(), sums(which, took, len(workers))):
-            self.by_worker[worker] += total
-        self.pool.add(pieces[:, 6], pieces[:, 7])
-        self._add(_BUSY, place, took)
-        first = pieces[:, 8] != 0
-        undeclared = pieces[:, 2] < 0
-        self._add(_EXECUTIONS, place[undeclared & first])
-        self._most(_LONGEST, place[undeclared], took[undeclared])
-        place, waited = place[first], (pieces[:, 6] - pieces[:, 5])[first]
-        self._add(_WAITING, place, waited)
-        self._most(_LONGEST_WAIT, place, waited)
-        if self._waits is not None and self._waits.found.any():
-            self._add(_GROUP, place, self._waits.found[first])
+    def _completed(self, table: Table, rows: Ints) -> None:
+        rows = rows[(table['completes'][rows] != NOTHING) & (table['vertex'][rows] >= 0)]
+        place, busy = self._place[table['vertex'][rows]], table['busy'][rows]
+        self._add('executions', place)
+        self._most('longest_ns', place, busy)
+        known = table['cpu'][rows] >= 0
+        place, rows = place[known], rows[known]
+        self._add('measured', place)
+        self._add('measured_busy_ns', place, busy[known])
+        self._add('cpu_ns', place, table['cpu'][rows])
+        self._add('held_interpreter', place, table['holds_gil'][rows])
 
-    def _add(self, column: int, places: Ints, values: Ints | None = None) -> None:
+    def _add(self, name: str, places: Ints, values: Any = None) -> None:
         """Add values of callbacks at these places; without values count them."""
-        self._table[:, column] += np.array(sums(
-            places, np.ones_like(places) if values is None else values, len(self._table)),
-            dtype=object)
+        column = self._table[NAMES.index(name)]
+        if values is None:
+            column += np.bincount(places, minlength=len(column))
+        else:
+            np.add.at(column, places, values)
 
-    def _most(self, column: int, places: Ints, times: Ints) -> None:
+    def _most(self, name: str, places: Ints, times: Ints) -> None:
         """Keep the longest times of callbacks at these places."""
-        longest = np.full(len(self._table), -1, dtype=np.int64)
-        np.maximum.at(longest, places, times)
-        self._table[:, column] = np.maximum(self._table[:, column], longest.astype(object))
+        np.maximum.at(self._table[NAMES.index(name)], places, times)
 
     @property
     def busy(self) -> int:
         """Return how long declared callbacks ran altogether, ns."""
-        return int(self._table[:-1, _BUSY].sum())
+        return int(self._table[NAMES.index('busy_ns'), :-1].sum())
 
     def callbacks(self) -> dict[str, dict[str, int]]:
         """Return what each declared callback used, in file order."""
@@ -207,17 +180,15 @@ class Usage(Observer):
         return self._result(-1)
 
     def _result(self, place: int) -> dict[str, int]:
-        row = self._table[place].tolist()
-        return dict(zip(_NAMES, row if row[_MEASURED] else row[:_MEASURED]))
+        column = self._table[:, place].tolist()
+        return dict(zip(NAMES, column if column[_MEASURED] else column[:_MEASURED]))
 
     def workers(self, count: int, duration: int) -> dict[str, Any]:
         """Return how busy the workers were; ``lent`` is what ran beside them (blocking calls)."""
-        busy = {str(w): self.by_worker[w] for w in sorted(self.by_worker) if w >= 0}
-        total = sum(self.by_worker.values())
         return {
-            'busy_ns': busy,
-            'lent_ns': sum(took for w, took in self.by_worker.items() if w < 0),
-            'use': share(total, count, duration),
+            'busy_ns': {str(w): busy for w, busy in sorted(self.by_worker.items()) if w >= 0},
+            'lent_ns': sum(busy for w, busy in self.by_worker.items() if w < 0),
+            'use': share(sum(self.by_worker.values()), count, duration),
             'over_time': self.pool.result()}
 
 

@@ -3,7 +3,8 @@
 """
 What executors report of themselves on ``/diagnostics``: the newest of it, and its tables.
 
-The statuses are those of ``mddag_executor.live.diagnostics``; others on the topic are left out.
+The statuses are those of ``mddag_executor.executor.diagnostics``; others on the topic are left
+out.
 On a terminal rich draws the tables (the extra ``top``), elsewhere they are plain text.
 """
 

@@ -20,12 +20,10 @@ from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
 
 _KEYS = ('min', 'median', 'p99', 'max')
-_HEADER = ('DAG', 'sink', 'due', 'then', 'in time', 'then', 'share', 'then', 'late', 'then',
-           'median', 'change', 'p99', 'change', 'max', 'change', '')
+_HEADER = ('sink', 'due A', 'due B', 'in time A', 'in time B', 'median A', 'B', 'p99 A', 'B', '')
 
 _COUNTS: tuple[Callable[[Mapping[str, Any]], Cell], ...] = (
-    lambda side: side['due'], lambda side: side['in_time'],
-    lambda side: percent(side['in_time'], side['due']), lambda side: side['late'])
+    lambda side: side['due'], lambda side: percent(side['in_time'], side['due']))
 
 
 def compare(
@@ -110,28 +108,27 @@ def _callback(use: Mapping[str, int] | None) -> dict[str, Any] | None:
 
 
 def sinks_table(difference: Mapping[str, Any]) -> str:
-    """Return the table of sinks: the first run's figure, then the second's or how it changed."""
+    """Return the table of sinks: the figures of run A, and those of run B or how they changed."""
     dags = difference['dags']
     short = short_names(name for dag in dags.values() for name in dag['sinks'])
     rows: list[list[Cell]] = []
-    for dag_name, dag in dags.items():
-        shown = dag_name
+    for dag in dags.values():
         for name, sink in dag['sinks'].items():
-            row: list[Cell] = [shown, short[name]]
+            row: list[Cell] = [short[name]]
             for cell in _COUNTS:
                 row.extend(None if side is None else cell(side)
                            for side in (sink['a'], sink['b']))
-            for key in _KEYS[1:]:
+            for key in ('median', 'p99'):
                 row.extend(_response(sink, key))
             rows.append([*row, _remark(sink)])
-            shown = ''
-    return table(_HEADER, rows)
+    return table(_HEADER, rows, marked=[
+        sink['worse'] for dag in dags.values() for sink in dag['sinks'].values()])
 
 
 def _response(sink: Mapping[str, Any], key: str) -> list[Cell]:
     side = sink['a']
     value = None if side is None or side['response_ns'] is None \
-        else format_ns(side['response_ns'][key])
+        else format_ns(side['response_ns'][key], 3)
     if sink['change'] is None:
         return [value, None]
     share = sink['change'][key]
@@ -140,15 +137,15 @@ def _response(sink: Mapping[str, Any], key: str) -> list[Cell]:
 
 def _remark(sink: Mapping[str, Any]) -> str:
     if sink['a'] is None:
-        return 'only in the second'
+        return 'only in B'
     if sink['b'] is None:
-        return 'only in the first'
+        return 'only in A'
     due = [bool(sink[side]['due']) for side in 'ab']
     remarks = ['worse'] if sink['worse'] else []
     if not all(due):
-        remarks.append('never due' + ('' if not any(due) else ' then' if due[0] else ' before'))
+        remarks.append('never due' + ('' if not any(due) else ' in B' if due[0] else ' in A'))
     if sink['a']['relative_deadline_ns'] != sink['b']['relative_deadline_ns']:
-        remarks.append(f'deadline then {format_ns(sink["b"]["relative_deadline_ns"])}')
+        remarks.append(f'deadline in B {format_ns(sink["b"]["relative_deadline_ns"])}')
     return ', '.join(remarks)
 
 
@@ -162,8 +159,8 @@ def callbacks_table(difference: Mapping[str, Any]) -> str:
                 value = None if side is None else side[what]
                 row.append(value if value is None or what == 'executions' else format_ns(value))
         rows.append(row)
-    return table(('callback', 'executions', 'then', 'mean', 'then', 'longest', 'then',
-                  'mean wait', 'then'), rows)
+    return table(('callback', 'executions A', 'B', 'mean A', 'B', 'longest A', 'B',
+                  'mean wait A', 'B'), rows)
 
 
 def lines(difference: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
@@ -175,7 +172,7 @@ def lines(difference: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
         run = difference[mark]
         pool = f'imported, {counted(run["workers"], "thread")}' if run['imported'] else (
             f'policy {printable(run["policy"])}, ' + counted(run['workers'], 'worker'))
-        yield (f'{"first" if mark == "a" else "then"}: {printable(run["trace"])}: '
+        yield (f'{mark.upper()}: {printable(run["trace"])}: '
                + verdicts_text(Counts(*(run[name] for name in Counts._fields))) + '; '
                + ('rescheduled, ' if run['rescheduled'] else '')
                + f'{pool}, {format_ns(run["duration_ns"])}')
@@ -184,4 +181,4 @@ def lines(difference: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
                + format_ns(difference['a']['skip_ns']))
     n = sum(sink['worse'] for dag in difference['dags'].values()
             for sink in dag['sinks'].values())
-    yield f'worse in the second run: {counted(n, "sink")}'
+    yield f'worse in B: {counted(n, "sink")}'

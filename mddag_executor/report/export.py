@@ -1,420 +1,202 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Rows of a run for spreadsheets and data frames: one for each execution, or for each sink's job.
+A recording for spreadsheets and data frames: one row for each execution, or for each sink's job.
 
-Theory of operation
--------------------
-The exporter observes a replay and hands out rows while it goes on; what it keeps are the jobs that
-are open and, because a callback may still run when its job has ended, the last few that were, and
-executions that have ended until it is known what they completed.
+Executions: a row is one run of a callback on a worker; a coroutine that was suspended has several,
+``first`` marks the first.  What no DAG declares has neither DAG nor job.
 
-Executions (``ExecutionRow``): a row is one run of a callback on a worker; a coroutine that was
-suspended has several, ``first`` marks the first.  What no DAG declares has neither DAG nor job.
+Jobs: a row is the verdict about one job at one sink: ``in_time``, ``late``, ``overdue`` (not
+completed when the run ended past its deadline), ``expired``, ``failed`` or ``aborted``; the last
+four have no completion.
 
-Jobs (``JobRow``): a row is the verdict about one job at one sink: ``in_time``, ``late``,
-``overdue`` (not completed when the run ended past its deadline), ``expired``, ``failed`` or
-``aborted``; the last four have no completion.
-
-Columns that end in ``_ns`` are whole nanoseconds: times on the trace's clock, or durations.
+Columns that end in ``_ns`` are whole nanoseconds: times on the recording's clock, or durations.
 ``start_s`` and ``release_s`` are seconds since the run's first release (or execution, where one
-came before).
+came before).  ``reference_deadline_ns`` is the vertex's (RAD), ``slack_ns`` what was left of it at
+the end.  ``worker`` -1 is a spare thread beside the pool.
 
-Rows come in the order of their releases, what has no release by its readiness (``Ordered``).  The
-exporter hands them out as they end, so as many as ``MOST_ORDERED`` are held back and sorted: a row
-that ended after more than so many later ones stands where it ended.
+Rows come in the order of their releases, those without one by their readiness.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 import csv
-import heapq
 import io
-from typing import Any, BinaryIO, get_args, get_type_hints, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
-from mddag_executor.core import Tables
-from mddag_executor.core.state import (
-    Decision,
-    DROP,
-    JOB_END,
-    SINK_COMPLETED,
-)
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.errors import MddagError
+from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by
 from mddag_executor.replay import Replay
-from mddag_executor.replay.computed import ComputedRun
-from mddag_executor.replay.happenings import Observer, Piece
-from mddag_executor.replay.judge import Judge
+from mddag_executor.replay.usage import ran
 from mddag_executor.report.text import printable
-from mddag_executor.report.timeline import no_names
-from msg_graph import TaskSet
+import numpy as np
 
-KEEP_ENDED = 4096
-MOST_HELD = 1024
-MOST_ORDERED = 65536
-BATCH = 65536
+ROWS = ('executions', 'jobs')
+"""What a row may be."""
+_BATCH = 65_536
 
 
-class ExecutionRow(NamedTuple):
+class Column(NamedTuple):
     """
-    One run of a callback on a worker.
+    A column to export.
 
-    ``reference_deadline_ns`` is the vertex's (RAD); ``slack_ns`` what was left of it at the end.
-    ``worker`` -1 is a spare thread beside the pool.  ``waiting_ns`` is only in the first of
-    several rows of one execution.
+    :ivar values: numbers, or with ``names`` the places of names.
+    :ivar known: where there is a value; None: everywhere.
     """
 
-    dag: str | None
-    job: int | None
-    vertex: str
-    worker: int
-    first: bool
-    start_s: float
-    release_ns: int | None
-    ready_ns: int
-    start_ns: int
-    end_ns: int
-    waiting_ns: int | None
-    executing_ns: int
-    reference_deadline_ns: int | None
-    slack_ns: int | None
+    name: str
+    values: Any
+    known: Mask | None = None
+    names: Sequence[str] = ()
 
 
-class JobRow(NamedTuple):
-    """The verdict about one job at one sink."""
-
-    dag: str
-    job: int
-    sink: str
-    release_s: float
-    release_ns: int
-    deadline_ns: int
-    completed_ns: int | None
-    response_ns: int | None
-    slack_ns: int | None
-    verdict: str
+def columns_of(replay: Replay, rows: str) -> list[Column]:
+    """Return the columns of the executions or jobs of a recording."""
+    return executions(replay)[0] if rows == 'executions' else jobs(replay)
 
 
-class Ran(NamedTuple):
-    """
-    An execution to export.
+def executions(replay: Replay) -> tuple[list[Column], Ints]:
+    """Return the columns of executions, and the rows of the table that they are."""
+    recording, judged = replay.recording, replay.judged
+    rows = ran(recording)
+    row, release, known = _releases(replay, rows)
+    ready = recording.executions['ready'][rows]
+    order = sort_by(np.where(known, release, ready))
+    rows, release, known = rows[order], release[order], known[order]
+    table = recording.executions[rows]
+    declared = table['vertex'] >= 0
+    names = [vertex.name for vertex in recording.task_set.vertices]
+    others, which = np.unique(table['callback'][~declared], return_inverse=True)
+    vertex = table['vertex'].astype(np.int64)
+    vertex[~declared] = len(names) + which
+    names += [recording.who.name(each) for each in others.tolist()]
+    start, end = table['start'], table['end']
+    reference = release + np.array([*judged.tables.rad_offset[:-1], 0])[table['vertex']]
+    first = table['piece'] == 0
+    return [
+        Column('dag', table['dag'], declared, [dag.name for dag in recording.task_set.dags]),
+        Column('job', table['job'], declared), Column('vertex', vertex, None, names),
+        Column('worker', table['worker']), Column('first', first),
+        Column('start_s', _seconds(recording, start)), Column('release_ns', release, known),
+        Column('ready_ns', table['ready']), Column('start_ns', start), Column('end_ns', end),
+        Column('waiting_ns', start - table['ready'], first),
+        Column('executing_ns', end - start), Column('reference_deadline_ns', reference, known),
+        Column('slack_ns', reference - end, known)], rows
 
-    ``legs`` are those of its vertex that it completed (none: it was not its last piece, or never
-    did), ``whole`` whether it completed the vertex, which then publishes.
-    """
 
-    row: ExecutionRow
-    piece: Piece
-    legs: tuple[int, ...] = ()
-    whole: bool = False
-
-
-class Target:
-    """Where rows go; here: nowhere."""
-
-    def begin(self, task_set: TaskSet, tables: Tables) -> None:
-        """Begin with what the run is of."""
-
-    def execution(self, ran: Ran) -> None:
-        """Write an execution."""
-
-    def verdict(self, row: JobRow, vertex: int) -> None:
-        """Write a verdict; the vertex is the global index of the sink."""
-
-    def finish(self) -> None:
-        """Write what is left."""
+def _releases(replay: Replay, rows: Ints) -> tuple[Ints, Ints, Mask]:
+    """Return the rows of the jobs of executions, their releases, and where there are any."""
+    table = replay.recording.executions
+    row, release = np.full(len(rows), -1), np.zeros(len(rows), dtype=np.int64)
+    dags = table['dag'][rows]
+    for dag, jobs_of in enumerate(replay.judged.jobs):
+        mine = np.flatnonzero((dags == dag) & (table['vertex'][rows] >= 0))
+        row[mine] = jobs_of.rows_of(table['job'][rows[mine]])
+        some = mine[row[mine] >= 0]
+        release[some] = jobs_of.release[row[some]]
+    return row, release, row >= 0
 
     def abandon(self) -> None:
         """Write nothing more, after an error."""
 
 
-class Exporter(Observer):
-    """Makes rows of a replay that it watches."""
-
-    def __init__(self, target: Target) -> None:
-        self.target = target
-        self._name_of: Callable[[int], str] = no_names
-        self._jobs: dict[tuple[int, int], int] = {}
-        # by vertex, job and ready time: what has ended, until it is known what it completed
-        self._held: dict[tuple[int, int, int], Ran] = {}
-        self._legs: dict[tuple[int, int], tuple[int, ...]] = {}
-        self._completed: tuple[int, tuple[int, int, int]] | None = None
-        self._ended: deque[tuple[int, int]] = deque()
-        self._origin: int | None = None
-
-    def of(self, replay: Replay) -> list[Observer]:
-        """Export a replay: return the observers to come after the judge."""
-        self._name_of = replay.run.who.name
-        return self._begin(replay.task_set, replay.judge)
-
-    def of_computed(self, run: ComputedRun) -> None:
-        """Export a schedule that was computed."""
-        judge = Judge(run.task_set, compare=False, judge_from=run.judge_from)
-        run.play([judge, *self._begin(run.task_set, judge)])
-        self.finish()
-
-    def _begin(self, task_set: TaskSet, judge: Judge) -> list[Observer]:
-        self._tables = judge.tables
-        self._names = [vertex.name for vertex in task_set.vertices]
-        self._dags = [dag.name for dag in task_set.dags]
-        self.target.begin(task_set, judge.tables)
-        return [self]
-
-    def released(self, dag: int, job: int, release: int, now: int) -> None:
-        """Open a job."""
-        self._jobs[dag, job] = release
-        if self._origin is None:
-            self._origin = release
-
-    def ran(
-        self, callback: int, dag: int, vertex: int, job: int, worker: int, ready: int, start: int,
-        end: int, first: int,
-    ) -> None:
-        """Make a row of an execution, and hand it out or hold it back."""
-        self._hand_out_completed()
-        piece = Piece(
-            callback, dag, vertex, job, worker, ready, start, end, bool(first))
-        release = self._jobs.get((dag, job)) if vertex >= 0 else None
-        reference = None if release is None else release + self._tables.rad_offset[vertex]
-        row = ExecutionRow(
-            self._dags[dag] if vertex >= 0 else None, job if vertex >= 0 else None,
-            self._names[vertex] if vertex >= 0 else self._name_of(callback), worker, bool(first),
-            self._seconds(start), release, ready, start, end, start - ready if first else None,
-            end - start, reference, None if reference is None else reference - end)
-        if vertex < 0:
-            self.target.execution(Ran(row, piece))
-            return
-        key = (vertex, job, ready)
-        self._hand_out(key)     # a piece before it, of a coroutine
-        self._held[key] = Ran(row, piece, self._legs.pop((vertex, job), ()))
-        if len(self._held) > MOST_HELD:
-            self._hand_out(next(iter(self._held)))
-
-    def completed(
-        self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int, ready: int,
-        start: int, ended: int, busy: int, number: int, cpu: int, held: int,
-    ) -> None:
-        """Note what an execution completed; one may complete several legs, one after the other."""
-        if self._completed is not None and self._completed[0] != number:
-            self._hand_out_completed()
-        if number < 0:      # of a simulated sync callback, which runs once for all legs
-            self._legs[vertex, job] = (*self._legs.get((vertex, job), ()), leg)
-            if len(self._legs) > MOST_HELD:
-                del self._legs[next(iter(self._legs))]
-            return
-        key = (vertex, job, ready)
-        ran = self._held.get(key)
-        if ran is not None:
-            self._held[key] = ran._replace(legs=(*ran.legs, leg), whole=bool(whole))
-            self._completed = (number, key)
-
-    def _hand_out_completed(self) -> None:
-        if self._completed is not None:
-            self._hand_out(self._completed[1])
-            self._completed = None
-
-    def _hand_out(self, key: tuple[int, int, int]) -> None:
-        ran = self._held.pop(key, None)
-        if ran is not None:
-            self.target.execution(ran)
-
-    def finish(self) -> None:
-        """Hand out what is left, once the run is over."""
-        for key in list(self._held):
-            self._hand_out(key)
-        self.target.finish()
-
-    def _seconds(self, time: int) -> float:
-        if self._origin is None:
-            self._origin = time
-        return (time - self._origin) / 1e9
-
-    def decided(self, decisions: Sequence[Decision]) -> None:
-        """Hand out verdicts."""
-        for kind, dag, vertex, job, deadline, time in decisions:
-            if kind == JOB_END:
-                self._ended.append((dag, job))
-                if len(self._ended) > KEEP_ENDED:
-                    self._jobs.pop(self._ended.popleft(), None)
-            elif kind != DROP:
-                self._verdict(kind, dag, vertex, job, deadline, time)
-
-    def _verdict(
-        self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
-    ) -> None:
-        release = deadline - self._tables.sink_deadline[vertex]
-        completed = time if kind in SINK_COMPLETED else None
-        self.target.verdict(JobRow(
-            self._dags[dag], job, self._names[vertex], self._seconds(release), release, deadline,
-            completed, None if completed is None else completed - release,
-            None if completed is None else deadline - completed, VERDICTS[kind]), vertex)
+def jobs(replay: Replay) -> list[Column]:
+    """Return the columns of the verdicts about jobs at sinks."""
+    recording, verdicts = replay.recording, replay.judged.verdicts
+    verdicts = verdicts[sort_by(verdicts['release'], verdicts['sink'])]
+    completed = verdicts['completed']
+    done = completed >= 0
+    return [
+        Column('dag', verdicts['dag'], None, [dag.name for dag in recording.task_set.dags]),
+        Column('job', verdicts['job']),
+        Column('sink', verdicts['sink'], None, [v.name for v in recording.task_set.vertices]),
+        Column('release_s', _seconds(recording, verdicts['release'])),
+        Column('release_ns', verdicts['release']), Column('deadline_ns', verdicts['deadline']),
+        Column('completed_ns', completed, done),
+        Column('response_ns', completed - verdicts['release'], done),
+        Column('slack_ns', verdicts['deadline'] - completed, done),
+        Column('verdict', verdicts['kind'], None, [VERDICTS[kind] for kind in sorted(VERDICTS)])]
 
 
-class Ordered(Target):
-    """
-    A target that puts rows into the order of time, and passes them on.
-
-    :param target: where to.
-    :param execution: gives the time by which an execution comes.
-    """
-
-    def __init__(self, target: Target, execution: Callable[[ExecutionRow], int]) -> None:
-        self._target = target
-        self._execution = execution
-        self._count = 0
-        self._executions: list[tuple[int, int, Ran]] = []
-        self._verdicts: list[tuple[int, int, int, tuple[JobRow, int]]] = []
-
-    def begin(self, task_set: TaskSet, tables: Tables) -> None:
-        """Begin with what the run is of."""
-        self._target.begin(task_set, tables)
-
-    def execution(self, ran: Ran) -> None:
-        """Hold an execution back until its turn."""
-        self._count += 1
-        heapq.heappush(self._executions, (self._execution(ran.row), self._count, ran))
-        if len(self._executions) > MOST_ORDERED:
-            self._target.execution(heapq.heappop(self._executions)[-1])
-
-    def verdict(self, row: JobRow, vertex: int) -> None:
-        """Hold a verdict back until its turn."""
-        self._count += 1
-        heapq.heappush(self._verdicts, (row.release_ns, vertex, self._count, (row, vertex)))
-        if len(self._verdicts) > MOST_ORDERED:
-            self._target.verdict(*heapq.heappop(self._verdicts)[-1])
-
-    def finish(self) -> None:
-        """Pass on what is left."""
-        for *_, ran in sorted(self._executions):
-            self._target.execution(ran)
-        for *_, verdict in sorted(self._verdicts):
-            self._target.verdict(*verdict)
-        self._target.finish()
+def _seconds(recording: Recording, times: Ints) -> Any:
+    return (times - (recording.start or 0)) / 1e9
 
     def abandon(self) -> None:
         """Write nothing more, after an error."""
         self._target.abandon()
 
 
-def by_release(row: ExecutionRow) -> int:
-    """Return the release of an execution's job, the readiness of what has none."""
-    return row.ready_ns if row.release_ns is None else row.release_ns
+# --- formats -------------------------------------------------------------------------------------
+
+def write_csv(file: BinaryIO, columns: Sequence[Column]) -> None:
+    """Write CSV (RFC 4180, UTF-8) below a line of titles; no value is an empty cell."""
+    text = io.TextIOWrapper(file, 'utf-8', 'backslashreplace', newline='')
+    writer = csv.writer(text)
+    writer.writerow([column.name for column in columns])
+    for begin in range(0, len(columns[0].values), _BATCH):
+        writer.writerows(zip(*(_cells(column, begin) for column in columns)))
+    text.flush()
+    text.detach()
 
 
-def by_start(row: ExecutionRow) -> int:
-    """Return when an execution started: so tracks are filled from the left."""
-    return row.start_ns
+def _cells(column: Column, begin: int) -> Iterator[Any]:
+    """Return some values as CSV has them; a name is harmless for terminals and spreadsheets."""
+    values = column.values[begin:begin + _BATCH]
+    if column.names:
+        names = [_harmless(name) for name in column.names]
+        found: Any = [names[place] for place in values.tolist()]
+    elif values.dtype == np.bool_:
+        found = ['true' if value else 'false' for value in values.tolist()]
+    elif values.dtype == np.float64:
+        found = [f'{value:.9f}' for value in values.tolist()]
+    else:
+        found = values.tolist()
+    if column.known is None:
+        return iter(found)
+    known = column.known[begin:begin + _BATCH].tolist()
+    return iter([value if there else None for value, there in zip(found, known)])
 
 
-class Rows(Target):
-    """
-    A target that writes rows of one kind.
-
-    :param kind: of the rows: executions, or jobs.
-    """
-
-    def __init__(
-        self, kind: type[ExecutionRow] | type[JobRow], writer: CsvWriter | ParquetWriter
-    ) -> None:
-        self._kind = kind
-        self._writer = writer
-
-    def execution(self, ran: Ran) -> None:
-        """Write an execution."""
-        if self._kind is ExecutionRow:
-            self._writer.write(ran.row)
-
-    def verdict(self, row: JobRow, vertex: int) -> None:
-        """Write a verdict."""
-        if self._kind is JobRow:
-            self._writer.write(row)
-
-    def finish(self) -> None:
-        """Write what is left."""
-        self._writer.end()
+def _harmless(name: str) -> str:
+    text = printable(name)
+    return f"'{text}" if text[:1] in ('=', '+', '-', '@') else text
 
     def abandon(self) -> None:
         """Write nothing more, after an error."""
         self._writer.abandon()
 
 
-class CsvWriter:
-    """Writes rows as CSV (RFC 4180, UTF-8) below a line of titles; no value is an empty cell."""
-
-    def __init__(self, file: BinaryIO, kind: type[ExecutionRow] | type[JobRow]) -> None:
-        self._text = io.TextIOWrapper(file, 'utf-8', 'backslashreplace', newline='')
-        self._writer = csv.writer(self._text)
-        self._writer.writerow(kind._fields)
-
-    def write(self, row: tuple[Any, ...]) -> None:
-        """Write a row."""
-        self._writer.writerow([_cell(value) for value in row])
-
-    def end(self) -> None:
-        """Leave the file to its owner."""
-        self._text.flush()
-        self._text.detach()
-
-    def abandon(self) -> None:
-        """Leave the file to its owner, without what is buffered."""
-
-
-def _cell(value: Any) -> Any:
-    """Return a value as CSV has it; a name is harmless for terminals and spreadsheets."""
-    if isinstance(value, str):
-        text = printable(value)
-        return f"'{text}" if text[:1] in ('=', '+', '-', '@') else text
-    if isinstance(value, bool):
-        return 'true' if value else 'false'
-    return f'{value:.9f}' if isinstance(value, float) else value
+def arrow_table(columns: Sequence[Column]) -> Any:
+    """Return columns as an Arrow table, names as dictionaries."""
+    import pyarrow
+    arrays, fields = [], []
+    for column in columns:
+        mask = None if column.known is None else ~column.known
+        if column.names:
+            indices = pyarrow.array(column.values.astype(np.int32), mask=mask)
+            array = pyarrow.DictionaryArray.from_arrays(
+                indices, pyarrow.array(list(column.names), pyarrow.string()))
+        else:
+            values = column.values
+            if values.dtype.kind == 'i':
+                values = values.astype(np.int64)
+            array = pyarrow.array(np.ascontiguousarray(values), mask=mask)
+        arrays.append(array)
+        fields.append(pyarrow.field(column.name, array.type, nullable=column.known is not None))
+    return pyarrow.table(arrays, schema=pyarrow.schema(fields))
 
 
-class ParquetWriter:
-    """Writes rows as Parquet, names as dictionaries."""
-
-    def __init__(self, file: BinaryIO, kind: type[ExecutionRow] | type[JobRow]) -> None:
-        import pyarrow
-        import pyarrow.parquet
-        types = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64(),
-                 bool: pyarrow.bool_()}
-        fields = []
-        for name, hint in get_type_hints(kind).items():
-            kinds = get_args(hint) or (hint,)       # `int | None`
-            fields.append(pyarrow.field(name, types[kinds[0]], nullable=len(kinds) > 1))
-        self._schema: Any = pyarrow.schema(fields)
-        self._arrow: Any = pyarrow
-        self._batch: list[tuple[Any, ...]] = []
-        self._writer: Any = pyarrow.parquet.ParquetWriter(
-            file, self._schema, compression='zstd')
-
-    def write(self, row: tuple[Any, ...]) -> None:
-        """Write a row, some time."""
-        self._batch.append(row)
-        if len(self._batch) >= BATCH:
-            self._flush()
-
-    def _flush(self) -> None:
-        if self._batch:
-            columns = [self._arrow.array(column, type=field.type)
-                       for column, field in zip(zip(*self._batch), self._schema)]
-            self._writer.write_table(self._arrow.table(columns, schema=self._schema))
-            self._batch.clear()
-
-    def end(self) -> None:
-        """Write what is left, and the footer."""
-        self._flush()
-        self._writer.close()
-
-    def abandon(self) -> None:
-        """Keep pyarrow from writing a footer when it is collected: the file is closed by then."""
-        self._writer.is_open = False
+def write_parquet(file: BinaryIO, columns: Sequence[Column]) -> None:
+    """Write Parquet."""
+    import pyarrow.parquet
+    pyarrow.parquet.write_table(arrow_table(columns), file, compression='zstd')
 
 
 def check_available(form: str) -> None:
     """Find out whether a format can be written, before long work starts."""
-    module = {'parquet': 'pyarrow', 'pftrace': 'perfetto'}.get(form)
+    module = {'parquet': 'pyarrow', 'tables': 'pyarrow'}.get(form)
     if module is None:
         return
     try:
@@ -429,22 +211,15 @@ def check_available(form: str) -> None:
             'install versions that fit together') from None
 
 
-def layout_of(target: Target) -> dict[str, Any]:
-    """Return the layout that shows what was written for Foxglove."""
-    from mddag_executor.report.foxglove import FoxgloveTarget
-    assert isinstance(target, FoxgloveTarget)
-    return target.layout
+def write(form: str, file: BinaryIO, replay: Replay, rows: str) -> None:
+    """
+    Write a recording.
 
-
-def target(form: str, file: BinaryIO, jobs: bool) -> Target:
-    """Return what writes a format: ``csv``, ``parquet``, ``pftrace`` or ``mcap``."""
-    kind = JobRow if jobs else ExecutionRow
-    if form == 'csv':
-        return Ordered(Rows(kind, CsvWriter(file, kind)), by_release)
-    if form == 'parquet':
-        return Ordered(Rows(kind, ParquetWriter(file, kind)), by_release)
-    if form == 'mcap':
-        from mddag_executor.report.foxglove import FoxgloveTarget
-        return FoxgloveTarget(file)
-    from mddag_executor.report.perfetto import PerfettoTarget
-    return Ordered(PerfettoTarget(file), by_start)
+    :param form: ``csv``, ``parquet`` or ``pftrace``.
+    :param rows: one of ``ROWS``, for the first two.
+    """
+    if form == 'pftrace':
+        from mddag_executor.report.perfetto import write_perfetto
+        write_perfetto(file, replay)
+    else:
+        {'csv': write_csv, 'parquet': write_parquet}[form](file, columns_of(replay, rows))

@@ -2,10 +2,73 @@
 'use strict';
 (() => {
   const NARROW = 700;                   // pixels, as in html.css
+  const MISSES = new Set(['late', 'expired', 'failed', 'aborted']);
   const element = (id) => document.getElementById(id);
   const meta = JSON.parse(element('mddag-meta').textContent);
   const missed = meta.missed.map(
     ([release, deadline, shown, text]) => ({release, deadline, shown, text}));
+
+  // The table of sinks: search, sort, and the rows that are not in the page at first.
+  function sinks() {
+    const table = document.querySelector('#mddag-sinks table');
+    if (!table) return;
+    const body = table.tBodies[0], search = element('mddag-search');
+    const titles = [...table.tHead.rows[0].cells].map((cell) => cell.textContent);
+    const button = element('mddag-all-sinks');
+    let more = JSON.parse(element('mddag-more-sinks').textContent);
+
+    function all() {
+      const [first] = body.rows;
+      for (const cells of more) {
+        const row = first.cloneNode(true), reached = cells[cells.length - 1];
+        row.dataset.reached = reached;
+        [...row.cells].forEach((cell, i) => {
+          if (i < cells.length - 1) {
+            cell.textContent = cells[i];
+            if (MISSES.has(titles[i])) cell.className = cells[i] === '0' ? '' : 'bad';
+            return;
+          }
+          const bar = cell.querySelector('i');
+          bar.style.width = `${100 * Math.min(1, reached)}%`;
+          bar.style.background = reached > 1 ? '#d7191c' : reached > 0.9 ? '#fd8d3c' : '#3182bd';
+          cell.lastChild.textContent = `${Math.round(100 * reached)} %`;
+        });
+        body.append(row);
+      }
+      more = [];
+      if (button) button.remove();
+    }
+
+    const units = {ns: 1, us: 1e3, ms: 1e6, s: 1e9};
+    function value(row, column) {
+      if (column === titles.length - 1) return Number(row.dataset.reached);
+      const text = row.cells[column].textContent, found = /^([-+\d.]+)(?: (\S+))?$/.exec(text);
+      if (text === '-') return -Infinity;
+      return found ? Number(found[1]) * (units[found[2]] || 1) : text;
+    }
+
+    if (button) button.addEventListener('click', all);
+    search.addEventListener('input', () => {
+      all();
+      const wanted = search.value.toLowerCase();
+      for (const row of body.rows) {
+        row.hidden = !`${row.cells[0].textContent} ${row.cells[1].textContent}`
+          .toLowerCase().includes(wanted);
+      }
+    });
+    let last = null;
+    [...table.tHead.rows[0].cells].forEach((title, column) =>
+      title.addEventListener('click', () => {
+        all();
+        const turn = last === column ? -1 : 1;
+        last = turn === 1 ? column : null;
+        const sign = column < 2 ? turn : -turn;       // names from a, figures from the largest
+        body.append(...[...body.rows].sort((one, other) => {
+          const a = value(one, column), b = value(other, column);
+          return sign * (a < b ? -1 : a > b ? 1 : 0);
+        }));
+      }));
+  }
 
   function brief(labels) {
     return new Map([...(labels.entries ? labels.entries() : Object.entries(labels))].map(
@@ -74,5 +137,6 @@
     }
     return start(doc);
   };
+  sinks();
   wait();
 })();

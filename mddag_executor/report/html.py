@@ -3,26 +3,21 @@
 """
 The HTML report of a run: one file with tables and pictures that needs no network.
 
-``Watch`` collects during a replay what the report shows; ``of_outcome`` and ``of_run`` return a
-report's data, ``write`` writes the page.
+``of_outcome`` and ``of_run`` return a report's data, ``write`` writes the page.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from mddag_executor import __version__
-from mddag_executor.core import Tally
 from mddag_executor.core.tally import total
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import Replay, Reschedule
 from mddag_executor.replay.computed import ComputedRun
-from mddag_executor.replay.happenings import Observer
-from mddag_executor.replay.judge import Judge
-from mddag_executor.replay.usage import Usage
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.html_data import (
     CLASSES,
@@ -38,10 +33,11 @@ from mddag_executor.report.html_tables import (
     paths_html,
     sinks_html,
     worst_html,
+    worst_line,
 )
 from mddag_executor.report.tables import never_due_lines, verdicts_line
 from mddag_executor.report.text import format_ns, printable
-from mddag_executor.report.timeline import MOST_EXECUTIONS, no_names, Timeline
+from mddag_executor.report.timeline import Timeline
 from mddag_executor.simulate import Load, SimulatedRun
 from mddag_executor.text import counted
 from msg_graph import TaskSet
@@ -54,43 +50,6 @@ _LEGEND = (
 _BARS = 'Each bar is one execution, in the colour of the least slack that it leads to.'
 
 
-class Watch:
-    """Collects what a report shows while a run is replayed."""
-
-    def __init__(self, most: int = MOST_EXECUTIONS) -> None:
-        self._most = most
-        self.timeline: Timeline
-        self.judge: Judge
-        self.usage: Usage
-
-    def of(self, replay: Replay) -> list[Observer]:
-        """Watch a replay: return the observers to come after the judge."""
-        return self._watch(replay.judge, replay.usage, replay.run.who.name)
-
-    def _watch(
-        self, judge: Judge, usage: Usage, names: Callable[[int], str] = no_names
-    ) -> list[Observer]:
-        self.judge, self.usage = judge, usage
-        self.timeline = Timeline(self._most, names=names)
-        return [self.timeline]
-
-    def of_computed(self, run: ComputedRun) -> Watch:
-        """Watch a schedule that was computed."""
-        judge = Judge(run.task_set, compare=False, judge_from=run.judge_from)
-        usage = Usage(run.task_set)
-        run.play([judge, usage, *self._watch(judge, usage)])
-        return self
-
-    def data(
-        self, title: str, facts: list[tuple[str, str]], task_set: TaskSet, workers: int,
-        duration_ns: int, warnings: list[str], tally: Tally | None = None,
-    ) -> ReportData:
-        """Return a report's data, once the run is over; ``tally`` None is the judge's."""
-        return ReportData(
-            title, facts, task_set, self.judge.tables, tally or self.judge.tally,
-            self.judge.chains, self.usage, self.timeline, workers, duration_ns, warnings)
-
-
 def check_available() -> None:
     """Find out whether reports can be made, before long work starts."""
     try:
@@ -100,34 +59,45 @@ def check_available() -> None:
             "--report: Bokeh is not installed: pip install 'mddag_executor[report]'") from None
 
 
-def of_outcome(outcome: Replay | Reschedule, watch: Watch | None) -> ReportData:
-    """Return the data of a report about a recorded run; ``watch`` was there if as recorded."""
+def of_outcome(outcome: Replay | Reschedule) -> ReportData:
+    """Return the data of a report about a recorded run."""
     result = outcome.result()
     what, title = 'recording', 'Replay as recorded'
     notes: Sequence[str] = ()
     worker_names: Sequence[str]
     if isinstance(outcome, Reschedule):
-        watch = Watch().of_computed(outcome.computed())
+        replay = Replay(outcome.computed().recording(result['workers']))
         what, title = ('bag', 'Bag') if outcome.recorded is None else (what, 'Replay')
         title, notes = f'{title}, rescheduled', outcome.notes
         worker_names = outcome.worker_names
     else:
-        worker_names = getattr(outcome.run, 'worker_names', ())
-    assert watch is not None
+        replay, worker_names = outcome, outcome.recording.worker_names
     facts = [(what, result['recording']['trace']), *_facts(result),
              *(('assumed', note) for note in notes)]
-    return watch.data(
-        title, facts, outcome.task_set, result['workers'], outcome.duration_ns, outcome.warnings,
+    return _data(
+        replay, title, facts, result['workers'], outcome.duration_ns, outcome.warnings,
     )._replace(paths=result.get('paths', {}), recorded=result.get('recorded_callbacks', {}),
-               misses=result.get('misses'), worker_names=worker_names)
+               misses=result.get('misses'), worker_names=worker_names,
+               causes=replay.explanation.causes() if isinstance(outcome, Replay) else {})
 
 
 def of_run(task_set: TaskSet, load: Load, run: SimulatedRun) -> ReportData:
     """Return the data of a report about a run that was simulated with its log."""
-    watch = Watch().of_computed(ComputedRun.of_run(task_set, load, run))
+    workers = run.settings.workers
+    replay = Replay(ComputedRun.of_run(task_set, load, run).recording(workers))
     facts = [('declaration', task_set.file), *_facts(run.result())]
-    return watch.data(
-        'Simulation', facts, task_set, run.settings.workers, run.ended_ns, [], run.tally)
+    return _data(replay, 'Simulation', facts, workers, run.ended_ns, [])._replace(
+        tally=run.tally)
+
+
+def _data(
+    replay: Replay, title: str, facts: list[tuple[str, str]], workers: int, duration_ns: int,
+    warnings: list[str],
+) -> ReportData:
+    judged = replay.judged
+    return ReportData(
+        title, facts, replay.task_set, judged.tables, replay.tally, replay.chains.breakdown(),
+        replay.usage, Timeline(replay.recording, judged), workers, duration_ns, warnings)
 
 
 def _facts(result: dict[str, Any]) -> list[tuple[str, str]]:
@@ -168,8 +138,8 @@ def _page(
     yield f'</head><body>\n<h1>{title}</h1>\n'
     yield from _head(data)
     if data.task_set.dags:
-        yield f'<h2>Sinks</h2>\n{sinks_html(data)}\n'
         yield misses_html(data, prepared)
+        yield f'<h2>Sinks</h2>\n{sinks_html(data)}\n'
     else:
         yield '<p class="note">No DAG is declared: give a GRAPH to judge deadlines.</p>\n'
     colours = (*(colour for _, colour in CLASSES), UNKNOWN)
@@ -211,6 +181,9 @@ def _head(data: ReportData) -> Iterator[str]:
     if data.task_set.dags:
         good = every.due and not every.missed
         yield f'<p class="verdict {"good" if good else "bad"}">{verdicts_line(dags)}</p>\n'
+        worst = worst_line(data)
+        if worst is not None:
+            yield f'<p>{escape(printable(worst))}</p>\n'
         if data.misses is not None:
             yield from (f'<p>{line}</p>\n' for line in causes_line(data.misses))
     for warning in [*never_due_lines(dags), *data.warnings]:

@@ -15,7 +15,7 @@ import json
 from typing import Any, NamedTuple
 
 from mddag_executor.core import Tables, Tally
-from mddag_executor.replay.chains import Chains
+from mddag_executor.recording.tables import Ints
 from mddag_executor.replay.usage import Usage
 from mddag_executor.report.tables import short_names
 from mddag_executor.report.text import format_ns, printable
@@ -25,7 +25,6 @@ from mddag_executor.report.timeline import (
     END,
     EXPIRED,
     FAILED,
-    Ints,
     JOB,
     OVERDUE,
     READY,
@@ -52,11 +51,13 @@ class ReportData(NamedTuple):
     """
     What a report is about.
 
+    :ivar breakdown: by sink where the times of its jobs went, as in the result of a replay.
     :ivar facts: what stands below the title: pairs of a word and a text.
     :ivar duration_ns: from the first release to the end of the run.
     :ivar paths: end-to-end times of the declared paths, as in the result of a replay.
     :ivar recorded: the callbacks of an imported recording, as in the result of a replay.
     :ivar misses: why deadlines were missed, as in the result of a replay.
+    :ivar causes: the cause of each miss, by global vertex of the sink and job.
     :ivar worker_names: what workers are called, where that is more than a number.
     """
 
@@ -65,7 +66,7 @@ class ReportData(NamedTuple):
     task_set: TaskSet
     tables: Tables
     tally: Tally
-    chains: Chains
+    breakdown: Mapping[int, Any]
     usage: Usage
     timeline: Timeline
     workers: int
@@ -74,6 +75,7 @@ class ReportData(NamedTuple):
     paths: Mapping[str, Any] = {}
     recorded: Mapping[str, Any] = {}
     misses: Mapping[str, Any] | None = None
+    causes: Mapping[tuple[int, int], str] = {}
     worker_names: Sequence[str] = ()
 
 

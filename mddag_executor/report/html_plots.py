@@ -14,6 +14,7 @@ from bokeh.colors import RGB
 from bokeh.models import (
     BasicTickFormatter,
     ColumnDataSource,
+    CustomJSTickFormatter,
     FixedTicker,
     HoverTool,
     Range1d,
@@ -79,6 +80,14 @@ def _style(plot: Any, grid: bool = True) -> None:
     plot.title.text_font_size = '12px'
     if not grid:
         plot.ygrid.grid_line_color = None
+
+
+_TICKS = """
+const span = range.end - range.start;
+const [scale, unit] = span >= 2 ? [1, 's'] : span >= 2e-3 ? [1e3, 'ms'] : [1e6, 'us'];
+const digits = Math.min(6, Math.max(0, 1 - Math.floor(Math.log10(span * scale))));
+return `${(tick * scale).toFixed(digits)} ${unit}`;
+"""
 
 
 def _seconds(plot: Any, what: str) -> None:
@@ -149,7 +158,8 @@ def _timeline(
                           fill_color=_RED, line_color='#ffffff')
     plot.add_tools(HoverTool(renderers=[marked], tooltips=_TOOLTIP))
     _lines(plot, lines)
-    _seconds(plot, 'time (s)')
+    plot.xaxis.axis_label = 'time'
+    plot.xaxis.formatter = CustomJSTickFormatter(code=_TICKS, args={'range': time})
     _style(plot, grid=False)
     return plot
 

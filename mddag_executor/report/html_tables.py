@@ -6,10 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Sequence
 from html import escape
+from typing import NamedTuple
 
-from mddag_executor.core.tally import total
+from mddag_executor.core.tally import counts, total
 from mddag_executor.replay.chains import Breakdown
-from mddag_executor.report.html_data import KINDS, Prepared, ReportData
+from mddag_executor.report.html_data import json_for_html, KINDS, Prepared, ReportData
 from mddag_executor.report.replays import (
     CALLBACKS_HEADER,
     callbacks_rows,
@@ -18,9 +19,12 @@ from mddag_executor.report.replays import (
     RECORDED_HEADER,
     recorded_rows,
 )
-from mddag_executor.report.tables import short_names, sink_rows
+from mddag_executor.report.tables import each_sink, missed_share, short_names, Sink, sink_rows
 from mddag_executor.report.text import format_ns, printable
+from mddag_executor.text import counted
 
+MOST_ROWS = 50
+"""So many sinks are in the page itself; a script adds the others."""
 _COLOURS = {
     'release_lag_ns': '#c7c7c7', 'waiting_ns': '#fd8d3c', 'executing_ns': '#3182bd',
     'suspended_ns': '#9e9ac8', 'transport_ns': '#74c476', 'unknown_ns': '#636363'}
@@ -64,11 +68,85 @@ def _text(is_text: bool) -> str:
     return ' class="text"' if is_text else ''
 
 
+class RankedSink(NamedTuple):
+    """
+    A sink, to be sorted from the worst to the best.
+
+    :ivar missed: the share of its due deadlines that it missed.
+    :ivar reached: its longest response time, as a share of the deadline; 0 if it never completed.
+    """
+
+    missed: float
+    reached: float
+    sink: Sink
+
+    @classmethod
+    def every(cls, data: ReportData) -> list[RankedSink]:
+        """Return all sinks, the worst ones first."""
+        found = []
+        for sink in each_sink(data.tally.result()['dags']):
+            response, deadline = (
+                sink.result[key] for key in ('response_ns', 'relative_deadline_ns'))
+            found.append(cls(
+                missed_share(counts(sink.result)),
+                0.0 if response is None else response['max'] / max(1, deadline), sink))
+        return sorted(found, key=lambda each: (-each.missed, -each.reached))
+
+
+def worst_line(data: ReportData) -> str | None:
+    """Return which sink was worst, and why; None: no job was due."""
+    ranked = [each for each in RankedSink.every(data) if counts(each.sink.result).due]
+    if not ranked:
+        return None
+    worst = ranked[0]
+    verdicts, response = counts(worst.sink.result), worst.sink.result['response_ns']
+    text = f'worst sink: {worst.sink.name}: '
+    if verdicts.missed:
+        text += f'{verdicts.missed} of {counted(verdicts.due, "deadline")} missed'
+        causes = {} if data.misses is None else data.misses['sinks'].get(worst.sink.name, {})
+        if any(causes.values()):
+            text += f', most often because of: {max(causes, key=lambda cause: causes[cause])}'
+        text += '; '
+    if response is None:
+        return text + 'it never completed'
+    return text + (
+        f'longest response time {format_ns(response["max"], 3)}, {100 * worst.reached:.0f} % of '
+        f'the deadline of {format_ns(worst.sink.result["relative_deadline_ns"])}')
+
+
 def sinks_html(data: ReportData) -> str:
-    """Return the table of sinks: verdicts, and response times by the deadline."""
+    """
+    Return the table of sinks, the worst ones first: verdicts and response times.
+
+    The rows after the first ``MOST_ROWS`` are data for the page's script, which adds them when
+    they are wanted.
+    """
     header, rows = sink_rows(data.tally.result()['dags'])
+    by_name = {}
+    for sink, cells in zip(each_sink(data.tally.result()['dags']), rows):
+        by_name[sink.dag, sink.name] = [sink.dag, *cells[1:]]
+    ranked = RankedSink.every(data)
     bad = range(header.index('late'), header.index('median'))
-    return f'<div class="wide">{html_table(header, rows, 2, bad)}</div>'
+    full = [
+        (*by_name[each.sink.dag, each.sink.name], _reached(each.reached)) for each in ranked]
+    shown = html_table([*header, 'max of deadline'], full[:MOST_ROWS], 2, bad,
+                       attributes=(f'data-reached="{each.reached:.4f}"' for each in ranked))
+    rest = [[*('-' if cell is None else printable(str(cell)) for cell in row[:-1]), each.reached]
+            for row, each in zip(full[MOST_ROWS:], ranked[MOST_ROWS:])]
+    more = (f'<button id="mddag-all-sinks">show all {len(full)}</button>' if rest else '')
+    return ('<p class="search"><input id="mddag-search" type="search" placeholder="search sinks" '
+            f'aria-label="search sinks"> {more} <span class="note">The worst ones come first; '
+            'click on a title to sort.</span></p>\n'
+            f'<div class="wide" id="mddag-sinks">{shown}</div>\n'
+            f'<script id="mddag-more-sinks" type="application/json">{json_for_html(rest)}'
+            '</script>')
+
+
+def _reached(share: float) -> Html:
+    """Return a bar from 0 to the deadline, red beyond it."""
+    colour = '#d7191c' if share > 1 else '#fd8d3c' if share > 0.9 else '#3182bd'
+    return Html(f'<span class="reached"><i style="width:{100 * min(1.0, share):.1f}%;'
+                f'background:{colour}"></i></span>{100 * share:.0f} %')
 
 
 def misses_html(data: ReportData, prepared: Prepared) -> str:
@@ -85,9 +163,11 @@ def misses_html(data: ReportData, prepared: Prepared) -> str:
         release = miss.deadline - data.tables.sink_deadline[miss.sink]
         late = None if miss.completed is None else format_ns(miss.completed - miss.deadline)
         response = None if miss.completed is None else format_ns(miss.completed - release)
-        rows.append((dag.name, short[vertex.name], KINDS[miss.kind], miss.job,
+        cause = [data.causes.get((miss.sink, miss.job))] if data.causes else []
+        rows.append((dag.name, short[vertex.name], KINDS[miss.kind], *cause, miss.job,
                      f'{release / 1e9:.6f} s', response, late))
-    header = ('DAG', 'sink', 'what', 'job', 'released at', 'response', 'late by')
+    header = ('DAG', 'sink', 'what', *(['cause'] if data.causes else []), 'job', 'released at',
+              'response', 'late by')
     shown = len(prepared.worst)
     what = f'The {shown} worst of {data.timeline.n_missed}' if shown < data.timeline.n_missed \
         else 'All'
@@ -95,29 +175,31 @@ def misses_html(data: ReportData, prepared: Prepared) -> str:
     attributes = (f'data-miss="{i}"' for i in prepared.worst)
     return (f'<h2>Missed deadlines</h2>\n<p class="note">{what}; click on one to see it in the '
             f'timeline.</p>\n<div class="scroll">'
-            f'{html_table(header, rows, 3, attributes=attributes)}</div>\n')
+            f'{html_table(header, rows, 3 + bool(data.causes), attributes=attributes)}</div>\n')
 
 
 def worst_html(data: ReportData) -> str:
     """Return a table with a bar for each sink: where the time of its worst job went."""
     short = short_names(vertex.name for vertex in data.task_set.vertices)
     rows = []
+    worst_of = {vertex: each['worst'] for vertex, each in data.breakdown.items()}
+    if len(worst_of) > MOST_ROWS:       # those nearest to their deadlines, or furthest past them
+        worst_of = dict(sorted(worst_of.items(), key=lambda item: (
+            item[1]['release_ns'] - item[1]['completed_ns'])
+            / data.tables.sink_deadline[item[0]])[:MOST_ROWS])
     longest = max((
-        (times.worst.completed - times.worst.release) / data.tables.sink_deadline[vertex]
-        for vertex, times in data.chains.sinks.items() if times.worst is not None), default=0.0)
-    used = [any(times.worst is not None and times.worst.breakdown[i]
-                for times in data.chains.sinks.values()) for i in range(len(_PARTS))]
-    for vertex, times in data.chains.sinks.items():
-        worst = times.worst
-        if worst is None:
-            continue
+        (worst['completed_ns'] - worst['release_ns']) / data.tables.sink_deadline[vertex]
+        for vertex, worst in worst_of.items()), default=0.0)
+    used = [any(worst[name] for worst in worst_of.values()) for name in Breakdown._fields]
+    for vertex, worst in worst_of.items():
         one = data.task_set.vertices[vertex]
-        response = worst.completed - worst.release
+        response = worst['completed_ns'] - worst['release_ns']
         deadline = data.tables.sink_deadline[vertex]
+        split = [worst[name] for name in Breakdown._fields]
         rows.append((
             data.task_set.dags[one.dag].name, short[one.name],
-            _stack(worst.breakdown, deadline, max(1.0, longest)), worst.job, format_ns(response),
-            *(format_ns(part, 3) for part, shown in zip(worst.breakdown, used) if shown),
+            _stack(split, deadline, max(1.0, longest)), worst['job'], format_ns(response),
+            *(format_ns(part, 3) for part, shown in zip(split, used) if shown),
             format_ns(deadline)))
     parts = [part for part, shown in zip(_PARTS, used) if shown]
     legend = ''.join(f'<span><i style="background:{colour}"></i>{name}</span>'
@@ -129,7 +211,7 @@ def worst_html(data: ReportData) -> str:
             f'<div class="wide">{html_table(header, rows, 3)}</div>')
 
 
-def _stack(parts: Breakdown, deadline: int, longest: float) -> Html:
+def _stack(parts: Sequence[int], deadline: int, longest: float) -> Html:
     """Return a bar on a scale from 0 to ``longest``, in parts of the deadline."""
     whole = max(1, deadline) * longest
     bars = ''.join(

@@ -1,11 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A run for Perfetto's viewer (https://ui.perfetto.dev), in its own format.
+A recording for Perfetto's viewer (https://ui.perfetto.dev), in its own format.
 
 Theory of operation
 -------------------
-Tracks stand in groups:
+Tracks are in groups:
 
 * *workers*: one for each worker, with what it ran; arrows (flows) go from the execution that
   published to the one that its message started (of several pieces, to and from the last);
@@ -17,162 +17,221 @@ Tracks stand in groups:
 
 Executions of one track may overlap (a reentrant group, jobs that overlap): then it has several
 tracks of one name, as Perfetto demands that slices of a track nest.  An execution goes to the
-first of them that is free when it starts.  So executions have to come by their start, and jobs by
-their release (``export.Ordered``).
+first of them that is free when it starts.
 
-Names stand in the file once (interned); each packet says with a flag that it needs them.  Times
-are the trace's, in nanoseconds.
+A trace is a row of packets in protobuf's encoding; the numbers of the fields are those of
+Perfetto's ``trace_packet.proto``.  Names of events are in the first packet of an event (interned);
+each packet says with a flag that it needs them.  Times are the recording's, in nanoseconds.
 """
 
 from __future__ import annotations
 
-from array import array
+from collections.abc import Iterable
 from typing import Any, BinaryIO
 
-from mddag_executor.core import legs_of, Tables
-from mddag_executor.report.export import JobRow, Ran, Target
+from mddag_executor.core import legs_of
+from mddag_executor.core.state import SINK_IN_TIME
+from mddag_executor.core.tally import VERDICTS
+from mddag_executor.recording.tables import NOTHING, sort_by, VERTEX
+from mddag_executor.replay import Replay
+from mddag_executor.report.export import executions
 from mddag_executor.report.text import format_ns, printable
-from msg_graph import TaskSet
 import numpy as np
-from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TracePacket, TrackEvent
 
 _SEQUENCE = 1
 _CLEARED, _NEEDED = 1, 2        # SEQ_INCREMENTAL_STATE_CLEARED, SEQ_NEEDS_INCREMENTAL_STATE
 _WORKERS, _CALLBACKS, _JOBS, _MISSED, _READY = range(1, 6)
+_BEGIN, _END, _INSTANT, _COUNTER = range(1, 5)
+_EXPLICIT = 3
 _MASK = 2 ** 64 - 1
+# Fields of messages, by number.
+_PACKET = 1
+_TIMESTAMP, _SEQUENCE_ID, _TRACK_EVENT, _INTERNED, _FLAGS, _TRACK = 8, 10, 11, 12, 13, 60
+_TYPE, _UUID, _NAME_IID, _NAME, _NOTE, _FLOW, _FLOW_ENDS, _VALUE = 9, 11, 10, 23, 4, 47, 48, 30
+_PENDING_BYTES = 1 << 20
 
 
-class PerfettoTarget(Target):
-    """
-    Writes a run as a Perfetto trace, packet by packet.
+def varint(value: int) -> bytes:
+    """Return a number as protobuf has it."""
+    value &= _MASK
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
 
-    :param file: where to; a trace is the packets one after the other.
-    """
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
+def number(field: int, value: int) -> bytes:
+    """Return a field that is a number."""
+    return varint(field << 3) + varint(value)
+
+
+def text(field: int, value: str) -> bytes:
+    """Return a field that is a text."""
+    return message(field, value.encode('utf-8', 'backslashreplace'))
+
+
+def message(field: int, content: bytes) -> bytes:
+    """Return a field that is a message."""
+    return varint(field << 3 | 2) + varint(len(content)) + content
+
+
+def _fixed(field: int, value: int) -> bytes:
+    return varint(field << 3 | 1) + (value & _MASK).to_bytes(8, 'little')
+
+
+def write_perfetto(file: BinaryIO, replay: Replay) -> None:
+    """Write a recording as a Perfetto trace."""
+    _Writer(file, replay).write()
+
+
+class _Writer:
+    """Writes one trace."""
+
+    def __init__(self, file: BinaryIO, replay: Replay) -> None:
+        self._file, self._replay = file, replay
+        self._recording, self._task_set = replay.recording, replay.task_set
+        self._pending: list[bytes] = []
+        self._size = 0
         self._uuid = _READY
         # by kind and number: the end of the last slice and the uuid of each of its tracks
         self._lanes: dict[tuple[Any, ...], list[list[int]]] = {}
-        self._dag_groups: dict[int, int] = {}
+        self._groups: dict[int, int] = {}
         self._names: dict[str, int] = {}
         self._keys: dict[str, int] = {}
+        self._interned = b''
+        head = number(_SEQUENCE_ID, _SEQUENCE)
+        self._head = head + number(_FLAGS, _NEEDED)
+        self._first_head = head + number(_FLAGS, _NEEDED | _CLEARED)
         self._first = True
-        # by execution: when it became ready, and when it started
-        self._ready, self._started = array('q'), array('q')
+        self._edges()
 
-    def begin(self, task_set: TaskSet, tables: Tables) -> None:
-        """Write what there is whatever the run was."""
-        self._task_set = task_set
-        # by global vertex: the edges to its successors, and by leg those of its message
+    def _edges(self) -> None:
+        """Count the edges: by vertex those to its successors, by leg those of its message."""
         self._out: list[list[int]] = []
         self._into: list[list[int]] = []
-        number = 0
-        for dag in task_set.dags:
+        count = 0
+        for dag in self._task_set.dags:
             edges: dict[tuple[int, int], int] = {}
             for vertex in dag.vertices:
                 for after in vertex.successors:
-                    edges[vertex.index, after] = number
-                    number += 1
+                    edges[vertex.index, after] = count
+                    count += 1
                 self._out.append([edges[vertex.index, after] for after in vertex.successors])
             self._into.extend(
                 [edges[before, vertex.index] for _, before in legs_of(vertex, dag.vertices)]
                 for vertex in dag.vertices)
-        self._n_edges = number
+        self._n_edges = count
+
+    def write(self) -> None:
         for uuid, name in ((_WORKERS, 'workers'), (_CALLBACKS, 'callbacks'),
                            (_JOBS, 'jobs by sink'), (_MISSED, 'missed deadlines')):
             self._describe(uuid, name, None, uuid)
         self._describe(_READY, 'ready callbacks', None, _READY, counts=True)
+        self._executions()
+        self._verdicts()
+        self._flush()
 
-    def execution(self, ran: Ran) -> None:
-        """Write an execution on the track of its worker and on that of its callback."""
-        row, piece = ran.row, ran.piece
-        if row.waiting_ns:
-            self._ready.append(row.ready_ns)
-            self._started.append(row.start_ns)
-        name = f'worker {row.worker}' if row.worker >= 0 else 'spare threads'
-        rank = row.worker if row.worker >= 0 else 1 << 20
-        track = self._lane(('worker', row.worker), name, _WORKERS, rank, piece.start, piece.end)
-        event = self._begin(track, row.vertex)
-        if row.dag is not None and row.job is not None:
-            self._note(event, 'DAG', row.dag)
-            self._note(event, 'job', row.job)
-        if row.waiting_ns is not None:
-            self._note(event, 'waiting_ns', row.waiting_ns)
-        if row.release_ns is not None:
-            self._note(event, 'since_release_ns', row.start_ns - row.release_ns)
-            self._note(event, 'reference_slack_ns', row.slack_ns or 0)
-        if ran.legs:
-            self._flows(event, ran)
-        self._put(piece.start, event)
-        self._end(track, piece.end)
-        key = ('callback', piece.vertex if piece.vertex >= 0 else -1 - piece.callback)
-        track = self._lane(key, row.vertex, self._group(piece.dag), piece.vertex + 1, piece.start,
-                           piece.end)
-        event = self._begin(track, row.vertex if row.job is None else f'job {row.job}')
-        self._put(piece.start, event)
-        self._end(track, piece.end)
+    # --- what there is ---------------------------------------------------------------------------
 
-    def _flows(self, event: Any, ran: Ran) -> None:
+    def _executions(self) -> None:
+        columns, rows = executions(self._replay)
+        of = {column.name: column for column in columns}
+        table = self._recording.executions
+        order = sort_by(of['start_ns'].values)
+        names = [printable(name) for name in of['vertex'].names]
+        dags = [dag.name for dag in self._task_set.dags]
+        rows = rows[order]
+        released = of['release_ns'].known[order] if of['release_ns'].known is not None else order
+        waiting = np.where(of['first'].values, of['waiting_ns'].values, 0)[order]
+        waits = waiting > 0
+        self._ready(of['ready_ns'].values[order][waits], of['start_ns'].values[order][waits])
+        columns_of = [each.tolist() for each in (
+            of['vertex'].values[order], of['first'].values[order], of['release_ns'].values[order],
+            released, of['slack_ns'].values[order], *(table[name][rows] for name in (
+                'callback', 'dag', 'vertex', 'job', 'leg', 'worker', 'ready', 'start', 'end',
+                'completes')))]
+        for (name, first, release, known, slack, callback, dag, vertex, job, leg, worker, ready,
+             start, end, completes) in zip(*columns_of):
+            track = self._lane(
+                ('worker', worker), f'worker {worker}' if worker >= 0 else 'spare threads',
+                _WORKERS, worker if worker >= 0 else 1 << 20, start, end)
+            parts = [self._name(names[name])]
+            if vertex >= 0:
+                parts += (self._note('DAG', dags[dag]), self._note('job', job))
+            if first:
+                parts.append(self._note('waiting_ns', start - ready))
+            if known:
+                parts += (self._note('since_release_ns', start - release),
+                          self._note('reference_slack_ns', slack))
+            if completes != NOTHING and vertex >= 0:
+                self._flows(parts, vertex, job, leg, completes == VERTEX)
+            self._event(start, _BEGIN, track, *parts)
+            self._event(end, _END, track)
+            key = 'callback', vertex if vertex >= 0 else -1 - callback
+            track = self._lane(
+                key, names[name], self._group(dag if vertex >= 0 else -1), vertex + 1, start, end)
+            self._event(start, _BEGIN, track, self._name(names[name]) if vertex < 0
+                        else text(_NAME, f'job {job}'))
+            self._event(end, _END, track)
+
+    def _flows(
+        self, parts: list[bytes], vertex: int, job: int, leg: int, whole: bool
+    ) -> None:
         """Let the flows of the messages that it took end here, and those that it sends begin."""
-        vertex = ran.piece.vertex
-        base = ran.piece.job * self._n_edges + 1
-        into = self._into[vertex]
-        for leg in ran.legs:
-            if leg < len(into):
-                event.terminating_flow_ids.append(base + into[leg] & _MASK)
-        if ran.whole:
-            event.flow_ids.extend(base + edge & _MASK for edge in self._out[vertex])
+        base, into = job * self._n_edges + 1, self._into[vertex]
+        legs: Iterable[int] = range(len(into)) if leg < 0 else (leg,)
+        parts += (_fixed(_FLOW_ENDS, base + into[each]) for each in legs if each < len(into))
+        if whole:
+            parts += (_fixed(_FLOW, base + edge) for edge in self._out[vertex])
 
-    def verdict(self, row: JobRow, vertex: int) -> None:
-        """Write a job on the track of its sink, and a missed deadline where all of them are."""
-        text = f'job {row.job}' + ('' if row.verdict == 'in_time' else f' ({row.verdict})')
-        if row.completed_ns is not None and row.completed_ns >= row.release_ns:
-            track = self._lane(('sink', vertex), row.sink, _JOBS, vertex, row.release_ns,
-                               row.completed_ns)
-            event = self._begin(track, text)
-            self._note(event, 'deadline_ns', row.deadline_ns)
-            self._note(event, 'slack_ns', row.slack_ns or 0)
-            self._put(row.release_ns, event)
-            self._end(track, row.completed_ns)
-        track = self._lane(('deadline', vertex), f'{row.sink} deadline', _JOBS, vertex, 0, 0)
-        event = self._event(TrackEvent.TYPE_INSTANT, track, f'job {row.job}')
-        self._put(row.deadline_ns, event)
-        if row.verdict == 'in_time':
-            return
-        event = self._event(TrackEvent.TYPE_INSTANT, _MISSED, f'{row.sink} missed')
-        self._note(event, 'DAG', row.dag)
-        self._note(event, 'job', row.job)
-        self._note(event, 'verdict', row.verdict)
-        self._note(event, 'deadline_ns', row.deadline_ns)
-        if row.slack_ns is not None:
-            self._note(event, 'late_by_ns', -row.slack_ns)
-        self._put(row.deadline_ns if row.completed_ns is None else row.completed_ns, event)
-
-    def finish(self) -> None:
-        """Write how many callbacks were ready over time, which is known only now."""
-        times = np.concatenate([self._ready, self._started])
-        step = np.repeat([1, -1], len(self._ready))
+    def _ready(self, ready: Any, started: Any) -> None:
+        """Write how many callbacks were ready over time."""
+        times = np.concatenate([ready, started])
+        step = np.repeat([1, -1], len(ready))
         when, place = np.unique(times, return_inverse=True)
         change = np.zeros(len(when), dtype=np.int64)
         np.add.at(change, place, step)
         for time, count in zip(when.tolist(), np.cumsum(change).tolist()):
-            event = self._event(TrackEvent.TYPE_COUNTER, _READY, None)
-            event.counter_value = count
-            self._put(time, event)
+            self._event(time, _COUNTER, _READY, number(_VALUE, count))
+
+    def _verdicts(self) -> None:
+        """Write jobs on the tracks of their sinks, and missed deadlines where all of them are."""
+        verdicts = self._replay.judged.verdicts
+        verdicts = verdicts[sort_by(verdicts['release'], verdicts['sink'])]
+        names = [vertex.name for vertex in self._task_set.vertices]
+        for kind, dag, sink, job, release, deadline, completed, *_ in verdicts.tolist():
+            name, verdict = names[sink], VERDICTS[kind]
+            label = f'job {job}' + ('' if kind == SINK_IN_TIME else f' ({verdict})')
+            if completed >= release:
+                track = self._lane(('sink', sink), name, _JOBS, sink, release, completed)
+                self._event(release, _BEGIN, track, text(_NAME, label),
+                            self._note('deadline_ns', deadline),
+                            self._note('slack_ns', deadline - completed))
+                self._event(completed, _END, track)
+            track = self._lane(('deadline', sink), f'{name} deadline', _JOBS, sink, 0, 0)
+            self._event(deadline, _INSTANT, track, text(_NAME, f'job {job}'))
+            if kind == SINK_IN_TIME:
+                continue
+            late = () if completed < 0 else (self._note('late_by_ns', completed - deadline),)
+            self._event(
+                deadline if completed < 0 else completed, _INSTANT, _MISSED,
+                self._name(f'{printable(name)} missed'),
+                self._note('DAG', self._task_set.dags[dag].name), self._note('job', job),
+                self._note('verdict', verdict), self._note('deadline_ns', deadline), *late)
 
     # --- tracks ----------------------------------------------------------------------------------
 
     def _group(self, dag: int) -> int:
         """Return the track that holds a DAG's callbacks."""
-        if dag not in self._dag_groups:
-            if dag < 0:
-                name = 'undeclared'
-            else:
+        if dag not in self._groups:
+            name = 'undeclared'
+            if dag >= 0:
                 one = self._task_set.dags[dag]
                 name = f'{one.name}, every {format_ns(one.period_ns)}'
-            self._dag_groups[dag] = self._new(name, _CALLBACKS, dag + 1)
-        return self._dag_groups[dag]
+            self._groups[dag] = self._new(name, _CALLBACKS, dag + 1)
+        return self._groups[dag]
 
     def _lane(
         self, key: tuple[Any, ...], name: str, parent: int, rank: int, start: int, end: int
@@ -194,62 +253,48 @@ class PerfettoTarget(Target):
     def _describe(
         self, uuid: int, name: str, parent: int | None, rank: int, counts: bool = False
     ) -> None:
-        packet = TracePacket()
-        packet.trusted_packet_sequence_id = _SEQUENCE
-        track = packet.track_descriptor
-        track.uuid = uuid
-        track.name = printable(name)
+        track = number(1, uuid) + text(2, printable(name))
         if parent is not None:
-            track.parent_uuid = parent
-        track.sibling_order_rank = rank
+            track += number(5, parent)
         if counts:
-            track.counter.SetInParent()
-        track.child_ordering = type(track).EXPLICIT
-        self._write(packet)
+            track += message(8, b'')
+        track += number(11, _EXPLICIT) + number(12, rank)
+        self._put(number(_SEQUENCE_ID, _SEQUENCE) + message(_TRACK, track))
 
     # --- events ----------------------------------------------------------------------------------
 
-    def _begin(self, track: int, name: str) -> Any:
-        return self._event(TrackEvent.TYPE_SLICE_BEGIN, track, name)
+    def _name(self, name: str) -> bytes:
+        iid = self._names.get(name)
+        if iid is None:
+            iid = self._names[name] = len(self._names) + 1
+            self._interned += message(2, number(1, iid) + text(2, name))
+        return number(_NAME_IID, iid)
 
-    def _end(self, track: int, time: int) -> None:
-        self._put(time, self._event(TrackEvent.TYPE_SLICE_END, track, None))
+    def _note(self, key: str, value: int | str) -> bytes:
+        iid = self._keys.get(key)
+        if iid is None:
+            iid = self._keys[key] = len(self._keys) + 1
+            self._interned += message(3, number(1, iid) + text(2, key))
+        return message(_NOTE, number(1, iid) + (
+            number(4, value) if isinstance(value, int) else text(6, printable(value))))
 
-    def _event(self, kind: Any, track: int, name: str | None) -> Any:
-        self._packet = packet = TracePacket()
-        packet.trusted_packet_sequence_id = _SEQUENCE
-        packet.sequence_flags = _NEEDED | (_CLEARED if self._first else 0)
+    def _event(self, time: int, kind: int, track: int, *parts: bytes) -> None:
+        event = number(_TYPE, kind) + number(_UUID, track) + b''.join(parts)
+        packet = number(_TIMESTAMP, max(0, time)) + (
+            self._first_head if self._first else self._head) + message(_TRACK_EVENT, event)
         self._first = False
-        event = packet.track_event
-        event.type = kind
-        event.track_uuid = track
-        if name is not None and name.startswith('job '):
-            event.name = name       # there are too many of them to keep
-        elif name is not None:
-            event.name_iid = self._intern(self._names, name, packet.interned_data.event_names)
-        return event
+        if self._interned:
+            packet += message(_INTERNED, self._interned)
+            self._interned = b''
+        self._put(packet)
 
-    def _note(self, event: Any, key: str, value: int | str) -> None:
-        note = event.debug_annotations.add()
-        note.name_iid = self._intern(
-            self._keys, key, self._packet.interned_data.debug_annotation_names)
-        if isinstance(value, int):
-            note.int_value = value
-        else:
-            note.string_value = printable(value)
+    def _put(self, packet: bytes) -> None:
+        self._pending.append(message(_PACKET, packet))
+        self._size += len(packet)
+        if self._size > _PENDING_BYTES:
+            self._flush()
 
-    def _intern(self, known: dict[str, int], name: str, new: Any) -> int:
-        number = known.get(name)
-        if number is None:
-            number = known[name] = len(known) + 1
-            entry = new.add()
-            entry.iid = number
-            entry.name = printable(name)
-        return number
-
-    def _put(self, time: int, event: Any) -> None:
-        self._packet.timestamp = max(0, time)
-        self._write(self._packet)
-
-    def _write(self, packet: Any) -> None:
-        self._file.write(Trace(packet=[packet]).SerializeToString())
+    def _flush(self) -> None:
+        self._file.write(b''.join(self._pending))
+        self._pending.clear()
+        self._size = 0

@@ -13,37 +13,33 @@ from mddag_executor.report.tables import each_sink, never_due_lines, percent, ve
 from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
 
-_TIMES_HEADER = (
-    'DAG', 'sink', 'release lag', 'waiting', 'for group', 'executing', 'suspended', 'transport',
-    'worst job', 'waiting', 'for group', 'executing', 'suspended', 'transport')
+_PARTS = {
+    'release lag': 'release_lag_ns', 'waiting': 'waiting_ns', 'for group': 'waiting_group_ns',
+    'executing': 'executing_ns', 'suspended': 'suspended_ns', 'transport': 'transport_ns'}
 CALLBACKS_HEADER = (
     'callback', 'executions', 'busy', 'mean', 'longest', 'mean wait', 'longest wait', 'CPU',
     'interpreter')
 RECORDED_HEADER = ('callback', 'executions', 'busy', 'shortest', 'mean', 'longest')
 PATHS_HEADER = ('path', 'arrived', 'case', 'count', 'min', 'median', 'p99', 'max')
 _COMPARISON_HEADER = (
-    'DAG', 'sink', 'deadline', 'in time', 'share', 'recorded', 'share', 'median',
-    'recorded', 'p99', 'recorded', 'max', 'recorded')
+    'sink', 'deadline', 'due', 'in time', 'recorded', 'p99', 'recorded', 'max', 'recorded')
 
 
-def times_table(dags: Mapping[str, Any]) -> str:
-    """Return a table of where the response times went: on average, and for the worst job."""
-    rows: list[list[Cell]] = []
-    for sink in each_sink(dags):
-        row: list[Cell] = [sink.shown_dag, sink.shown_name]
-        breakdown = sink.result['breakdown']
-        if breakdown is None:
-            rows.append([*row, *[None] * 12])
-        else:
-            mean, worst = breakdown['mean'], breakdown['worst']
-            rows.append([*row, _time(mean['release_lag_ns']), *_parts(mean),
-                         worst['job'], *_parts(worst)])
-    return table(_TIMES_HEADER, rows)
-
-
-def _parts(parts: Mapping[str, int]) -> list[Cell]:
-    return [_time(parts[f'{key}_ns'])
-            for key in ('waiting', 'waiting_group', 'executing', 'suspended', 'transport')]
+def times_tables(dags: Mapping[str, Any]) -> Iterator[str]:
+    """Yield tables of where the response times went: on average, and for the worst job."""
+    for title, which in (('Where the response times went, on average:', 'mean'),
+                         ('The same of the worst job of each sink:', 'worst')):
+        found = [(sink.shown_name, None if sink.result['breakdown'] is None
+                  else sink.result['breakdown'][which]) for sink in each_sink(dags)]
+        # most programs have neither groups that wait nor coroutines
+        parts = [name for name, key in _PARTS.items() if name not in ('for group', 'suspended')
+                 or any(of is not None and of[key] for _, of in found)]
+        yield title
+        yield table(('sink', *(['job'] if which == 'worst' else []), *parts), [
+            [name, *([None] if which == 'worst' else []), *[None] * len(parts)] if of is None else
+            [name, *([of['job']] if which == 'worst' else []),
+             *(_time(of[_PARTS[part]]) for part in parts)]
+            for name, of in found])
 
 
 def _time(nanoseconds: int) -> str:
@@ -129,15 +125,13 @@ def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> st
     for sink in each_sink(dags):
         sides = (sink.result, recorded[sink.dag]['sinks'][sink.name])
         row: list[Cell] = [
-            sink.shown_dag, sink.shown_name, format_ns(sink.result['relative_deadline_ns'])]
-        for side in sides:
-            verdicts = counts(side)
-            row.extend((f'{verdicts.in_time} of {verdicts.due}',
-                        percent(verdicts.in_time, verdicts.due)))
-        for key in ('median', 'p99', 'max'):
+            sink.shown_name, format_ns(sink.result['relative_deadline_ns']),
+            counts(sides[0]).due]
+        row += [percent(counts(side).in_time, counts(side).due) for side in sides]
+        for key in ('p99', 'max'):
             for side in sides:
                 response = side['response_ns']
-                row.append(None if response is None else format_ns(response[key]))
+                row.append(None if response is None else _time(response[key]))
         rows.append(row)
     return table(_COMPARISON_HEADER, rows)
 

@@ -24,7 +24,8 @@ _BEST = '#3182bd'
 def lines(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the tables of callbacks, the tightest first, and of sinks, and the lines below."""
     short = _short(result)
-    yield 'How many times as long each callback may take, alone:'
+    yield from _load_lines(result)
+    yield '\nHow many times as long each callback may take, alone:'
     yield table(('callback', 'may take', 'then misses'), [
         [short[name], _times(one['factor']), short[one['breaks']]]
         for name, one in _tightest(result)])
@@ -32,6 +33,14 @@ def lines(result: Mapping[str, Any]) -> Iterator[str]:
     yield table(('sink', 'deadline', 'least margin', 'of it', '99 % have', 'median'), [
         [short[name], *_margins(sink)] for name, sink in result['sinks'].items()])
     yield from _summary(result)
+
+
+def _is_judged(result: Mapping[str, Any]) -> bool:
+    """Return whether there are sinks that complete, some of them in time."""
+    sinks = result['sinks']
+    never = sum(sink['margin_ns'] is None and not result['missed'].get(name)
+                for name, sink in sinks.items())
+    return never < len(sinks) and len(result['left_out']) < len(sinks)
 
 
 def _margins(sink: Mapping[str, Any]) -> list[Cell]:
@@ -49,10 +58,10 @@ def _summary(result: Mapping[str, Any]) -> Iterator[str]:
              if sink['margin_ns'] is None and not result['missed'].get(name)]
     if never:
         yield f'never completed, so not judged: {counted(len(never), "sink")}: {listed(never)}'
-    if len(never) == len(result['sinks']):
-        return
-    if len(result['left_out']) == len(result['sinks']):
-        yield 'every sink misses every deadline as things are: nothing is left that could break'
+    if not _is_judged(result):
+        if len(never) < len(result['sinks']):
+            yield ('every sink misses every deadline as things are: nothing is left that could '
+                   'break')
         return
     free = sum(one['factor'] is None for one in result['callbacks'].values())
     most = result['most']
@@ -66,7 +75,13 @@ def _summary(result: Mapping[str, Any]) -> Iterator[str]:
         yield (f'{counted(sum(some.values()), "deadline")} missed as things are: '
                + listed([f'{name} ({n})' for name, n in some.items()])
                + '; the factors say when another one is missed')
-    load = result['load']
+
+
+def _load_lines(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield how much longer all may take together, and how many workers and CPUs are enough."""
+    if not _is_judged(result):
+        return
+    load, most = result['load'], result['most']
     yield 'the load as a whole: ' + (
         f'{most:g} times and more' if load['factor'] is None else
         f'{_times(load["factor"])}, then {printable(load["breaks"])} misses')
@@ -88,7 +103,7 @@ def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
            '<link rel="icon" href="data:,">\n'
            f'<style>{_STYLE.read_text(encoding="utf-8")}</style></head><body>\n'
            f'<h1>{heading}</h1>\n')
-    for line in _summary(result):
+    for line in (*_load_lines(result), *_summary(result)):
         yield f'<p class="note">{escape(line)}</p>\n'
     short = _short(result)
     yield ('<h2>How many times as long each callback may take, alone</h2>\n<p class="note">The '

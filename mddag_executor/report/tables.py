@@ -61,8 +61,33 @@ def each_sink(dags: Mapping[str, Any]) -> Iterator[Sink]:
 
 
 def sink_table(dags: Mapping[str, Any]) -> str:
-    """Return a table with a row for each sink: counts, and response times by its deadline."""
-    return table(*sink_rows(dags))
+    """
+    Return a table for a terminal with a row for each sink, those that missed most first.
+
+    It has counts, and response times by the deadline.  Rows with misses are red on a terminal.
+    """
+    every = total(dags)
+    rare = [name for name in ('expired', 'failed', 'aborted') if getattr(every, name)]
+    found = [(sink, counts(sink.result)) for sink in each_sink(dags)]
+    found.sort(key=lambda each: -missed_share(each[1]))
+    rows: list[list[Cell]] = []
+    above = None
+    for sink, verdicts in found:
+        rows.append([
+            '' if sink.dag == above else sink.dag, sink.shown_name, verdicts.due,
+            percent(verdicts.in_time, verdicts.due), verdicts.late,
+            *(getattr(verdicts, name) for name in rare),
+            *response_cells(sink.result['response_ns'], 3),
+            format_ns(sink.result['relative_deadline_ns'])])
+        above = sink.dag
+    return table(
+        ('DAG', 'sink', 'due', 'in time', 'late', *rare, *HEADER[7:]), rows,
+        marked=[verdicts.in_time < verdicts.due for _, verdicts in found])
+
+
+def missed_share(verdicts: Counts) -> float:
+    """Return which share of the due deadlines was missed."""
+    return (verdicts.due - verdicts.in_time) / max(1, verdicts.due)
 
 
 def sink_rows(dags: Mapping[str, Any]) -> tuple[list[str], list[list[Cell]]]:
@@ -86,11 +111,11 @@ def rare_ends(every: Counts) -> list[str]:
     return [name for name in ('failed', 'aborted') if getattr(every, name)]
 
 
-def response_cells(response: Mapping[str, int] | None) -> list[Cell]:
+def response_cells(response: Mapping[str, int] | None, digits: int = 4) -> list[Cell]:
     """Return the cells for median, p99 and max of response times."""
     if response is None:
         return [None, None, None]
-    return [format_ns(response[key]) for key in ('median', 'p99', 'max')]
+    return [format_ns(response[key], digits) for key in ('median', 'p99', 'max')]
 
 
 def percent(part: int, whole: int) -> str:

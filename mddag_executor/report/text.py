@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+import os
 import re
+import sys
 
 from mddag_executor.text import listed as listed_plainly
 
@@ -13,6 +15,7 @@ Cell = str | int | float | None
 
 _LONGEST_LIST = 10
 _NUMBER = re.compile(r'[-+]?[\d,]+(\.\d+)?( ?(%|ns|us|ms|s|min|h|MB|KB))?|-|')
+_RED, _PLAIN = '\x1b[31m', '\x1b[0m'
 _UNITS = ((1, 'ns'), (1_000, 'us'), (1_000_000, 'ms'), (1_000_000_000, 's'))
 
 
@@ -58,12 +61,21 @@ def format_ns(nanoseconds: int, digits: int = 4) -> str:
     return f'{sign}{text} {unit}'
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
+def is_coloured() -> bool:
+    """Return whether standard output is a terminal that shows colours (see no-color.org)."""
+    return sys.stdout.isatty() and not os.environ.get('NO_COLOR') and os.environ.get(
+        'TERM') != 'dumb'
+
+
+def table(
+    header: Sequence[str], rows: Iterable[Sequence[Cell]], marked: Sequence[bool] = ()
+) -> str:
     """
     Return an aligned table; columns of numbers (also with a unit) are right-aligned.
 
     :param header: the titles of the columns
     :param rows: their cells; None is printed as `-`, a float with two decimals
+    :param marked: which rows are red where there are colours
     """
     body = [[_cell(cell) for cell in row] for row in rows]
     for row in body:
@@ -74,10 +86,13 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
              for column in columns]
     lines = [[printable(title) for title in header], *body]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    return ''.join(
-        '  '.join(cell.rjust(width) if is_right else cell.ljust(width)
-                  for cell, width, is_right in zip(line, widths, right)).rstrip() + '\n'
-        for line in lines)
+    texts = ['  '.join(
+        cell.rjust(width) if is_right else cell.ljust(width)
+        for cell, width, is_right in zip(line, widths, right)).rstrip() for line in lines]
+    if any(marked) and is_coloured():
+        texts[1:] = [f'{_RED}{text}{_PLAIN}' if red else text
+                     for text, red in zip(texts[1:], marked)]
+    return ''.join(text + '\n' for text in texts)
 
 
 def _cell(cell: Cell) -> str:

@@ -17,18 +17,17 @@ from functools import partial
 import itertools
 from typing import Any
 
-from mddag_executor.live.compat import (
+from mddag_executor.executor.compat import attach_futures
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.work import Work
+from mddag_executor.replacements import instead, Replacements
+from mddag_executor.rerun.compat import (
     action_handle,
-    attach_futures,
     CLIENT_HANDLE,
     feedback_callback,
     goal_states,
-    instead,
-    Replacements,
     SERVER_HANDLE,
 )
-from mddag_executor.live.entity import Entity
-from mddag_executor.live.work import Work
 from mddag_executor.rerun.loop import Loop
 from mddag_executor.rerun.services import Header
 
@@ -164,4 +163,4 @@ class Actions:
         entity = self._entities().get(id(waitable))
         if entity is not None and not entity.removed:
             engine = self._loop.engine
-            engine.ready(Work(waitable, function, (argument,), entity=entity), self._loop.now)
+            engine.ready(Work(entity, function, (argument,)), self._loop.now)

@@ -13,8 +13,9 @@ from collections.abc import Callable
 from typing import Any
 
 from mddag_executor.core import NEVER
-from mddag_executor.live.engine import Engine
-from mddag_executor.live.work import Work
+from mddag_executor.core.rules import progress
+from mddag_executor.executor.engine import Engine
+from mddag_executor.executor.work import Work
 from mddag_executor.simulate.machine import begins, new_machine, NEXT_TIME, settle, share
 
 
@@ -56,8 +57,10 @@ class Computing:
         :param takes: how long, if nothing keeps it; of that it computes ``work.cpu_ns``.
         :param leaving: what is to be done before its end, and how far it is then.
         """
-        self._engine.takes(work, takes)
-        begins(self._state, self._machine, work.x, takes, work.cpu_ns, False)
+        state, x = self._state, work.x
+        state.x_left[x] += takes - state.x_cost[x]  # else the core cannot say how far it is
+        state.x_cost[x] = takes
+        begins(state, self._machine, x, takes, work.cpu_ns, False)
         self._running[work.worker] = what
         if leaving:
             self._places[work.x] = sorted(leaving, key=lambda each: each[0], reverse=True)
@@ -86,7 +89,7 @@ class Computing:
     def go_on(self, now: int) -> bool:
         """Do what is due; False: there is nothing."""
         for x, places in self._places.items():
-            if places and self._engine.progress(x, now) >= places[-1][0]:
+            if places and progress(self._state, x, now) >= places[-1][0]:
                 leaves = places.pop()[1]
                 self._leaves_next(x)
                 leaves()

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import Any
 
-from mddag_executor.live.compat import instead, Replacements
+from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.executor import NodeHolder
 from mddag_executor.rerun.loop import Loop
 from mddag_executor.rerun.messages import Messages

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from mddag_executor.executor.compat import BareExecutor
+from mddag_executor.executor.entity import Entity, TASK
+from mddag_executor.executor.tasks import make_task, Unclaimed
+from mddag_executor.executor.work import QuickCallback, Work
 from mddag_executor.hosting.host import Guest, Host
-from mddag_executor.live.compat import BareExecutor
-from mddag_executor.live.entity import Entity, TASK
-from mddag_executor.live.tasks import make_task, Unclaimed
-from mddag_executor.live.work import QuickCallback, Work
 from mddag_executor.rerun.loop import Loop, POLL_NS
 from rclpy.node import Node
 from rclpy.task import Task

@@ -40,11 +40,12 @@ import math
 from typing import Any
 
 from mddag_executor.core import NEVER
-from mddag_executor.live.compat import UNKNOWN
-from mddag_executor.live.engine import Engine
-from mddag_executor.live.groups import Refused
-from mddag_executor.live.jobs import Origin
-from mddag_executor.live.work import Destroyed, QuickCallback, Work
+from mddag_executor.core.state import DONE
+from mddag_executor.executor.compat import UNKNOWN
+from mddag_executor.executor.engine import Engine
+from mddag_executor.executor.groups import Refused
+from mddag_executor.executor.jobs import Origin
+from mddag_executor.executor.work import Destroyed, QuickCallback, Work
 from mddag_executor.rerun.computing import Computing
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.strands import Strands
@@ -201,7 +202,7 @@ class Loop:
             self.strands.expire(now)
             return True
         engine = self.engine
-        work = engine.dispatch(now) if engine.has_waiting else None
+        work = engine.dispatch(0, now)
         if work is not None:
             self._execute(work)
             return True
@@ -321,9 +322,16 @@ class Loop:
         if work in self._resumed:
             self._resumed.discard(work)
             return 0
-        if not self.engine.makes_whole(work):
+        if not self._is_last_leg(work, origin):
             return 0
         return self._times.execution(origin.dag, origin.vertex, release)
+
+    def _is_last_leg(self, work: Work, origin: Origin) -> bool:
+        """Return whether the end of a running execution completes its vertex."""
+        state, tables = self.engine.scheduler.state, self.engine.tables
+        first = state.job_base[origin.slot] + tables.region_offset[origin.vertex]
+        return all(state.x_state[x] == DONE
+                   for x in range(first, first + tables.n_legs[origin.vertex]) if x != work.x)
 
     def ended(self, execution: Execution, now: int) -> None:
         """End an execution in virtual time, or suspend it."""

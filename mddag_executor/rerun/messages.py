@@ -14,7 +14,7 @@ the run publishes on the topic: then the node's messages count.
 
 Which job does a message belong to?  That of the execution that has sent it.  A recorded one starts
 a job where it is its DAG's source.  Elsewhere its publisher is not here, and it enters the job
-that its header's stamp names, or one of its own (see ``live.other_processes``).
+that its header's stamp names, or one of its own (see ``executor.other_processes``).
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
-from mddag_executor.live.compat import callback_type, WITH_INFO
-from mddag_executor.live.entity import Entity
-from mddag_executor.live.intake.entities import alive
-from mddag_executor.live.jobs import header_stamp, Origin
-from mddag_executor.live.recorder import Recorder
-from mddag_executor.live.work import Work
+from mddag_executor.executor.compat import callback_type, WITH_INFO
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.jobs import header_stamp, Origin
+from mddag_executor.executor.recorder import Recorder
+from mddag_executor.executor.snapshot import alive
+from mddag_executor.executor.work import Work
 from mddag_executor.rerun.errors import RerunError
 from mddag_executor.rerun.loop import ARRIVED, Held, Loop
 from mddag_executor.rerun.outputs import Outputs
@@ -277,7 +277,7 @@ class Messages:
                 'source_timestamp': source_stamp, 'received_timestamp': now,
                 'publication_sequence_number': number,
                 'reception_sequence_number': inlet.received}
-        work = Work(entity.rclpy, entity.rclpy.callback, args, entity=entity)
+        work = Work(entity, entity.rclpy.callback, args)
         release = stamp = -1
         if entity.source >= 0:
             release, stamp = self._release(entity, message, source_stamp)
@@ -287,7 +287,7 @@ class Messages:
             if stamp < 0:
                 stamp = now  # a job of its own
         if self._recorder is not None:
-            self._recorder.taken(entity, message, source_stamp)
+            self._recorder.taken(entity, message, source_stamp, now)
         engine.arrived(work, origin, release, stamp, now)
 
     def _release(self, entity: Entity, message: Any, source_stamp: int) -> tuple[int, int]:

@@ -24,18 +24,18 @@ from typing import Any, BinaryIO
 from mddag_executor import defaults
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
+from mddag_executor.executor import publishing
+from mddag_executor.executor.engine import Engine
+from mddag_executor.executor.entity import WAITABLE
+from mddag_executor.executor.other_processes import OtherProcesses
+from mddag_executor.executor.recorder import Recorder
+from mddag_executor.executor.registry import Registry
+from mddag_executor.executor.shutdown import is_over
+from mddag_executor.executor.snapshot import is_qos_event, snapshot
+from mddag_executor.executor.work import Work
 from mddag_executor.hosting.host import Guest
 from mddag_executor.hosting.loading import describe, Program, ros_arguments
-from mddag_executor.live import hooks
-from mddag_executor.live.compat import instead, Replacements
-from mddag_executor.live.engine import Engine
-from mddag_executor.live.entity import WAITABLE
-from mddag_executor.live.intake.entities import is_qos_event, snapshot
-from mddag_executor.live.other_processes import OtherProcesses
-from mddag_executor.live.recorder import Recorder
-from mddag_executor.live.registry import Registry
-from mddag_executor.live.shutdown import is_over
-from mddag_executor.live.work import Work
+from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.actions import Actions
 from mddag_executor.rerun.clocks import VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
@@ -226,7 +226,7 @@ class Rerun:
         arguments = sys.argv  # each program has its own
         self._programs = programs
         with _context(self._settings.ros_args) as context:
-            hooks.install()
+            publishing.install()
             self._make(context)
             loop = self._loop
             try:
@@ -274,7 +274,7 @@ class Rerun:
             original(guard)
             entity = self._registry.by_id.get(id(guard))
             if entity is not None and guard.callback is not None:
-                work = Work(guard, guard.callback, entity=entity)
+                work = Work(entity, guard.callback)
                 self._loop.soon(lambda: self._engine.ready(work, self._loop.now))
 
         return trigger

@@ -16,15 +16,11 @@ from functools import partial
 import itertools
 from typing import Any
 
-from mddag_executor.live.compat import (
-    complete_request,
-    instead,
-    new_request,
-    Replacements,
-    service_name,
-)
-from mddag_executor.live.entity import Entity, SERVICE
-from mddag_executor.live.work import Work
+from mddag_executor.executor.compat import complete_request, service_name
+from mddag_executor.executor.entity import Entity, SERVICE
+from mddag_executor.executor.work import Work
+from mddag_executor.replacements import instead, Replacements
+from mddag_executor.rerun.compat import new_request
 from mddag_executor.rerun.loop import Loop
 from rclpy.client import Client
 from rclpy.exceptions import InvalidHandle
@@ -106,8 +102,8 @@ class Services:
             return
         service = entity.rclpy
         work = Work(
-            service, service.callback, (request, service.srv_type.Response()),
-            partial(service.send_response, header=(client, number)), entity=entity)
+            entity, service.callback, (request, service.srv_type.Response()),
+            partial(service.send_response, header=(client, number)))
         engine, now = self._loop.engine, self._loop.now
         if entity.source >= 0:
             engine.arrived(work, None, now, -1, now)

@@ -19,10 +19,9 @@ from typing import NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.errors import UsageError
-from mddag_executor.replay.as_recorded import Replay
 from mddag_executor.replay.bags import Bag, is_ordinary
 from mddag_executor.replay.load import LoadBuilder
-from mddag_executor.replay.run import open_run
+from mddag_executor.replay.run import open_recording
 from mddag_executor.rerun.errors import RerunError
 from mddag_executor.rerun.times import AsRecorded, SameInEachJob, Times
 from mddag_executor.simulate import draw_execution_times, read_execution_times
@@ -202,11 +201,10 @@ def _begins_as_mcap(path: str) -> bool:
 
 def _recorded(path: str, task_set: TaskSet, name: str) -> Source:
     """Return what a recorded run has: from when to when it was, and its times."""
-    run = open_run(path, task_set, name)
+    run = open_recording(path, task_set, name)
     tables = Tables.build(task_set, max_active_jobs=NEVER)
     head = run.head
-    builder = LoadBuilder(task_set, tables, run.who, head.workers, max(0, head.cpus))
-    Replay(run, more=lambda replay: [builder], paths=False)
+    builder = LoadBuilder(run, tables, head.workers, max(0, head.cpus))
     start = run.end if run.start is None else run.start
     return Source(
         name, min(start, head.time or start), run.end, None, AsRecorded(tables, builder.build()))

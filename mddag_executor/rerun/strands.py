@@ -36,8 +36,6 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.live.thread_clock import is_runnable
-
 _LOOK_S = 0.05
 _LONGEST_LOOK_S = 1.0
 """More time between two looks is that of a process that was stopped."""
@@ -322,6 +320,14 @@ class _Watch:
                 raise Stuck(owner, 'blocking', self._patience_s)
             if self._computed_s > _COMPUTES * self._patience_s:
                 raise Stuck(owner, 'computing', _COMPUTES * self._patience_s)
+
+
+def is_runnable(folder: Path) -> bool:
+    """Return whether a thread runs or waits for a CPU, by its folder in /proc (proc(5))."""
+    try:
+        return (folder / 'stat').read_bytes().rpartition(b')')[2].split()[0] == b'R'
+    except (OSError, IndexError):
+        return False
 
 
 def place_of(ident: int) -> str:

@@ -18,10 +18,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from mddag_executor.live.compat import ends_sleep, instead, Replacements, with_timer_info
-from mddag_executor.live.entity import Entity
-from mddag_executor.live.intake.timers import ZERO_PERIOD_NS
-from mddag_executor.live.work import Work
+from mddag_executor.executor.compat import ends_sleep, with_timer_info
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.timers import ZERO_PERIOD_NS
+from mddag_executor.executor.work import Work
+from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.loop import Loop, TIMER
 from rclpy.exceptions import InvalidHandle
 from rclpy.timer import Timer
@@ -118,8 +119,7 @@ class Timers:
         if ends_sleep(callback):
             callback()
             return
-        work = Work(
-            timer, with_timer_info(timer, callback, info), (), due=now, entity=known.entity)
+        work = Work(known.entity, with_timer_info(timer, callback, info))
         engine.timer_due(work, now, now)
 
     # --- what nodes do with them -----------------------------------------------------------------

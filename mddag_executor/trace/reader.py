@@ -163,6 +163,10 @@ class TraceReader:
         """Yield what ``events`` yields in the order of time, many at once."""
         return self._read(Channels(set(names), True), Reading.by_time)
 
+    def chunks(self, names: Iterable[str]) -> Iterator[Events]:
+        """Yield the same in the order of the file, chunk by chunk."""
+        return self._read(Channels(set(names), True), Reading.by_file)
+
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the messages of some topics, in the order of the file; they are not decoded."""
         return self._read(Channels(set(), True), partial(
@@ -209,8 +213,7 @@ def read_events(path: str | os.PathLike[str],
     """
     Yield the events of a trace in the order of time, in the form that CARET's analysis takes.
 
-    It stops on events that it does not know: `mddag_executor.replay.caret_events` leaves those
-    out, and adds what it needs of a trace of this executor.
+    It stops on events that it does not know.
 
     Each is a dict of `_name` (as in `ros2:callback_start`), `_timestamp` (ns), `_vpid`, `_vtid`
     and the event's fields as the file has them. In an imported recording it has `_procname`, too:

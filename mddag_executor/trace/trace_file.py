@@ -43,7 +43,7 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-from mddag_executor.output_rules import EXISTS, open_recording, REMEDY
+from mddag_executor.output_rules import create_recording, EXISTS, REMEDY
 from mddag_executor.trace import cdr, records
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.groups import Group, GROUPS
@@ -185,7 +185,7 @@ class TraceFile:
         self._start: int | None = None      # least and greatest time of all messages
         self._end = 0
         try:
-            self._stream = open_recording(self.path, overwrite)
+            self._stream = create_recording(self.path, overwrite)
         except FileExistsError:
             raise TraceError(self.path, EXISTS, REMEDY) from None
         except (OSError, ValueError) as error:

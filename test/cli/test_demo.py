@@ -110,5 +110,5 @@ def test_the_main_job_in_two_processes(
     assert len(load(tmp_path / 'made' / 'placed.yaml').processes) == 2
     assert [(run['what'], run['executor']) for run in result['measured']] == [
         (what, executor) for what in ('2 processes', 'one process')
-        for executor in ('rad-events', 'events')]
+        for executor in ('rad', 'events')]
     assert 'predicted in time' in process.stdout and 'demo.p2.mcap' in process.stdout

@@ -7,18 +7,15 @@ from __future__ import annotations
 from contextlib import redirect_stdout
 import io
 import json
+import os
 from pathlib import Path
-import re
 import subprocess
 import sys
 from typing import Any
 
-from mcap.reader import make_reader
 from mddag_executor.cli import main as program
-from mddag_executor.replay import caret_events
-from mddag_executor.replay.for_caret import CARET_EVENTS
-from mddag_executor.trace import read_events, TraceFile, TraceReader
-from mddag_executor.trace.schema import EventType
+from mddag_executor.recording.tables import TABLES
+from mddag_executor.replay import open_recording
 import pytest
 
 from .helpers import caller
@@ -60,8 +57,6 @@ def test_a_file_of_each_form(
 ) -> None:
     if name.endswith('parquet'):
         pytest.importorskip('pyarrow', reason='pyarrow is not installed')
-    if name.endswith('pftrace'):
-        pytest.importorskip('perfetto', reason='perfetto is not installed')
     out = tmp_path / name
     assert call(capsys, 'export', trace, '-o', out) == (0, f'exported: {out}\n', '')
     assert out.read_bytes().startswith(start)
@@ -90,8 +85,8 @@ def test_another_graph_judges(
 
 @pytest.mark.parametrize(('arguments', 'error'), [
     (['export', 'TRACE', '-o', 'out.xlsx'], 'it is not known what to write'),
-    (['export', 'TRACE', '-o', 'out'], '.pftrace, .csv, .parquet, .foxglove.mcap or /'),
     (['export', 'TRACE', '-o', 'copy.mcap'], 'it is not known what to write'),
+    (['export', 'TRACE', '-o', 'out'], 'let the name end in .pftrace, .csv, .parquet or /'),
     (['export', 'TRACE', '-o', 'out.pftrace', '--rows', 'jobs'], '--rows: '),
     (['export', '-', '-', '-o', 'out.csv'], 'standard input can be only one'),
     (['export', 'GRAPH', '-o', 'out.csv'], 'error: '),
@@ -121,7 +116,6 @@ def test_bad_input(
 
 @pytest.mark.parametrize(('package', 'arguments', 'extra'), [
     ('pyarrow', ['export', 'TRACE', '-o', 'out.parquet'], 'export'),
-    ('perfetto', ['export', 'TRACE', '-o', 'out.pftrace'], 'export'),
     ('bokeh', ['replay', 'TRACE', '--report', 'out.html'], 'report'),
     ('bokeh', ['simulate', 'GRAPH', '--report', 'out.html'], 'report')])
 def test_a_missing_package_is_named(
@@ -191,12 +185,12 @@ def test_diff(
     call(capsys, 'simulate', quick, '--duration', '100ms', '--workers', 1, '--trace', after)
     status, out, err = call(capsys, 'diff', trace, after, '--fail-on-worse', '--callbacks')
     assert (status, err) == (0, '')
-    assert ['/n', 'n:s', '10', '10', '0', '10', '0.00', '%', '100.00', '%', '10', '0', '6', 'ms',
-            '-50.0', '%', '6', 'ms', '-50.0', '%', '6', 'ms', '-50.0', '%'] in [
+    assert ['n:s', '10', '10', '0.00', '%', '100.00', '%', '6', 'ms', '-50.0', '%', '6', 'ms',
+            '-50.0', '%'] in [
                 line.split() for line in out.splitlines()]
-    assert '/n:t' in out and 'worse in the second run: 0 sinks' in out
+    assert '/n:t' in out and 'worse in B: 0 sinks' in out
     status, out, _ = call(capsys, 'diff', after, trace, '--fail-on-worse')
-    assert status == 1 and 'worse in the second run: 1 sink' in out
+    assert status == 1 and 'worse in B: 1 sink' in out
     assert call(capsys, 'diff', after, trace)[0] == 0
     status, out, _ = call(capsys, 'diff', after, trace, '--json', '-')
     result = json.loads(out)
@@ -213,77 +207,76 @@ def test_diff(
         == 0
 
 
-def test_a_file_for_foxglove_and_its_layout(
+def test_the_tables_of_a_recording(
     trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / 'run.foxglove.mcap'
-    assert call(capsys, 'export', trace, '-o', out) == (0, f'exported: {out}\n', '')
-    topics: dict[str, list[Any]] = {}
-    times = []
-    with out.open('rb') as file:
-        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
-            assert schema is not None
-            assert (schema.encoding, channel.message_encoding) == ('jsonschema', 'json')
-            assert (schema.name == 'foxglove.Log') == (channel.topic == '/misses')
-            topics.setdefault(channel.topic, []).append(json.loads(message.data))
-            times.append(message.log_time)
-    assert times == sorted(times)
-    assert list(topics) == ['/workers/0', '/sinks/n/s', '/misses']
-    # each callback runs 10 times: it begins, and the worker is idle again
-    states = [message['state'] for message in topics['/workers/0']]
-    assert [states.count(state) for state in ('/n:t', '/n:s', 'idle')] == [10, 10, 20]
-    assert topics['/sinks/n/s'][0] == {
-        'job': 0, 'verdict': 'late', 'missed': 1, 'deadline_ms': 5.0, 'response_ms': 6.0,
-        'margin_ms': -1.0}
-    assert topics['/misses'][0] == {
-        'timestamp': {'sec': 0, 'nsec': 6_000_000}, 'level': 3,
-        'message': 'job 0 of /n late by 1 ms', 'name': '/n:s', 'file': '', 'line': 0}
-    layout = json.loads((tmp_path / 'run.foxglove.json').read_text())
-    shown = json.dumps(layout['layout'])
-    assert all(panel in shown for panel in layout['configById'])
-    paths = [path['value'] for panel in layout['configById'].values()
-             for path in panel.get('paths', ())]
-    assert all(path.rpartition('.')[0] in topics for path in paths)
+    parquet = pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
+    out = tmp_path / 'tables'
+    assert call(capsys, 'export', DEMO, '-o', f'{out}/') == (0, f'exported: {out}/\n', '')
+    recording = open_recording(DEMO)
+    assert {path.stem for path in out.iterdir()} == set(TABLES)
+    for name in TABLES:
+        table = parquet.read_table(out / f'{name}.parquet')
+        assert table.num_rows == len(getattr(recording, name))
+        assert table.schema.metadata[b'mddag.tables'] == b'1'
+    executions = parquet.read_table(out / 'executions.parquet')
+    assert executions.schema.field('start').metadata == {b'unit': b'ns'}
+    assert executions['start'].to_pylist() == recording.executions['start'].tolist()
+    names = {vertex.name for vertex in recording.task_set.vertices}
+    assert set(executions['vertex'].to_pylist()) - {None} <= names
+    keys = {callback.key for callback in recording.task_set.callbacks}
+    assert {row['callback'] for row in executions.to_pylist() if row['vertex']} <= keys
 
 
-@pytest.mark.needs('babeltrace2')
-@pytest.mark.parametrize('recorded', [False, True])
-def test_a_session_that_is_imported_again_has_the_same_events(
-    recorded: bool, trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    trace = DEMO if recorded else trace
-    out, back = tmp_path / 'session', tmp_path / 'back.mcap'
-    assert call(capsys, 'export', trace, '-o', f'{out}/') == (0, f'exported: {out}/\n', '')
-    assert call(capsys, 'import', 'ctf', out, '-o', back)[0] == 0
-    before, after = (list(TraceReader(path).events(sorted=True)) for path in (trace, back))
-    assert after.pop(0)[0] == 'ros2:rcl_init'       # what tracetools_analysis asks for
-    assert before == after
-    status, _, error = call(capsys, 'export', trace, '-o', f'{out}/')
-    assert (status, error) == (
-        2, f'error: {out}: is there already: name another folder\n')
-
-
-@pytest.mark.needs('babeltrace2')
-def test_a_session_for_caret_has_what_its_tracer_sees(
+def test_a_folder_replaces_an_earlier_export_only(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out, back = tmp_path / 'session', tmp_path / 'back.mcap'
-    assert call(capsys, 'export', DEMO, '-o', f'{out}/', '--caret')[0] == 0
-    assert call(capsys, 'import', 'ctf', out, '-o', back)[0] == 0
-    wanted = {'ros2_caret:dds_write', 'ros2:dispatch_subscription_callback', 'ros2:callback_start'}
-    names = [event['_name'] for event in read_events(back)]
-    assert wanted <= set(names) <= CARET_EVENTS
-    expected = list(caret_events(DEMO))
-    assert len(names) == len(expected)
-    found = [event for event in read_events(back) if event['_name'] in wanted]
-    assert found == [event for event in expected if event['_name'] in wanted]
+    pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
+    out, part = tmp_path / 'tables', tmp_path / '.tables.part'
+    done = 0, f'exported: {out}/\n', ''
+    part.mkdir()        # as a killed command leaves it
+    (part / 'releases.parquet').write_bytes(b'half')
+    assert call(capsys, 'export', DEMO, '-o', f'{out}/') == done
+    whole = {path.name: path.read_bytes() for path in out.iterdir()}
+    (out / 'misses.parquet').unlink()
+    (out / 'releases.parquet').write_bytes(b'old')
+    assert call(capsys, 'export', DEMO, '-o', f'{out}/') == done
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == whole
+    assert os.listdir(tmp_path) == ['tables']
+    (out / 'mine.txt').write_text('notes')
+    assert call(capsys, 'export', DEMO, '-o', f'{out}/') == (
+        2, '', f'error: {out}: this folder holds other files, for instance mine.txt: name a new '
+        'folder, or remove this one\n')
+    assert len(os.listdir(out)) == len(whole) + 1 and os.listdir(tmp_path) == ['tables']
+    file = tmp_path / 'file'
+    file.write_text('notes')
+    status, _, error = call(capsys, 'export', DEMO, '-o', f'{file}/')
+    assert status == 2 and error.startswith(f'error: {file}: there is a file already')
+
+
+def test_an_export_that_stops_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
+    out = tmp_path / 'tables'
+    out.mkdir()
+    (out / 'releases.parquet').write_bytes(b'old')
+
+    def stopped(recording: object, folder: Path) -> None:
+        (folder / 'releases.parquet').write_bytes(b'half')
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr('mddag_executor.recording.frames.write_tables', stopped)
+    call(capsys, 'export', DEMO, '-o', f'{out}/')
+    assert os.listdir(tmp_path) == ['tables']
+    assert (out / 'releases.parquet').read_bytes() == b'old'
 
 
 @pytest.mark.parametrize(('arguments', 'error'), [
-    (('--caret', '-o', 'x.csv'), "--caret: it is for a folder: let the name of -o end in '/'"),
-    (('--rows', 'jobs', '-o', 'x/'), 'leave GRAPH, --reschedule and --rows out'),
-    (('--rows', 'jobs', '-o', 'x.foxglove.mcap'), 'a .mcap gets both')])
-def test_options_of_sessions_and_foxglove(
+    (('--rows', 'jobs', '-o', 'x/'), 'the tables are both'),
+    (('-o', 'x.mcap'), 'it is not known what to write'),
+    (('-o', 'nowhere/x/'), 'there is no directory nowhere')])
+def test_outputs_that_cannot_be(
     arguments: tuple[str, ...], error: str, trace: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, _, said = call(capsys, 'export', trace, *arguments)
@@ -305,18 +298,3 @@ def test_a_parquet_export_that_fails_is_one_line(
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr.startswith('error: ') and done.stderr.count('\n') == 1
     assert not (tmp_path / 'out.parquet').exists()
-
-
-def test_a_session_has_the_names_that_were_imported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A trace calls an event's own field `timestamp` otherwise; a session does not."""
-    kind = EventType('my_app', 'frame', (
-        ('timestamp_', 'int64'), ('other_', 'int64'), ('vpid_', 'int64'), ('vtid__', 'int64'),
-        ('vtid_', 'int64')))
-    with TraceFile(tmp_path / 'a.mcap', extra_events=[kind]) as file:
-        file.add('my_app:frame', 1, 2, 3, 4, 5, 6, 7, 8)
-    assert call(capsys, 'export', tmp_path / 'a.mcap', '-o', f'{tmp_path}/s/')[0] == 0
-    metadata = (tmp_path / 's' / 'ust' / 'metadata').read_text()
-    line = next(line for line in metadata.splitlines() if 'my_app:frame' in line)
-    assert re.findall(r'} _(\w+);', line) == ['timestamp', 'other_', 'vpid', 'vtid__', 'vtid']

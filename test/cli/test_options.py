@@ -104,7 +104,7 @@ def test_the_help_of_verbs_of_verbs(
 
 
 def test_the_limit_of_workers_is_the_same_everywhere(tmp_path: Path) -> None:
-    from mddag_executor.live.settings import resolve
+    from mddag_executor.executor.settings import resolve
     graph = tmp_path / 'g.yaml'
     simulate = ['simulate', str(graph), '--duration', '1us', '--workers']
     for workers, status in ((4096, 0), (4097, 2)):
@@ -117,6 +117,6 @@ def test_the_limit_of_workers_is_the_same_everywhere(tmp_path: Path) -> None:
             ['generate', '--workers', str(workers), '--utilisation', '0.001', '-o',
              str(tmp_path / 'made.yaml')]) == status
         with refused:
-            resolve(str(graph), workers, 1, 'auto')
+            resolve(str(graph), workers, 1)
         with refused:
             check(Settings(workers=workers))

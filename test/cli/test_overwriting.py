@@ -38,7 +38,7 @@ def run(graph: Path, capsys: pytest.CaptureFixture[str]) -> Path:
 
 @pytest.mark.parametrize('command', [
     'export run.mcap -o run.mcap',
-    'export run.mcap -o ./run.mcap --overwrite',
+    'export run.mcap -o ./run.mcap',
     'export run.mcap -o link.csv',
     'replay run.mcap --json run.mcap',
     'replay run.mcap graph.yaml --json graph.yaml',
@@ -129,7 +129,7 @@ def test_empty_files_and_other_results_are_replaced(
     assert call(capsys, 'replay', run, '--json', '/dev/null', '--junit', '/dev/null')[0] == 0
 
 
-@pytest.mark.parametrize('there', ['run.p.mcap', 'run.q.2.mcap'])
+@pytest.mark.parametrize('there', ['run.p.mcap', 'run.q.mcap'])
 def test_several_processes_replace_no_trace(
     folder: Path, capsys: pytest.CaptureFixture[str], there: str
 ) -> None:

@@ -180,3 +180,31 @@ def test_what_can_not_be(
     assert (status, out, errors.count('\n')) == (2, '', 1), errors
     assert errors.startswith('error: ') and problem in errors
     assert not list(tmp_path.iterdir())
+
+
+def test_a_part_by_time(
+    files: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ten jobs, one each 100 ms: that at `--from` is in the part, that at `--to` is not."""
+    part = '--from', '200ms', '--to', '500ms'
+    for name, due in (('own.mcap', 3), ('imported.mcap', 2)):
+        given = files[name], *(() if name == 'own.mcap' else (files['graph.yaml'],))
+        status, output, _ = call(capsys, 'replay', *given, *part, '--json', '-')
+        assert status == 0 and json.loads(output)['dags']['/camera']['jobs'] == due
+        status, output, _ = call(capsys, 'explain', *given, *part)
+        assert status == 0 and f'{due} sink jobs due' in output
+        jobs = tmp_path / 'jobs.csv'
+        assert call(capsys, 'export', *given, *part, '--rows', 'jobs', '-o', str(jobs))[0] == 0
+        assert len(jobs.read_text().splitlines()) == 1 + due
+
+
+@pytest.mark.parametrize(('arguments', 'error'), [
+    ('--from 2s --to 1s', '--to: the part ends before it begins'),
+    ('--to 1s --skip 1s', '--skip: the part begins with --from'),
+    ('--to 1s --reschedule', '--to: the scheduler runs over whole recordings'),
+    ('--from 60min', 'it ends 1.000 s after its first release: give an earlier time')])
+def test_parts_that_cannot_be(
+    files: dict[str, str], arguments: str, error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, _, said = call(capsys, 'replay', files['own.mcap'], *arguments.split())
+    assert status == 2 and error in said and len(said.splitlines()) == 1

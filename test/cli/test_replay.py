@@ -33,12 +33,12 @@ def test_the_tables(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = call(capsys, trace)
     assert (status, err) == (0, '')
     lines = [line.split() for line in out.splitlines()]
-    assert ['/driver', 'filter:run', '3', '2', '66.67', '%', '1', '0', '6', 'ms', '10', 'ms', '10',
-            'ms', '8', 'ms'] in lines
-    assert ('Where the response times went: means, and the worst job of each sink:'
-            in out.splitlines())
-    assert ['/driver', 'filter:run', '0', 'ns', '1', 'ms', '0', 'ns', '6', 'ms', '0', 'ns', '0',
-            'ns', '2', '1', 'ms', '0', 'ns', '9', 'ms', '0', 'ns', '0', 'ns'] in lines
+    assert ['/driver', 'filter:run', '3', '66.67', '%', '1', '6', 'ms', '10', 'ms', '10', 'ms',
+            '8', 'ms'] in lines
+    at = out.splitlines().index('Where the response times went, on average:')
+    assert lines[at + 2] == ['filter:run', '0', 'ns', '1', 'ms', '6', 'ms', '0', 'ns']
+    at = out.splitlines().index('The same of the worst job of each sink:')
+    assert lines[at + 2] == ['filter:run', '2', '0', 'ns', '1', 'ms', '9', 'ms', '0', 'ns']
     assert '3 sink jobs due, 2 in time (66.67 %), 1 late, 0 expired' in out
     assert 'policy rad, 2 workers, 40 ms, utilisation 0.225 (all callbacks: 0.225)' in out
     assert 'first miss: /filter:run, job 2, 2 ms late' in out
@@ -112,9 +112,8 @@ def test_reschedule(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
         '--overheads', 'none')
     assert (status, err) == (0, '')
     lines = [line.split() for line in out.splitlines()]
-    assert ['/driver', 'filter:run', '8', 'ms', '2', 'of', '3', '66.67', '%', '2', 'of', '3',
-            '66.67', '%', '5', 'ms', '6', 'ms', '9', 'ms', '10', 'ms', '9', 'ms', '10',
-            'ms'] in lines
+    assert ['filter:run', '8', 'ms', '3', '66.67', '%', '66.67', '%', '9', 'ms', '10', 'ms', '9',
+            'ms', '10', 'ms'] in lines
     assert ('policy fifo, 1 worker, preemptive, 40 ms, utilisation 0.450, workers busy 45.0 %'
             in out.splitlines())
     assert 'first miss: /filter:run, job 2, 1 ms late' in out

@@ -343,7 +343,7 @@ def test_the_names_of_synthetic_nodes_are_those_of_the_declaration(
 def test_two_workers_are_a_bound(graph: Path, mddag: Mddag) -> None:
     process = mddag(
         'run', graph, '--synthetic', 'sleep', '--utilisation', '0.9', '--workers', '2',
-        '--duration', '1s', '--json', '-', '--intake', 'waitset')
+        '--duration', '1s', '--json', '-')
     result = json.loads(process.stdout)
     assert result['workers'] == 2
     assert result['measured']['utilisation'] == pytest.approx(0.9, abs=0.001)
@@ -374,13 +374,32 @@ def test_the_table_has_a_row_for_each_sink() -> None:
         'two': {'sinks': {'/x/lonely:b': sink(0, response_ns=None)}}})
     lines = text.splitlines()
     assert len(lines) == 4
-    assert lines[1].split() == ['one', '/long/way/node:a', '10', '10', '100.00', '%', '0', '0',
-                                '2', 'ms', '3', 'ms', '4', 'ms', '30', 'ms']
+    assert lines[1].split() == ['one', '/long/way/node:a', '10', '100.00', '%', '0', '2', 'ms',
+                                '3', 'ms', '4', 'ms', '30', 'ms']
     assert lines[2].split()[0] == '/other/node:a'
-    assert lines[3].split() == ['two', 'lonely:b', '0', '0', '-', '0', '0', '-', '-', '-', '30',
-                                'ms']
+    assert lines[3].split() == ['two', 'lonely:b', '0', '-', '0', '-', '-', '-', '30', 'ms']
     assert 'aborted' not in text
     assert 'aborted' in sink_table({'a': {'sinks': {'/x:a': sink(1, aborted=2)}}})
+
+
+def test_what_missed_most_comes_first_and_is_red_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dags = {'one': {'sinks': {'/n:good': sink(10), '/n:some': sink(10, 2)}},
+            'two': {'sinks': {'/n:most': sink(10, 9)}}}
+    plain = sink_table(dags)
+    assert [line.split()[:2] for line in plain.splitlines()[1:]] == [
+        ['two', 'n:most'], ['one', 'n:some'], ['n:good', '10']]
+    monkeypatch.setattr(sys.stdout, 'isatty', lambda: True)
+    monkeypatch.setenv('TERM', 'xterm')
+    monkeypatch.delenv('NO_COLOR', raising=False)
+    lines = sink_table(dags).splitlines()
+    assert [line.startswith('\x1b[31m') and line.endswith('\x1b[0m') for line in lines] == [
+        False, True, True, False]
+    for name, value in (('TERM', 'dumb'), ('NO_COLOR', '1')):
+        with monkeypatch.context() as here:
+            here.setenv(name, value)
+            assert sink_table(dags) == plain
 
 
 def test_names_are_short_where_that_is_enough() -> None:

@@ -137,9 +137,9 @@ def test_the_paper_workload(capsys: pytest.CaptureFixture[str]) -> None:
 def test_the_table_for_people(capsys: pytest.CaptureFixture[str], graph: Path) -> None:
     assert main(['simulate', str(graph), '--workers', '1', '--duration', '100ms']) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split()[:6] == ['DAG', 'sink', 'due', 'in', 'time', 'share']
-    assert lines[1].split()[:4] == ['lidar', 'filter:near', '10', '3']
-    assert lines[2].split()[0] == 'filter:far'
+    assert lines[0].split()[:6] == ['DAG', 'sink', 'due', 'in', 'time', 'late']
+    assert lines[1].split()[:4] == ['lidar', 'filter:far', '9', '22.22']
+    assert lines[2].split()[:3] == ['filter:near', '10', '30.00']
     assert lines[-3] == 'rad, 1 worker, not preemptive, 100 ms, utilisation 1.100'
     assert lines[-2].startswith('10 jobs, 19 sink jobs due, ')
     assert lines[-1] == ('first miss: /filter:far of job 2 of lidar, deadline at 32 ms, '

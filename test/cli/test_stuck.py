@@ -12,7 +12,7 @@ import pytest
 PROGRAM = """
 import threading, time
 from mddag_executor.cli.stuck import dump_when_stuck
-from mddag_executor.live.session import Session
+from mddag_executor.hosting.session import Session
 
 class Executor:
     def spin(self):

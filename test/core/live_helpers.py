@@ -45,8 +45,4 @@ def start_job(scheduler: Scheduler, job: int = 0, now: int = 0, dag: int = 0) ->
 
 def undeclared(scheduler: Scheduler, job: int, group: int, now: int, holds: int = 0) -> int:
     """Make a callback that no DAG declares ready; return its execution."""
-    x = scheduler.undeclared(job, now)
-    scheduler.state.x_group[x] = group
-    scheduler.state.x_holds[x] = holds
-    scheduler.ready(x, now)
-    return x
+    return scheduler.ready_undeclared(job, group, holds, now)

@@ -14,7 +14,7 @@ What Python's lock, its garbage collector and the system's scheduler let an exec
 * ``policy``: how late that timer runs while other processes take every CPU, with the workers and
   with the whole process under the normal and a real-time policy.
 
-``docs/gil.md`` and ``docs/real_time.md`` quote it.
+``docs/machine.md`` names it.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from typing import Any
 from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.core import quantile
 from mddag_executor.errors import MddagError, UsageError
-from mddag_executor.live import current_job
-from mddag_executor.live.executor import MultiDeadlineExecutor
-from mddag_executor.live.session import Session
+from mddag_executor.executor import current_job
+from mddag_executor.executor.executor import MultiDeadlineExecutor
+from mddag_executor.hosting.session import Session
 from msg_graph import loads
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup

@@ -43,9 +43,9 @@ import time
 from typing import Any
 
 from mddag_executor.defaults import LIVE_SEED
-from mddag_executor.live import DeadlineMiss
-from mddag_executor.live.executor import MultiDeadlineExecutor
-from mddag_executor.live.measure import ExecutionPlan
+from mddag_executor.executor import DeadlineMiss
+from mddag_executor.executor.executor import MultiDeadlineExecutor
+from mddag_executor.hosting.measure import ExecutionPlan
 from msg_graph import load, TaskSet
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -117,7 +117,7 @@ class Soak:
 
     def __init__(
         self, task_set: TaskSet, seconds: float, *, utilisation: float = 0.8, workers: int = 7,
-        seed: int = 0, intake: str = 'auto', say: Callable[[str], None] = lambda text: None,
+        seed: int = 0, say: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._graph = task_set.file
         self._seconds = seconds
@@ -130,7 +130,7 @@ class Soak:
         deadlines = [v.deadline_ns or 0 for v in task_set.vertices]
         self._settle_s = min(2.0, max(deadlines) / 1e9)
         self.executor = MultiDeadlineExecutor(
-            task_set, num_workers=workers, on_deadline_miss=self._on_miss, intake=intake)
+            task_set, num_workers=workers, on_deadline_miss=self._on_miss)
         self.nodes = SoakNodes(task_set, plan)
         self._simulated = SimulatedTime()
         self._stalls = StallWatch()
@@ -343,14 +343,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--utilisation', type=float, default=0.8)
     parser.add_argument('--workers', type=int, default=7)
     parser.add_argument('--seed', type=int, default=LIVE_SEED)
-    parser.add_argument('--intake', choices=('auto', 'events', 'waitset'), default='auto')
     args = parser.parse_args(arguments)
     rclpy.init(args=[])
     try:
         result = Soak(
             load(args.graph), args.seconds, utilisation=args.utilisation, workers=args.workers,
-            seed=args.seed, intake=args.intake,
-            say=lambda text: print(text, file=sys.stderr, flush=True)).run()
+            seed=args.seed, say=lambda text: print(text, file=sys.stderr, flush=True)).run()
     finally:
         try_shutdown()
     print(json.dumps(result, indent=1))

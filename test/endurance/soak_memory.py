@@ -25,7 +25,7 @@ import subprocess
 import sys
 import time
 
-from mddag_executor.live.measure import ExecutionPlan
+from mddag_executor.hosting.measure import ExecutionPlan
 from msg_graph import load
 import rclpy
 from rclpy.utilities import try_shutdown

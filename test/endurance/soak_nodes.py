@@ -8,9 +8,9 @@ from collections.abc import Callable
 import threading
 from typing import Any
 
-from mddag_executor.live import current_job
-from mddag_executor.live.measure import ExecutionPlan
-from mddag_executor.live.synthetic import quiet_node, SyntheticWorkload
+from mddag_executor.executor import current_job
+from mddag_executor.hosting.measure import ExecutionPlan
+from mddag_executor.hosting.synthetic import quiet_node, SyntheticWorkload
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node

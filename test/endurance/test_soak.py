@@ -20,21 +20,21 @@ TOP = Path(__file__).resolve().parents[2]
 
 def soak(*arguments: str, timeout: float = 150.0) -> dict[str, Any]:
     done = subprocess.run(
-        [sys.executable, 'test/endurance/soak.py', *arguments], cwd=TOP, text=True,
-        capture_output=True, timeout=timeout, check=False, stdin=subprocess.DEVNULL)
+        [sys.executable, '-X', 'faulthandler', 'test/endurance/soak.py', *arguments], cwd=TOP,
+        text=True, capture_output=True, timeout=timeout, check=False, stdin=subprocess.DEVNULL)
+    said = f'status {done.returncode}\n{done.stderr}\n{done.stdout}'
+    print(said)  # pytest shows it with a failure
+    assert done.stdout and 'Traceback' not in done.stderr, said
     result: dict[str, Any] = json.loads(done.stdout)
-    assert done.returncode == (1 if result['failed'] else 0)
-    assert 'Traceback' not in done.stderr, done.stderr
+    assert done.returncode == (1 if result['failed'] else 0), said
     return result
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('intake', ['events', 'waitset'])
-def test_a_short_soak_loses_nothing_and_keeps_nothing(intake: str):
+def test_a_short_soak_loses_nothing_and_keeps_nothing():
     """Deadlines are left to `make soak`: they depend on what else the machine does."""
     result = soak(
-        'config/autoware.yaml', '--seconds', '25', '--utilisation', '0.5', '--seed', '3',
-        '--intake', intake)
+        'config/autoware.yaml', '--seconds', '25', '--utilisation', '0.5', '--seed', '3')
     failed = [line for line in result['failed'] if 'deadlines missed' not in line]
     assert failed == []
     assert sum(result['faults'][fault] for fault in FAULTS) == result['clean_windows'] >= 2

@@ -11,7 +11,7 @@ from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.errors import MddagError
-from mddag_executor.live.settings import Thresholds
+from mddag_executor.executor.settings import Thresholds
 import msg_graph
 import pytest
 import rclpy
@@ -31,7 +31,6 @@ WRONG = [
     *(('policy', value) for value in (None, 5, 'x', [], {})),
     *(('default_deadline', value) for value in (
         None, 1.5, -5, 0, True, [], 10**30, Duration(seconds=-1))),
-    *(('intake', value) for value in (None, 5, 'x')),
     *(('max_active_jobs', value) for value in ('x', 0, -1, 1.5, None, True)),
     *(('on_deadline_miss', value) for value in (5, 'x', [])),
     *(('worker_policy', value) for value in (5, 'x', '__class__', 'sched_yield')),

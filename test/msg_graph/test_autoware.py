@@ -145,3 +145,17 @@ def test_deadlines_can_be_met(multi: TaskSet) -> None:
         for sink in dag.sinks:
             deadline = dag.vertices[sink].deadline_ns
             assert deadline is not None and lengths[sink] <= deadline
+
+
+def test_the_reference_system_as_described() -> None:
+    task_set = load(CONFIG / 'reference_system.yaml')
+    callbacks = task_set.callbacks
+    assert len({callback.node for callback in callbacks}) == 24
+    timers = {c.node: c.timer_period_ns for c in callbacks if c.kind == 'timer'}
+    assert sorted(timers.values()) == [ms * MS for ms in (25, 60, 100, 100, 100, 100, 120)]
+    planner = [c for c in callbacks if c.node == '/BehaviorPlanner']
+    assert sorted(c.kind for c in planner) == ['subscription'] * 6 + ['timer']
+    busy = [c for c in callbacks if c.execution_time is not None]
+    assert {c.execution_time.mean_ns for c in busy if c.execution_time} == {10 * MS}
+    path, = task_set.paths
+    assert len([key for key in path.callbacks if key in {c.key for c in busy}]) == 7

@@ -1,13 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The flows that a path's steps are made of, one by one."""
+"""The flows along a path, one by one."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from mddag_executor.replay.paths import PathBook
-import pytest
+from mddag_executor.replay.paths import leaves, Paths
 
 
 class Flow(NamedTuple):
@@ -18,26 +17,16 @@ class Flow(NamedTuple):
     end: int | None
 
 
-def flows(book: PathBook) -> list[Flow]:
-    """Return the flows along the first path, of which nothing has been forgotten."""
-    book._round()
-    steps = [row for row in book._forest.rows[:len(book._forest)].tolist() if row[1] == 0]
-    parents = {row[0] for row in steps}
-    every = book._forest.rows[:len(book._forest)].tolist()
-    numbers = [i for i, row in enumerate(every) if row[1] == 0]
-    table = dict(zip(numbers, steps))
-    # executions that another one reads which went on
-    went_on = {row[0] for i, row in table.items() if i in parents and row[3]}
-    last = len(book.paths[0].callbacks) - 1
+def flows(paths: Paths) -> list[Flow]:
+    """Return the flows along the first path."""
+    steps = paths.steps(0)
+    last = len(paths.paths[0].callbacks) - 1
     found = []
-    for leaf, row in table.items():
-        dead = row[0] != -1 and row[3] and row[2] < last and row[0] in went_on
-        if leaf in parents or dead:
-            continue
+    for leaf in leaves(steps, last).tolist():
         columns: list[tuple[int | None, int | None]] = [(None, None)] * (last + 1)
         begin = end = None
         while leaf != -1:
-            parent, _, position, is_run, time, ended, _ = table[leaf]
+            parent, position, is_run, time, ended = steps[leaf].item()
             sent, start = columns[position]
             columns[position] = (sent, time) if is_run else (time, start)
             if is_run and position == last and ended != -1:
@@ -47,17 +36,3 @@ def flows(book: PathBook) -> list[Flow]:
             leaf = parent
         found.append(Flow(columns, begin, end))
     return sorted(found, key=lambda flow: [time or 0 for each in flow.columns for time in each])
-
-
-def note_steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Return what will have how many steps stay each time when flows are forgotten."""
-    left: list[int] = []
-    settle = PathBook._settle
-
-    def note(book: PathBook, at_end: bool) -> None:
-        settle(book, at_end)
-        if not at_end:
-            left.append(len(book._forest))
-
-    monkeypatch.setattr(PathBook, '_settle', note)
-    return left

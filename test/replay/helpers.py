@@ -306,8 +306,7 @@ class VirtualRun:
 
     def _undeclared(self, now: int) -> None:
         self.undeclared_runs += 1
-        x = self.scheduler.undeclared(self.undeclared_runs, now)
-        self.scheduler.ready(x, now)
+        x = self.scheduler.ready_undeclared(self.undeclared_runs, -1, 0, now)
         self._waiting[x] = _Execution(x, -1, 0, -1, -1, -1, now)
 
     def _message(

@@ -10,16 +10,16 @@ import os
 from pathlib import Path
 from typing import Any
 
-from mddag_executor.replay import happenings, paths, replay, reschedule
+from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.linker import Execution, Linker, LinkObserver, Publication
-from mddag_executor.replay.paths import PathBook, Paths
-from mddag_executor.replay.run import open_run
+from mddag_executor.replay.paths import Paths
+from mddag_executor.replay.run import open_recording
 from mddag_executor.trace import import_ctf, TraceReader
 from msg_graph import loads, TaskSet
 import pytest
 
 from .cases_by_hand import slow_cases
-from .flows import flows, note_steps
+from .flows import flows
 
 # not a part of the repository: looked for beside it
 BESIDE = Path(__file__).resolve().parents[3] / 'shared' / 'caret'
@@ -94,16 +94,15 @@ class Links(LinkObserver):
 
 
 @pytest.fixture(scope='module')
-def seen(trace: Path, graph: TaskSet) -> tuple[Links, PathBook]:
-    run = open_run(trace, graph)
-    seen, found = Links(), Paths(run)
-    run.play([found])
-    linker = Linker(run.who, seen)
+def seen(trace: Path, graph: TaskSet) -> tuple[Links, Paths]:
+    recording = open_recording(trace, graph)
+    seen = Links()
+    linker = Linker(recording.who, seen)
     for event in TraceReader(trace).layout_events(linker.events):
         linker.take(event)
     linker.finish()
-    assert run.warnings == []
-    return seen, found.book
+    assert recording.warnings == []
+    return seen, Paths(recording)
 
 
 def rows(name: str) -> Iterator[tuple[int | None, ...]]:
@@ -114,7 +113,7 @@ def rows(name: str) -> Iterator[tuple[int | None, ...]]:
             yield tuple(int(cell) if cell else None for cell in line)
 
 
-def test_callbacks(seen: tuple[Links, PathBook]) -> None:
+def test_callbacks(seen: tuple[Links, Paths]) -> None:
     found = [(run.start, run.end) for run in seen[0].runs
              if run.callback.label == '/filter_node subscription /topic1']
     expected = list(rows('cb_filter_node_callback_0.csv'))
@@ -122,7 +121,7 @@ def test_callbacks(seen: tuple[Links, PathBook]) -> None:
     assert len(found) == 49
 
 
-def test_communication(seen: tuple[Links, PathBook]) -> None:
+def test_communication(seen: tuple[Links, Paths]) -> None:
     found = [(m.rclcpp, m.rcl, m.dds, m.stamp,
               seen[0].arrived.get((id(m), '/filter_node subscription /topic1')))
              for m in seen[0].messages if m.topic == '/topic1']
@@ -131,7 +130,7 @@ def test_communication(seen: tuple[Links, PathBook]) -> None:
     assert len(found) == 49
 
 
-def test_path(seen: tuple[Links, PathBook]) -> None:
+def test_path(seen: tuple[Links, Paths]) -> None:
     columns = [flow.columns for flow in flows(seen[1])]
     found = [(c[0][0], c[1][1], c[1][0], c[2][1], c[3][0], c[4][1], c[5][0], c[6][1])
              for c in columns]
@@ -165,18 +164,6 @@ def test_the_replay_says_the_same(trace: Path, graph: TaskSet) -> None:
     assert result['callbacks']['/filter_node:callback_0']['executions'] == 49
     assert {name: dag['jobs'] for name, dag in result['dags'].items()} == {
         '/drive_node': 49, '/sensor_dummy_node': 49, '/timer_driven_node': 49}
-
-
-def test_the_same_when_what_is_over_is_forgotten(
-    trace: Path, graph: TaskSet, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    expected = replay(trace, graph).result()['paths']
-    left = note_steps(monkeypatch)
-    monkeypatch.setattr(paths, 'SETTLE', 100)
-    monkeypatch.setattr(happenings, 'BATCH', 50)
-    monkeypatch.setattr(paths, 'KEEP', 4)
-    assert replay(trace, graph).result()['paths'] == expected
-    assert len(left) > 3 and max(left) < 200, left
 
 
 def test_without_a_graph(trace: Path) -> None:

@@ -11,8 +11,9 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
-from mddag_executor.replay import replay, reschedule
+from mddag_executor.replay import open_recording, replay, reschedule
 from mddag_executor.trace import EVENTS, TraceFile
 from msg_graph import GraphError
 import pytest
@@ -167,3 +168,16 @@ def test_a_process_that_was_killed(tmp_path: Path) -> None:
             assert found['completed'] == sink['completed']
             assert found['late'] - found['overdue'] == sink['late']
             assert found['expired'] == sink['expired']
+
+
+def test_an_event_at_the_end_of_all_times(tmp_path: Path) -> None:
+    """The run ends before the time that stands for never, so the scheduler's does."""
+    path = tmp_path / 'a.mcap'
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, 1, 1, SMALL, 'g.yaml', 'rad', 2, MS, 3, False)
+        file.add('job_release', START_TIME, 1, 1, 0, 0, START_TIME)
+        file.add('expire', 2 ** 63 - 1, 1, 1, 0, 0)
+    recording = open_recording(path)
+    assert recording.end == NEVER - 1
+    result = reschedule(path).result()
+    assert sum(dag['jobs'] for dag in result['dags'].values()) == 1

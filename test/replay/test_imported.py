@@ -7,9 +7,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from mddag_executor.recording.tables import LEG, VERTEX
 from mddag_executor.replay import replay, ReplayError, reschedule
-from mddag_executor.replay.happenings import Observer
-from mddag_executor.replay.run import open_run
+from mddag_executor.replay.run import open_recording
 from msg_graph import loads, TaskSet
 import pytest
 
@@ -346,17 +346,10 @@ def test_cut_anywhere_it_says_something_or_judges_what_is_there(
 
 
 def test_the_last_leg_makes_a_sync_callback_whole(recorded: Recorded, graph: TaskSet) -> None:
-    told: list[tuple[int, int, bool]] = []
-
-    class Completed(Observer):
-
-        def completed(self, dag: int, vertex: int, job: int, leg: int, whole: bool, end: int,
-                      *execution: int) -> None:
-            if graph.vertices[vertex].name == '/fuse:join':
-                told.append((job, leg, bool(whole)))
-
-    open_run(recorded.write(), graph).play([Completed()])
-    assert told == [each for job in range(N) for each in ((job, 1, False), (job, 0, True))]
+    table = open_recording(recorded.write(), graph).executions
+    join = [v.name for v in graph.vertices].index('/fuse:join')
+    told = table[table['vertex'] == join][['job', 'leg', 'completes']].tolist()
+    assert told == [each for job in range(N) for each in ((job, 1, LEG), (job, 0, VERTEX))]
 
 
 def test_a_job_whose_end_is_lost_keeps_no_other_from_expiring(tmp_path: Path) -> None:

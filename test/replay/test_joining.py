@@ -112,7 +112,7 @@ def test_a_job_goes_on_in_the_other_trace(tmp_path: Path, late: int) -> None:
     breakdown = sink(result)['breakdown']
     assert breakdown['mean']['transport_ns'] == MS, breakdown
     assert result['workers'] == 4 and set(result['callbacks']) == {'/a:tick', '/b:take'}
-    assert outcome.run.worker_names == ['up 0', 'up 1', 'down 0', 'down 1']
+    assert outcome.recording.worker_names == ['up 0', 'up 1', 'down 0', 'down 1']
     assert result['recording']['shut_down'] and result['recording']['end_ns'] == BASE + 100 * MS
 
 

@@ -7,9 +7,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from mddag_executor.replay.drafting import System
-from mddag_executor.replay.imported_run import ImportedRun
 from mddag_executor.replay.linker import Execution, Linker, LinkObserver, Publication
-from mddag_executor.replay.run import open_run
+from mddag_executor.replay.run import open_recording
 from mddag_executor.trace import TraceReader
 import pytest
 
@@ -46,13 +45,12 @@ class Links(LinkObserver):
 def linked(path: Path) -> tuple[Links, list[str]]:
     """Return what the linker says of a recording, and the warnings."""
     got = Links()
-    run = open_run(path)
-    linker = Linker(run.who, got)
+    recording = open_recording(path)
+    linker = Linker(recording.who, got)
     for event in TraceReader(path).layout_events(linker.events):
         linker.take(event)
     linker.finish()
-    run.play([])
-    return got, [line.removeprefix(f'{path}: ') for line in run.warnings]
+    return got, [line.removeprefix(f'{path}: ') for line in recording.warnings]
 
 
 @pytest.fixture
@@ -235,9 +233,8 @@ def test_what_was_initialised_before_the_recording(tmp_path: Path) -> None:
     recorded.add('ros2:rclcpp_timer_callback_added', 92 * MS, 1, 10_011, CAMERA)
     recorded.add('ros2:rclcpp_timer_link_node', 93 * MS, 1, 10_011, 1)
     recorded.run(CAMERA, 1, 131 * MS, 132 * MS)
-    run = open_run(recorded.write())
-    assert isinstance(run, ImportedRun)
-    assert [(c.label, c.grid) for c in run.who.every] == [
+    recording = open_recording(recorded.write())
+    assert [(c.label, c.grid) for c in recording.who.every] == [
         ('/camera timer 100ms', BEGIN + 30 * MS)]
     drafted, = System(recorded.path).draft().callbacks()
     assert (drafted.node, drafted.period_ns) == ('/camera', 100 * MS)

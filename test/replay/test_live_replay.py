@@ -124,14 +124,11 @@ def spinning(executor: Any) -> Iterator[None]:
         assert not thread.is_alive()
 
 
-@pytest.mark.parametrize('intake', ['events', 'waitset'])
-def test_replay_counts_what_the_executor_counted(
-    ros_context: Any, tmp_path: Path, intake: str
-) -> None:
+def test_replay_counts_what_the_executor_counted(ros_context: Any, tmp_path: Path) -> None:
     from mddag_executor import MultiDeadlineExecutor
     path = tmp_path / 'live.mcap'
     executor = MultiDeadlineExecutor(
-        loads(GRAPH, 'live.yaml'), context=ros_context, trace=str(path), intake=intake)
+        loads(GRAPH, 'live.yaml'), context=ros_context, trace=str(path))
     nodes = build_nodes(ros_context)
     for node in nodes:
         executor.add_node(node)

@@ -4,9 +4,12 @@
 
 from __future__ import annotations
 
-from mddag_executor.replay.paths import PathBook
+from mddag_executor.recording import tables
+from mddag_executor.recording.entities import Entities, Node, Publisher
+from mddag_executor.recording.head import Head
+from mddag_executor.recording.tables import Recording, Rows
+from mddag_executor.replay.paths import Paths
 from msg_graph import loads
-import numpy as np
 
 from .flows import flows
 
@@ -37,51 +40,72 @@ NONE = -1
 
 
 class Driver:
-    """Tells a book what happens, by names."""
+    """Makes a recording of what happens, by names; times are any, ascending."""
 
     def __init__(self, text: str = GRAPH) -> None:
-        self.book = PathBook(loads(text, 'graph.yaml'))
-        self._number = 0
+        self.task_set = loads(text, 'graph.yaml')
+        self.places = self.task_set.places()
+        vertices = self.task_set.places_of_vertices()
+        self.vertex = {key: vertices.index(place) for key, place in self.places.items()}
+        self.who = Entities()
+        self._subscriptions: dict[tuple[str, str], int] = {}
+        self._executions = Rows(
+            tables.EXECUTIONS, 'callback', 'vertex', 'start', 'began', 'end', 'message')
+        self._sent = Rows(tables.PUBLICATIONS, 'publisher', 'execution', 'vertex', 'time')
+        self._took = Rows(tables.TAKES, 'execution', 'message')
 
-    def _add(self, what: int, *row: int) -> int:
-        rows = [np.empty((0, width), dtype=np.int64) for width in (7, 4, 7, 4)]
-        rows[what] = np.array([(0, *row)], dtype=np.int64)
-        self.book.add(1, *rows)
-        self._number += 1
-        return self._number
+    def _callback(self, key: str, topic: str) -> int:
+        """Return the number of the subscription with which a callback takes a topic."""
+        number = self._subscriptions.get((key, topic))
+        if number is None:
+            number = self._subscriptions[key, topic] = len(self._subscriptions) + 1
+            for name, fields in (
+                    ('rcl_subscription_init', {
+                        'subscription_handle': number, 'node_handle': 0,
+                        'rmw_subscription_handle': number, 'topic_name': topic}),
+                    ('rclcpp_subscription_init', {
+                        'subscription_handle': number, 'subscription': number}),
+                    ('rclcpp_subscription_callback_added', {
+                        'subscription': number, 'callback': number})):
+                self.who.note(f'ros2:{name}', {'_timestamp': 0, '_vpid': 0, **fields})
+        return number
 
     def run(self, key: str, start: int, message: int = NONE, topic: str = '') -> int:
         """Begin an execution; return its number."""
-        number = self._number
-        self._add(0, self.book.callbacks[key], number, start,
-                  self.book.topics.get(topic, -2) if topic else NONE, message, NONE)
-        return number
+        return self._executions.add(
+            self._callback(key, topic), self.vertex[key], start, start, NONE, message)
 
     def send(self, key: str | None, run: int, topic: str, time: int, node: str = '') -> int:
         """Publish; return the message's number."""
-        number = self._number
         node = node or (key or '').partition(':')[0]
-        self._add(2, NONE if key is None else self.book.callbacks[key], self.book.nodes[node],
-                  run, self.book.topics.get(topic, -2), number, time)
-        return number
+        number = len(self.who.every_publisher) + 1
+        self.who.every_publisher[number] = Publisher(number, Node(0, node, 0), topic)
+        return self._sent.add(number, run, NONE if key is None else self.vertex[key], time)
 
     def end(self, key: str, run: int, time: int) -> None:
         """End an execution."""
-        self._add(1, self.book.callbacks[key], run, time)
+        self._executions.columns['end'][run] = time
 
     def took(self, key: str, run: int, message: int) -> None:
         """Let a running callback take a message."""
-        self._add(3, self.book.callbacks[key], run, message)
+        self._took.add(run, message)
+
+    @property
+    def paths(self) -> Paths:
+        return Paths(Recording(
+            'by hand', Head(0, '', '', 'rad', 1, 0, 0, False), self.task_set, self.task_set,
+            self.who, declared=False, executions=self._executions.table(), links=True,
+            publications=self._sent.table(), takes=self._took.table()))
 
     def starts(self) -> list[list[int | None]]:
         """Return for each flow its first publication and the start of each later callback."""
         return [[flow.columns[0][0], *(c[1] for c in flow.columns[1:])]
-                for flow in flows(self.book)]
+                for flow in flows(self.paths)]
 
 
 def test_a_flow_over_trigger_variable_and_topic() -> None:
     d = Driver()
-    assert [hop.kind for hop in d.book.hops[0]] == ['trigger', 'variable', 'topic', 'trigger']
+    assert [hop.kind for hop in d.paths.hops[0]] == ['trigger', 'variable', 'topic', 'trigger']
     a = d.run('/a:send', 0)
     m = d.send('/a:send', a, '/t', 1)
     d.end('/a:send', a, 2)
@@ -101,7 +125,7 @@ def test_a_flow_over_trigger_variable_and_topic() -> None:
     end = d.run('/d:end', 32, v, '/v')
     d.end('/d:end', end, 33)
     assert d.starts() == [[1, 6, 10, None, None], [1, 6, 20, 30, 32]]
-    whole = flows(d.book)[1]
+    whole = flows(d.paths)[1]
     assert (whole.begin, whole.end) == (0, 33)
 
 

@@ -8,14 +8,15 @@ from pathlib import Path
 
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.head import Head
+from mddag_executor.recording.tables import EXECUTIONS, Recording, rows
 from mddag_executor.replay import replay
-from mddag_executor.replay.entities import Entities
-from mddag_executor.replay.happenings import Batch, Piece, RAN
-from mddag_executor.replay.usage import GroupWaits, PoolUse
+from mddag_executor.replay.usage import group_waits, PoolUse
 from mddag_executor.trace import TraceFile
 import numpy as np
 
-from .helpers import add_execution, MS, START_TIME
+from .helpers import add_execution, MS, small, START_TIME
 
 STEP = PoolUse.FIRST_STEP_NS
 SPANS = st.lists(st.tuples(st.integers(0, 10 ** 13), st.integers(0, 10 ** 11)), max_size=30)
@@ -23,11 +24,10 @@ SPANS = st.lists(st.tuples(st.integers(0, 10 ** 13), st.integers(0, 10 ** 11)), 
 
 @given(SPANS)
 def test_no_time_is_lost_and_steps_are_few(spans: list[tuple[int, int]]) -> None:
-    pool = PoolUse()
-    for start, took in spans:
-        pool.add(np.array([start]), np.array([start + took]))
-    result = pool.result()
-    assert sum(result['busy_ns']) == sum(took for _, took in spans)
+    starts = np.array([start for start, _ in spans], dtype=np.int64)
+    took = np.array([each for _, each in spans], dtype=np.int64)
+    result = PoolUse(starts, starts + took).result()
+    assert sum(result['busy_ns']) == int(took.sum())
     assert len(result['busy_ns']) <= PoolUse.MOST_STEPS
     busy = [(start, start + took) for start, took in spans if took]
     if busy:
@@ -36,15 +36,10 @@ def test_no_time_is_lost_and_steps_are_few(spans: list[tuple[int, int]]) -> None
 
 
 def test_steps() -> None:
-    pool = PoolUse()
     # the second beside the first
-    pool.add(np.array([10 * STEP + 7, 10 * STEP]), np.array([12 * STEP + 3, 10 * STEP + 5]))
+    pool = PoolUse(np.array([10 * STEP + 7, 10 * STEP]), np.array([12 * STEP + 3, 10 * STEP + 5]))
     assert pool.result() == {
         'step_ns': STEP, 'start_ns': 10 * STEP, 'busy_ns': [STEP - 7 + 5, STEP, 3]}
-
-
-def piece(callback: int, ready: int, start: int, end: int) -> Piece:
-    return Piece(callback, 0, 0, 0, 0, ready, start, end, True)
 
 
 def test_waits_for_the_group() -> None:
@@ -55,18 +50,15 @@ def test_waits_for_the_group() -> None:
         groups.take(('ros2:rcl_timer_init', 0, 0, 0, entity, 5))
         groups.take(('ros2:rclcpp_timer_callback_added', 0, 0, 0, entity, entity))
         groups.take(('ros2_caret:callback_group_add_timer', 0, 0, 0, group, entity))
-    waits = GroupWaits(groups)
-    pieces = [piece(1, 0, 2, 10), piece(2, 4, 12, 20), piece(3, 5, 20, 30),
-              piece(1, 8, 25, 30), piece(9, 0, 40, 41)]
+    pieces = [(1, 0, 2, 10), (2, 4, 12, 20), (3, 5, 20, 30), (1, 8, 25, 30), (9, 0, 40, 41)]
+    callback, ready, start, end = (list(column) for column in zip(*pieces))
+    task_set = small()
+    recording = Recording(
+        'by hand', Head(0, '', '', 'rad', 1, 0, 0, False), task_set, task_set, groups,
+        executions=rows(EXECUTIONS, len(pieces), callback=callback, vertex=-1, ready=ready,
+                        began=start, start=start, end=end))
     # the second from 4 to 10; the last of the group from 8 to 10 and from 12 to 20
-    expected = [0, 6, 0, 10, 0]
-    waits.take(Batch([RAN] * 5, {RAN: pieces}))
-    assert waits.found.tolist() == expected
-    waits, found = GroupWaits(groups), []
-    for each in pieces:
-        waits.take(Batch([RAN], {RAN: [each]}))
-        found += waits.found.tolist()
-    assert found == expected
+    assert group_waits(recording).tolist() == [0, 6, 0, 10, 0]
 
 
 def test_what_computed_and_held_the_interpreter(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def test_a_run_is_no_worse_than_itself(result: dict[str, Any]) -> None:
         'executions': 3, 'mean_ns': 3 * MS, 'longest_ns': 6 * MS, 'mean_wait_ns': 0}
     text = list(lines(difference, False))
     assert '3 sink jobs due, 2 in time (66.67 %), 1 late' in text[1]
-    assert text[-1] == 'worse in the second run: 0 sinks'
+    assert text[-1] == 'worse in B: 0 sinks'
 
 
 @pytest.mark.parametrize(('sink', 'tolerance', 'worse'), [
@@ -65,9 +65,8 @@ def test_the_tables(result: dict[str, Any]) -> None:
         'min': 5 * MS, 'median': 9 * MS, 'p99': 20 * MS, 'max': 20 * MS})
     difference = compare(result, after)
     line = sinks_table(difference).splitlines()[1].split()
-    assert line == ['/driver', 'filter:run', '3', '3', '2', '1', '66.67', '%', '33.33', '%',
-                    '1', '2', '6', 'ms', '+50.0', '%', '10', 'ms', '+100.0', '%', '10', 'ms',
-                    '+100.0', '%', 'worse']
+    assert line == ['filter:run', '3', '3', '66.67', '%', '33.33', '%', '6', 'ms', '+50.0', '%',
+                    '10', 'ms', '+100.0', '%', 'worse']
     table = [row.split() for row in callbacks_table(difference).splitlines()]
     assert ['/driver:tick', '3', '3', '3', 'ms', '3', 'ms', '6', 'ms', '6', 'ms', '0', 'ns', '0',
             'ns'] in table
@@ -77,10 +76,10 @@ def test_what_only_one_run_has(result: dict[str, Any], tmp_path: Path) -> None:
     graph = runs.GRAPH.replace('deadline: 8ms', 'deadline: 5ms').replace('name: whole', 'name: w')
     other = replay(runs.by_hand(tmp_path / 'other.mcap'), msg_graph.loads(graph)).result()
     difference = compare(result, other)
-    assert 'worse, deadline then 5 ms' in sinks_table(difference)
+    assert 'worse, deadline in B 5 ms' in sinks_table(difference)
     lacking = {**result, 'dags': {}}
-    assert 'only in the first' in sinks_table(compare(result, lacking))
+    assert 'only in A' in sinks_table(compare(result, lacking))
     difference = compare(lacking, result)
-    assert 'only in the second' in sinks_table(difference) and not difference['worse']
+    assert 'only in B' in sinks_table(difference) and not difference['worse']
     assert difference['dags']['/driver']['sinks']['/filter:run']['a'] is None
     assert '/driver:tick' in callbacks_table(compare({**result, 'callbacks': {}}, result))

@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from mddag_executor.replay import replay
-from mddag_executor.replay.judge import Judge
 from mddag_executor.replay.run_writer import write_trace
-from mddag_executor.report import export
-from mddag_executor.report.export import Exporter, KEEP_ENDED, MOST_HELD, target
+from mddag_executor.report.export import _harmless, write
 import pytest
 
 from . import runs
@@ -24,13 +22,8 @@ DEMO = runs.CONFIG.parent / 'bags' / 'demo_short.mcap'
 
 
 def exported(path: Path, form: str, jobs: bool = False) -> bytes:
-    if form == 'pftrace':
-        pytest.importorskip('perfetto', reason='perfetto is not installed')
     file = io.BytesIO()
-    rows = target(form, file, jobs)
-    exporter = Exporter(rows)
-    replay(path, more=exporter.of)
-    exporter.finish()
+    write(form, file, replay(path), 'jobs' if jobs else 'executions')
     return file.getvalue()
 
 
@@ -62,9 +55,7 @@ def test_jobs_as_csv(tmp_path: Path) -> None:
         'slack_ns': str(-2 * MS), 'verdict': 'late'}
 
 
-def test_rows_come_in_the_order_of_their_releases(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_come_in_the_order_of_their_releases(tmp_path: Path) -> None:
     task_set = runs.autoware()
     load, run = runs.simulated(task_set, ms=500, utilisation=1.2, preemptive=True)
     path = tmp_path / 'run.mcap'
@@ -75,10 +66,6 @@ def test_rows_come_in_the_order_of_their_releases(
 
     for jobs in (False, True):
         assert releases(jobs) == sorted(releases(jobs))
-    whole = releases(True)
-    monkeypatch.setattr(export, 'MOST_ORDERED', 10)     # more rows than are held back
-    assert sorted(releases(True)) == whole
-    monkeypatch.undo()
     parsed = Parsed(exported(path, 'pftrace'))
     groups = {name: [start for parent, start in parsed.begins if parent == name]
               for name in ('workers', 'jobs by sink')}
@@ -90,8 +77,7 @@ def test_csv_is_harmless(tmp_path: Path) -> None:
     data = exported(path, 'csv')
     assert b'\x1b' not in data
     assert read_csv(data)[6]['vertex'] == runs.HOSTILE.replace('\x1b', '\\x1b')
-    from mddag_executor.report.export import _cell
-    assert [_cell(text) for text in ('=1+1', '+1', '-1', '@x', '/n:a')] == [
+    assert [_harmless(text) for text in ('=1+1', '+1', '-1', '@x', '/n:a')] == [
         "'=1+1", "'+1", "'-1", "'@x", '/n:a']
 
 
@@ -132,45 +118,6 @@ def test_the_rows_are_those_of_the_replay() -> None:
     busy = sum(int(row['executing_ns']) for row in declared)
     assert busy == sum(use['busy_ns'] for use in result['callbacks'].values())
     assert all(row['release_ns'] for row in declared)
-
-
-def test_memory_does_not_grow_with_the_run(tmp_path: Path) -> None:
-    task_set = runs.autoware()
-    load, run = runs.simulated(task_set, ms=1000)
-    write_trace(tmp_path / 'run.mcap', task_set, load, run)
-    exporter = Exporter(target('csv', io.BytesIO(), False))
-    replay(tmp_path / 'run.mcap', more=exporter.of)
-    assert KEEP_ENDED > len(exporter._ended) > 100
-    assert len(exporter._held) < 50
-    for _ in range(KEEP_ENDED):
-        exporter._ended.append((0, 10 ** 9))
-    before = len(exporter._jobs)
-    from mddag_executor.core.state import JOB_END
-    exporter.decided([(JOB_END, 0, -1, 10 ** 9, 0, 0)] * 50)
-    assert len(exporter._ended) >= KEEP_ENDED and len(exporter._jobs) < before
-
-
-def test_what_is_never_completed_is_not_held_for_ever() -> None:
-    class Count:
-        executions = 0
-
-        def execution(self, ran: Any) -> None:
-            self.executions += 1
-
-        def finish(self) -> None:
-            pass
-
-    count: Any = Count()
-    exporter = Exporter(count)
-    task_set = runs.autoware()
-    judge = Judge(task_set, compare=False)
-    count.begin = lambda *_: None
-    exporter._begin(task_set, judge)
-    for i in range(3 * MOST_HELD):
-        exporter.ran(1, 0, 0, i, 0, i, i, i + 1, 1)
-    assert count.executions == 2 * MOST_HELD == 3 * MOST_HELD - len(exporter._held)
-    exporter.finish()
-    assert count.executions == 3 * MOST_HELD
 
 
 # --- Perfetto ------------------------------------------------------------------------------------

@@ -15,8 +15,17 @@ from hypothesis import strategies as st
 from mddag_executor.replay import replay
 from mddag_executor.report import html
 from mddag_executor.report.html_data import json_for_html, label, prepare
-from mddag_executor.report.html_tables import Html, html_table, misses_html, worst_html
+from mddag_executor.report.html_tables import (
+    Html,
+    html_table,
+    misses_html,
+    MOST_ROWS,
+    sinks_html,
+    worst_html,
+)
 from mddag_executor.report.timeline import MOST_EXECUTIONS
+from mddag_executor.simulate import periodic_load, Settings, simulate
+import msg_graph
 import pytest
 
 from . import runs
@@ -54,17 +63,13 @@ class Page(HTMLParser):
 
 
 def report(path: Path) -> Page:
-    watch = html.Watch()
-    outcome = replay(path, more=watch.of)
     file = io.BytesIO()
-    html.write(file, html.of_outcome(outcome, watch))
+    html.write(file, html.of_outcome(replay(path)))
     return Page(file.getvalue().decode())
 
 
 def test_what_stands_in_the_file_is_what_ran(tmp_path: Path) -> None:
-    watch = html.Watch()
-    outcome = replay(runs.by_hand(tmp_path / 'run.mcap'), more=watch.of)
-    prepared = prepare(html.of_outcome(outcome, watch))
+    prepared = prepare(html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap'))))
     found = prepared.executions
     assert prepared.origin == runs.START + 10 * runs.MS
     assert found['left'] == pytest.approx([0, 0.002, 0.010, 0.013, 0.020, 0.027, 0.031])
@@ -89,12 +94,18 @@ def test_the_tables_have_the_figures_of_the_replay(tmp_path: Path) -> None:
     text = ' '.join(' '.join(page.texts).split())
     assert '3 sink jobs due, 2 in time (66.67 %), 1 late, 0 expired' in text
     assert '/driver filter:run 3 2 66.67 % 1 0 6 ms 10 ms 10 ms 8 ms' in text
-    assert '/driver filter:run late 2 0.020000 s 10 ms 2 ms' in text    # the table of misses
+    # the table of misses
+    assert '/driver filter:run late ran long 2 0.020000 s 10 ms 2 ms' in text
+    assert ('worst sink: /filter:run: 1 of 3 deadlines missed, most often because of: ran '
+            'long; longest response time 10 ms, 125 % of the deadline of 8 ms') in text
+    assert text.index('Missed deadlines') < text.index('Sinks')
     assert '/driver:tick 3 9 ms 3 ms 6 ms 0 ns 0 ns' in text
-    bars = [attributes['style'] or '' for tag, attributes in page.elements
-            if tag == 'i' and 'width' in (attributes.get('style') or '')]
-    assert sum(float(bar.split('%')[0].removeprefix('width:')) for bar in bars) \
-        == pytest.approx(100)       # the worst of all fills the scale
+    reached, *bars = [
+        float((attributes['style'] or '').split('%')[0].removeprefix('width:'))
+        for tag, attributes in page.elements
+        if tag == 'i' and 'width' in (attributes.get('style') or '')]
+    assert reached == 100       # past the deadline
+    assert sum(bars) == pytest.approx(100)      # the worst of all fills the scale
 
 
 def test_misses_stand_by_time_and_worst_jobs_on_one_scale() -> None:
@@ -111,6 +122,27 @@ def test_misses_stand_by_time_and_worst_jobs_on_one_scale() -> None:
         parts = sum(float(part) for part in re.findall(r'width:([0-9.]+)%', stack))
         line = float(re.search(r'left:([0-9.]+)%', stack)[1])
         assert parts / line == pytest.approx(ms(response) / ms(deadline), rel=0.01)
+
+
+def test_the_worst_sinks_come_first_and_many_on_demand(tmp_path: Path) -> None:
+    nodes = '\n'.join(
+        f'  - {{node: /n{i}, callbacks: [{{name: c, timer: 100ms, dag: d{i}, deadline: 50ms, '
+        f'execution_time: {1 + i * 7 % 60}ms}}]}}' for i in range(60))
+    task_set = msg_graph.loads(f'mddag: 1\nworkers: 60\nnodes:\n{nodes}\n')
+    load = periodic_load(
+        task_set, [[vertex.callback.execution_time.draw(0)] for dag in task_set.dags
+                   for vertex in dag.vertices], 200 * 10 ** 6)
+    run = simulate(task_set, load, Settings('rad', 60, 200 * 10 ** 6), log=True)
+    data = html.of_run(task_set, load, run)
+    page = sinks_html(data)
+    reached = [float(each) for each in re.findall('<tr data-reached="([0-9.]+)"', page)]
+    rest = json.loads(re.search('application/json">(.*)</script>', page)[1])
+    every = reached + [row[-1] for row in rest]
+    assert len(reached) == MOST_ROWS and len(every) == 60
+    assert every == sorted(every, reverse=True)
+    assert every == pytest.approx(sorted(((1 + i * 7 % 60) / 50 for i in range(60)), reverse=True))
+    titles = page.count('<th') - page.count('<thead')
+    assert all(len(row) == titles for row in rest)
 
 
 def ms(text: str) -> float:
@@ -157,9 +189,8 @@ def test_markup_is_only_what_says_so() -> None:
 
 def test_end_to_end_times_of_declared_paths(tmp_path: Path) -> None:
     page = report(runs.by_hand(tmp_path / 'run.mcap'))
-    watch = html.Watch()
-    outcome = replay(runs.by_hand(tmp_path / 'run.mcap'), more=watch.of)
-    data = html.of_outcome(outcome, watch)
+    outcome = replay(runs.by_hand(tmp_path / 'run.mcap'))
+    data = html.of_outcome(outcome)
     assert data.paths == outcome.result()['paths']
     text = ' '.join(' '.join(page.texts).split())
     assert ('worst-with-external-latency' in text) is bool(data.paths)

@@ -68,9 +68,8 @@ def write(path: Path, data: html.ReportData) -> Path:
 @pytest.fixture(scope='module')
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('small')
-    watch = html.Watch()
-    outcome = replay(runs.by_hand(folder / 'run.mcap', hostile=True), more=watch.of)
-    return write(folder / 'report.html', html.of_outcome(outcome, watch))
+    outcome = replay(runs.by_hand(folder / 'run.mcap', hostile=True))
+    return write(folder / 'report.html', html.of_outcome(outcome))
 
 
 @pytest.fixture(scope='module')

@@ -21,7 +21,7 @@ import time
 from typing import Any
 
 from mddag_executor.replay import replay
-from mddag_executor.report.export import Exporter, target
+from mddag_executor.report.perfetto import write_perfetto
 import pytest
 
 from . import runs
@@ -124,9 +124,7 @@ class Processor:
 
 def exported(path: Path) -> bytes:
     file = io.BytesIO()
-    exporter = Exporter(target('pftrace', file, False))
-    replay(path, more=exporter.of)
-    exporter.finish()
+    write_perfetto(file, replay(path))
     return file.getvalue()
 
 

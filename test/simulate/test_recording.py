@@ -126,12 +126,12 @@ def test_the_events_of_a_run(tmp_path: Path) -> None:
         (1, 'dispatch', 0, 0, 0), (1, 'callback_start', 1, None, None),
         (2, 'callback_end', 1, None, None), (2, 'complete', 0, 0, 0),
         (2, 'dispatch', 0, 1, 0), (2, 'callback_start', 2, None, None),
-        (4, 'job_release', 1, None, 1),
         (4, 'callback_end', 2, None, None),
+        (4, 'job_release', 1, None, 1),
         (4, 'dispatch', 1, 0, 1), (4, 'callback_start', 3, None, None),
         (5, 'callback_end', 3, None, None), (5, 'complete', 1, 0, 1),
         (5, 'dispatch', 0, 1, 0), (5, 'callback_start', 2, None, None),
-        (7, 'complete', 0, 1, 0), (7, 'callback_end', 2, None, None), (7, 'complete', 0, 1, 0),
+        (7, 'callback_end', 2, None, None), (7, 'complete', 0, 1, 0), (7, 'complete', 0, 1, 0),
         (8, 'shutdown', None, None, None)]
     dispatches = [event for event in events if event['_name'] == 'mddag:dispatch']
     assert [(d['ready'], d['reference_deadline'], d['worker']) for d in dispatches] == [

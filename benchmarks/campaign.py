@@ -1,0 +1,243 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Measurements: what each is made of; making them one after the other, each in a process of its own.
+
+With repetitions all measurements are made in turn, and then all of them again: what disturbs the
+machine for a while hits every executor alike.  Of the repetitions the median of each figure is
+taken; messages are counted over all of them, so that no loss is hidden.
+
+Nothing of ROS is imported here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+import json
+import statistics
+import sys
+from typing import Any
+
+from mddag_executor.core import policy as find_policy
+from mddag_executor.errors import UsageError
+from mddag_executor.hosting.child import ChildError, CrashError, run_child, Tick
+from msg_graph import GraphError, load
+
+OURS = 'rad'
+"""The name of this executor."""
+
+PEERS = ('single', 'multi', 'events')
+"""rclpy's SingleThreadedExecutor, MultiThreadedExecutor and EventsExecutor."""
+
+NONE = 'none'
+"""No executor: what the nodes of a declared load cost by themselves (see ``executors``)."""
+
+EXECUTORS = (OURS, *PEERS)
+ROBOT = 'robot'
+"""The load that is the ordinary nodes of an example."""
+LOADS = ('autoware', 'topics', 'entities', 'reference-system', ROBOT)
+DECLARED = {
+    'autoware': 'config/autoware.yaml', 'reference-system': 'config/reference_system.yaml'}
+"""The loads that are synthetic nodes, and the declarations that ship for them."""
+ROBOT_GRAPH = 'examples/robot/graph.yaml'
+PHASES = ('drawn', 'together')
+"""When the topics of a message load are published: each at a phase of its own, or all in a row."""
+
+PATIENCE_S = 90.0
+"""What a process may take besides its window and warm-up: discovery and the end."""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """
+    One measurement: an executor and a load.
+
+    :ivar executor: one of ``EXECUTORS``.
+    :ivar policy: of this executor; rclpy's have none.
+    :ivar seconds: length of the measured window, after ``warm_up_s``.
+    :ivar seed: of the execution times, or of the phases of the published topics.
+    :ivar graph: path of the declaration, for declared loads.
+    :ivar utilisation: what its execution times are scaled to; None takes them as drawn.
+    :ivar bodies: how these execute, as ``execution.Mode``.
+    :ivar topics: how many topics are published, each with one subscription.
+    :ivar rate_hz: how often each is.
+    :ivar idle: how many subscriptions there are besides, whose topics nobody publishes.
+    :ivar phases: when the topics are published, one of ``PHASES``.
+    :ivar scale: of how much the robot's nodes compute.
+    :ivar process: which of the declared processes it is of; None: of all that there are.
+    """
+
+    load: str
+    executor: str
+    policy: str = 'rad'
+    workers: int = 7
+    seconds: float = 10.0
+    seed: int = 0
+    warm_up_s: float = 1.0
+    graph: str | None = None
+    utilisation: float | None = None
+    bodies: str = 'sleep'
+    topics: int = 1
+    rate_hz: float = 100.0
+    idle: int = 0
+    phases: str = 'drawn'
+    scale: float = 1.0
+    process: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Return the executor's name, with the policy unless that is rad."""
+        return self.executor if self.policy == 'rad' else f'{self.executor}:{self.policy}'
+
+    def to_json(self) -> str:
+        """Return the measurement as text."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Spec:
+        """Return the measurement that ``to_json`` wrote."""
+        fields: dict[str, Any] = json.loads(text)
+        return cls(**fields)
+
+
+def parse_executors(text: str, policies: str | None = None) -> list[tuple[str, str]]:
+    """
+    Return executors and policies that a comma separated list names.
+
+    :param text: as ``rad,rad:fifo,multi``.
+    :param policies: comma separated; ours without a policy of its own runs with each of them.
+    :raises UsageError: on an unknown name, and one that stands there twice.
+    """
+    default = ['rad'] if policies is None else [name.strip() for name in policies.split(',')]
+    for name in default:
+        find_policy(name)
+    found: list[tuple[str, str]] = []
+    for item in text.split(','):
+        name, colon, policy = item.strip().partition(':')
+        if name not in (*EXECUTORS, NONE):
+            raise UsageError(
+                f"--executors: '{name}' is unknown: give some of {', '.join((*EXECUTORS, NONE))}")
+        if colon and name != OURS:
+            raise UsageError(
+                f"--executors: '{item.strip()}': only this executor knows policies: leave it out")
+        if colon:
+            find_policy(policy)
+        for each in [policy] if colon else default if name == OURS else ['rad']:
+            if (name, each) in found:
+                raise UsageError(f"--executors: '{item.strip()}' stands there twice: name it once")
+            found.append((name, each))
+    if policies is not None and not any(name == OURS for name, _ in found):
+        raise UsageError(f'--policies: they are those of this executor: name {OURS}')
+    return found
+
+
+def measure(
+    spec: Spec, tick: Tick | None = None, patience_s: float = PATIENCE_S
+) -> dict[str, Any]:
+    """
+    Make one measurement in a new process; return its figures.
+
+    Of a declaration with ``processes:`` each is one, all at a time.
+
+    :raises CrashError: when the process crashed, did not end and was killed, or gave no result.
+    :raises ChildError: when the measurement cannot be made.
+    """
+    names = _processes(spec)
+    if len(names) > 1:
+        from benchmarks.loads import of_processes
+        with ThreadPoolExecutor(len(names)) as threads:
+            parts = threads.map(lambda name: measure(
+                replace(spec, process=name), tick if name == names[0] else None, patience_s),
+                names)
+            return of_processes(spec, list(parts))
+    return run_child(
+        [sys.executable, '-m', 'benchmarks.child', spec.to_json()], spec.name,
+        spec.seconds + spec.warm_up_s + patience_s + spec.idle * 0.05, tick)
+
+
+def _processes(spec: Spec) -> list[str]:
+    """Return the declared processes that a measurement is made of."""
+    if spec.load not in DECLARED or spec.process is not None or spec.graph is None:
+        return []
+    try:
+        return [process.name for process in load(spec.graph).processes]
+    except GraphError as error:
+        raise ChildError(str(error)) from None
+
+
+def run_all(
+    specs: Sequence[Spec], repeat: int, tick: Callable[[Spec, int, float], None],
+    warn: Callable[[str], None],
+) -> list[dict[str, Any]]:
+    """
+    Make all measurements in turn, ``repeat`` times; return a result for each of them.
+
+    :param tick: gets now and then which one goes on, how many were made, and for how many s.
+    :param warn: gets each that crashed; its figures are None when it never succeeded.
+    :raises ChildError: when a measurement cannot be made, or when all of them crashed.
+    """
+    runs: list[list[dict[str, Any]]] = [[] for _ in specs]
+    made = 0
+    for _ in range(repeat):
+        for spec, results in zip(specs, runs):
+            def report(passed: float, spec: Spec = spec, made: int = made) -> None:
+                tick(spec, made, passed)
+
+            try:
+                results.append(measure(spec, report))
+            except CrashError as error:
+                warn(str(error))
+            made += 1
+    if not any(runs):
+        raise ChildError('no measurement succeeded: see the warnings')
+    return [combine(spec, results, repeat) for spec, results in zip(specs, runs)]
+
+
+_COUNTS = ('published', 'received', 'lost')
+_FIGURES = (
+    'utilisation', 'sink_jobs_due', 'on_time', 'late', 'missing', 'callbacks_per_s',
+    'cpu_us_per_callback', 'middleware_cpu_us_per_callback', 'utilisation_taken',
+    'dispatch_latency_us', 'hot_path_us')
+_OF_ROBOT = ('sinks', 'cpu_cores')
+
+
+def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict[str, Any]:
+    """
+    Return the result of a measurement from its repetitions.
+
+    :return: an object of ``live --json``; ``runs`` in it has the repetitions' figures.
+    """
+    result: dict[str, Any] = {
+        'load': spec.load, 'executor': spec.name, 'workers': spec.workers,
+        'seconds': spec.seconds, 'seed': spec.seed, 'repeat': repeat,
+        'crashed': repeat - len(runs)}
+    figures = (*_FIGURES, *_OF_ROBOT) if spec.load == ROBOT else _FIGURES
+    middle = {name: _median([run.get(name) for run in runs]) for name in figures}
+    if spec.load == ROBOT:
+        result.update(graph=spec.graph, scale=spec.scale)
+        middle['sinks'] = middle['sinks'] or {}
+    elif spec.load in DECLARED:
+        result.update(graph=spec.graph, bodies=spec.bodies)
+    else:
+        result.update(
+            topics=spec.topics, rate_hz=spec.rate_hz, idle=spec.idle, phases=spec.phases,
+            **{name: sum(run[name] for run in runs) for name in _COUNTS})
+    due = middle['sink_jobs_due']
+    result.update(middle, on_time_ratio=middle['on_time'] / due if due else None)
+    kept = {*_FIGURES, *_OF_ROBOT, *_COUNTS, 'on_time_ratio', 'callbacks', 'window_ns',
+            'attribution', 'infeasible_sinks'} - {'utilisation'}
+    result['runs'] = [{k: v for k, v in run.items() if k in kept} for run in runs]
+    return result
+
+
+def _median(values: Sequence[Any]) -> Any:
+    """Return the median of what is not None, also of each in dictionaries; whole where all are."""
+    found = [value for value in values if value is not None]
+    if not found:
+        return None
+    if isinstance(found[0], dict):
+        return {name: _median([value[name] for value in found]) for name in found[0]}
+    whole = all(isinstance(value, int) for value in found)
+    return statistics.median_low(found) if whole else statistics.median(found)

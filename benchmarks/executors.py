@@ -1,0 +1,136 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The executors that are compared, how they are spun, and when their callbacks start.
+
+Theory of operation
+-------------------
+*No executor at all* (``NoExecutor``) shows what the nodes of a declaration cost by themselves.
+A thread for each timer waits until that is due and calls it.  Whoever
+publishes takes the message from each subscription of the topic, and runs its callback, in its own
+thread.  There is no queue, order, pool, callback group or attribution; nothing is passed
+from one thread to another.  What is left is what every executor pays for: waiting for timers,
+emulated execution, publishing, the middleware, taking messages, and the bodies themselves.  So the
+difference to an executor's CPU time is what that executor takes.  Callbacks that one message
+starts run one after the other, and so do all jobs of a DAG, so less is done in time; the cost of
+each callback hardly depends on that.
+
+*Starts* of callbacks are noted in the same way under every executor: the callback of a
+subscription is replaced by one that reads the clock first, which costs about 1 us.  A list takes
+one tuple for each start; appending is one indivisible step in CPython, so there is no lock.
+(Timers of synthetic nodes note their starts themselves.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+import inspect
+import threading
+import time
+from typing import Any
+
+from benchmarks.campaign import NONE, OURS, Spec
+from mddag_executor.executor.compat import message_taker, timer_functions
+from mddag_executor.hosting.peers import make_peer
+from msg_graph import TaskSet
+from rclpy.executors import Executor
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+
+
+def make_executor(spec: Spec, task_set: TaskSet | None) -> Executor:
+    """
+    Make an executor.
+
+    :param task_set: the declared tasks, which only this executor makes use of.
+    """
+    if spec.executor == OURS:
+        # Here: the others are measured without a trace of this executor in the process.
+        from mddag_executor.executor.executor import MultiDeadlineExecutor
+        return MultiDeadlineExecutor(
+            task_set, num_workers=spec.workers, policy=spec.policy, process=spec.process)
+    return NoExecutor() if spec.executor == NONE else make_peer(spec.executor, spec.workers)
+
+
+class NoExecutor(Executor):
+    """Stands where an executor does; for a process that ends when it has been measured."""
+
+    def spin(self) -> None:
+        """Run the timers and subscriptions of the nodes that were added."""
+        nodes = self.get_nodes()
+        take_where_published([s for node in nodes for s in node.subscriptions])
+        for timer in [timer for node in nodes for timer in node.timers]:
+            threading.Thread(target=self._run, args=(timer,), daemon=True).start()
+        while self.context.ok():
+            time.sleep(0.1)
+
+    def _run(self, timer: Timer) -> None:
+        _, call, _ = timer_functions(timer)
+        while self.context.ok():
+            left: int | None = timer.time_until_next_call()
+            if left is None:
+                return  # it was cancelled, at the end
+            if left > 0:
+                time.sleep(left / 1e9)
+                continue
+            with timer.handle:
+                call()
+            timer.callback()
+
+
+def take_where_published(subscriptions: list[Subscription]) -> None:
+    """Let every publisher of this process take from these, and run their callbacks."""
+    by_topic: dict[str, list[tuple[Subscription, Any]]] = {}
+    for subscription in subscriptions:
+        by_topic.setdefault(subscription.topic_name, []).append(
+            (subscription, message_taker(subscription)))
+    send = Publisher.publish
+    takers: dict[int, list[tuple[Subscription, Any]]] = {}
+
+    def publish(self: Any, msg: Any) -> None:
+        send(self, msg)
+        found = takers.get(id(self))
+        if found is None:
+            found = takers[id(self)] = by_topic.get(self.topic_name, [])
+        for subscription, take in found:
+            with subscription.handle:
+                taken = take()
+            if taken is not None:
+                subscription.callback(*taken)
+
+    Publisher.publish = publish  # type: ignore[method-assign]
+
+
+Start = tuple[int, int]
+"""When a callback started, ns since the epoch, and its dispatch latency, ns."""
+
+
+def _nothing(message: Any) -> None:
+    pass
+
+
+def noting(
+    starts: list[Start], callback: Callable[[Any], None] = _nothing
+) -> Callable[..., None]:
+    """Return a subscription's callback that notes its start and calls another one."""
+    append, time_ns = starts.append, time.time_ns
+
+    def on_message(message: Any, info: Any = None) -> None:
+        now = time_ns()
+        if info is None:
+            message, info = message
+        append((now, now - info['source_timestamp']))
+        callback(message)
+
+    # rclpy goes by the signature whether a callback wants message and info. Its EventsExecutor
+    # (7.1) then gives both in one tuple, which is why the second argument has a default.
+    vars(on_message)['__signature__'] = inspect.Signature([
+        inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY)
+        for name in ('message', 'info')])
+    return on_message
+
+
+def within(starts: Iterable[Start], begin: int, end: int) -> list[int]:
+    """Return the latencies of what started in a window (ns since the epoch), ns."""
+    return [latency for at, latency in list(starts) if begin <= at <= end]

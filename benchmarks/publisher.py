@@ -1,0 +1,136 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Publish topics at fixed rates from a process of its own, and count.
+
+Theory of operation: the process says that it is ready when each of its topics has a subscription,
+begins to publish on the first order, and stops on the second.  Then it says how many messages it
+published on each topic.  It cannot outlive the process that gives the orders.
+
+All topics have the same period.  With a seed their phases are drawn, so that messages come neither
+all at once nor evenly spaced; without one all are published in a row, each period.  What falls
+behind by more than a period leaves releases out: messages in a burst would be lost for want of
+queue depth, which is no fault of the executor that is measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+import heapq
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+import os
+import random
+import time
+from typing import Any
+
+from mddag_executor.hosting.child import ChildError
+from mddag_executor.hosting.session import MATCH_TIMEOUT_S
+from mddag_executor.hosting.synthetic import QOS, quiet_node
+import rclpy
+from rclpy.publisher import Publisher
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Header
+
+
+class PublisherProcess:
+    """
+    The process that publishes, seen from the one that measures; a context manager.
+
+    :param topics: what it publishes.
+    """
+
+    def __init__(self, topics: Sequence[str], rate_hz: float, seed: int | None) -> None:
+        context = get_context('spawn')
+        self._orders, orders = context.Pipe()
+        self._process = context.Process(
+            target=_run, args=(topics, rate_hz, seed, orders), daemon=True)
+        self._process.start()
+        orders.close()
+
+    def __enter__(self) -> PublisherProcess:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *args: object) -> None:
+        """End the process, whatever it does."""
+        self._process.kill()
+        self._process.join()
+
+    def wait_until_ready(self) -> None:
+        """
+        Wait until all its topics have a subscription.
+
+        :raises ChildError: when the process ended instead.
+        """
+        self._answer()
+
+    def begin(self) -> None:
+        """Let it publish."""
+        with suppress(OSError):  # the missing answer shows it
+            self._orders.send(None)
+
+    def finish(self) -> list[int]:
+        """
+        Stop it and return how many messages it published on each topic.
+
+        :raises ChildError: when the process ended before.
+        """
+        self.begin()
+        counts: list[int] = self._answer()
+        return counts
+
+    def _answer(self) -> Any:
+        try:
+            return self._orders.recv()
+        except (EOFError, OSError):
+            raise ChildError('the publishing process ended early: check ROS_DOMAIN_ID and the '
+                             'network') from None
+
+
+def _run(
+    topics: Sequence[str], rate_hz: float, seed: int | None, orders: Connection
+) -> None:
+    """Publish as ordered; the end of who gives the orders is an order, too."""
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = quiet_node('/mddag_bench_publisher')
+    publishers = [node.create_publisher(Header, topic, QOS) for topic in topics]
+    end = time.monotonic() + MATCH_TIMEOUT_S
+    while not all(publisher.get_subscription_count() for publisher in publishers):
+        if orders.poll(0.01) or time.monotonic() > end:
+            os._exit(1)
+    with suppress(EOFError, OSError):
+        orders.send('ready')
+        orders.recv()
+        orders.send(publish(publishers, rate_hz, seed, orders.poll))
+        orders.recv()
+        orders.recv()  # what was published last may have to be sent again
+    os._exit(0)
+
+
+def publish(
+    publishers: Sequence[Publisher], rate_hz: float, seed: int | None,
+    is_to_stop: Callable[[float], bool],
+) -> list[int]:
+    """
+    Publish on all topics until asked to stop; return how often on each.
+
+    :param is_to_stop: waits for that so many seconds.
+    """
+    period = round(1e9 / rate_hz)
+    generator = random.Random(seed)
+    begin = time.monotonic_ns() + 1_000_000
+    due = [(begin + (0 if seed is None else generator.randrange(period)), index)
+           for index in range(len(publishers))]
+    heapq.heapify(due)
+    counts = [0] * len(publishers)
+    message = Header()
+    while True:
+        at, index = due[0]
+        if is_to_stop(max(0, at - time.monotonic_ns()) / 1e9):
+            return counts
+        publishers[index].publish(message)
+        counts[index] += 1
+        missed = max(0, time.monotonic_ns() - at) // period
+        heapq.heapreplace(due, (at + (1 + missed) * period, index))

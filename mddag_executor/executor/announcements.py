@@ -1,0 +1,216 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the executors of one machine announce to each other of their publications.
+
+Theory of operation
+-------------------
+A message says when it was published and its publication sequence number, and nothing else
+of its job.  Within a process the window of time of each publication is noted (``jobs``).  So the
+process that publishes for another one announces just that, right behind the message: topic,
+window, sequence number, and the job, on a topic of its own.  Both have the same system clock.
+
+1.  *Announced* is each publication on a topic by which a DAG leaves the process, for the DAGs that
+    ``processes:`` divides and whose jobs no header stamp identifies (``other_processes``); also
+    one of no job, so that nobody waits for it.
+2.  A job is called by the executor that released it first and its number there, wherever it goes,
+    and has one release, by the steady clock that all processes of a machine share.
+    Those of a topic that overlap in time are announced together, when the last of them has
+    returned: a message may lie in the windows of all.  Between processes nobody could say when
+    that is so; so what several processes publish on one topic is a doubt (``contested``).
+3.  A message that may come from another process and belongs to no publication that is known waits
+    for its announcement, which is under way: for ``WAIT_NS`` at least, and until the check after
+    that, as the process may just have been stopped.  Then it runs as undeclared, and is counted.
+    Publications of one publisher are announced in their order, so its messages stay in order.
+4.  Announced publications are looked up with those of this process, by one rule (``Jobs.find``):
+    window and sequence number.
+5.  Only executors with the same declaration understand each other: its digest is in the name of
+    the topic.  Each process has a topic of its own, so that nobody hears itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import hashlib
+import os
+import struct
+import time
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor.executor.jobs import (
+    Announced,
+    NO_ORIGIN,
+    Origin,
+    Publication,
+    PublisherNumbers,
+)
+from mddag_executor.executor.other_processes import contested
+from mddag_executor.executor.work import Work
+from msg_graph import TaskSet
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import UInt8MultiArray
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.workers import WorkerPool
+
+WAIT_NS, CHECK_NS = 100_000_000, 50_000_000
+"""How long a message waits for its announcement, and how often that is checked."""
+_QOS = QoSProfile(
+    reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1000)
+# whose, publisher, sequence, begin, end; home, number and release of the job; DAG, vertex, topic
+_ENTRY = struct.Struct('<QQQqqQQqiiI')
+
+
+class Announcements:
+    """
+    Announces publications to the other processes, and receives what these announce.
+
+    :param process: which of the declared ones this is.
+    :param pool: whose engine it is; all but ``unmatched`` and ``close`` happens under its lock.
+    """
+
+    def __init__(
+        self, task_set: TaskSet, process: str, context: Context, pool: WorkerPool,
+    ) -> None:
+        self._pool = pool
+        self._jobs = pool.engine.jobs
+        self._engine = pool.engine
+        self._clock = pool.clock
+        self._give = pool.inbox.announced
+        self._topics = sorted({t for c in task_set.callbacks for t in c.publishes})
+        self._number = {topic: i for i, topic in enumerate(self._topics)}
+        self._contested = contested(task_set)
+        self._token = int.from_bytes(os.urandom(8), 'little')
+        self._publishers: dict[tuple[int, int], PublisherNumbers] = {}
+        # until when (trace's clock) each message waits, and what the middleware says of it
+        self._waiting: list[tuple[int, Work, dict[str, Any]]] = []
+        self._checked_at = 0
+        digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
+        names = [each.name for each in task_set.processes]
+        own = names.index(process)
+        # Its own arguments go before those of the process, which name the process' nodes.
+        name = f'mddag_jobs_{os.getpid()}_{own}'
+        self.node = Node(
+            name, context=context, enable_rosout=False, start_parameter_services=False,
+            cli_args=['--ros-args', '-r', f'__node:={name}'],
+            parameter_overrides=[Parameter('start_type_description_service', value=False)])
+        self._n_others = len(names) - 1
+        self._publisher: Publisher | None = self.node.create_publisher(
+            UInt8MultiArray, f'/mddag/jobs_{digest}/p{own}', _QOS)
+        self.subscriptions = [
+            self.node.create_subscription(
+                UInt8MultiArray, f'/mddag/jobs_{digest}/p{i}', self._hear, _QOS,
+                callback_group=ReentrantCallbackGroup())
+            for i in range(len(names)) if i != own]
+        self._jobs.announce = self._announce
+
+    def unmatched(self) -> list[str]:
+        """Return the topics on which the processes have not met yet."""
+        publisher = self._publisher
+        if publisher is None:
+            return []
+        found = [s.topic_name for s in self.subscriptions if not s.get_publisher_count()]
+        if publisher.get_subscription_count() < self._n_others:
+            found.append(publisher.topic_name)
+        return found
+
+    def close(self) -> None:
+        """Announce nothing more."""
+        self._jobs.announce = None
+        self._publisher = None
+        self.node.destroy_node()
+
+    def _announce(
+        self, send: Callable[[Any, Any], None], topic: str, several: list[Publication]
+    ) -> None:
+        """Announce publications to the others (rules 1 and 2)."""
+        entries = b''.join(self._entry(topic, publication) for publication in several)
+        publisher = self._publisher
+        if publisher is not None:
+            send(publisher, UInt8MultiArray(data=entries))
+
+    def _entry(self, topic: str, publication: Publication) -> bytes:
+        origin = publication.origin
+        assert isinstance(origin, Origin)
+        job = self._job(origin)
+        dag = -1 if job is None else origin.dag
+        (home, number), release = job or ((0, 0), 0)
+        return _ENTRY.pack(
+            self._token, id(publication.numbers), publication.sequence, publication.begin,
+            publication.end, home, number, release, dag, origin.vertex, self._number[topic])
+
+    def _job(self, origin: Origin) -> tuple[tuple[int, int], int] | None:
+        """Return name and release of a job; None for none, and one that has ended meanwhile."""
+        others = self._engine.other_processes
+        if origin is NO_ORIGIN or others is None:
+            return None
+        with self._pool.lock:
+            release = self._engine.open_release(origin)
+            if release is None:
+                return None
+            name = others.name_of(origin)
+            if name is None:  # it was released here, and may come back
+                name = (self._token, origin.job)
+                others.name(name, origin)
+        return name, release - self._clock.offset_ns
+
+    def _hear(self, message: UInt8MultiArray) -> None:
+        """Handle what another process announces, and pass on what has waited for it."""
+        if len(message.data) % _ENTRY.size:
+            return
+        for entry in _ENTRY.iter_unpack(message.data):
+            self._take_in(*entry)
+        for entry in list(self._waiting):
+            origin = self._find(entry[1], entry[2])
+            if origin is not None:
+                self._waiting.remove(entry)
+                self._give(entry[1], origin)
+
+    def _take_in(
+        self, whose: int, of: int, sequence: int, begin: int, end: int, home: int, number: int,
+        release: int, dag: int, vertex: int, topic: int,
+    ) -> None:
+        if topic < len(self._topics) and dag < len(self._engine.dag_names):  # else of a stranger
+            publisher = self._publishers.setdefault((whose, of), PublisherNumbers())
+            self._jobs.take_in(self._topics[topic], Publication(
+                begin, publisher, Announced((home, number), dag, vertex, release), sequence, end))
+
+    def _find(
+        self, work: Work, info: dict[str, Any], counted: bool = False
+    ) -> Origin | Announced | None:
+        return self._jobs.find(
+            work.entity.topic, info['source_timestamp'],
+            info.get('publication_sequence_number'), counted)
+
+    def take(self, work: Work, info: dict[str, Any], now: int) -> None:
+        """Handle a message that may come from another process; pass it on when it is known."""
+        if work.entity.topic in self._contested:
+            self._jobs.doubtful += 1
+            self._give(work, None)
+            return
+        origin = self._find(work, info)
+        if origin is not None:
+            self._give(work, origin)
+            return
+        if not self._waiting:
+            self._check_later()
+        self._waiting.append((now + WAIT_NS, work, info))
+
+    def _check_later(self) -> None:
+        self._pool.call_at_locked(
+            time.monotonic_ns() + CHECK_NS, lambda: self._pool.report(self._check))
+
+    def _check(self, now: int) -> None:
+        """Pass on what has waited for too long (rule 3)."""
+        late = [entry for entry in self._waiting if entry[0] <= self._checked_at]
+        self._checked_at = now
+        for entry in late:
+            self._waiting.remove(entry)
+            self._give(entry[1], self._find(entry[1], entry[2], counted=True))
+        if self._waiting:
+            self._check_later()

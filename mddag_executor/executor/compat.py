@@ -1,0 +1,374 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+All that this program uses of rclpy beyond its documented interface.
+
+Nobody else uses a private name of rclpy, or what is behind a handle: ``test/test_layers.py`` holds
+that. Each entry says in which versions it was seen. *7.1* is Jazzy: 7.1.5, which the package index
+has, and what is known of the releases up to 7.1.9. *9.1* is Kilted: 9.1.2. Where nothing else is
+said, it is in both, and the executor cannot do without it. ``test/executor/test_compat.py`` tries
+each on the rclpy that is installed.
+
+Two adapters have modules of their own: ``listeners`` (``handle.pointer``) and ``waitsets``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
+import inspect
+from operator import attrgetter
+import sys
+import threading
+import types
+from typing import Any
+import weakref
+
+import rclpy
+import rclpy.client
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import Executor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.subscription import Subscription
+from rclpy.task import Future, Task
+from rclpy.time_source import TimeSource
+import rclpy.timer
+
+RCLError: type[Exception] = _rclpy.RCLError
+"""What rcl reports. 9.1 has it as ``rclpy.subscription.RCLError``, too."""
+
+RCL_ERRORS = (InvalidHandle, RCLError)
+"""What rclpy raises of anything whose context has ended, among others."""
+
+
+# --- taking --------------------------------------------------------------------------------------
+
+def message_taker(subscription: Any) -> Callable[[], tuple[Any, dict[str, Any]] | None]:
+    """Return what takes a message (bytes of a raw subscription) with its info, or None."""
+    return partial(subscription.handle.take_message, subscription.msg_type, subscription.raw)
+
+
+def request_taker(service: Any) -> Callable[[], tuple[Any, Any]]:
+    """Return what takes a request with its header; that is None where there is none."""
+    return partial(service.handle.service_take_request, service.srv_type.Request)
+
+
+def response_taker(client: Any) -> Callable[[], tuple[Any, Any]]:
+    """Return what takes the header of a response and that; None where there is none."""
+    return partial(client.handle.take_response, client.srv_type.Response)
+
+
+callback_type: Callable[[Any], Any] = attrgetter('_callback_type')
+"""Says whether a subscription's callback takes a message's info, too: then ``WITH_INFO``."""
+
+WITH_INFO = Subscription.CallbackType.WithMessageInfo
+
+
+# --- timers --------------------------------------------------------------------------------------
+
+TimerInfo: Any = getattr(rclpy.timer, 'TimerInfo', None)
+"""What a timer's callback can ask for by an annotation. Public in 9.1; 7.1 has no such thing."""
+
+
+def timer_functions(timer: Any) -> tuple[
+    Callable[[], int | None], Callable[[], dict[str, int] | None], Callable[[], int],
+]:
+    """
+    Return what asks how long it is until a timer's next call, calls it, and asks for its period.
+
+    Unlike the timer's own methods they do not enter its handle each time. In 9.1 a call returns
+    what a ``TimerInfo`` says; in 7.1 None.
+    """
+    handle = timer.handle
+    call = getattr(handle, 'call_timer_with_info', handle.call_timer)
+    return handle.time_until_next_call, call, handle.get_timer_period
+
+
+_info_parameters: weakref.WeakKeyDictionary[Any, str | None] = weakref.WeakKeyDictionary()
+
+
+def with_timer_info(timer: Any, callback: Any, call: dict[str, int] | None) -> Any:
+    """Return a timer's callback with the ``TimerInfo`` of a call, where it asks for that (9.1)."""
+    if call is None or callback is None:
+        return callback
+    function = getattr(callback, '__func__', callback)
+    try:
+        name = _info_parameters[function]
+    except KeyError:
+        name = _info_parameters[function] = _info_parameter(callback)
+    except TypeError:  # there are no weak references to it
+        name = _info_parameter(callback)
+    if name is None:
+        return callback
+    info = TimerInfo(**call, clock_type=timer.clock.clock_type)
+    return partial(callback, **{name: info})
+
+
+def _info_parameter(callback: Any) -> str | None:
+    try:
+        parameters = inspect.signature(callback).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    return next((p.name for p in parameters if p.annotation == TimerInfo), None)
+
+
+def ends_sleep(callback: Any) -> bool:
+    """Return whether a timer's callback is that of a ``Rate``, which ends a thread's sleep."""
+    return type(callback) is types.MethodType and callback.__func__ is threading.Event.set
+
+
+# --- futures -------------------------------------------------------------------------------------
+
+def complete_request(client: Any, number: int, response: Any, executor: Any) -> None:
+    """Complete the future of a client's request; its callbacks run in an executor."""
+    try:
+        future = client.get_pending_request(number)
+    except KeyError:
+        return  # the request was cancelled
+    future._set_executor(executor)
+    future.set_result(response)
+
+
+def attach_futures(waitable: Any, executor: Any) -> None:
+    """Have the callbacks of a waitable's futures run in an executor."""
+    for future in waitable._futures:
+        future._set_executor(executor)
+
+
+_UNBLOCK = next(
+    (each for each in rclpy.client.Client.call.__code__.co_consts
+     if getattr(each, 'co_name', '') == 'unblock'), None)
+
+
+def ends_call(callback: Any) -> bool:
+    """Return whether it is the done callback by which ``Client.call`` stops waiting."""
+    return _UNBLOCK is not None and getattr(callback, '__code__', None) is _UNBLOCK
+
+
+_NUMBERS = {
+    'goal': '_goal_sequence_number_to_goal_id', 'cancel': '_pending_cancel_requests',
+    'result': '_pending_result_requests'}
+
+
+def sender_is_behind(waitable: Any, data: Any) -> bool:
+    """
+    Return whether an action client has taken a response to a request that it does not know yet.
+
+    In 7.1.5 it sends a request before it notes its number, and throws away what comes in between:
+    the future would never be done (rclpy issue 1123).
+    """
+    return all(hasattr(waitable, numbers) for numbers in _NUMBERS.values()) and any(
+        name in data and data[name][0] not in getattr(waitable, numbers)
+        for name, numbers in _NUMBERS.items())
+
+
+def feedback_taken(waitable: Any, data: Any, most: int) -> list[tuple[Callable[..., Any], Any]]:
+    """
+    Return the feedback that an action client has taken, each with the callback that it is for.
+
+    It is removed from what was taken. A client takes one feedback at a time. So with a result, all
+    that is there is taken, too: another thread may have the result in its hands soon, and then
+    the client has forgotten the callback. Other waitables have none.
+
+    In 9.1 a client has a lock for its handle.
+    """
+    callbacks = getattr(waitable, '_feedback_callbacks', None)
+    if callbacks is None:  # without a look at the type: rclpy.action loads much
+        return []
+    messages = [data['feedback']] if 'feedback' in data else []
+    if 'result' in data and callbacks:
+        kind = waitable._action_type.Impl.FeedbackMessage
+        lock: AbstractContextManager[Any] = getattr(waitable, '_lock', nullcontext())
+        with lock:
+            while len(messages) < most:
+                message = waitable._client_handle.take_feedback(kind)
+                if message is None:
+                    break
+                messages.append(message)
+    found = []
+    for message in messages:
+        callback = callbacks.get(bytes(message.goal_id.uuid))
+        if callback is not None:
+            data.pop('feedback', None)  # the first one
+            found.append((callback, message))
+    return found
+
+
+# --- tasks and coroutines ------------------------------------------------------------------------
+
+_TASK_CODE = Task.__call__.__code__.co_filename
+
+
+class BareTask(Task):
+    """
+    A task that does not go on by itself when what it waits for is done.
+
+    :ivar waits_for: the future that its coroutine waits for, where rclpy says so (7.1.9).
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.waits_for: Future | None = None
+        super().__init__(*args, **kwargs)  # type: ignore[no-untyped-call]
+
+    def _add_resume_callback(self, future: Future, executor: Any) -> None:
+        self.waits_for = future
+
+    def unfetched(self) -> BaseException | None:
+        """Return what the task has raised, if nobody has asked for it yet (``exception``)."""
+        error: BaseException | None = None if self._exception_fetched else self._exception
+        return error
+
+    def mark_fetched(self) -> None:
+        """Take note that somebody takes care of what it has raised: else that is printed."""
+        self._exception_fetched = True
+
+
+def forget_task_frames(error: BaseException) -> None:
+    """Remove from a traceback the frames in which a task caught it: they refer to the task."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_frame.f_code.co_filename == _TASK_CODE:
+        trace.tb_frame.clear()
+        trace = trace.tb_next
+    error.__traceback__ = trace
+
+
+UNKNOWN = object()
+"""Stands for something awaited that cannot be found out: it is asked again now and then."""
+
+
+def awaited(coroutine: Any) -> Any:
+    """
+    Return the rclpy future that a suspended coroutine waits for, or UNKNOWN.
+
+    From 7.1.9 on, the coroutine says it itself. In 7.1.5 and 9.1 ``Future.__await__`` is a
+    generator that yields nothing. So the future is looked up where the chain of awaits ends.
+    """
+    inner = coroutine
+    while True:
+        if type(inner) is types.CoroutineType:
+            inner = inner.cr_await
+        elif type(inner) is types.GeneratorType:
+            if inner.gi_yieldfrom is None:
+                break
+            inner = inner.gi_yieldfrom
+        else:
+            break
+    if type(inner) is types.GeneratorType and inner.gi_frame is not None:
+        inner = inner.gi_frame.f_locals.get('self')
+    return inner if hasattr(inner, 'add_done_callback') else UNKNOWN
+
+
+# --- executors and nodes -------------------------------------------------------------------------
+
+TASKS_NEWEST_FIRST = TimerInfo is None
+"""Whether tasks that wait run in the reverse of their order: in all of 7.1, but not in 9.1."""
+
+
+def _nothing() -> None:
+    """Do nothing when a context ends."""
+
+
+class BareExecutor(Executor):
+    """rclpy's executor, without its own way of running things."""
+
+    _sigint_gc: Any = None  # for its finalizer, where construction fails
+
+    def __init__(self, *, context: Any = None) -> None:
+        # The context keeps a WeakMethod of ``wake``. When that goes first, as at Python 3.11's
+        # exit, its end is an exception that is printed. See ``shutdown.call_at_shutdown``.
+        self.wake = _nothing  # type: ignore[method-assign]
+        super().__init__(context=context)
+        del self.wake
+
+    def signal_guard(self) -> Any:
+        """Return the guard condition that a signal triggers."""
+        return self._sigint_gc
+
+    def is_gone(self) -> bool:
+        """Return whether ``shutdown`` has let go of everything."""
+        return self._guard is None
+
+    def create_future(self) -> Future:
+        """Return a future whose callbacks run in this executor (rclpy from 7.1.6 on)."""
+        return Future(executor=self)
+
+    def is_ending(self) -> bool:
+        """Return whether the executor has been asked to end."""
+        return bool(self._is_shutdown)
+
+    def begin_end(self) -> None:
+        """Ask the executor to end."""
+        self._is_shutdown = True
+
+    def _call_task_in_next_spin(self, task: Task) -> None:
+        """Leave a task (7.1.9) to whoever runs it, who asks it again by himself."""
+
+
+class _FirstNode:
+    """Stands first among a context's nodes, to notice that they are destroyed."""
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        self.destroy_node = call
+
+
+def on_end(context: Any, call: Callable[[], None]) -> object:
+    """
+    Have a function called when a context is shut down, before its nodes are gone.
+
+    In 9.1 a context first destroys its nodes, which it has in a list, and only then does what it
+    was given by ``on_shutdown``. There, the function is called twice.
+
+    :return: what is to be kept for as long as that is wanted.
+    """
+    context.on_shutdown(call)
+    first = _FirstNode(call)
+    nodes = getattr(context, '_Context__node_weak_ref_list', None)
+    if nodes is not None:
+        nodes.insert(0, weakref.ref(first))
+    return first
+
+
+def is_called_by_spin() -> bool:
+    """
+    Return whether the method that asks was called by ``rclpy.spin``.
+
+    That runs one callback at a time, in every version.
+    """
+    return sys._getframe(2).f_code is rclpy.spin.__code__
+
+
+@contextmanager
+def executor_kept(node: Any) -> Iterator[None]:
+    """Have another executor run a node, as it is added to that; ``node.executor`` stays."""
+    before, node._Node__executor_weakref = node._Node__executor_weakref, None
+    try:
+        yield
+    finally:
+        node._Node__executor_weakref = before
+
+
+def keeps_time(subscription: Any) -> bool:
+    """Return whether it is the one through which rclpy gets a node's simulated time."""
+    return getattr(subscription.callback, '__func__', None) is TimeSource.clock_callback
+
+
+def is_of_wait_for_message(entity: Any) -> bool:
+    """
+    Return whether it is a subscription that ``rclpy.wait_for_message`` makes for a moment.
+
+    That takes from it itself, and would wait in vain for what an executor has taken before.
+    """
+    callback = getattr(entity, 'callback', None)
+    return getattr(callback, '__module__', None) == 'rclpy.wait_for_message'
+
+
+def is_builtin(service: Any) -> bool:
+    """Return whether it is a service that rclpy makes for each node: parameters and the like."""
+    return str(getattr(service.callback, '__module__', '')).startswith('rclpy.')
+
+
+def service_name(entity: Any) -> str:
+    """Return the name of a service or client. 7.1.5 has no ``service_name``."""
+    name: str = entity.service_name if hasattr(entity, 'service_name') else entity.srv_name
+    return name

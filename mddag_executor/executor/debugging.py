@@ -1,0 +1,80 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Checks of the engine at the end of every section under its lock.
+
+``MDDAG_DEBUG=1`` switches them on, and the tracebacks of errors (``cli.main``);
+``MDDAG_DEBUG=engine`` switches on these checks only.
+
+A check costs time for each execution that waits and each job that is open.  So if there are more
+than ``CHECKED_PER_SECTION`` of these, only some sections are followed by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import os
+import threading
+from types import TracebackType
+from typing import Any
+
+from mddag_executor.errors import MddagError
+
+VARIABLE = 'MDDAG_DEBUG'
+CHECKED_PER_SECTION = 100
+"""At least this many jobs and executions may be checked after each section: about 0.1 ms."""
+
+
+class InvariantError(MddagError):
+    """The engine is in a state that it must never be in; the text says all that is wrong."""
+
+    def __init__(self, broken: list[str]) -> None:
+        super().__init__(
+            f'engine: {"; ".join(broken)}: this is a defect of mddag_executor, please report it')
+        self.broken = broken
+
+
+class CheckedLock:
+    """
+    A reentrant lock; a check follows each section, unless that raises.
+
+    :param check: raises when something is wrong; after that it is not called any more.
+    :param size: returns how much there is to check.
+    """
+
+    def __init__(self, check: Callable[[], None], size: Callable[[], int]) -> None:
+        self._lock = threading.RLock()
+        self._check = check
+        self._size = size
+        self._depth = 0
+        self._unchecked = 0
+        self._has_failed = False
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+        self._depth += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._depth -= 1
+        try:
+            if kind is None and self._depth == 0 and not self._has_failed:
+                self._unchecked += CHECKED_PER_SECTION
+                if self._unchecked >= self._size():
+                    self._unchecked = 0
+                    self._has_failed = True
+                    self._check()
+                    self._has_failed = False
+        finally:
+            self._lock.release()
+
+    def _is_owned(self) -> bool:
+        return self._lock._is_owned()  # type: ignore[attr-defined, no-any-return]
+
+
+def engine_lock(check: Callable[[], None], size: Callable[[], int]) -> Any:
+    """Return the lock of an engine: a checked one if ``MDDAG_DEBUG`` asks for it."""
+    is_checked = os.environ.get(VARIABLE) in ('1', 'engine')
+    return CheckedLock(check, size) if is_checked else threading.RLock()

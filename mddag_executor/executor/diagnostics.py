@@ -1,0 +1,321 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What an executor reports on ``/diagnostics``, the topic that ROS's own tools look at.
+
+Theory of operation
+-------------------
+Once a period a thread of its own reads the executor's counters and publishes one
+``DiagnosticArray``: a status for each DAG that has a callback in this process, and one for the
+pool.  It takes no lock and touches nothing on a callback's way: counters are read
+as they stand (a count that moves on while others are read shows one period later), so no
+worker ever waits for it.
+
+A DAG's status says what came of its results (jobs of its sinks) lately.  STALE: nothing has been
+released for a while.  ERROR, WARN: see ``Thresholds``.  The pool's status says WARN when something
+was lost: messages beyond a queue's depth, releases of timers, messages whose job was not found,
+events of the trace, misses that ``on_deadline_miss`` was too slow for.
+
+By the conventions of diagnostics names are ``NAME: DAG`` and ``NAME: workers``, the hardware_id is
+the host's name and the process, and values are texts whose units stand in their keys.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+import os
+import socket
+import threading
+import time
+from typing import NamedTuple, TYPE_CHECKING
+
+from mddag_executor.core import quantile
+from mddag_executor.core.tally import Counts, counts, Tally
+from mddag_executor.executor.settings import Thresholds
+from mddag_executor.executor.shutdown import is_over, join, stop_at_exit
+from mddag_executor.text import counted
+from rclpy.logging import get_logger
+
+if TYPE_CHECKING:
+    from diagnostic_msgs.msg import DiagnosticArray
+    from mddag_executor.executor.miss_notifier import MissNotifier
+    from mddag_executor.executor.recorder import Recorder
+    from mddag_executor.executor.registry import Registry
+    from mddag_executor.executor.workers import WorkerPool
+    from msg_graph import Dag, TaskSet
+    from rclpy.context import Context
+
+TOPIC = '/diagnostics'
+WORKERS = 'workers'
+NODE_NAME = 'mddag_diagnostics'
+OK, WARN, ERROR, STALE = range(4)
+END_TIMEOUT_S = 2.0
+
+
+class Status(NamedTuple):
+    """One status: name, level (OK, WARN, ERROR, STALE), message, values by key."""
+
+    name: str
+    level: int
+    message: str
+    values: dict[str, str]
+
+
+class _Seen(NamedTuple):
+    """The counters of a DAG at one time, as they stood."""
+
+    results: Counts
+    jobs: int
+    completed: list[int]
+    in_stops: int
+
+
+class DagWatch:
+    """
+    Judges the state of one DAG, period by period.
+
+    :param every_ns: the period of the diagnostics.
+    :param in_stops: by DAG, how many misses stops of the machine explain.
+    """
+
+    def __init__(
+        self, tally: Tally, dag: Dag, thresholds: Thresholds, every_ns: int,
+        in_stops: Sequence[int],
+    ) -> None:
+        self._tally = tally
+        self._dag = dag
+        self._thresholds = thresholds
+        self._in_stops = in_stops
+        self._sinks = {tally.vertex_name(v): sink for v, sink in tally.sinks_of(dag).items()}
+        self._stale_after = max(thresholds.stale_periods * dag.period_ns, every_ns)
+        # what was seen in each period of the window, and before it
+        self._seen = deque([self._look()], maxlen=thresholds.window + 1)
+        self._released_at: int | None = None
+
+    def _look(self) -> _Seen:
+        sinks = self._sinks.values()
+        return _Seen(
+            Counts.total(counts(vars(sink)) for sink in sinks), self._tally.jobs[self._dag.index],
+            [sink.completed for sink in sinks], self._in_stops[self._dag.index])
+
+    def status(self, now: int) -> Status:
+        """Return the state of things; to be called once a period (``now``: monotonic ns)."""
+        last, seen = self._seen[-1], self._look()
+        self._seen.append(seen)
+        if seen.jobs != last.jobs:
+            self._released_at = now
+        before, results = self._seen[0], seen.results
+        window = results.minus(before.results)
+        in_stops = seen.in_stops - before.in_stops
+        level, message = self._level(results.minus(last.results), window, now, in_stops)
+        ratio = window.missed / window.due if window.due else 0.0
+        values = {
+            'period_ms': _ms(self._dag.period_ns), 'jobs': str(seen.jobs),
+            'results': str(results.due), 'missed': str(results.missed),
+            'late': str(results.late), 'expired': str(results.expired),
+            'aborted': str(results.aborted), 'failed': str(results.failed),
+            'window_results': str(window.due), 'window_missed': str(window.missed),
+            'window_missed_ratio': f'{ratio:.4f}', 'window_in_stops': str(in_stops),
+            **self._response_times(last, seen)}
+        return Status(f'{self._thresholds.name}: {self._dag.name}', level, message, values)
+
+    def _level(
+        self, step: Counts, window: Counts, now: int, in_stops: int
+    ) -> tuple[int, str]:
+        limits = self._thresholds
+        if self._released_at is None:
+            return STALE, 'nothing has been released yet'
+        silent = now - self._released_at
+        if silent >= self._stale_after:
+            return STALE, f'nothing has been released for {silent / 1e9:.1f} s'
+        if not window.missed:
+            return OK, f'{counted(window.due, "result")} in time'
+        message = f'{window.missed} of {window.due} results missed their deadlines'
+        if in_stops:
+            message += f', {in_stops} as the machine stood still'
+        if window.missed >= max(
+                limits.warn_burst, limits.error_ratio * window.due):
+            return ERROR, message
+        if step.missed >= limits.warn_burst or window.missed >= limits.warn_ratio * window.due:
+            return WARN, message
+        return OK, message
+
+    def _response_times(self, last: _Seen, seen: _Seen) -> dict[str, str]:
+        """Return the response times of the last period, in parts of their deadlines and in ms."""
+        times: list[int] = []
+        used: list[float] = []
+        margins: dict[str, int] = {}
+        for (name, sink), before, now in zip(self._sinks.items(), last.completed, seen.completed):
+            # while others are added, one may be there twice
+            kept = sink.responses
+            found = [kept[-i] for i in range(1, min(now - before, len(kept)) + 1)]
+            times += found
+            if found:
+                margins[name] = sink.relative_deadline_ns - max(found)
+                used.append(max(found) / sink.relative_deadline_ns)
+        if not times:
+            return {}
+        times.sort()
+        return {
+            'response_p50_ms': _ms(quantile(times, 0.5)),
+            'response_p99_ms': _ms(quantile(times, 0.99)), 'response_max_ms': _ms(times[-1]),
+            'deadline_used_max': f'{max(used):.2f}', 'margin_min_ms': _ms(min(margins.values())),
+            **{f'margin_ms {name}': _ms(margin) for name, margin in margins.items()}}
+
+
+def _ms(nanoseconds: int) -> str:
+    return f'{nanoseconds / 1e6:.3f}'
+
+
+class PoolWatch:
+    """Judges the state of the workers and of what everybody shares, period by period."""
+
+    def __init__(
+        self, pool: WorkerPool, registry: Registry, recorder: Recorder | None,
+        thresholds: Thresholds, notifier: MissNotifier | None = None,
+    ) -> None:
+        self._engine = pool.engine
+        self._notifier = notifier
+        self._pool = pool
+        self._registry = registry
+        self._recorder = recorder
+        self._thresholds = thresholds
+        self._last = self._read()
+        self._at = time.monotonic_ns(), time.process_time_ns()
+
+    def _read(self) -> dict[str, int]:
+        jobs = self._engine.jobs
+        return {
+            **self._registry.totals(), 'doubtful': jobs.doubtful,
+            'trace_lost': 0 if self._recorder is None else self._recorder.writer.dropped,
+            'unreported_misses': 0 if self._notifier is None else self._notifier.unreported}
+
+    def status(self, now: int) -> Status:
+        """Return the state of things; to be called once a period (``now``: monotonic ns)."""
+        counts = self._read()
+        step = {key: max(0, n - self._last[key]) for key, n in counts.items()}
+        cpu = time.process_time_ns()
+        passed, cpu_used = max(1, now - self._at[0]), cpu - self._at[1]
+        self._last, self._at = counts, (now, cpu)
+        workers = self._engine.n_workers
+        lost = [f'{step[key]} {what}' for key, what in (
+            ('dropped', 'dropped'), ('skipped', 'timer releases skipped'),
+            ('unattributed', 'messages without a job'), ('trace_lost', 'trace events lost'),
+            ('unreported_misses', 'misses not reported to on_deadline_miss'),
+        ) if step[key]]
+        failed = self._recorder is not None and self._recorder.writer.error is not None
+        if failed:
+            lost.append('the trace cannot be written')
+        scheduler = self._engine.scheduler
+        values = {
+            'policy': scheduler.policy.name, 'workers': str(workers),
+            'idle_workers': str(scheduler.idle_workers), 'lent': str(self._pool.lent),
+            'queue': str(scheduler.queue_length), 'computing': str(self._registry.computing()),
+            'callbacks_per_s': f'{step["ran"] * 1e9 / passed:.1f}',
+            'busy_ratio': f'{step["busy_ns"] / passed / workers:.3f}',
+            'cpu_ratio': f'{cpu_used / passed:.3f}',
+            'cpu_us_per_callback': f'{cpu_used / 1e3 / step["ran"]:.1f}' if step['ran'] else '',
+            **{key: str(counts[key]) for key in (
+                'ran', 'dropped', 'skipped', 'unattributed', 'doubtful', 'trace_lost',
+                'unreported_misses')}}
+        return Status(
+            f'{self._thresholds.name}: {WORKERS}',
+            ERROR if failed else WARN if lost else OK,
+            ', '.join(lost) or f'{counted(step["ran"], "callback")} ran', values)
+
+
+class Diagnostics:
+    """
+    Publishes the state of an executor, from a thread of its own.
+
+    :param period_ns: how often.
+    :param process: which of the declared processes this is.
+    """
+
+    def __init__(
+        self, context: Context, task_set: TaskSet | None, pool: WorkerPool, registry: Registry,
+        recorder: Recorder | None, period_ns: int, thresholds: Thresholds,
+        process: str | None = None, notifier: MissNotifier | None = None,
+    ) -> None:
+        self._context = context
+        self._registry = registry
+        self._period_ns = period_ns
+        self._hardware_id = f'{socket.gethostname()}/{process or os.getpid()}'
+        verdicts = pool.engine.verdicts
+        self._dags = []
+        for dag in task_set.dags if task_set is not None else ():
+            # one that several processes share is reported where its source and its sinks are
+            reported_by = dag.vertices if process is None else [
+                dag.vertices[i] for i in (dag.source, *dag.sinks)]
+            self._dags.append((
+                {vertex.callback.key for vertex in reported_by},
+                DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.in_stops)))
+        self._pool = PoolWatch(pool, registry, recorder, thresholds, notifier)
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def statuses(self) -> list[Status]:
+        """Return a status for each DAG that is here, and the pool's."""
+        now = time.monotonic_ns()
+        hosted = self._registry.hosted()
+        found = [watch.status(now) for keys, watch in self._dags if not keys.isdisjoint(hosted)]
+        return [*found, self._pool.status(now)]
+
+    def start(self) -> None:
+        """Begin to publish; nothing happens when it has begun before."""
+        if self._thread is None:
+            stop_at_exit(self)
+            self._thread = threading.Thread(
+                target=self._run, name='mddag-diagnostics', daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End publishing; nothing happens when it has never begun."""
+        self._ending.set()
+        if self._thread is not None:
+            join(self._thread, END_TIMEOUT_S)
+
+    def _run(self) -> None:
+        try:
+            self._publish()
+        except Exception as error:
+            if not is_over(self._context):
+                get_logger('mddag_executor').error(f'there will be no diagnostics: {error}')
+
+    def _publish(self) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray
+        from rclpy.node import Node
+        from rclpy.parameter import Parameter
+        # No executor runs the node, since it has nothing to run.
+        # Its own arguments go before those of the process, which name the process' nodes.
+        node = Node(
+            NODE_NAME, context=self._context, enable_rosout=False, start_parameter_services=False,
+            cli_args=['--ros-args', '-r', f'__node:={NODE_NAME}_{os.getpid()}'],
+            parameter_overrides=[Parameter('start_type_description_service', value=False)])
+        try:
+            publisher = node.create_publisher(DiagnosticArray, TOPIC, 10)
+            due = time.monotonic_ns() + self._period_ns
+            while not self._ending.wait(max(0, due - time.monotonic_ns()) / 1e9):
+                if is_over(self._context):
+                    return
+                publisher.publish(self._message())
+                # a period that was missed (the machine slept) is not made up for
+                due = max(due + self._period_ns, time.monotonic_ns())
+        finally:
+            with suppress(Exception):  # the context has ended meanwhile
+                node.destroy_node()
+
+    def _message(self) -> DiagnosticArray:
+        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+        message = DiagnosticArray()
+        # of the system's clock: simulated time may stand still, and this is about the process
+        stamp = message.header.stamp
+        stamp.sec, stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
+        for status in self.statuses():
+            message.status.append(DiagnosticStatus(
+                level=bytes([status.level]), name=status.name, message=status.message,
+                hardware_id=self._hardware_id,
+                values=[KeyValue(key=key, value=value) for key, value in status.values.items()]))
+        return message

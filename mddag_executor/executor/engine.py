@@ -1,0 +1,677 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The engine of a live run: the core, and the work that waits in it.
+
+Theory of operation
+-------------------
+The engine gets what happens, with the time of it, and says what to run.  It has no thread,
+lock or clock and knows nothing of rclpy; ``workers`` has all of these, and calls the engine under
+its lock, so that times never decrease.  Nobody but the engine and its parts (``jobs``,
+``other_processes``) changes the core's state.
+
+1.  *What becomes ready* (``timer_due``, ``arrived``, ``ready``) is work for a job of a declared
+    DAG, or for none.  Messages of known publications go to the job of these (``jobs``), others
+    may enter from another process (``other_processes``), and what fits nothing runs as undeclared.
+2.  *A queue holds as many messages as its QoS says*; of more than that the oldest go, and are
+    counted.  What no DAG declares runs in the order of becoming ready, so that nobody starves.
+    For that the turn is the callback's and not the message's: where a queue overflows all the
+    time, none of its messages waits for long, and it would have its turn after everybody who has
+    waited longer.  So the next message takes the place of the one that goes.
+3.  *What to run* (``dispatch``) and *what became of it* (``finished``,
+    ``suspended``, ``refused``, …) is the core's decision, see ``core.rules``.
+4.  *What the core decides beside* (verdicts, ends of jobs, what an abort drops) is counted,
+    recorded and reported to the user (``verdicts``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from threading import get_native_id
+from typing import TYPE_CHECKING
+
+from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core.deadlines import Deadlines
+from mddag_executor.core.invariants import broken_invariants
+from mddag_executor.core.jobs import is_judged, judge_from
+from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE
+from mddag_executor.core.state import (
+    IDLE,
+    JUDGE_FROM,
+    N_IDLE,
+    OPEN,
+    SUSPENDED,
+    WAITING,
+)
+from mddag_executor.executor.debugging import InvariantError
+from mddag_executor.executor.entity import Entity, SUBSCRIPTION, TIMER
+from mddag_executor.executor.jobs import Announced, Jobs, NO_ORIGIN, Origin
+from mddag_executor.executor.other_processes import OtherProcesses
+from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
+from mddag_executor.trace.groups import EXECUTION
+from msg_graph import TaskSet
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.work import Work
+
+MOST_MISSED = 1000
+"""After a long stop (a suspended machine) at most so many releases are judged one by one."""
+MOST_LOOKED_AT = 32
+"""When more executions are ready than this, it is not checked whether all of them hold the GIL."""
+LONG_NS = 1_000_000
+"""While a callback holds the GIL for longer than this, what cannot start wakes nobody."""
+
+
+class Engine:
+    """
+    Turns what became ready into executions of the core, and its decisions into work.
+
+    All times are ns on the trace's clock and do not decrease from call to call.
+
+    :param record: where trace events go; None records nothing.
+    :param on_miss: gets every miss (see ``Verdicts``).
+    :param process: which of the declared processes this is.
+    """
+
+    def __init__(
+        self, task_set: TaskSet | None, n_workers: int, policy: str, *, default_deadline: int,
+        max_active_jobs: int, expire_after: int, record: Record | None = None,
+        on_miss: Callable[[DeadlineMiss], None] | None = None, process: str | None = None,
+    ) -> None:
+        self.tables = Tables.build(
+            task_set, legs=True, groups=False, default_deadline=default_deadline,
+            max_active_jobs=max_active_jobs, expire_after=expire_after)
+        self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
+        self.deadlines = Deadlines(self.tables, self.scheduler.state)
+        self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
+        self.jobs = Jobs(task_set)
+        self.other_processes = OtherProcesses.of(
+            task_set, self.tables, self.scheduler, self.jobs, process)
+        self.dag_names = [d.name for d in task_set.dags] if task_set else []
+        self.n_workers = n_workers
+        self.record = record
+        self.undeclared = 0
+        # how often a callback group did not let something run, and what waits for that
+        self.refusals = 0
+        self.to_ask_again: list[Entity] = []
+        self._state = self.scheduler.state
+        self._work: dict[int, Work] = {}
+        self._next_job = [0] * self.tables.n_dags
+        self._finished = False
+        # those that hold the GIL, in the order in which they began; not to be changed from outside
+        self.holders: list[Work] = []
+        self._holds_since = 0
+        self._keys_are_deadlines = policy in ('rad', 'gedf')
+
+    # --- what became ready -----------------------------------------------------------------------
+
+    def timer_due(self, work: Work, due: int, now: int) -> None:
+        """Handle a timer that became due at ``due``."""
+        entity = work.entity
+        if entity.removed or self._finished:
+            return
+        if entity.depth and len(entity.waiting) >= entity.depth:
+            entity.skipped += 1
+            if entity.source >= 0:
+                self._skip_job(entity, due, now)
+        elif entity.source >= 0:
+            self._start_job(work, max(entity.since, min(due, now)), now)
+        else:
+            self._start_undeclared(work, now)
+
+    def timer_missed(self, entity: Entity, due: int, period: int, count: int, now: int) -> None:
+        """
+        Note that ``count`` periods after that of ``due`` were missed: they are late.
+
+        But not those before the executor began to look after the timer.
+        """
+        if entity.removed or self._finished:
+            return
+        early = min(count, max(0, (entity.since - due - 1) // period))
+        due, count = due + early * period, count - early
+        entity.skipped += count
+        if entity.source >= 0:
+            for i in range(max(1, count - MOST_MISSED + 1), count + 1):
+                self._skip_job(entity, min(due + i * period, now), now)
+
+    def arrived(
+        self, work: Work, origin: Origin | Announced | None, release: int, stamp: int, now: int
+    ) -> None:
+        """
+        Handle a message.
+
+        :param origin: the publication that it comes from, where one was found.
+        :param release: the release of the job that it starts or enters with, if it does.
+        :param stamp: that of its header where it says which job it belongs to, else -1.
+        """
+        entity = work.entity
+        if entity.removed or self._finished:
+            return
+        if entity.depth and len(entity.waiting) >= entity.depth:
+            self._drop(entity, next(iter(entity.waiting)), 'qos_depth', now)
+        if entity.source >= 0:
+            self._start_job(work, max(entity.since, min(release, now)), now)
+            if stamp >= 0 and self.other_processes is not None and work.origin is not None:
+                self.other_processes.note(stamp, work.origin)
+            return
+        if isinstance(origin, Announced):
+            origin = self._enter_announced(origin, min(release, now), now)
+        elif origin is None and stamp >= 0:
+            origin = self._enter(entity, stamp, min(release, now), now)
+        if origin is None or not self._start_successor(work, origin, now):
+            if entity.callback is not None:
+                entity.unattributed += 1
+            self._start_undeclared(work, now)
+
+    def ready_message(self, work: Work, now: int) -> None:
+        """Handle a message of a subscription that no DAG declares."""
+        entity = work.entity
+        if entity.removed or self._finished:
+            return
+        if entity.depth and len(entity.waiting) >= entity.depth:
+            self._replace_oldest(work, now)
+        else:
+            self._start_undeclared(work, now)
+
+    def ready(self, work: Work, now: int) -> None:
+        """Handle anything that no DAG declares: requests, guard conditions, waitables, tasks."""
+        if not work.entity.removed and not self._finished:
+            self._start_undeclared(work, now)
+
+    def ran_at_once(self, entity: Entity) -> None:
+        """Count an undeclared callback that ran where it was taken."""
+        entity.ready += 1
+        entity.ran += 1
+        self.undeclared += 1
+
+    def _start_job(self, work: Work, release: int, now: int) -> None:
+        dag = self.tables.dag_of[work.entity.source]
+        slot = self._release(dag, release, now)
+        work.origin = Origin(slot, dag, self._state.job_index[slot], work.entity.source)
+        self._start(work, self.scheduler.source(slot), now)
+
+    def _enter(self, entity: Entity, stamp: int, release: int, now: int) -> Origin | None:
+        """Find or start the job of a message from another process (see ``other_processes``)."""
+        if self.other_processes is None or not entity.remote_publishers:
+            return None
+        dag = self.tables.dag_of[entity.remote_publishers[0]]
+        job = self.other_processes.find(dag, stamp)
+        if job is None:
+            slot = self._release(dag, release, now)
+            job = Origin(slot, dag, self._state.job_index[slot], entity.remote_publishers[0])
+            self.other_processes.note(stamp, job)
+        # Of a sync: the first of its legs that nothing has come for yet.
+        return job._replace(vertex=next(
+            (v for v in entity.remote_publishers if self._is_idle(job, *entity.targets[v])),
+            entity.remote_publishers[0]))
+
+    def _enter_announced(self, announced: Announced, release: int, now: int) -> Origin | None:
+        """Find or start the job that another process announces (see ``announcements``)."""
+        if self.other_processes is None or announced.dag < 0:
+            return None
+        job = self.other_processes.named(announced.dag, announced.name)
+        if job is None:
+            slot = self._release(announced.dag, release, now)
+            job = Origin(
+                slot, announced.dag, self._state.job_index[slot], announced.vertex)
+            self.other_processes.name(announced.name, job)
+        return job._replace(vertex=announced.vertex)
+
+    def reference_deadline(self, work: Work) -> int | None:
+        """Return when an execution of an open job is to be done; None for any other."""
+        release = None if work.origin is None else self.open_release(work.origin)
+        if release is None or work.origin is None:
+            return None
+        return release + self.tables.rad_offset[work.origin.vertex]
+
+    def open_release(self, origin: Origin) -> int | None:
+        """Return the release of a job that is open, None of one that has ended."""
+        state, slot = self._state, origin.slot
+        is_open = (state.job_dag[slot] == origin.dag and state.job_index[slot] == origin.job
+                   and state.job_state[slot] == OPEN)
+        return state.job_release[slot] if is_open else None
+
+    def _is_idle(self, job: Origin, vertex: int, leg: int) -> bool:
+        return self._state.x_state[self.scheduler.execution(job.slot, vertex, leg)] == IDLE
+
+    def _skip_job(self, entity: Entity, release: int, now: int) -> None:
+        """Account for a release whose source does not run: the job expires at once."""
+        slot = self._release(self.tables.dag_of[entity.source], release, now)
+        self.scheduler.expire(slot, now)
+        self._decided(now)
+
+    def _release(self, dag: int, release: int, now: int) -> int:
+        job = self._next_job[dag]
+        self._next_job[dag] = job + 1
+        slot = self.scheduler.release(dag, job, release, now)
+        if self._state.decisions:
+            self._decided(now)
+        self.deadlines.watch(slot)
+        self.verdicts.released(dag, job, release, now, is_judged(self._state, slot))
+        return slot
+
+    def _start_successor(self, work: Work, origin: Origin, now: int) -> bool:
+        """Make the vertex ready that a message of a known publication starts."""
+        entity = work.entity
+        target = entity.targets.get(origin.vertex)
+        if target is None:
+            return False
+        state = self._state
+        slot, dag, job, _ = origin
+        vertex, leg = target
+        if (state.job_dag[slot] != dag or state.job_index[slot] != job
+                or state.job_state[slot] != OPEN):
+            if not self.verdicts.was_aborted(dag, job):
+                return False
+            entity.ready += 1
+            self.verdicts.dropped(entity, Origin(slot, dag, job, vertex), 'aborted', now)
+            return True
+        x = state.job_base[slot] + self.tables.region_offset[vertex] + leg
+        if state.x_state[x] != IDLE:
+            return False  # a second message for the same vertex of the same job
+        work.origin = Origin(slot, dag, job, vertex)
+        self._start(work, x, now)
+        return True
+
+    def _start_undeclared(self, work: Work, now: int) -> None:
+        self.undeclared += 1
+        entity = work.entity
+        x = self.scheduler.ready_undeclared(entity.ready, entity.group, entity.habit.holds, now)
+        work.x = x
+        work.ready_ns = now
+        entity.ready += 1
+        entity.waiting[x] = None
+        self._work[x] = work
+
+    def _start(self, work: Work, x: int, now: int) -> None:
+        entity, state = work.entity, self._state
+        state.x_group[x] = entity.group
+        state.x_holds[x] = entity.habit.holds
+        self.scheduler.ready(x, now)
+        work.x = x
+        work.ready_ns = now
+        entity.ready += 1
+        entity.waiting[x] = None
+        self._work[x] = work
+
+    # --- what does not run -----------------------------------------------------------------------
+
+    def _replace_oldest(self, work: Work, now: int) -> None:
+        """Keep QoS for a callback that no DAG declares: whose turn it is stays as it was."""
+        entity = work.entity
+        places = iter(entity.waiting)
+        first, second = next(places), next(places, -1)
+        oldest = self._work[first]
+        if second < 0:
+            oldest.x = -1
+            self.undeclared += 1
+            self.verdicts.dropped(entity, NO_ORIGIN, 'qos_depth', now)
+            work.x = first
+            work.ready_ns = now
+            entity.ready += 1
+            self._work[first] = work
+            return
+        heir = self._work[second]
+        self._work[first], self._work[second] = heir, oldest
+        heir.x, oldest.x = first, second
+        self._drop(entity, second, 'qos_depth', now)
+        self._start_undeclared(work, now)
+
+    def _drop(self, entity: Entity, x: int, reason: str, now: int) -> None:
+        del entity.waiting[x]
+        work = self._work.pop(x)
+        work.x = -1
+        self.scheduler.drop(x, now)
+        self.verdicts.dropped(entity, work.origin or NO_ORIGIN, reason, now)
+        self._decided(now)
+
+    def remove(self, entity: Entity, now: int) -> None:
+        """Forget a destroyed entity: what waits of it never runs."""
+        entity.removed = True
+        for x in list(entity.waiting):
+            self._drop(entity, x, 'destroyed', now)
+
+    # --- what to run -----------------------------------------------------------------------------
+
+    @property
+    def has_waiting(self) -> bool:
+        """Return whether anything waits that a worker may be able to run."""
+        state = self._state
+        return bool(state.ready or state.held_back or state.unpolled)
+
+    @property
+    def idle_workers(self) -> int:
+        """Return how many workers run nothing."""
+        return self._state.scalars[N_IDLE]
+
+    def dispatch(self, worker: int, now: int) -> Work | None:
+        """
+        Dispatch the next execution on a worker that runs nothing; None: nothing may start.
+
+        :param worker: the one to take if it runs nothing; else the lowest idle one is taken.
+        """
+        state = self._state
+        if not (state.ready or state.held_back or state.unpolled) or not state.scalars[N_IDLE]:
+            return None
+        if state.worker_x[worker] >= 0:
+            worker = state.worker_x.index(-1)
+        if self.holders:
+            state.overtaking[1] = self._may_be_overtaken(now)
+        x = self.scheduler.take(worker, now)
+        if state.decisions:
+            self._decided(now)
+        if x < 0:
+            return None
+        work = self._work.pop(x)
+        entity = work.entity
+        entity.waiting.pop(x, None)
+        work.worker = worker
+        if state.x_holds[x]:
+            self.holders.append(work)
+            self._holds_since = now
+        if entity.collect_more is not None:
+            collect, entity.collect_more = entity.collect_more, None
+            collect()
+        return work
+
+    def relative_deadline(self, entity: Entity) -> int:
+        """Return the least time (ns) from an arrival at an entity to its deadline; -1: unknown."""
+        if entity.callback is None:
+            return self.tables.rad_offset[self.tables.n_vertices]
+        if entity.source >= 0 and (entity.kind == TIMER or self.jobs.is_released_at_arrival(
+                self.tables.dag_of[entity.source])):
+            return self.tables.rad_offset[entity.source]
+        return -1  # a successor, or a release that lies before the arrival
+
+    def may_start_more(self, now: int) -> bool:
+        """Return whether an idle worker may be able to start something; True if in doubt."""
+        state = self._state
+        ready, held_back = state.ready, state.held_back
+        if not state.scalars[N_IDLE] or not (ready or held_back or state.unpolled):
+            return False
+        is_held = bool(self.holders)
+        if state.unpolled or len(ready) > MOST_LOOKED_AT or held_back and not is_held:
+            return True
+        x_holds, x_group, owners = state.x_holds, state.x_group, state.group_owner
+        first = held_back[0] if held_back else None
+        for entry in ready:
+            x = entry[4]
+            group = x_group[x]
+            if group >= 0 and owners[group] >= 0 and owners[group] != x:
+                continue
+            if not is_held or not x_holds[x]:
+                return True
+            if first is None or entry < first:
+                first = entry
+        return (first is not None and first[0] < self._urgent_key()
+                and bool(self._may_be_overtaken(now)))
+
+    # --- the GIL ---------------------------------------------------------------------------------
+
+    def _urgent_key(self) -> int:
+        """Return the priority of the most urgent execution that holds the GIL."""
+        return min(self._state.x_key[work.x][0] for work in self.holders)
+
+    def _may_be_overtaken(self, now: int) -> bool:
+        """Return whether what comes first may overtake the last one that began to hold the GIL."""
+        return overtaking_pays(
+            self.tables, self._state, 1, now - self._holds_since,
+            self.holders[-1].entity.habit.mean_ns, False)
+
+    def overtaking_bound(self, now: int) -> tuple[int, int]:
+        """
+        Return what need not be known while the last one that began to hold the GIL does so.
+
+        :return: what holds the GIL, too, and has at least this relative deadline (ns), and until
+            when (0, 0: everything has to be known).
+        """
+        if len(self.holders) != 1:
+            return 0, 0
+        work = self.holders[0]
+        mean = work.entity.habit.mean_ns
+        left = mean - (now - self._holds_since)
+        if left < LONG_NS:
+            return 0, 0
+        bound = PATIENCE * left
+        if self._keys_are_deadlines:
+            bound = min(bound, max(0, self._state.x_key[work.x][0] - now))
+        until = overtaking_pays_from(self.tables, self._state, 1, mean)
+        return bound, self._holds_since + until
+
+    def interpreter_holder(self) -> Work | None:
+        """Return the most urgent execution that holds the interpreter."""
+        holders = self.holders
+        if len(holders) < 2:
+            return holders[0] if holders else None
+        return min(holders, key=lambda work: self._state.x_key[work.x])
+
+    def _let_go(self, work: Work) -> None:
+        if work in self.holders:
+            self.holders.remove(work)
+
+    def stop_holding(self, work: Work) -> None:
+        """Give the interpreter back for an execution that does not need it now."""
+        self._let_go(work)
+        self.scheduler.stop_holding(work.x)
+
+    def lend(self, work: Work) -> None:
+        """Free the worker of an execution that goes on without one."""
+        self._let_go(work)
+        self.scheduler.lend(work.x)
+
+    def resume(self, work: Work) -> None:
+        """Make a suspended execution ready to go on; nothing happens when it is not suspended."""
+        if work.x >= 0 and self._state.x_state[work.x] == SUSPENDED:
+            self.scheduler.resume(work.x)
+
+    def leave_group(self, work: Work) -> None:
+        """Note that an execution's callback group has let it run (see ``groups``)."""
+        self.scheduler.leave_group(work.x)
+
+    def ask_again(self) -> None:
+        """Make ready again what a callback group did not let run."""
+        refused, self.to_ask_again = self.to_ask_again, []
+        for entity in refused:
+            x = next(iter(entity.waiting), -1)
+            if x >= 0 and self._state.x_state[x] == SUSPENDED:
+                self.scheduler.resume(x)
+
+    # --- what became of it -----------------------------------------------------------------------
+
+    def finished(
+        self, work: Work, start: int, end: int, now: int, vtid: int, worker: int,
+        failed: bool = False,
+    ) -> None:
+        """
+        End an execution that ran from ``start`` to ``end``; ``now`` is not before these.
+
+        :param vtid: the thread that it ran in; ``worker`` is -1 where that has lent its worker.
+        :param failed: whether its callback has let an exception out.
+        """
+        entity = work.entity
+        entity.ran += 1
+        entity.failed += failed
+        x, work.x = work.x, -1
+        if work in self.holders:
+            self.holders.remove(work)
+        if self.verdicts.tally.overdue and work.origin is not None:
+            deadline = self.verdicts.tally.overdue.get((work.origin.vertex, work.origin.job), -1)
+            if end <= deadline:  # that it was overdue was reported before this was known
+                entity.busy_ns += deadline + 1 - end
+                end = deadline + 1
+        end_it = self.scheduler.fail if failed else self.scheduler.complete
+        if self.record is None:
+            end_it(x, end)
+        elif work.origin is None:
+            self._record_run(work, start, end, vtid, worker)
+            end_it(x, end)
+        else:
+            tables, state = self.tables, self._state
+            slot, dag, job, vertex = work.origin
+            deadline = state.job_release[slot] + tables.rad_offset[vertex]
+            leg = x - state.job_base[slot] - tables.region_offset[vertex]
+            held = state.x_holds[x]
+            whole = end_it(x, end)
+            if failed:  # this first, or its completion would count
+                self.record('fail', now, vtid, dag, tables.index_in_dag[vertex], job)
+            self.record(
+                EXECUTION, start, vtid, entity.address, dag, tables.index_in_dag[vertex],
+                job, worker, work.ready_ns, deadline, end, now, whole, leg, work.cpu_ns, held)
+        if self._state.decisions:
+            self._decided(now)
+
+    def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
+        """Take a running execution off its worker until ``resume``."""
+        if self.record is not None:
+            self._record_run(work, start, end, vtid, worker)
+        self._let_go(work)
+        self.scheduler.suspend(work.x)
+        self._work[work.x] = work
+
+    def refused(self, work: Work, now: int) -> None:
+        """Put an execution back that its callback group does not let run now (see ``groups``)."""
+        entity, x = work.entity, work.x
+        if entity.removed:
+            self.destroyed(work, now)
+            return
+        self._let_go(work)
+        self.scheduler.refuse(x)
+        self._work[x] = work
+        entity.waiting = {x: None, **entity.waiting}
+        self.to_ask_again.append(entity)
+        self.refusals += 1
+        if 0 < entity.depth < len(entity.waiting) and entity.kind != TIMER:
+            self._drop(entity, x, 'qos_depth', now)  # a newer one has come meanwhile
+
+    def left_open(
+        self, work: Work, start: int, end: int, vtid: int, worker: int, ran: bool
+    ) -> None:
+        """Take an execution off its worker that could not do its work: its context has ended."""
+        if self.record is not None and ran:
+            self._record_run(work, start, end, vtid, worker)
+        self.lend(work)
+        work.x = -1
+        work.entity.ran += ran
+        work.entity.dropped += not ran
+
+    def destroyed(self, work: Work, now: int) -> None:
+        """End a dispatched execution that must not run: its job cannot complete any more."""
+        x, work.x = work.x, -1
+        self._let_go(work)
+        if work.origin is not None:
+            self.scheduler.expire_open(work.origin.slot, now)
+        self.scheduler.complete(x, now)
+        self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'destroyed', now)
+        self._decided(now)
+
+    def _record_run(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
+        """Record that a callback has run which no DAG declares, or which goes on later."""
+        record = self.record
+        assert record is not None
+        _, dag, job, vertex = work.origin or NO_ORIGIN
+        index, deadline = -1, 0
+        if dag >= 0:
+            index = self.tables.index_in_dag[vertex]
+            deadline = self.release_of(work) + self.tables.rad_offset[vertex]
+        address = work.entity.address
+        record(
+            'dispatch', start, vtid, address, dag, index, job, worker, work.ready_ns, deadline)
+        record('callback_start', start, vtid, address, False)
+        record('callback_end', end, vtid, address)
+
+    def release_of(self, work: Work) -> int:
+        """Return the release of the job that a declared execution belongs to; it is not over."""
+        assert work.origin is not None
+        return self._state.job_release[work.origin.slot]
+
+    def _decided(self, now: int) -> None:
+        """Carry out what the core has decided since the last call."""
+        decisions = self.scheduler.decisions()
+        if self._finished:  # it was judged already, and the trace is closed
+            return
+        for x in self.verdicts.add(decisions, now):
+            work = self._work.pop(x, None)
+            if work is not None:  # the core dropped it: what is left of an aborted job
+                work.entity.waiting.pop(x, None)
+                work.x = -1
+                self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'aborted', now)
+
+    @property
+    def is_judging(self) -> bool:
+        """Return whether there are verdicts about jobs that are released now."""
+        return self._state.scalars[JUDGE_FROM] < NEVER
+
+    def set_judging(self, judging: bool, since: int | None, now: int) -> None:
+        """Give verdicts about jobs released from now (or a time) on, or about none for now."""
+        release = NEVER if not judging else now if since is None else since
+        judge_from(self._state, release)
+        if self.record is not None:
+            self.record('judge_from', now, get_native_id(), release)
+
+    def judge_overdue(self, now: int) -> None:
+        """Report the sinks whose deadlines are over and which have not completed."""
+        if self._finished:
+            return
+        self.deadlines.judge(now)
+        if self._state.decisions:
+            self._decided(now)
+
+    # --- debugging -------------------------------------------------------------------------------
+
+    def size(self) -> int:
+        """Return how many jobs and executions there are to ``validate``."""
+        return len(self._state.job_dag) + len(self._state.x_state)
+
+    def validate(self) -> None:
+        """
+        Check all that is always true between two calls.
+
+        :raises InvariantError: when something is not.
+        """
+        broken = [
+            *broken_invariants(self.tables, self._state), *self.deadlines.broken_invariants(),
+            *self._broken_invariants()]
+        if broken:
+            raise InvariantError(broken)
+
+    def _broken_invariants(self) -> Iterator[str]:
+        state = self._state
+        if state.decisions:
+            yield f'the decisions {state.decisions} were not carried out'
+        for x, work in self._work.items():
+            if work.x != x or state.x_state[x] not in (WAITING, SUSPENDED):
+                yield f'execution {x} has state {state.x_state[x]}, its work is of {work.x}'
+            elif (x in work.entity.waiting) != (state.x_started[x] < 0):
+                yield f'execution {x}, started at {state.x_started[x]}, is counted wrongly'
+        for entity in {work.entity for work in self._work.values()}:
+            if any(x not in self._work or self._work[x].entity is not entity
+                   for x in entity.waiting):
+                yield f'{[*entity.waiting]} are not all executions of one entity that wait'
+            if entity.kind == SUBSCRIPTION and 0 < entity.depth < len(entity.waiting):
+                yield (f'{len(entity.waiting)} messages wait in a queue of depth '
+                       f'{entity.depth}')
+        if len(self._work) != state.x_state.count(WAITING) + state.x_state.count(SUSPENDED):
+            yield f'of what waits or is suspended, work is known of {sorted(self._work)} only'
+        holding = sorted(x for x in state.worker_x if x >= 0 and state.x_holds[x])
+        if sorted(work.x for work in self.holders) != holding:
+            yield f'executions {holding} hold the GIL, noted are {[w.x for w in self.holders]}'
+            return
+        keys = [state.x_key[work.x][0] for work in self.holders]
+        if any(after >= before for before, after in zip(keys, keys[1:])):
+            yield f'the GIL was overtaken by something that is not more urgent: {keys}'
+
+    # --- the end ---------------------------------------------------------------------------------
+
+    def finish(self, now: int, end: int | None = None) -> None:
+        """
+        Judge what is open, once, when the run ends.
+
+        :param end: when it began to start nothing more, if that was before now: what ran has ended
+            since, but a deadline after it could no longer be met.
+        """
+        end = now if end is None else end
+        self.scheduler.expire_idle(end)
+        self._decided(now)
+        self.scheduler.finish(end)
+        self._decided(now)
+        self._finished = True

@@ -1,0 +1,166 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What the executor keeps for each entity of rclpy: timer, subscription, service, …."""
+
+from __future__ import annotations
+
+from collections.abc import Callable as Callable_
+import functools
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor.core import legs_of, Tables
+from mddag_executor.executor.gil import GilHabit
+from msg_graph import Callback, TaskSet
+from msg_graph.binding import entity_name
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.groups import Gate
+
+TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
+    'timer', 'subscription', 'service', 'client', 'guard', 'waitable', 'task')
+
+UNKNOWN_NS = 100_000_000
+"""A callback is expected to take this long at first."""
+
+COUNTS = ('ready', 'ran', 'failed', 'dropped', 'skipped', 'unattributed', 'busy_ns')
+_HAVE_HANDLES = (TIMER, SUBSCRIPTION, SERVICE)
+
+
+class Entity:
+    """
+    An entity as the executor sees it.
+
+    :param rclpy: rclpy's own object.
+    :param callback: the declared callback that it is, or None.
+    :param group: the number of its mutually exclusive callback group in the core, or -1.
+    :param depth: how many of its executions may wait; 0 stands for any number.
+    """
+
+    __slots__ = (
+        'kind', 'rclpy', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
+        'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
+        'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'remote_publishers',
+        'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns', 'publishes', 'at_once',
+        'habit', 'since', 'gate', 'most_waiting', 'collect_more', 'classify', 'is_nested',
+        '__weakref__')
+
+    def __init__(
+        self, kind: str, rclpy: Any, node: str, callback: Callback | None, group: int,
+        depth: int, label: str,
+    ) -> None:
+        self.kind = kind
+        self.rclpy = rclpy
+        self.node = node
+        self.callback = callback
+        self.group = group
+        self.depth = depth
+        self.label = label
+        self.topic = ''
+        # global vertex of the source that this starts, or -1
+        self.source = -1
+        # publishing vertex -> (vertex that its message starts, leg)
+        self.targets: dict[int, tuple[int, int]] = {}
+        # the vertices in other processes whose messages enter here
+        self.remote_publishers: list[int] = []
+        # whether other processes announce publications for it; whether it is what hears of these
+        self.awaits = False
+        self.is_own = False
+        # its executions that wait, the oldest first
+        self.waiting: dict[int, None] = {}
+        self.ready = 0
+        self.ran = 0
+        # how many times its callback let an exception out
+        self.failed = 0
+        self.dropped = 0
+        self.skipped = 0
+        self.busy_ns = 0
+        self.unattributed = 0
+        # how long its callback takes, and goes on after it has published first, lately
+        self.wall_ns = UNKNOWN_NS
+        self.tail_ns = 0
+        # of a subscription: the policy for which a publisher's messages do not come
+        self.incompatible_qos: str | None = None
+        # the topics that its callback has published on
+        self.publishes: set[str] = set()
+        self.removed = False
+        # whether it holds the interpreter while it runs
+        # (one entity stands for all tasks, whatever they do)
+        self.habit = GilHabit(
+            False if kind == TASK else None if callback is None else callback.holds_interpreter)
+        # when the executor began to look after it, on the trace's clock: no job is due before
+        self.since = 0
+        # whether it runs where it is taken (see ``at_once``)
+        self.at_once = False
+        # so many may wait in Python, the rest stays in the middleware; 0: any number
+        self.most_waiting = 0
+        # called when less of it waits again: more may be left in the middleware
+        self.collect_more: Callable_[[], None] | None = None
+        # called when it is known, or has changed, whether it holds the GIL; whether it did then
+        self.classify: Callable_[[], None] | None = None
+        self.is_nested = 0
+        # its callback group, where that is to be asked whether it may run
+        self.gate: Gate | None = None
+        self.address = id(self)
+        # taken from before a callback runs: it raises once the entity is destroyed
+        self.handle = rclpy.handle if kind in _HAVE_HANDLES else None
+
+    @property
+    def symbol(self) -> str:
+        """Return module and name of what it calls, as ``rclcpp_callback_register`` has it."""
+        function: Any = getattr(self.rclpy, 'callback', None)
+        while isinstance(function, functools.partial):
+            function = function.func
+        if function is None:
+            function = None if self.kind in (CLIENT, TASK) else type(self.rclpy)
+        elif not hasattr(function, '__qualname__'):
+            function = type(function)
+        return '' if function is None else f'{function.__module__}.{function.__qualname__}'
+
+    @property
+    def name(self) -> str:
+        """Return the key of its declared callback, or what an undeclared one is called."""
+        if self.callback is not None:
+            return self.callback.key
+        return entity_name(self.node, self.symbol, f'{self.kind} {self.label}'.rstrip())
+
+    def is_through(self) -> bool:
+        """Return whether nothing of it waits or runs."""
+        return self.ready <= self.ran + self.dropped
+
+    def count_into(self, counts: dict[str, dict[str, Any]]) -> None:
+        """
+        Add what there is to count to the counts of this entity's callback.
+
+        What nobody uses (the many services and events of every node) is left out.
+        """
+        if self.callback is None and not self.ready + self.skipped + self.dropped:
+            return
+        total = counts.setdefault(self.name, {
+            'kind': self.kind, 'declared': self.callback is not None, 'waiting': 0,
+            'holds_interpreter': False, 'interpreter_share': None, 'incompatible_qos': None,
+            **dict.fromkeys(COUNTS, 0)})
+        for key in COUNTS:
+            total[key] += getattr(self, key)
+        total['waiting'] += len(self.waiting)
+        total['holds_interpreter'] |= bool(self.habit.holds)
+        total['incompatible_qos'] = total['incompatible_qos'] or self.incompatible_qos
+        share = self.habit.share
+        if share is not None:
+            total['interpreter_share'] = max(total['interpreter_share'] or 0.0, round(share, 3))
+
+
+def link(entity: Entity, task_set: TaskSet, tables: Tables, topic: str) -> None:
+    """Find the vertices that an entity bound to a declared callback starts."""
+    callback = entity.callback
+    assert callback is not None
+    entity.topic = topic
+    for dag in task_set.dags:
+        first = tables.first_vertex[dag.index]
+        for vertex in dag.vertices:
+            if vertex.callback is not callback and vertex.callback.key != callback.key:
+                continue
+            if vertex.index == dag.source:
+                entity.source = first + vertex.index
+            for leg, (place, before) in enumerate(legs_of(vertex, dag.vertices)):
+                if callback.topics[place] == topic:
+                    entity.targets[first + before] = (first + vertex.index, leg)

@@ -1,0 +1,685 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The executor: rclpy's contract on top of engine and workers.
+
+Theory of operation
+-------------------
+``spin`` lets the workers wait for what happens and run callbacks (``workers``).  The calling
+thread waits, too, for what ends the spin (an exception, a shutdown, a done future, a timeout),
+for entities that come and go (``upkeep``), and for what is done at once (``at_once``).
+
+``spin_once`` is one turn of a worker in the calling thread.
+
+What has been taken and not run yet stays with the core and runs with the next spin.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+import gc
+import os
+import select
+import threading
+import time
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor.clocks import TraceClock
+from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
+from mddag_executor.core.policies import policy as find_policy
+from mddag_executor.executor import publishing, settings
+from mddag_executor.executor.announcements import Announcements
+from mddag_executor.executor.at_once import AtOnce
+from mddag_executor.executor.compat import (
+    BareExecutor,
+    ends_call,
+    is_called_by_spin,
+    RCL_ERRORS,
+    TASKS_NEWEST_FIRST,
+)
+from mddag_executor.executor.diagnostics import Diagnostics
+from mddag_executor.executor.engine import Engine
+from mddag_executor.executor.entity import Entity, TASK
+from mddag_executor.executor.gil import short_switch_interval
+from mddag_executor.executor.inbox import Inbox
+from mddag_executor.executor.miss_log import MissLog
+from mddag_executor.executor.miss_notifier import MissNotifier
+from mddag_executor.executor.name_check import NameCheck
+from mddag_executor.executor.recorder import Recorder
+from mddag_executor.executor.registry import Registry
+from mddag_executor.executor.settings import Thresholds
+from mddag_executor.executor.shutdown import (
+    call_at_shutdown,
+    ContextChecks,
+    halt_at_exit,
+    is_over,
+)
+from mddag_executor.executor.statistics import statistics
+from mddag_executor.executor.statistics_types import Statistics
+from mddag_executor.executor.tasks import make_task, Unclaimed
+from mddag_executor.executor.upkeep import Upkeep
+from mddag_executor.executor.verdicts import DeadlineMiss
+from mddag_executor.executor.waitables import WaitSetThread
+from mddag_executor.executor.work import current, QuickCallback, Work
+from mddag_executor.executor.workers import WorkerPool
+from msg_graph import TaskSet
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, TimeoutObject
+from rclpy.task import Future, Task
+
+if TYPE_CHECKING:
+    from rclpy.context import Context
+    from rclpy.node import Node
+    from typing_extensions import Self
+
+MOST_SELECTED = 1024
+"""``select`` takes descriptors below this."""
+SETTLE_TURNS = 20
+"""So many milliseconds after a future is done its action's callbacks may still take."""
+SETTLED_TURNS = 3
+
+
+def deadline_of(timeout_sec: float | None) -> float | None:
+    """
+    Return the monotonic time at which a time-out is over; None for never.
+
+    :param timeout_sec: seconds; None or negative: for ever.
+    :raises TypeError: when it is no number.
+    """
+    if timeout_sec is None or timeout_sec < 0:
+        return None
+    return time.monotonic() + timeout_sec
+
+
+class MultiDeadlineExecutor(BareExecutor):
+    """
+    Run callbacks in the order that their deadlines need, on a bounded pool of workers.
+
+    What works with ``rclpy.executors.MultiThreadedExecutor`` works with it.  Callbacks of declared
+    DAG tasks get the priority RAD, the reference absolute deadline of the multi-deadline DAG
+    model (Yano and Azumi, RTSS 2024 WiP); others that of ``default_deadline`` after they became
+    ready.
+
+    :param graph: a declaration (path of a YAML file), a ``msg_graph.TaskSet``, or None.
+    :param num_workers: threads of the pool; by default what the declaration says, else seven.
+    :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
+    :param context: the context that the executor belongs to, or None for the default one.
+    :param trace: path of an MCAP file to record to, or None. A file that is there already is kept:
+        the constructor raises, unless ``overwrite`` is true.
+    :param on_deadline_miss: called with each ``DeadlineMiss``, in a thread of its own; what it
+        raises comes out of the spin.  If it takes too long, misses are counted and not reported
+        (``unreported_misses`` in ``statistics()``).
+    :param default_deadline: relative deadline of undeclared callbacks: ns, text as ``100ms``, or
+        an rclpy ``Duration``.
+    :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
+    :param worker_priority: their priority under it.
+    :param worker_cpus: the CPUs that they may use.
+    :param freeze_gc: when the first spin begins, collect garbage and have the collector leave
+        alone what there is by then (``gc.freeze``): for programs that make their nodes first.
+    :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: as
+        ``default_deadline``; None or 0: not at all.
+    :param thresholds: what makes a status of the diagnostics worse than OK.
+    :param process: which of the declared ``processes`` this is; what runs in the others is not
+        counted as missing.
+    :param num_threads: ``num_workers`` under the name that ``MultiThreadedExecutor`` has for it.
+    :param overwrite: whether ``trace`` may replace a file.
+    :raises msg_graph.GraphError: when the declaration is not right.
+    :raises mddag_executor.errors.MddagError: on an unknown policy or thread setting, a
+        value of the wrong kind, and when the trace cannot be written.
+    :raises rclpy.exceptions.NotInitializedException: when ``rclpy.init`` was not called before.
+    """
+
+    def __init__(
+        self,
+        graph: str | os.PathLike[str] | TaskSet | None = None,
+        num_workers: int | None = None,
+        *,
+        policy: str = 'rad',
+        context: Context | None = None,
+        trace: str | os.PathLike[str] | None = None,
+        on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,
+        default_deadline: int | str | Duration = DEFAULT_DEADLINE_NS,
+        max_active_jobs: int = MAX_ACTIVE_JOBS,
+        worker_policy: str | None = None,
+        worker_priority: int | None = None,
+        worker_cpus: Iterable[int] | None = None,
+        freeze_gc: bool = False,
+        diagnostics_period: int | str | Duration | None = None,
+        thresholds: Thresholds | None = None,
+        process: str | None = None,
+        num_threads: int | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        task_set, num_workers, deadline_ns = settings.resolve(
+            graph, num_workers, default_deadline, num_threads)
+        prepare = settings.thread_setting(worker_policy, worker_priority, worker_cpus)
+        every_ns = settings.diagnostics_period_ns(diagnostics_period)
+        max_active_jobs = settings.whole_number(
+            'max_active_jobs', max_active_jobs, settings.MOST_JOBS)
+        settings.check_callable('on_deadline_miss', on_deadline_miss)
+        find_policy(policy)
+        settings.check_context(context)
+        settings.check_process(process, task_set)
+        thresholds = settings.check_thresholds(thresholds)
+        # All is checked by now: nothing below leaves a trace or a thread of what can't be made.
+        publishing.install()
+        self._trace_clock = TraceClock()
+        self._recorder = None if trace is None else Recorder(
+            os.fspath(trace), task_set, policy, num_workers, deadline_ns, max_active_jobs,
+            self._trace_clock, overwrite=overwrite)
+        self._errors: deque[BaseException] = deque()
+        self._process = process
+        self._unclaimed = Unclaimed(self._fail, lambda: self._at_once.ring())
+        self._spinning = threading.Lock()
+        self._finished = False
+        self._ended_by_callback = False
+        # reentrant: a signal's handler may end the run in the thread that ends it
+        self._ending = threading.RLock()
+        self._freeze_gc = freeze_gc
+        self._notifier = None if on_deadline_miss is None else MissNotifier(
+            on_deadline_miss, self._fail)
+        self._engine = Engine(
+            task_set, num_workers, policy, default_deadline=deadline_ns,
+            max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
+            record=self._recorder.record if self._recorder else None,
+            on_miss=None if self._notifier is None else self._notifier.post, process=process)
+        inbox = Inbox(self._engine, self._trace_clock, self._recorder, self._fail)
+        self._pool = WorkerPool(
+            self._engine, self._trace_clock, inbox, self._fail, self._context_ended, prepare)
+        self._at_once = AtOnce(self._engine, self._pool.lock, self._fail)
+        self._pool.serve_meanwhile = self._serve_meanwhile
+        self._pool.stopped = self._stopped
+        self._pool.context_ended = self._at_once.ring
+        self._pool.entities_changed = self.wake
+        self._miss_log = MissLog(self._engine.verdicts)
+        self._pool.missed = self._miss_log.write
+        self._registry = Registry(task_set, self._engine, self._pool.leave_group)
+        self._new_tasks: deque[Work] = deque()
+        self._task_entity = Entity(TASK, None, '', None, -1, 0, '')
+        if self._recorder is not None:
+            self._recorder.entities((), [self._task_entity])
+        self._names = NameCheck(task_set, self._registry, process)
+        self._announcements: Announcements | None = None
+        self._checks = ContextChecks()
+        self._stepping: select.epoll | None = None
+        super().__init__(context=context)
+        self._wait_sets = WaitSetThread(
+            self.context, self, self.signal_guard(), self._pool.post, self._signalled, self._fail)
+        self._upkeep = Upkeep(
+            self._nodes_to_serve, self._registry, self._pool, self._at_once, self._recorder,
+            self.context, self, self._wait_sets, self._fail)
+        self._diagnostics: Diagnostics | None = None
+        if every_ns is not None:
+            self._diagnostics = Diagnostics(
+                self.context, task_set, self._pool, self._registry, self._recorder, every_ns,
+                thresholds, process, self._notifier)
+        if process is not None and task_set is not None and (
+                self._engine.other_processes is not None
+                and self._engine.other_processes.announces):
+            self._announcements = Announcements(task_set, process, self.context, self._pool)
+            inbox.announcements = self._announcements
+            self._registry.own = {*self._announcements.subscriptions}
+        # What is ready still would run before the spin notices.
+        call_at_shutdown(self.context, self._pool.start_no_more)
+        call_at_shutdown(self.context, self._context_ends)
+        halt_at_exit(self)
+
+    def _nodes_to_serve(self) -> list[Any]:
+        nodes: list[Any] = list(self.get_nodes())
+        return nodes if self._announcements is None else [*nodes, self._announcements.node]
+
+    def _context_ended(self) -> bool:
+        return is_over(self.context)
+
+    def _context_ends(self) -> None:
+        """Note whether a callback of this executor ends the context."""
+        running = current.running
+        self._ended_by_callback = (
+            running is not None and running.engine is self._engine
+            or self._notifier is not None and self._notifier.is_calling())
+        self.wake()
+
+    # --- nodes -----------------------------------------------------------------------------------
+
+    def add_node(self, node: Node) -> bool:
+        """
+        Add a node whose callbacks this executor runs; False when it has it already.
+
+        :raises TypeError: when it is no node.
+        :raises RuntimeError: when the executor was shut down.
+        """
+        if not hasattr(node, 'executor'):
+            raise TypeError(f'{node!r} is no node: add an rclpy.node.Node')
+        if self.is_gone():
+            raise RuntimeError('The executor was shut down: add the node to a new one')
+        added: bool = super().add_node(node)
+        if added:
+            self.wake()
+        return added
+
+    def remove_node(self, node: Node) -> None:
+        """
+        Stop running a node's callbacks; another executor may then have it.
+
+        What was taken of its messages and not run yet is dropped and counted; if nothing spins,
+        not before the next spin, as the node may be back then (``rclpy.spin_once``).
+        """
+        super().remove_node(node)
+        self._upkeep.change()
+        if self._pool.running:
+            self._upkeep.refresh()
+        else:
+            self._upkeep.stop_listening()
+
+    def wake(self) -> None:
+        """Take note of entities that were created or destroyed, or of a change of state."""
+        self._upkeep.change()
+        self._at_once.ring()
+
+    def _signalled(self) -> None:
+        """Take note that rclpy has got a signal: the context ends soon."""
+        self._checks.begin()
+        self._at_once.ring()
+
+    # --- tasks -----------------------------------------------------------------------------------
+
+    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
+        """Run a function or coroutine in this executor; return its task, which is a future."""
+        # A callback that ends a Client.call needs no worker: all of them may wait in such calls.
+        if type(callback) is QuickCallback or ends_call(callback):
+            task = Task(callback, args, kwargs)
+            task()
+            return task
+        task, work = make_task(
+            self._task_entity, self, self._pool.resume, self._unclaimed, callback, args, kwargs)
+        is_spinning = self._spinning.locked()
+        if is_spinning:
+            self._pool.report(self._engine.ready, work)
+        else:
+            self._new_tasks.append(work)
+        if not (is_spinning and self._pool.running):  # a spin that has just begun may not look
+            self._at_once.ring()
+        return task
+
+    def _submit_tasks(self) -> None:
+        """Have the tasks run that were created while nobody spun, in rclpy's order."""
+        take = self._new_tasks.pop if TASKS_NEWEST_FIRST else self._new_tasks.popleft
+        while self._new_tasks:
+            self._pool.report(self._engine.ready, take())
+
+    # --- what a host of programs needs -----------------------------------------------------------
+
+    def on_callback_ended(
+        self, listener: Callable[[Any, BaseException | None], bool]
+    ) -> None:
+        """
+        Have a function called after each callback, in its thread.
+
+        :param listener: gets rclpy's entity (None: a task), and what its callback raised, or None;
+            returns whether it takes care of that, so that it does not end ``spin``.
+        """
+        self._pool.callback_ended = listener
+
+    def lend(self) -> AbstractContextManager[None]:
+        """Return what lends the worker of the calling callback, if it is one, while entered."""
+        running = current.running
+        return nullcontext() if running is None else running.lend()
+
+    # --- spinning --------------------------------------------------------------------------------
+
+    @property
+    def is_spinning(self) -> bool:
+        """Return whether somebody spins (rclpy from 7.1.9 on)."""
+        return self._spinning.locked()
+
+    def spin(self) -> None:
+        """
+        Run callbacks on the pool until shutdown.
+
+        It returns also when a callback ends the context (``rclpy.shutdown``), and at once when
+        that has ended before.
+
+        :raises ExternalShutdownException: when something else ends the context.
+        :raises RuntimeError: when the executor spins already.
+        :raises Exception: what a callback raised.
+        """
+        with short_switch_interval():
+            self._spin(lambda: False, None)
+        self._raise_error()  # of the callback that has ended the context, after that
+
+    def spin_until_future_complete(
+        self, future: Future, timeout_sec: float | None = None
+    ) -> None:
+        """Run callbacks on the pool until a future is done or the time is over."""
+        future.add_done_callback(QuickCallback(self._at_once.ring))
+        try:
+            with short_switch_interval():
+                self._spin(lambda: future.done() or future.cancelled(), timeout_sec)
+        except ExternalShutdownException:
+            pass
+
+    def _spin(self, done: Callable[[], bool], timeout_sec: float | None) -> None:
+        deadline = deadline_of(timeout_sec)
+        if not self._spinning.acquire(blocking=False):
+            raise RuntimeError('Executor is already spinning')
+        try:
+            if self.is_ending() or is_over(self.context):
+                return
+            if self._freeze_gc:
+                self._freeze_gc = False
+                gc.collect()
+                gc.freeze()
+            self._submit_tasks()  # as in rclpy, before what else is ready
+            self._upkeep.refresh()
+            self._wait_sets.start()
+            if self._notifier is not None:
+                self._notifier.start()
+            self._pool.start()
+            self._pool.stopped(time.monotonic_ns(), time.monotonic_ns())  # noticed from now on
+            while not self.is_ending():
+                self._raise_error()
+                if done():
+                    self._settle()
+                    self._raise_error()  # of what ran before it was done
+                    return
+                if self._was_ended():
+                    return
+                self._submit_tasks()
+                if self._diagnostics is not None:
+                    self._diagnostics.start()
+                self._names.check(self._engine.is_judging)
+                rest = self._upkeep.rest_s()
+                if rest == 0.0:
+                    self._upkeep.refresh()
+                    rest = None
+                left = self._patience_s(deadline, rest)
+                if left is not None and left <= 0 and rest is None:
+                    return
+                self._at_once.handle(self._at_once.loop.wait(-1 if left is None else left))
+            self._raise_error()
+        except RCL_ERRORS:
+            if not self._was_ended():
+                raise
+        finally:
+            self._pool.pause()
+            if is_over(self.context):
+                self._pool.close(0.5)
+                self._end_run()
+                if self._notifier is not None:
+                    self._notifier.stop()
+            self._close()
+            self._spinning.release()
+
+    def _patience_s(self, deadline: float | None, rest: float | None) -> float | None:
+        """Return for how long the spinning thread may wait; None: until something rings."""
+        times = [rest, self._unclaimed.rest_s(), self._names.rest_s()]
+        if self._checks.at is not None:
+            self._checks.due()
+            times.append(self._checks.seconds())
+        if deadline is not None:
+            times.append(max(0.0, deadline - time.monotonic()))
+        return min((each for each in times if each is not None), default=None)
+
+    def _settle(self) -> None:
+        """
+        Let run what belongs to a completed future's action, where there are any: its feedback.
+
+        With one thread that was published before the answer which completed the future; with
+        several it may take a moment longer.  So wait until nothing has been to do for a while.
+        """
+        if not self._upkeep.has_waitables:
+            return
+        quiet = 0
+        for _ in range(SETTLE_TURNS):
+            quiet = quiet + 1 if self._pool.is_idle() else 0
+            if quiet >= SETTLED_TURNS:
+                return
+            time.sleep(0.001)
+
+    def _was_ended(self) -> bool:
+        """
+        Return whether a callback has ended the context.
+
+        :raises ExternalShutdownException: when something else has.
+        """
+        if not is_over(self.context):
+            return False
+        with suppress(InvalidHandle):
+            self.context.ok()  # waits for the thread that is just ending it
+        if not self._ended_by_callback:
+            raise ExternalShutdownException()
+        return True
+
+    def _check_context(self) -> None:
+        if is_over(self.context):
+            raise ExternalShutdownException()
+
+    def _stopped(self, begin: int, end: int) -> None:
+        """Take note that no thread of the process ran from ``begin`` to ``end`` (monotonic)."""
+        with self._pool.lock:
+            self._engine.verdicts.stopped(
+                begin + self._trace_clock.offset_ns, end + self._trace_clock.offset_ns)
+
+    def _fail(self, error: BaseException) -> None:
+        """Take an exception from another thread; it comes out of the spin."""
+        self._errors.append(error)
+        self._at_once.ring()
+
+    def _raise_error(self) -> None:
+        self._unclaimed.look()
+        while self._errors:
+            error = self._errors.popleft()
+            # what others raised just because a callback has ended their context
+            if not (self._ended_by_callback and isinstance(error, RCL_ERRORS)):
+                raise error
+
+    @contextmanager
+    def _serve_meanwhile(self) -> Iterator[None]:
+        """Have other threads do everything while the callback of a ``spin_once`` waits."""
+        ended = False
+
+        def serve() -> None:
+            while not ended and not self.is_ending() and not is_over(self.context):
+                self._at_once.handle(self._at_once.loop.wait())
+                self._upkeep.refresh()
+
+        thread = threading.Thread(target=serve, name='mddag-serve-meanwhile', daemon=True)
+        self._pool.start()
+        thread.start()
+        try:
+            yield
+        finally:
+            ended = True
+            self._at_once.ring()
+            thread.join()
+            self._pool.pause()
+            self._pool.resume_stepping()
+
+    # --- one callback at a time ------------------------------------------------------------------
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """
+        Wait for one callback and run it in the calling thread.
+
+        Called by ``rclpy.spin``, which would otherwise run one callback at a time, it does what
+        ``spin`` does.
+
+        :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
+        """
+        if timeout_sec is None and is_called_by_spin():
+            self.spin()
+            return
+        self._spin_once(timeout_sec, lambda: False)
+
+    def spin_once_until_future_complete(
+        self, future: Future, timeout_sec: float | TimeoutObject | None = None
+    ) -> None:
+        """Wait for one callback, or until a future is done, and run it."""
+        seconds = timeout_sec.timeout if isinstance(timeout_sec, TimeoutObject) else timeout_sec
+        future.add_done_callback(QuickCallback(self.wake))
+        self._spin_once(seconds, lambda: future.done() or future.cancelled())
+
+    def _spin_once(self, timeout_sec: float | None, done: Callable[[], bool]) -> None:
+        deadline = deadline_of(timeout_sec)
+        if not self._spinning.acquire(blocking=False):
+            raise RuntimeError('Executor is already spinning')
+        try:
+            with self._pool.stepping():
+                while not self.is_ending():
+                    self._check_context()
+                    self._raise_error()
+                    ran = self._step(deadline, done)
+                    self._raise_error()
+                    if ran or done():
+                        return
+                    if deadline is not None and time.monotonic() >= deadline:
+                        return
+        except RCL_ERRORS:
+            self._check_context()
+            raise
+        finally:
+            self._spinning.release()
+
+    def _step(self, deadline: float | None, done: Callable[[], bool]) -> bool:
+        """
+        Handle what is ready, waiting where nothing is; run one callback if there is one.
+
+        :param deadline: when to wait no longer (monotonic, s); None: never.
+        :param done: whether there is nothing to wait for any more.
+        :return: whether one ran.
+        """
+        if self._stepping is None:
+            self._stepping = select.epoll()
+            self._stepping.register(self._pool.loop.fd, select.EPOLLIN)
+            self._stepping.register(self._at_once.loop.fd, select.EPOLLIN)
+            self._wait_sets.start()
+        if self._diagnostics is not None:
+            self._diagnostics.start()
+        if self._notifier is not None:
+            self._notifier.start()
+        if self._handle_once():
+            return True
+        if done():  # what it woke up for has just been handled
+            return False
+        self._wait_stepping(self._patience_s(deadline, None))
+        return self._handle_once()
+
+    def _handle_once(self) -> bool:
+        """Handle what is ready; run one callback if there is one, and return whether one ran."""
+        self._upkeep.refresh()
+        ran = self._at_once.handle(self._at_once.loop.wait(0))
+        self._submit_tasks()
+        return self._pool.run_one(self._pool.loop.wait(0)) or ran
+
+    def _wait_stepping(self, left: float | None) -> None:
+        """Wait until something arrives or becomes due; at most so many seconds, None: for ever."""
+        assert self._stepping is not None
+        fd = self._stepping.fileno()
+        if left is None or fd >= MOST_SELECTED:
+            self._stepping.poll(-1 if left is None else left)
+        else:
+            select.select([fd], [], [], left)  # to the microsecond; an epoll waits whole ms
+
+    # --- the end ---------------------------------------------------------------------------------
+
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """
+        Stop running callbacks and wait for those that run.
+
+        :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
+        :return: whether everything has finished.
+        """
+        if timeout_sec is not None and timeout_sec < 0:
+            timeout_sec = None
+        self.begin_end()
+        self.wake()
+        self._pool.pause()
+        if not self._pool.close(timeout_sec):
+            return False
+        self._end_run()
+        reported = self._notifier is None or self._notifier.stop(timeout_sec)
+        finished: bool = super().shutdown(timeout_sec)
+        if self._spinning.acquire(blocking=False):  # else the spin does that when it ends
+            self._close()
+            self._spinning.release()
+        return finished and reported
+
+    def _close(self) -> None:
+        """Close what an executor waits in, once it has ended."""
+        with self._ending:
+            if self._finished and self.is_ending():
+                if self._stepping is not None:
+                    self._stepping.close()
+                self._pool.loop.close()
+                self._at_once.loop.close()
+
+    def _end_run(self) -> None:
+        """Judge what is open and close the trace, once; a second thread waits for that."""
+        with self._ending:
+            if not self._finished:
+                self._finished = True
+                self._judge_and_close()
+
+    def _judge_and_close(self) -> None:
+        if self._diagnostics is not None:
+            self._diagnostics.stop()
+        self._wait_sets.stop()
+        self._upkeep.clear()
+        if self._announcements is not None:
+            self._announcements.close()
+        with self._pool.lock:
+            now = self._pool.tick()
+            end = min(now, self._pool.stopped_at or now)
+            self._engine.finish(now, end)
+        if self._recorder is not None:
+            self._recorder.close(now, end)
+
+    def halt(self) -> None:
+        """Start nothing more, since the interpreter ends; see ``wait_halted``."""
+        self.begin_end()
+        self._pool.pause()
+        self.wake()
+
+    def wait_halted(self, seconds: float) -> None:
+        """Wait until what runs has ended and nobody spins, at most for a time."""
+        end = time.monotonic() + seconds
+        self._pool.close(seconds)
+        # Not by taking the lock: a thread that steps once more meanwhile would get an exception.
+        while self._spinning.locked() and time.monotonic() < end:
+            time.sleep(0.001)
+
+    def set_judging(self, judging: bool, since: int | None = None) -> None:
+        """
+        Give verdicts about jobs that are released from now on, or about none until called again.
+
+        :param since: a time to judge from (monotonic ns), if that is not now.
+        """
+        if since is not None:
+            since += self._trace_clock.offset_ns
+        self._pool.report(self._engine.set_judging, judging, since)
+
+    def unmatched(self) -> list[str]:
+        """Return the topics on which it has not met the other processes of its DAGs yet."""
+        self._upkeep.refresh()
+        found = [] if self._announcements is None else self._announcements.unmatched()
+        others = self._engine.other_processes
+        try:
+            if others is not None:
+                found += others.unmatched(
+                    [*self._registry.subscriptions()], self.get_nodes())
+        except InvalidHandle:
+            pass  # destroyed meanwhile
+        return found
+
+    def __enter__(self) -> Self:
+        """Return the executor; it is shut down at the end of the block."""
+        super().__enter__()
+        return self
+
+    def statistics(self) -> Statistics:
+        """Return a snapshot of what has happened so far: see ``Statistics`` for its keys."""
+        return statistics(
+            self._pool, self._registry, self._recorder, self._process, self._notifier)

@@ -1,0 +1,72 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Callback groups of a user's own class.
+
+Theory of operation
+-------------------
+Of rclpy's two kinds of callback groups the core knows what they allow.  Any other is asked, as
+rclpy's executors do: ``can_execute`` and ``beginning_execution`` before a callback, and
+``ending_execution`` after it.  That is code of the user's, which may wait for a lock.  So the
+worker that is to run the callback asks, without the engine's lock.
+
+Each entity of such a group is a group of one in the core (rule 4), which it leaves as soon as it
+may run: so its messages are asked about one at a time, in their order.  What is refused waits,
+and is asked about again after each callback that ends, and every few milliseconds in a spin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TYPE_CHECKING
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.work import Work
+
+_METHODS = ('can_execute', 'beginning_execution', 'ending_execution')
+
+
+class Refused(Exception):
+    """The callback group does not let a callback run now."""
+
+
+def decides_itself(group: Any) -> bool:
+    """Return whether a callback group is of neither of rclpy's kinds, or changes one of them."""
+    return not any(
+        all(getattr(getattr(group, name), '__func__', None) is getattr(kind, name)
+            for name in _METHODS)
+        for kind in (MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup))
+
+
+class Gate:
+    """
+    An entity's callback group that decides itself.
+
+    :param passed: called with an execution that may run, before it does.
+    """
+
+    def __init__(self, group: Any, entity: Any, passed: Callable[[Work], None]) -> None:
+        self._group = group
+        self._entity = entity
+        self._passed = passed
+
+    def step(self, work: Work) -> Any:
+        """
+        Run a step of an execution as ``Work.step`` does, if it may begin.
+
+        :raises Refused: where it may not.
+        """
+        group, entity = self._group, self._entity
+        if work.coroutine is None:
+            if not (group.can_execute(entity) and group.beginning_execution(entity)):
+                raise Refused
+            self._passed(work)
+        waits_for = None
+        try:
+            waits_for = work.step()
+        finally:
+            if waits_for is None:
+                group.ending_execution(entity)
+        return waits_for

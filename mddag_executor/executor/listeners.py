@@ -1,0 +1,142 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Descriptors that one epoll can wait for: eventfds that the middleware writes to, and a timerfd.
+
+Theory of operation
+-------------------
+rcl calls a listener ``callback(const void * user_data, size_t number_of_events)`` for each
+message, request, response or event that arrives, and for each reset of a timer.  libc's
+``eventfd_write(int fd, eventfd_t value)`` fits this call on the ABIs of x86-64 and aarch64, so the
+middleware writes to an eventfd itself: without Python, without the GIL, and without a thread of
+this package.  Setting and clearing a listener is synchronous.
+
+An eventfd counts what has arrived.  epoll reports each write once (edge-triggered), so nobody has
+to read the count.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+from typing import Any
+
+from mddag_executor.errors import MddagError
+
+_libc = ctypes.PyDLL(None, use_errno=True)  # none of its calls blocks, so the GIL is kept
+_rcl = ctypes.CDLL('librcl.so')  # rclpy has loaded it
+_WRITE = ctypes.cast(_libc.eventfd_write, ctypes.c_void_p)
+
+MANY = 1 << 20
+"""Stands for all that is there, where nobody has counted it."""
+
+_SETTERS = {
+    'subscription': 'rcl_subscription_set_on_new_message_callback',
+    'service': 'rcl_service_set_on_new_request_callback',
+    'client': 'rcl_client_set_on_new_response_callback',
+    'event': 'rcl_event_set_callback',
+    'timer': 'rcl_timer_set_on_reset_callback',
+}
+
+
+def _setter(name: str) -> Any:
+    function = getattr(_rcl, name)
+    function.argtypes = [ctypes.c_void_p] * 3
+    function.restype = ctypes.c_int
+    return function
+
+
+_SET = {kind: _setter(name) for kind, name in _SETTERS.items()}
+
+_next_call_time = _rcl.rcl_timer_get_next_call_time
+_next_call_time.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
+_next_call_time.restype = ctypes.c_int
+
+_until_next_call = _rcl.rcl_timer_get_time_until_next_call
+_until_next_call.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
+_until_next_call.restype = ctypes.c_int
+
+_timer_settime = _libc.timerfd_settime
+_timer_settime.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p]
+
+
+class ListenerError(MddagError):
+    """The middleware cannot announce what arrives at an entity."""
+
+
+def set_listener(kind: str, address: int, fd: int) -> None:
+    """
+    Have the middleware write to an eventfd whenever something arrives at an entity.
+
+    What has arrived before counts, too: the descriptor becomes readable at once, with ``MANY``.
+
+    :param kind: ``subscription``, ``service``, ``client``, ``event`` or ``timer``.
+    :param address: that of the rcl entity, which must not be destroyed meanwhile.
+    :raises ListenerError: when the middleware has no listener for such an entity.
+    """
+    if _SET[kind](address, _WRITE, fd) != 0:
+        raise ListenerError(f'{kind}: the middleware cannot announce what arrives: use another '
+                            'RMW_IMPLEMENTATION')
+    os.eventfd_write(fd, MANY)
+
+
+def clear_listener(kind: str, address: int) -> None:
+    """Have the middleware write nothing more for an entity; it never does once this returns."""
+    _SET[kind](address, None, None)
+
+
+def new_eventfd() -> int:
+    """Return a new eventfd that nobody is blocked by."""
+    return os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+
+
+class NextCall:
+    """
+    When rcl is to call a timer next, on the timer's clock.
+
+    :param address: that of the rcl timer.
+    """
+
+    __slots__ = ('_address', '_value', '_reference')
+
+    def __init__(self, address: int) -> None:
+        self._address = address
+        self._value = ctypes.c_int64()
+        self._reference = ctypes.byref(self._value)
+
+    def read(self) -> int | None:
+        """Return the time in ns; None when the timer is cancelled."""
+        if _next_call_time(self._address, self._reference) != 0:
+            return None
+        return self._value.value
+
+    def until(self) -> int | None:
+        """Return in how many ns that is, below zero if it is due; None when it is cancelled."""
+        if _until_next_call(self._address, self._reference) != 0:
+            return None
+        return self._value.value
+
+
+class TimerFd:
+    """
+    A timerfd on the monotonic clock.
+
+    :ivar fd: becomes readable at the time that was set.
+    :ivar at: that time, monotonic ns; 0: none is set.
+    """
+
+    __slots__ = ('fd', 'at', '_time')
+
+    def __init__(self) -> None:
+        self.fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
+        if self.fd < 0:
+            raise OSError(ctypes.get_errno(), 'timerfd_create')
+        self.at = 0
+        self._time = (ctypes.c_long * 4)()  # interval, then time: seconds, nanoseconds
+
+    def arm(self, at: int) -> None:
+        """Set the time; 0 for none."""
+        self.at = at
+        self._time[2], self._time[3] = divmod(at, 1_000_000_000)
+        _timer_settime(self.fd, 1, self._time, None)  # 1: TFD_TIMER_ABSTIME

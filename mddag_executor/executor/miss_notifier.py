@@ -1,0 +1,127 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reports missed deadlines to the user's handler, in a thread of its own.
+
+Theory of operation
+-------------------
+1.  A worker that finds a miss only appends it to a queue: the handler may log, sleep, publish or
+    call a service, and a worker that waits for it would run no callbacks meanwhile.
+2.  The queue is bounded. A miss that does not fit is counted and never reported: the counts are in
+    ``statistics()`` and ``/diagnostics``, and a warning in the log names them.
+3.  What the handler raises, also ``SystemExit``, comes out of ``spin``; later misses are reported.
+4.  At the end the waiting misses are still reported, but the handler is called no more after
+    ``REPORT_S``, and not waited for after ``END_S``: it may call a service that is no longer
+    answered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from queue import SimpleQueue
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from mddag_executor.executor.shutdown import join, stop_at_exit
+from mddag_executor.text import counted
+from rclpy.logging import get_logger
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.verdicts import DeadlineMiss
+
+MOST_WAITING = 256
+"""So many misses wait for the handler: at 10 ms each it is 2.5 s late by then."""
+REPORT_S, END_S = 1.0, 2.0
+WARN_EVERY_S = 10.0
+
+
+class MissNotifier:
+    """
+    Calls a handler with each miss, in the order in which they were found.
+
+    :param handler: the user's ``on_deadline_miss``.
+    :param fail: gets what the handler raises.
+    """
+
+    def __init__(
+        self, handler: Callable[[DeadlineMiss], None], fail: Callable[[BaseException], None],
+    ) -> None:
+        self._handler = handler
+        self._fail = fail
+        self._queue: SimpleQueue[DeadlineMiss | None] = SimpleQueue()
+        self._thread = threading.Thread(
+            target=self._run, name='mddag-deadline-misses', daemon=True)
+        self._starting = threading.Lock()
+        self._ends_at: float | None = None
+        self._did_not_fit = 0
+        self._too_late = 0
+        self._warned = 0
+        self._warn_at = 0.0
+
+    @property
+    def unreported(self) -> int:
+        """Return how many misses the handler was not called with."""
+        return self._did_not_fit + self._too_late
+
+    def post(self, miss: DeadlineMiss) -> None:
+        """Have a miss reported; it never waits, and the caller may hold a lock."""
+        if self._queue.qsize() < MOST_WAITING:
+            self._queue.put(miss)
+        else:
+            self._did_not_fit += 1
+
+    def start(self) -> None:
+        """Begin to report; further calls do nothing."""
+        with self._starting:
+            if self._thread.ident is None and self._ends_at is None:
+                stop_at_exit(self)
+                self._thread.start()
+
+    def is_calling(self) -> bool:
+        """Return whether the calling thread is the one that calls the handler."""
+        return threading.current_thread() is self._thread
+
+    def stop(self, timeout: float | None = None) -> bool:
+        """
+        Report what waits, and end; further calls wait again.
+
+        Called by the handler itself, it returns at once, and the rest is reported after that.
+
+        :param timeout: seconds to wait for the handler, if that is less than ``END_S``.
+        :return: whether the handler has returned.
+        """
+        with self._starting:
+            if self._ends_at is None:
+                self._ends_at = time.monotonic() + REPORT_S
+                self._queue.put(None)
+            if self._thread.ident is None:
+                return True
+        join(self._thread, END_S if timeout is None else min(timeout, END_S))
+        return not self._thread.is_alive() or self.is_calling()
+
+    def _run(self) -> None:
+        while True:
+            miss = self._queue.get()
+            if miss is None:
+                break
+            if self._ends_at is not None and time.monotonic() > self._ends_at:
+                self._too_late += 1
+                continue
+            try:
+                self._handler(miss)
+            except BaseException as error:
+                self._fail(error)
+            if time.monotonic() >= self._warn_at:
+                self._warn()
+        self._warn()
+
+    def _warn(self) -> None:
+        """Write to the log how many misses were not reported since it was written last."""
+        new = self.unreported - self._warned
+        if new:
+            self._warned += new
+            self._warn_at = time.monotonic() + WARN_EVERY_S
+            get_logger('mddag_executor').warning(
+                f'on_deadline_miss: {counted(new, "miss was", "misses were")} not reported, as '
+                'it has not returned in time: have it return sooner')

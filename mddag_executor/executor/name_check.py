@@ -1,0 +1,102 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Warns once of declared callbacks that no node has, and asks what may be meant.
+
+Theory of operation
+-------------------
+A declaration names nodes and topics; a program that calls one of them differently (a namespace, a
+remapping, a typing error) runs without any verdict.  Two periods after the executor began to
+judge, and ``LEAST_S`` at the least, the declared callbacks are listed that no entity is bound to,
+with the question which undeclared one is meant (``msg_graph.binding.meant``), and the undeclared
+callbacks that have run.  Nothing is said while the executor has no nodes, nor of callbacks that
+may run in another process (``msg_graph.drift``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import time
+from typing import Any, TYPE_CHECKING
+
+from mddag_executor.executor.entity import SERVICE, SUBSCRIPTION, TIMER
+from mddag_executor.text import counted, listed
+from msg_graph import Callback, TaskSet
+from msg_graph.binding import is_background, meant
+from msg_graph.drift import dags_of, may_run_elsewhere
+from msg_graph.errors import printable
+from rclpy.logging import get_logger
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.registry import Registry
+
+LEAST_S = 1.0
+"""Programs may make their nodes for so long while they spin."""
+
+
+class NameCheck:
+    """
+    Compares the names of the nodes with those of the declaration, once.
+
+    :param process: which of the declared processes this is.
+    :param warn: takes a warning; None: it goes to the log.
+    """
+
+    def __init__(
+        self, task_set: TaskSet | None, registry: Registry, process: str | None,
+        warn: Callable[[str], Any] | None = None, clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._task_set = task_set
+        self._dags = {} if task_set is None else dags_of(task_set)
+        self._registry = registry
+        self._process = process
+        self._warn = warn
+        self._clock = clock
+        self._begin: float | None = None
+        self._done = task_set is None
+
+    def rest_s(self) -> float | None:
+        """Return after how many seconds to ``check`` again; None: never."""
+        return None if self._done else LEAST_S
+
+    def check(self, is_judging: bool) -> None:
+        """Warn if it is time to; to be called now and then by the thread that spins."""
+        if self._done or not is_judging or not self._registry.by_id:
+            return
+        now = self._clock()
+        if self._begin is None:
+            self._begin = now
+        if now - self._begin < LEAST_S:
+            return
+        missing = self._missing()
+        periods = [dag.period_ns for callback in missing for dag in self._dags[callback.key]]
+        if periods and now - self._begin < 2e-9 * min(periods):
+            return
+        self._done = True
+        if missing:
+            (self._warn or get_logger('mddag_executor').warning)(printable(self._text(missing)))
+
+    def _missing(self) -> list[Callback]:
+        assert self._task_set is not None
+        elsewhere = self._registry.elsewhere(self._process)
+        nodes = {entity.node for entity in self._registry.by_id.values()}
+        return [callback for callback in self._registry.unbound()
+                if callback.key not in elsewhere and not may_run_elsewhere(
+                    callback, self._dags.get(callback.key, ()), nodes, self._task_set)]
+
+    def _text(self, missing: list[Callback]) -> str:
+        assert self._task_set is not None
+        others = self._registry.undeclared()
+        names = []
+        for callback in missing:
+            question = meant(callback, others)
+            names.append(callback.key if question is None else f'{callback.key} ({question})')
+        text = (f'{self._task_set.file}: no node here has '
+                f'{counted(len(missing), "declared callback")}: {listed(names)}')
+        ran = sorted({entity.name for entity in self._registry.by_id.values()
+                      if entity.callback is None and entity.ran and not entity.is_own
+                      and entity.kind in (TIMER, SUBSCRIPTION, SERVICE)
+                      and not is_background(entity.label, entity.node)})
+        if ran:
+            text += f'; undeclared callbacks that ran: {listed(ran)}'
+        return f'{text}: use the same names here and there, or remap the nodes'

@@ -1,0 +1,226 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+DAGs over several processes: find the job that a message from another process belongs to.
+
+Theory of operation
+-------------------
+In a process of its own every executor sees only the publications of its own callbacks.  Across
+processes and machines the message itself must say which job it belongs to, and it does where the
+DAG's source declares ``release_from: header_stamp``: nodes pass the stamp of the sensor's message
+on from the source to the sinks, and that stamp is the release of the job.  Of other DAGs that the
+declared ``processes`` divide, the executors of one machine announce to each other which
+publication is of which job (``announcements``).  These are the rules, for such DAGs only:
+
+1.  A vertex is *here* when an entity of this executor is bound to its callback now.  A job has in
+    this process the vertices that are here when it is released here; its sinks elsewhere are
+    judged there (rule 10 of ``core.rules``).
+2.  A message whose publication is known here belongs to that publication's job, as always.
+3.  Any other message on a topic *enters* when exactly one vertex that is not here publishes the
+    topic to it (or several do to one sync, which waits for as many messages), and its header has a
+    stamp that is not zero.  It belongs to the open job of that stamp; if there is none yet, it
+    starts one, whose release is the stamp.  Where publications are announced, it belongs to the
+    job and comes from the vertex that were announced with its own.
+4.  The job of a stamp is the one that a source's message or an entering message with that stamp
+    has started here, or one of whose callbacks here has published a message with that stamp; that
+    of an announced name the one that was released here or has entered by that name.  So a DAG may
+    leave a process and come back.
+5.  Whatever leaves a doubt (two vertices elsewhere that publish the topic, no stamp, a job that
+    has ended, a second message for the same vertex of the same job) runs as undeclared, and is
+    counted as unattributed.
+
+A stamp is a time of the system's clock: between machines these have to be synchronised (PTP,
+NTP), and what they differ by shows in the response times.  A timer that is a source has its
+nominal due time as release where it runs, and elsewhere the stamp that its node gave the message:
+with a stamp taken from the clock in the callback it is later there by the dispatch latency.
+
+Two executors in one process that share a graph are to each other as two processes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Hashable, Iterable, Sequence, Set
+import threading
+from typing import Any
+
+from mddag_executor.core import Scheduler, Tables
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.jobs import Jobs, Origin
+from mddag_executor.executor.verdicts import Record
+from msg_graph import Dag, TaskSet, Vertex
+
+KEEP = 4096
+"""The jobs of so many stamps are remembered."""
+
+
+class OtherProcesses:
+    """
+    The DAGs that may reach beyond this process, and the jobs of their stamps.
+
+    ``update`` and ``find`` are called under the engine's lock; ``note`` from any thread.
+
+    :param dags: those that may by stamps; None: whose source declares ``release_from:
+        header_stamp``.
+    :param announced: the indices of those whose publications are announced.
+    """
+
+    def __init__(
+        self, task_set: TaskSet, tables: Tables, scheduler: Scheduler, jobs: Jobs,
+        dags: Sequence[Dag] | None = None, announced: Set[int] = frozenset(),
+    ) -> None:
+        if dags is None:
+            dags = [d for d in task_set.dags if d.release_from == 'header_stamp']
+        self._announced = announced
+        self._crossing = {d.index for d in dags}
+        self._dags = [d for d in task_set.dags if d.index in self._crossing | announced]
+        self._tables = tables
+        self._scheduler = scheduler
+        self._job_notes = jobs
+        self._callbacks = [v.callback.key for d in task_set.dags for v in d.vertices]
+        self._here: dict[int, list[int]] = {}
+        # on which topics messages go to other processes
+        self._leaving: set[str] = set()
+        # by DAG and stamp, or DAG and name; the names of jobs that have entered
+        self._jobs: dict[tuple[int, Hashable], Origin] = {}
+        self._kept: deque[tuple[int, Hashable]] = deque()
+        self._names: dict[tuple[int, int], tuple[int, int]] = {}
+
+    @staticmethod
+    def of(
+        task_set: TaskSet | None, tables: Tables, scheduler: Scheduler, jobs: Jobs,
+        process: str | None = None,
+    ) -> OtherProcesses | None:
+        """
+        Return what is kept for a declaration; None: no DAG reaches beyond the process.
+
+        :param process: which of the declared ones this is; None: publications are not announced.
+        """
+        announced = divided(task_set) if task_set is not None and process is not None else set()
+        if task_set is None or not announced and all(
+                d.release_from != 'header_stamp' for d in task_set.dags):
+            return None
+        return OtherProcesses(task_set, tables, scheduler, jobs, announced=announced)
+
+    @property
+    def announces(self) -> bool:
+        """Return whether there are DAGs whose publications are announced."""
+        return bool(self._announced)
+
+    def update(self, hosted: set[str], entities: Iterable[Entity]) -> list[tuple[int, list[int]]]:
+        """
+        Update which callbacks are here now (rules 1 and 3).
+
+        :param hosted: the keys of the callbacks.
+        :return: for each DAG of which that has changed, which vertices are here.
+        """
+        changes = []
+        leaving: set[str] = set()
+        announced: set[str] = set()
+        for dag in self._dags:
+            here = [int(v.callback.key in hosted) for v in dag.vertices]
+            if here != self._here.get(dag.index):
+                self._here[dag.index] = here
+                self._scheduler.expect(dag.index, here)
+                changes.append((dag.index, here))
+            if not all(here):
+                (announced if dag.index in self._announced else leaving).update(
+                    t for v in dag.vertices if here[v.index] for t in v.callback.publishes
+                    if dag.index in self._crossing or self._leaves(dag, v, here, t))
+        self._leaving = {
+            t for dag in self._dags for v in dag.vertices if self._here[dag.index][v.index]
+            for t in v.callback.publishes if self._leaves(dag, v, self._here[dag.index], t)}
+        self._job_notes.note_headers(self.note, leaving)
+        self._job_notes.announce_on(announced)
+        for entity in entities:
+            entity.awaits = any(
+                self._callbacks[v] not in hosted and self._tables.dag_of[v] in self._announced
+                for v in entity.targets)
+            entity.remote_publishers = self._entrance(entity, hosted)
+        return changes
+
+    def unmatched(self, entities: Iterable[Entity], nodes: Iterable[Any]) -> list[str]:
+        """Return the topics by which jobs leave or enter, and nobody else has been met on."""
+        here = Counter(entity.label for entity in entities)
+        found = [e.label for e in entities if (e.awaits or e.remote_publishers)
+                 and not e.rclpy.get_publisher_count()]
+        for publisher in (p for node in nodes for p in node.publishers):
+            topic = publisher.topic_name
+            if topic in self._leaving and publisher.get_subscription_count() <= here[topic]:
+                found.append(topic)
+        return found
+
+    @staticmethod
+    def _leaves(dag: Dag, vertex: Vertex, here: list[int], topic: str) -> bool:
+        """Return whether a topic of a vertex starts one that is not here."""
+        return any(not here[after] and topic in dag.vertices[after].callback.topics
+                   for after in vertex.successors)
+
+    def host(
+        self, hosted: set[str], entities: Iterable[Entity], record: Record | None, now: int
+    ) -> None:
+        """Update which callbacks are here now, as ``update`` does, and record what changes."""
+        for dag, here in self.update(hosted, entities):
+            if record is not None:
+                vertices = ','.join(str(i) for i, is_here in enumerate(here) if is_here)
+                record('hosted', now, threading.get_native_id(), dag, vertices)
+
+    def _entrance(self, entity: Entity, hosted: set[str]) -> list[int]:
+        """Return the vertices elsewhere from which messages enter at an entity."""
+        remote = [v for v in entity.targets if self._callbacks[v] not in hosted]
+        if len({entity.targets[v][0] for v in remote}) > 1:
+            return []
+        crossing = all(self._tables.dag_of[v] in self._crossing for v in remote)
+        return remote if crossing else []
+
+    def elsewhere(self) -> set[str]:
+        """Return the callbacks of these DAGs that are not here."""
+        return {v.callback.key for dag in self._dags for v in dag.vertices
+                if not self._here.get(dag.index, [0] * len(dag.vertices))[v.index]}
+
+    def note(self, stamp: int, origin: Origin) -> None:
+        """Note the job of a stamp (rule 4)."""
+        if stamp >= 0 and origin.dag in self._crossing:
+            self._keep(stamp, origin)
+
+    def _keep(self, name: Hashable, origin: Origin) -> None:
+        key = (origin.dag, name)
+        if key not in self._jobs:
+            self._kept.append(key)
+            if len(self._kept) > KEEP:
+                gone = self._jobs.pop(self._kept.popleft(), None)
+                if gone is not None:
+                    self._names.pop((gone.dag, gone.job), None)
+        self._jobs[key] = origin
+
+    def find(self, dag: int, stamp: int) -> Origin | None:
+        """Return the job of a stamp, also one that has ended; None for a new one."""
+        return self._jobs.get((dag, stamp))
+
+    def named(self, dag: int, name: tuple[int, int]) -> Origin | None:
+        """Return the job of an announced name, also one that has ended; None for a new one."""
+        return self._jobs.get((dag, name))
+
+    def name(self, name: tuple[int, int], origin: Origin) -> None:
+        """Note the name of a job: that of one that enters, or is announced (rule 4)."""
+        self._names[origin.dag, origin.job] = name
+        self._keep(name, origin)
+
+    def name_of(self, origin: Origin) -> tuple[int, int] | None:
+        """Return the name of a job, None for one that has none yet."""
+        return self._names.get((origin.dag, origin.job))
+
+
+def contested(task_set: TaskSet) -> set[str]:
+    """Return the topics that callbacks of several declared processes publish."""
+    processes: dict[str, set[str | None]] = {}
+    for callback in task_set.callbacks:
+        for topic in callback.publishes:
+            processes.setdefault(topic, set()).add(task_set.process_of(callback.node))
+    return {topic for topic, several in processes.items() if len(several) > 1}
+
+
+def divided(task_set: TaskSet) -> set[int]:
+    """Return the DAGs that the declared processes divide, and no header stamp joins."""
+    return {dag.index for dag in task_set.dags if dag.release_from != 'header_stamp' and len(
+        {task_set.process_of(vertex.callback.node) for vertex in dag.vertices}) > 1}

@@ -1,0 +1,132 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Two places in rclpy at which the executor must know what a callback does.
+
+Theory of operation
+-------------------
+``Publisher.publish`` and ``Client.call`` are wrapped once for the process, when the first executor
+is made.
+
+1.  *A callback in* ``Client.call`` lends its worker to a spare thread (``workers``).
+2.  *A publication on a trigger topic* is noted, so that its messages find their job (``jobs``).
+3.  *Delivery within the process.*  A middleware that delivers within a process does so inside of
+    ``publish``: when that returns, the message can be taken.  The publishing thread has just made
+    it, so it takes the message itself instead of waking a worker: the descriptors of this
+    process's subscriptions on the topic are switched off while it publishes; then it takes what
+    was announced, and switches them on again.  Nothing depends on who else publishes: whatever
+    arrives otherwise, or later, wakes a worker.
+4.  A thread that publishes while it has the engine's lock (a signal handler can) leaves the
+    message to a worker.
+
+Outside of callbacks of this executor, on topics that nobody here subscribes to, both methods do
+what they always did.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, Protocol
+
+from mddag_executor.executor.jobs import NO_ORIGIN, Publication, PublisherState
+from mddag_executor.executor.work import current
+from rclpy.client import Client
+from rclpy.publisher import Publisher
+
+
+class Delivery(Protocol):
+    """The subscriptions of one executor on a topic, that publishing threads take from."""
+
+    def hold(self) -> None:
+        """Announce nothing for now."""
+
+    def collect_published(self, publication: Publication | None) -> None:
+        """Take what was announced since ``hold``, and announce again."""
+
+
+_STATE = '_mddag_publisher_state'
+_deliveries: dict[str, tuple[Delivery, ...]] = {}
+_lock = threading.Lock()
+_installed = False
+
+
+def replace_delivery(topic: str, old: Delivery | None, new: Delivery | None) -> None:
+    """Have publishing threads take by ``new`` what they have taken by ``old``; None: nothing."""
+    with _lock:
+        several = [each for each in _deliveries.get(topic, ()) if each is not old]
+        if new is not None:
+            several.append(new)
+        if several:
+            _deliveries[topic] = tuple(several)
+        else:
+            _deliveries.pop(topic, None)
+
+
+def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Publication | None:
+    """Publish; return the publication if it is of a trigger topic, by a callback."""
+    running = current.running
+    topic = None
+    if running is not None:
+        running.publishes(publisher, msg, state.topic)
+        topic = running.engine.jobs.topics.get(state.topic)
+    if topic is None and not state.is_tracked:
+        original(publisher, msg)
+        return None
+    with state.lock:
+        state.count += 1
+        try:
+            if running is None or topic is None:
+                original(publisher, msg)
+                return None
+            state.is_tracked = True
+            work = running.work
+            origin = NO_ORIGIN if work is None or work.origin is None else work.origin
+            publication: Publication = running.engine.jobs.publish(
+                original, publisher, msg, state, topic, origin)
+            return publication
+        except BaseException:
+            state.count -= 1  # the middleware has not counted it
+            raise
+
+
+def install() -> None:
+    """Wrap rclpy's two methods; further calls change nothing."""
+    global _installed
+    with _lock:
+        if _installed:
+            return
+        _installed = True
+    send = Publisher.publish
+    call = Client.call
+
+    def publish(self: Any, msg: Any) -> None:
+        state = self.__dict__.get(_STATE)
+        if state is None:
+            state = self.__dict__.setdefault(_STATE, PublisherState(self.topic_name))
+        deliveries = _deliveries.get(state.topic)
+        if deliveries is None:
+            if current.running is None and not state.is_tracked:
+                send(self, msg)
+            else:
+                _send(send, self, msg, state)
+            return
+        publication = None
+        for delivery in deliveries:
+            delivery.hold()
+        try:
+            publication = _send(send, self, msg, state)
+        finally:
+            for delivery in deliveries:
+                delivery.collect_published(publication)
+
+    def call_and_wait(self: Any, request: Any, *args: Any, **kwargs: Any) -> Any:
+        running = current.running
+        if running is None:
+            return call(self, request, *args, **kwargs)
+        with running.lend():
+            return call(self, request, *args, **kwargs)
+
+    publish.__doc__ = send.__doc__
+    call_and_wait.__doc__ = call.__doc__
+    Publisher.publish = publish  # type: ignore[method-assign]
+    Client.call = call_and_wait  # type: ignore[method-assign]

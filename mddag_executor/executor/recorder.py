@@ -1,0 +1,136 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What the executor writes into a trace besides its hot path: who is who, and what was taken."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+import socket
+import threading
+from typing import Any
+import weakref
+
+from mddag_executor import defaults
+from mddag_executor.clocks import boot, TraceClock
+from mddag_executor.executor.entity import Entity, SERVICE, SUBSCRIPTION, TIMER
+from mddag_executor.trace.errors import TraceError
+from msg_graph import TaskSet
+from rclpy.exceptions import InvalidHandle
+from rclpy.logging import get_logger
+from rclpy.utilities import get_rmw_implementation_identifier
+
+
+class Recorder:
+    """
+    The trace of one executor.
+
+    Addresses are those of Python objects: the node, the entity, and, for callbacks, what is kept
+    for the entity (``Entity``).
+
+    :param writer: writes the file, as a ``TraceWriter``; None: one that keeps nobody waiting.
+    :param overwrite: whether the file may replace one that is there.
+    :param cpus: that there are, 0: nobody knows; None: the machine's.
+    :raises mddag_executor.trace.TraceError: when the file cannot be written.
+    """
+
+    def __init__(
+        self, path: str, task_set: TaskSet | None, policy: str, workers: int,
+        default_deadline: int, max_active_jobs: int, clock: TraceClock, writer: Any = None,
+        cpus: int | None = None, overwrite: bool = False,
+    ) -> None:
+        if writer is None:
+            from mddag_executor.trace.writer import TraceWriter  # late: it loads the compression
+            writer = TraceWriter(path, clock_offset=clock.offset_ns, overwrite=overwrite)
+        self.writer = writer
+        self.record = self.writer.record
+        self.path = path
+        self._clock = clock
+        # by themselves: another one may have the address of one that is gone
+        self._known: weakref.WeakSet[Any] = weakref.WeakSet()
+        self._say(
+            'task_set', task_set.text if task_set else '', task_set.file if task_set else '',
+            policy, workers, default_deadline, max_active_jobs, False,
+            defaults.processors() if cpus is None else cpus)
+        self._say('caret_init', clock.offset_ns, 'jazzy')
+        self._say('host', socket.gethostname(), boot())
+        self._say('rmw_implementation', get_rmw_implementation_identifier())
+        self._say('construct_executor', id(self), 'multi_deadline_executor')
+
+    def _say(self, event: str, *fields: Any) -> None:
+        self.record(event, self._clock.now(), threading.get_native_id(), *fields)
+
+    def entities(self, nodes: Iterable[Any], added: list[Entity]) -> None:
+        """Record new nodes, publishers and entities, with the tracepoints CARET expects."""
+        by_name: dict[str, int] = {}
+        for node in nodes:
+            try:
+                by_name[node.get_fully_qualified_name()] = id(node)
+                self._node(node)
+            except InvalidHandle:
+                continue  # destroyed meanwhile
+        for entity in added:
+            if entity.is_own:
+                continue
+            try:
+                self._entity(entity, by_name.get(entity.node, 0))
+            except InvalidHandle:
+                continue
+
+    def _node(self, node: Any) -> None:
+        address = id(node)
+        if node not in self._known:
+            self._known.add(node)
+            self._say('rcl_node_init', address, address, node.get_name(), node.get_namespace())
+        for publisher in list(node.publishers):
+            if publisher not in self._known:
+                self._known.add(publisher)
+                self._say(
+                    'rcl_publisher_init', id(publisher), address, id(publisher),
+                    publisher.topic_name, publisher.qos_profile.depth)
+
+    def _entity(self, entity: Entity, node: int) -> None:
+        handle = id(entity.rclpy)
+        if entity.kind == TIMER:
+            self._say('rcl_timer_init', handle, entity.rclpy.timer_period_ns)
+            self._say('rclcpp_timer_callback_added', handle, entity.address)
+            self._say('rclcpp_timer_link_node', handle, node)
+        elif entity.kind == SUBSCRIPTION:
+            self._say('rcl_subscription_init', handle, node, handle, entity.label, entity.depth)
+            self._say('rclcpp_subscription_init', handle, handle)
+            self._say('rclcpp_subscription_callback_added', handle, entity.address)
+        elif entity.kind == SERVICE:
+            self._say('rcl_service_init', handle, node, handle, entity.label)
+            self._say('rclcpp_service_callback_added', handle, entity.address)
+        else:
+            self._say('rclcpp_callback_register', entity.address, entity.name)
+            return
+        self._say('rclcpp_callback_register', entity.address, entity.symbol)
+        group = getattr(entity.rclpy, 'callback_group', None)
+        if group is not None and group not in self._known:
+            self._known.add(group)
+            exclusive = entity.group >= 0 and entity.gate is None
+            kind = 'mutually_exclusive' if exclusive else 'reentrant'
+            self._say('add_callback_group', id(self), id(group), kind)
+        if group is not None:
+            self._say(f'callback_group_add_{entity.kind}', id(group), handle)
+
+    def taken(self, entity: Entity, message: Any, source_timestamp: int, now: int) -> None:
+        """Record that a message was taken; ``now``: when, which is not after it became ready."""
+        self.record(
+            'rmw_take', now, threading.get_native_id(), id(entity.rclpy), id(message),
+            source_timestamp, True)
+
+    def close(self, now: int, end: int | None = None) -> None:
+        """
+        Record the run's end and complete the file.
+
+        Where it could not be written, the run has gone on without it; this says so in the log.
+
+        :param end: up to when deadlines are judged, if that is before now; in the trace's clock.
+        """
+        self.record(
+            'shutdown', now, threading.get_native_id(), now if end is None else end)
+        try:
+            self.writer.close()
+        except TraceError as error:
+            get_logger('mddag_executor').error(f'the trace is incomplete: {error}')

@@ -1,0 +1,293 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Which entities there are: the declared callback of each, its callback group in the core."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import threading
+from typing import Any
+import weakref
+
+from mddag_executor.executor.compat import keeps_time, service_name
+from mddag_executor.executor.engine import Engine
+from mddag_executor.executor.entity import (
+    CLIENT,
+    COUNTS,
+    Entity,
+    GUARD,
+    link,
+    SERVICE,
+    SUBSCRIPTION,
+    TIMER,
+    WAITABLE,
+)
+from mddag_executor.executor.groups import decides_itself, Gate
+from mddag_executor.executor.snapshot import EntitySet
+from mddag_executor.executor.sources import KEEP_ALL_DEPTH, SERVICE_DEPTH
+from mddag_executor.executor.work import Work
+from msg_graph import binding, Callback, TaskSet
+from msg_graph.duration import exact_duration
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import EventHandler, QoSSubscriptionEventType
+from rclpy.exceptions import InvalidHandle
+from rclpy.qos import HistoryPolicy, qos_policy_name_from_kind
+
+_MOST_UNDECLARED = 4096
+_INCOMPATIBLE = QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS
+
+KINDS = (TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE)
+"""In the order of ``snapshot.LISTS``."""
+
+
+class Registry:
+    """
+    What is kept for all entities of the executor's nodes.
+
+    It is refreshed under the engine's lock; other threads find entities in it, and ask for counts
+    at any time.
+
+    :ivar by_id: what is kept for each entity of rclpy, by the ``id`` of that.
+    :param passed: called with each execution that a callback group has let through (see
+        ``groups``).
+    """
+
+    def __init__(
+        self, task_set: TaskSet | None, engine: Engine, passed: Callable[[Work], None],
+    ) -> None:
+        self._task_set = task_set
+        self._tables = engine.tables
+        self._engine = engine
+        self._passed = passed
+        self._binder = binding.Binder(task_set) if task_set is not None else None
+        # the core's numbers of callback groups (where a group decides itself, of its entities),
+        # and all that are not given back yet
+        self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
+        self._numbers: set[int] = set()
+        self._counting = threading.Lock()
+        self.by_id: dict[int, Entity] = {}
+        # the executor's own subscriptions
+        self.own: set[Any] = set()
+        # destroyed entities whose last executions are not done yet, and the counts of those before
+        self._retired: list[Entity] = []
+        self._past: dict[str, dict[str, Any]] = {}
+        self._published: dict[str, set[str]] = {}
+        self._undeclared: dict[binding.Entity, None] = {}
+        self._names: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
+
+    @property
+    def declared(self) -> tuple[Callback, ...]:
+        """Return the declared callbacks."""
+        return self._task_set.callbacks if self._task_set is not None else ()
+
+    def refresh(self, found: EntitySet) -> tuple[list[Entity], list[Entity]]:
+        """
+        Take over which entities the nodes have now.
+
+        :param found: what the nodes have.
+        :return: those that are new, and those that are gone.
+        """
+        present: dict[int, Entity] = {}
+        new: list[tuple[str, Any, str]] = []
+        for node, lists in found.items():
+            try:
+                name = self._name(node)
+            except InvalidHandle:
+                continue  # destroyed between being listed and looked at
+            for kind, some in zip(KINDS, lists):
+                for rclpy_entity in some:
+                    key = id(rclpy_entity)
+                    entity = self.by_id.get(key)
+                    if entity is None or entity.rclpy is not rclpy_entity or self._retimed(entity):
+                        present.pop(key, None)
+                        new.append((kind, rclpy_entity, name))
+                    else:
+                        present[key] = entity
+        gone = [each for key, each in self.by_id.items() if key not in present]
+        for each in gone:  # first, as what is new may be their callback's next entity
+            self._unbind(each)
+        made = [self._new_entity(*each) for each in new]
+        added = [each for each in made if each is not None]
+        present.update((id(each.rclpy), each) for each in added)
+        with self._counting:
+            self.by_id = present
+            self._retired.extend(gone)
+            self._fold()
+        self._free_groups()
+        return added, gone
+
+    def is_stale(self) -> bool:
+        """
+        Return whether `refresh` would change something though no entity has come or gone.
+
+        An undeclared timer has another period: it may be declared. Or what still ran of an entity
+        that had gone is through.
+        """
+        return (any(self._retimed(entity) for entity in self.timers())
+                or any(entity.is_through() for entity in self._retired))
+
+    def _retimed(self, entity: Entity) -> bool:
+        if entity.kind != TIMER or entity.callback is not None or self._binder is None:
+            return False
+        try:
+            return entity.label != exact_duration(entity.rclpy.timer_period_ns)
+        except InvalidHandle:
+            return False  # destroyed meanwhile
+
+    def _name(self, node: Any) -> str:
+        """Return a node's name, also when it has been destroyed since and not removed."""
+        name: str | None = self._names.get(node)
+        if name is None:
+            name = self._names[node] = node.get_fully_qualified_name()
+        return name
+
+    def _fold(self) -> None:
+        """Keep of retired entities that are through only their counts: memory is bounded."""
+        retired, self._retired = self._retired, []
+        for entity in retired:
+            if entity.is_through():
+                entity.count_into(self._past)
+                if entity.callback is not None:
+                    self._published.setdefault(entity.callback.key, set()).update(entity.publishes)
+            else:
+                self._retired.append(entity)
+
+    def publishes(self) -> dict[str, set[str]]:
+        """Return on which topics each declared callback has published."""
+        with self._counting:
+            found = {callback.key: set(self._published.get(callback.key, ()))
+                     for callback in self.declared}
+            for entity in (*self._retired, *self.by_id.values()):
+                if entity.callback is not None:
+                    found[entity.callback.key] |= entity.publishes
+        return found
+
+    def counts(self) -> dict[str, dict[str, Any]]:
+        """Return the counts of all entities there have been, by callback (see ``Entity``)."""
+        with self._counting:
+            counts = {name: dict(past) for name, past in self._past.items()}
+            for entity in (*self._retired, *self.by_id.values()):
+                entity.count_into(counts)
+        return counts
+
+    def computing(self) -> int:
+        """Return how many callbacks that have run hold the interpreter while they run."""
+        return sum(bool(e.ran and e.habit.holds) for e in list(self.by_id.values()))
+
+    def totals(self) -> dict[str, int]:
+        """
+        Return the counts of all callbacks together, from any thread.
+
+        Unlike ``counts`` this costs next to nothing for an entity that nobody uses.
+        """
+        totals = dict.fromkeys(COUNTS, 0)
+        with self._counting:
+            for past in self._past.values():
+                for key in COUNTS:
+                    totals[key] += past[key]
+            for entity in (*self._retired, *self.by_id.values()):
+                if entity.ready or entity.skipped:
+                    for key in COUNTS:
+                        totals[key] += getattr(entity, key)
+        return totals
+
+    def hosted(self) -> set[str]:
+        """Return the keys of the declared callbacks that an entity is bound to now."""
+        return {
+            entity.callback.key for entity in self.by_id.values()
+            if entity.callback is not None}
+
+    def elsewhere(self, process: str | None) -> set[str]:
+        """Return the declared callbacks that run in other processes than this one."""
+        if self._task_set is None or process is None:
+            return set()
+        return {c.key for c in self.declared if self._task_set.process_of(c.node) != process}
+
+    def unbound(self) -> list[Callback]:
+        """Return the declared callbacks that no entity is bound to now."""
+        return [] if self._binder is None else self._binder.unbound()
+
+    def undeclared(self) -> list[binding.Entity]:
+        """Return the timers, subscriptions and services there were that are not declared."""
+        return list(self._undeclared)
+
+    def subscriptions(self) -> list[Entity]:
+        """Return the subscriptions that there are now."""
+        return [entity for entity in self.by_id.values() if entity.kind == SUBSCRIPTION]
+
+    def note_event(self, handler: EventHandler, status: Any) -> None:
+        """Take note of a QoS event: of the policy for which a subscription gets nothing."""
+        if status is None or handler.event_type != _INCOMPATIBLE:
+            return
+        for entity in self.subscriptions():
+            if handler in entity.rclpy.event_handlers:
+                entity.incompatible_qos = qos_policy_name_from_kind(status.last_policy_kind)
+
+    def timers(self) -> list[Entity]:
+        """Return the timers that there are now."""
+        return [entity for entity in self.by_id.values() if entity.kind == TIMER]
+
+    def _new_entity(self, kind: str, rclpy_entity: Any, node: str) -> Entity | None:
+        callback, topic, depth, label, period = None, '', 0, '', None
+        try:
+            if kind == TIMER:
+                period = rclpy_entity.timer_period_ns
+                depth, label = 1, exact_duration(period)
+            elif kind == SUBSCRIPTION:
+                topic = label = rclpy_entity.topic_name
+                qos = rclpy_entity.qos_profile
+                depth = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else 0
+            elif kind in (SERVICE, CLIENT):
+                label = service_name(rclpy_entity)
+            elif kind == GUARD:
+                label = 'condition'
+        except Exception as error:
+            if type(error).__name__ == 'InvalidHandle':
+                return None  # destroyed between being listed and looked at
+            raise
+        bindable = binding.Entity(node, kind, '' if kind == TIMER else label, period)
+        if kind in (TIMER, SUBSCRIPTION, SERVICE) and self._binder is not None:
+            callback = self._binder.bind(bindable)
+        group = getattr(rclpy_entity, 'callback_group', None)
+        decides = group is not None and decides_itself(group)
+        number = self._number(rclpy_entity if decides else group)
+        entity = Entity(kind, rclpy_entity, node, callback, number, depth, label)
+        if decides:
+            entity.gate = Gate(group, rclpy_entity, self._passed)
+        if kind == SUBSCRIPTION and depth == 0:
+            entity.most_waiting = KEEP_ALL_DEPTH
+        elif kind == SERVICE:
+            entity.most_waiting = SERVICE_DEPTH
+        entity.is_own = rclpy_entity in self.own
+        entity.at_once = callback is None and kind == SUBSCRIPTION and keeps_time(rclpy_entity)
+        if callback is None and kind in (TIMER, SUBSCRIPTION, SERVICE) and not entity.is_own:
+            if len(self._undeclared) < _MOST_UNDECLARED:
+                self._undeclared[bindable] = None
+        if callback is not None:
+            assert self._task_set is not None
+            link(entity, self._task_set, self._tables, topic)
+            if kind == TIMER and entity.source >= 0:
+                dag = self._tables.dag_of[entity.source]
+                entity.depth = self._tables.source_depth(dag)
+        return entity
+
+    def _number(self, group: Any) -> int:
+        """Return the core's number of a callback group, -1 for a reentrant one and for none."""
+        if group is None or isinstance(group, ReentrantCallbackGroup):
+            return -1
+        number = self._groups.get(group)
+        if number is None:
+            number = self._groups[group] = self._engine.scheduler.new_group()
+            self._numbers.add(number)
+        return number
+
+    def _free_groups(self) -> None:
+        """Give the numbers back of groups that are gone, as memory is bounded."""
+        if len(self._groups) < len(self._numbers):
+            for number in self._numbers.difference(list(self._groups.values())):
+                self._numbers.remove(number)
+                self._engine.scheduler.free_group(number)
+
+    def _unbind(self, entity: Entity) -> None:
+        if self._binder is not None and entity.callback is not None:
+            self._binder.release(entity.callback, entity.topic or None)

@@ -1,0 +1,213 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The settings with which an executor is made: checked, and brought into one form.
+
+What makes no sense, or is impossible on this machine or for this process, is a ``UsageError``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+import operator
+import os
+from typing import Any
+
+from mddag_executor.defaults import workers
+from mddag_executor.errors import UsageError
+from msg_graph import load, parse_duration, TaskSet
+from msg_graph.duration import DAY
+from msg_graph.errors import did_you_mean, listed, shown
+from msg_graph.model import MOST_WORKERS
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.exceptions import NotInitializedException
+from rclpy.utilities import get_default_context
+
+THREAD_POLICIES = ('SCHED_OTHER', 'SCHED_BATCH', 'SCHED_FIFO', 'SCHED_RR')
+SHORTEST_DIAGNOSTICS_NS = 10_000_000
+MOST_JOBS = 1_000_000
+
+
+def whole_number(name: str, value: Any, most: int, unit: str = '') -> int:
+    """Return a whole number from 1 up."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool):
+        raise UsageError(f'{name}: {value!r} is no whole number: give 1{unit} or more')
+    if number < 1:
+        raise UsageError(f'{name}: {number}{unit} is too {"short" if unit else "few"}: '
+                         'give at least 1')
+    if number > most:
+        raise UsageError(f'{name}: {number}{unit} is too much: give at most {most}{unit}')
+    return number
+
+
+def check_callable(name: str, value: Any) -> None:
+    """Look at something that is to be called, or None."""
+    if value is not None and not callable(value):
+        raise UsageError(f'{name}: {value!r} cannot be called: give a function or None')
+
+
+def check_thresholds(value: Any) -> Thresholds:
+    """Return the thresholds of the diagnostics, the usual ones for None."""
+    if value is not None and not isinstance(value, Thresholds):
+        raise UsageError(f'thresholds: {value!r} are none: give Thresholds(...), or None')
+    return value or Thresholds()
+
+
+def check_context(context: Any) -> None:
+    """
+    Look at the context that an executor is to belong to, None for the default one.
+
+    :raises NotInitializedException: when it has not been initialised.
+    """
+    if context is not None and not isinstance(context, Context):
+        raise UsageError(f'context: {context!r} is no rclpy context: give one, or None')
+    if (get_default_context() if context is None else context).handle is None:
+        raise NotInitializedException('an executor needs a context: call rclpy.init() before')
+
+
+def check_process(name: str | None, task_set: TaskSet | None) -> None:
+    """Look at the name of a declared process, or None."""
+    names = [process.name for process in task_set.processes] if task_set is not None else []
+    if name is not None and name not in names:
+        remedy = did_you_mean(name, names, f'give one of {listed(names)}') if names else (
+            "declare 'processes:', or leave it out")
+        raise UsageError(f'process {shown(name)}: the declaration has no such process: {remedy}')
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """
+    What makes a status of ``/diagnostics`` worse than OK.
+
+    :ivar warn_ratio: WARN when this share of the window's results missed their deadlines.
+    :ivar warn_burst: WARN when so many misses came in one period of the diagnostics.
+    :ivar error_ratio: ERROR when this share of the window's results missed them, and they are
+        ``warn_burst`` or more (two results of which one is late are no proof).
+    :ivar window: how many periods of the diagnostics the window has.
+    :ivar stale_periods: STALE when a source has released nothing for so many of its periods, and
+        for a period of the diagnostics.
+    :ivar name: what stands before the names of the statuses, for robots with several processes.
+    """
+
+    warn_ratio: float = 0.01
+    warn_burst: int = 3
+    error_ratio: float = 0.1
+    window: int = 10
+    stale_periods: int = 3
+    name: str = 'mddag'
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for field in ('warn_ratio', 'error_ratio'):
+            value = getattr(self, field)
+            if not isinstance(value, (int, float)) or not 0.0 < value <= 1.0:
+                raise UsageError(f'{field}: {value} is no share: give more than 0, at most 1')
+        for field in ('warn_burst', 'window', 'stale_periods'):
+            whole_number(field, getattr(self, field), MOST_JOBS)
+
+
+def _nanoseconds(time: Any) -> Any:
+    """Return the ns of a text as ``1s`` or of rclpy's ``Duration``; else what it is."""
+    if isinstance(time, str):
+        return parse_duration(time)
+    return time.nanoseconds if isinstance(time, Duration) else time
+
+
+def diagnostics_period_ns(period: int | str | Duration | None) -> int | None:
+    """
+    Return the period of the diagnostics in ns, None for none.
+
+    :param period: ns, text as ``1s``, or a ``Duration``; None or 0: no diagnostics.
+    """
+    period = _nanoseconds(period)
+    if period is None or period == 0:
+        return None
+    period = whole_number('diagnostics_period', period, DAY, ' ns')
+    if period < SHORTEST_DIAGNOSTICS_NS:
+        raise UsageError(
+            f'diagnostics_period: {period} ns is too short: give at least '
+            f'{SHORTEST_DIAGNOSTICS_NS // 1_000_000}ms, or 0 for none')
+    return period
+
+
+def resolve(
+    graph: str | os.PathLike[str] | TaskSet | None, num_workers: int | None,
+    default_deadline: int | str | Duration, num_threads: int | None = None,
+) -> tuple[TaskSet | None, int, int]:
+    """
+    Return the task set, the number of workers and the default deadline (ns) of an executor.
+
+    :param num_threads: what ``MultiThreadedExecutor`` calls ``num_workers``.
+    :raises msg_graph.GraphError: when the declaration is not right.
+    """
+    task_set = load(graph) if isinstance(graph, (str, os.PathLike)) else graph
+    if task_set is not None and not isinstance(task_set, TaskSet):
+        raise UsageError(f'graph: {graph!r} is no declaration: give the path of one, a TaskSet, '
+                         'or None' + (f'; a number of threads is num_workers={graph}'
+                                      if type(graph) is int else ''))
+    if num_threads is not None:
+        if num_workers is not None:
+            raise UsageError('num_threads: num_workers is given, too: give one of the two')
+        num_workers = whole_number('num_threads', num_threads, MOST_WORKERS)
+    if num_workers is None:
+        num_workers = workers(None, task_set)
+    num_workers = whole_number('num_workers', num_workers, MOST_WORKERS)
+    default_deadline = whole_number(
+        'default_deadline', _nanoseconds(default_deadline), DAY, ' ns')
+    return task_set, num_workers, default_deadline
+
+
+def thread_setting(
+    policy: str | None, priority: int | None, cpus: Iterable[int] | None
+) -> Callable[[], None] | None:
+    """Return what each worker thread calls first, None where nothing is to be set."""
+    if policy is None and cpus is None:
+        if priority is not None:
+            raise UsageError(
+                'worker_priority: there is no policy for it: give worker_policy too')
+        return None
+    if policy is not None and policy not in THREAD_POLICIES:
+        raise UsageError(
+            f"worker_policy: '{policy}' is unknown: give one of {', '.join(THREAD_POLICIES)}")
+    if not hasattr(os, 'sched_setscheduler'):
+        raise UsageError('worker_policy: this system has none: leave it out')
+    if priority is not None and priority != 0:  # 0: the one of SCHED_OTHER
+        whole_number('worker_priority', priority, 99)
+    if cpus is not None:
+        cpus = _cpus(cpus)
+
+    def prepare() -> None:
+        if cpus is not None:
+            os.sched_setaffinity(0, cpus)
+        if policy is None:
+            return
+        try:
+            os.sched_setscheduler(0, getattr(os, policy), os.sched_param(priority or 0))
+        except (PermissionError, OSError) as error:
+            raise UsageError(
+                f'worker_policy: this process may not use {policy} {priority or 0} ({error}): '
+                'raise its rtprio limit (ulimit -r) or run it with CAP_SYS_NICE') from None
+
+    return prepare
+
+
+def _cpus(cpus: Any) -> set[int]:
+    """Return a set of CPUs that this process may use, and has one at least."""
+    mine = os.sched_getaffinity(0)
+    try:
+        found = set(cpus)
+    except TypeError:
+        found = set()
+    if isinstance(cpus, str) or not found:
+        raise UsageError(f'worker_cpus: {cpus!r} is no set of CPUs: choose from {sorted(mine)}')
+    if not found <= mine:
+        raise UsageError(
+            f'worker_cpus: {sorted(found, key=str)} has CPUs that this process may not use: '
+            f'choose from {sorted(mine)}')
+    return found

@@ -1,0 +1,101 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What an executor has done: a snapshot in plain dictionaries (``statistics_types``), and drift.
+
+The rules of drift are in ``msg_graph.drift``. What they need to know of a live run the executor
+keeps anyway, but for the releases: ``Watch`` gets each of them.
+"""
+
+from __future__ import annotations
+
+from typing import cast, TYPE_CHECKING
+
+from mddag_executor.core.tally import counts, never_due
+from mddag_executor.executor.miss_notifier import MissNotifier
+from mddag_executor.executor.recorder import Recorder
+from mddag_executor.executor.registry import Registry
+from mddag_executor.executor.statistics_types import CallbackCounts, Statistics, Stops
+from mddag_executor.executor.workers import WorkerPool
+from msg_graph import TaskSet
+from msg_graph.drift import Drift, drift, Observed, Releases
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.executor import MultiDeadlineExecutor
+
+
+def statistics(
+    pool: WorkerPool, registry: Registry, recorder: Recorder | None, process: str | None = None,
+    notifier: MissNotifier | None = None,
+) -> Statistics:
+    """Return the counts of a run; ``statistics_types`` says what each means."""
+    engine = pool.engine
+    with pool.lock:
+        result = engine.verdicts.tally.result()
+        stops = cast(Stops, engine.verdicts.stops.result())
+        waiting = engine.scheduler.queue_length
+        idle = engine.scheduler.idle_workers
+        undeclared = engine.undeclared
+        elsewhere = set() if engine.other_processes is None else engine.other_processes.elsewhere()
+    elsewhere |= registry.elsewhere(process)
+    callbacks = cast('dict[str, CallbackCounts]', registry.counts())
+    never_ran = [c.key for c in registry.declared
+                 if c.key not in elsewhere
+                 and (c.key not in callbacks or not callbacks[c.key]['ran'])]
+    for dag in result['dags'].values():  # their sinks are judged where they are
+        dag['sinks'] = {name: sink for name, sink in dag['sinks'].items()
+                        if name.partition('@')[0] not in elsewhere or counts(sink).due}
+    return {
+        'policy': engine.scheduler.policy.name, 'workers': engine.n_workers,
+        'deadline_missed': result['deadline_missed'], 'first_miss': result['first_miss'],
+        'never_due': never_due(result['dags']), 'dags': result['dags'], 'stops': stops,
+        'callbacks': callbacks, 'undeclared': undeclared,
+        'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
+        'queue': waiting, 'idle_workers': idle, 'lent': pool.lent,
+        'unattributed': {
+            'unknown': engine.jobs.unknown,
+            'doubtful': engine.jobs.doubtful},
+        'never_ran': never_ran,
+        'unreported_misses': 0 if notifier is None else notifier.unreported,
+        'trace': None if recorder is None else {
+            'path': recorder.path, 'lost': recorder.writer.dropped,
+            'error': None if recorder.writer.error is None else str(recorder.writer.error)},
+    }
+
+
+class Watch:
+    """
+    Watches an executor from here on.
+
+    :param task_set: the declaration that the executor was made with.
+    """
+
+    def __init__(self, executor: MultiDeadlineExecutor, task_set: TaskSet) -> None:
+        self._executor = executor
+        self._task_set = task_set
+        self._now = executor._trace_clock.now
+        self._begin = self._now()
+        self._releases = [Releases() for _ in task_set.dags]
+        executor._engine.verdicts.on_release = self._released
+
+    def _released(self, dag: int, release: int) -> None:
+        if dag < len(self._releases):
+            self._releases[dag].add(release)
+
+    def drift(self, statistics: Statistics) -> list[Drift]:
+        """Return where the run and the declaration disagree; ``statistics`` are its counts."""
+        return drift(self._task_set, self.observed(statistics))
+
+    def observed(self, statistics: Statistics) -> Observed:
+        """Return what was seen; ``statistics`` are the counts of the run."""
+        first = min((r.first for r in self._releases if r.count), default=self._begin)
+        counts = statistics['callbacks']
+        sources = (dag.vertices[dag.source].callback.key for dag in self._task_set.dags)
+        return Observed(
+            duration_ns=max(0, self._now() - first),
+            releases=dict(zip(sources, self._releases)),
+            got={key: count['ready'] for key, count in counts.items()},
+            ran={key: count['ran'] for key, count in counts.items()},
+            publishes={**self._executor._registry.publishes()},
+            nodes={key.rpartition(':')[0] for key in counts},
+            undeclared=self._executor._registry.undeclared())

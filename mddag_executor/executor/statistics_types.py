@@ -1,0 +1,150 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What ``MultiDeadlineExecutor.statistics()`` returns: plain dictionaries, with their keys.
+
+``dags``, ``deadline_missed`` and ``first_miss`` have the form of ``replay --json``. Times are in
+ns; names of callbacks and sinks are ``/node:callback``.
+"""
+
+from __future__ import annotations
+
+from typing import TypedDict
+
+ResponseTimes = TypedDict(  # noqa: UP013 - a class would shadow min and max
+    'ResponseTimes', {'min': int, 'median': int, 'p99': int, 'max': int})
+"""Response times of a sink from the release on; quantiles are those of the last 2,000."""
+
+
+class SinkCounts(TypedDict):
+    """
+    What came of the jobs at a sink.
+
+    ``late`` counts completions after the deadline and, at the end of the run, jobs that were
+    ``overdue``. Jobs of which none completed have no ``response_ns``.
+    """
+
+    relative_deadline_ns: int
+    completed: int
+    late: int
+    overdue: int
+    expired: int
+    failed: int
+    aborted: int
+    response_ns: ResponseTimes | None
+
+
+class JobEnds(TypedDict):
+    """How the jobs of a DAG ended, each counted once."""
+
+    completed: int
+    late: int
+    aborted: int
+    expired: int
+    failed: int
+
+
+class DagCounts(TypedDict):
+    """A DAG: its released jobs, how they ended, and its sinks by name."""
+
+    jobs: int
+    ends: JobEnds
+    sinks: dict[str, SinkCounts]
+
+
+class FirstMiss(TypedDict):
+    """The first missed deadline; ``completed_ns`` is None if the sink did not complete."""
+
+    dag: str
+    vertex: str
+    job: int
+    deadline_ns: int
+    completed_ns: int | None
+
+
+class Stop(TypedDict):
+    """A time in which no thread of the process ran, ns since the epoch."""
+
+    begin_ns: int
+    end_ns: int
+
+
+class Stops(TypedDict):
+    """All stops: how many, how long together, how many misses they explain, and the last."""
+
+    count: int
+    total_ns: int
+    misses: int
+    latest: list[Stop]
+
+
+class CallbackCounts(TypedDict):
+    """
+    A callback, declared or not.
+
+    ``ready`` counts what became ready, ``ran`` executions (``failed``: they raised),
+    ``dropped`` what did not run (QoS depth, destroyed, aborted), ``skipped`` releases of a timer
+    that was too slow, ``unattributed`` messages of a declared callback whose job was not found.
+    ``interpreter_share`` is the part of its time in which it needs the interpreter, None: not
+    known yet. ``incompatible_qos`` is the policy for which a subscription gets nothing from a
+    publisher.
+    """
+
+    kind: str
+    declared: bool
+    ready: int
+    ran: int
+    failed: int
+    dropped: int
+    skipped: int
+    unattributed: int
+    busy_ns: int
+    waiting: int
+    holds_interpreter: bool
+    interpreter_share: float | None
+    incompatible_qos: str | None
+
+
+class Unattributed(TypedDict):
+    """Messages of declared callbacks that ran without a job: publication unknown, or doubtful."""
+
+    unknown: int
+    doubtful: int
+
+
+class TraceState(TypedDict):
+    """The trace: its path, how many events were lost, and why recording ended early."""
+
+    path: str
+    lost: int
+    error: str | None
+
+
+class Statistics(TypedDict):
+    """
+    A snapshot of a run.
+
+    ``never_due`` lists sinks without a job that was due, ``never_ran`` declared callbacks that
+    have not run. ``unreported_misses`` counts misses that ``on_deadline_miss`` was not called
+    with, because it had not returned from earlier ones in time. ``undeclared`` counts
+    executions of undeclared callbacks; ``queue`` is what is ready and waits; ``lent`` counts
+    how often a callback that waits has lent its worker to others.
+    """
+
+    policy: str
+    workers: int
+    deadline_missed: bool
+    first_miss: FirstMiss | None
+    never_due: list[str]
+    dags: dict[str, DagCounts]
+    stops: Stops
+    callbacks: dict[str, CallbackCounts]
+    undeclared: int
+    dropped: dict[str, int]
+    queue: int
+    idle_workers: int
+    lent: int
+    unattributed: Unattributed
+    never_ran: list[str]
+    unreported_misses: int
+    trace: TraceState | None

@@ -1,0 +1,146 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Tasks of the executor: futures that know whether somebody takes care of their exception.
+
+Theory of operation
+-------------------
+What a task raises comes out of spin, as with rclpy's executors, unless somebody else takes care of
+it: who awaits the task, or has asked for a callback at its end, before it fails (it is
+*observed*).
+
+With several workers a task that a callback creates may have failed before that callback gets to
+its ``await``, or to ``result()``.  So such an exception is put by for as long as that callback is
+under way and somebody holds on to the task; who fetches it meanwhile takes care of it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+import inspect
+from typing import Any
+import weakref
+
+from mddag_executor.executor.compat import BareTask, forget_task_frames
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.work import current, QuickCallback, TaskWork, Work
+from rclpy.task import Future
+
+LOOK_S = 0.05
+"""How often to check whether a callback still runs that has created a task which failed."""
+
+
+class ObservedTask(BareTask):
+    """
+    A task that knows whether somebody waits for it, and so takes care of its exception.
+
+    :ivar maker: the execution whose callback has created it, or None.
+    :ivar put_by: gets its exception where nobody took care of that, once it was put by.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.observed = False
+        running = current.running
+        self.maker: Work | None = None if running is None else running.work
+        self.put_by: Callable[[BaseException], None] | None = None
+        super().__init__(*args, **kwargs)
+
+    def __del__(self) -> None:
+        """Report an exception that was put by: nobody can take care of it any more."""
+        if self.put_by is not None:
+            self.give_out()
+        super().__del__()  # type: ignore[no-untyped-call]
+
+    def unclaimed(self) -> BaseException | None:
+        """Return its exception if nobody takes care of that."""
+        return None if self.observed else self.unfetched()
+
+    def give_out(self) -> None:
+        """Report an exception that was put by, unless somebody has taken care of it."""
+        report, self.put_by = self.put_by, None
+        error = self.unclaimed()
+        if error is not None and report is not None:
+            self.mark_fetched()
+            report(error)
+
+    def add_done_callback(self, callback: Callable[[Future], None]) -> None:
+        """Add a callback for when the task is done."""
+        self.observed = True
+        super().add_done_callback(callback)  # type: ignore[no-untyped-call]
+
+
+class Unclaimed:
+    """
+    The exceptions of tasks that nobody takes care of so far.
+
+    :param fail: gets those that nobody will take care of.
+    :param ring: called when there is something to ``look`` at.
+    """
+
+    def __init__(
+        self, fail: Callable[[BaseException], None], ring: Callable[[], None] = lambda: None
+    ) -> None:
+        self._fail = fail
+        self._ring = ring
+        # weakly, so that a task can go that nobody holds on to: it reports its exception then
+        self._tasks: deque[weakref.ref[ObservedTask]] = deque()
+
+    def ended(self, task: ObservedTask) -> None:
+        """
+        Note that a task has ended.
+
+        :raises BaseException: what it has raised, if nobody can take care of that.
+        """
+        error = task.unclaimed()
+        if error is None:
+            task.maker = None
+            return
+        if task.maker is None or task.maker.x < 0:
+            task.mark_fetched()
+            raise error
+        forget_task_frames(error)  # else the task holds on to itself
+        task.put_by = self._fail
+        self._tasks.append(weakref.ref(task))
+        self._ring()
+
+    def rest_s(self) -> float | None:
+        """Return after how many seconds to ``look`` again; None: there is nothing to look at."""
+        return LOOK_S if self._tasks else None
+
+    def look(self) -> None:
+        """Report the exceptions of tasks whose makers have ended."""
+        for _ in range(len(self._tasks)):
+            reference = self._tasks.popleft()
+            task = reference()
+            if task is None or task.unclaimed() is None:
+                continue
+            if task.maker is None or task.maker.x < 0:
+                task.give_out()
+            else:
+                self._tasks.append(reference)
+
+
+def make_task(
+    entity: Entity, executor: Any, resume: Callable[[TaskWork], None], unclaimed: Unclaimed,
+    callback: Any, args: tuple[Any, ...], kwargs: dict[str, Any],
+) -> tuple[ObservedTask, TaskWork]:
+    """
+    Make a task of a function, a coroutine function or a coroutine, and the work that runs it.
+
+    :param resume: makes the work ready again; called when the task is cancelled.
+    :param unclaimed: where its exception goes if nobody takes care of that.
+    """
+    coroutine = None
+    if inspect.iscoroutinefunction(callback):
+        callback, args, kwargs = callback(*args, **kwargs), (), {}
+    if inspect.iscoroutine(callback):
+        coroutine = callback
+    task = ObservedTask(callback, args, kwargs, executor=executor)
+    work = TaskWork(entity, task)
+    work.coroutine = coroutine
+    work.then = unclaimed.ended
+    if coroutine is not None:
+        Future.add_done_callback(task, QuickCallback(partial(resume, work)))  # not an observer
+    return task, work

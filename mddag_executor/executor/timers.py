@@ -1,0 +1,320 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+When timers are due: a heap by due time behind the timerfd, instead of an rcl wait set.
+
+Theory of operation
+-------------------
+1.  rcl keeps a timer's state (next call time, period, cancelled) and stays the authority: a timer
+    runs only if rcl says that it is due, and ``call_timer`` moves it on; rcl skips missed periods
+    and keeps the phase.  Kept here is only when to ask.
+2.  *Nominal due time.*  rcl's next call time is exact, on the timer's clock.  The offset to the
+    monotonic clock is measured once for each timer and kept as long as it is right within
+    ``TOLERANCE_NS``, so due times are points of an exact grid.
+3.  *Changes.*  A timer that is due later than expected shows when it is asked.  One that is due
+    earlier (it was cancelled and is reset, or its period was shortened and it is reset) is
+    announced by rcl's listener for resets.
+4.  *Simulated time.*  A timer whose clock is overridden has no due time on the monotonic clock.
+    It is asked after each jump of its clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from heapq import heapify, heappop, heappush
+import time
+from typing import Any
+
+from mddag_executor.executor.compat import RCL_ERRORS, timer_functions, with_timer_info
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.listeners import clear_listener, NextCall, set_listener
+from mddag_executor.executor.loop import ALWAYS
+from mddag_executor.executor.work import Work
+from rclpy.clock import Clock, JumpHandle, JumpThreshold
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidHandle
+
+TOLERANCE_NS = 20_000
+"""How far a clock may be off before the offset is measured again (system clocks are slewed)."""
+
+ZERO_PERIOD_NS = 1_000_000
+"""A timer without a period is always due; it runs this often."""
+
+Fired = tuple['TimerSource', Work, int, int]
+"""A timer that is due, its execution, nominal due time (monotonic ns), periods missed after it."""
+
+_now = time.monotonic_ns
+
+
+class TimerSource:
+    """
+    A timer.
+
+    :ivar fd: becomes readable when it is reset (see ``loop``).
+    :ivar due: when to ask rcl next (monotonic ns), while ``entry`` is its entry's number, not 0.
+    """
+
+    __slots__ = (
+        'entity', 'timer', 'handle', 'fd', 'urgency', 'is_counted', 'due', 'entry', 'simulated',
+        'may_be_simulated', '_queue', '_next_call', '_call', '_until', '_period', '_offset',
+        '_clock', '_is_steady', 'last_period')
+
+    asks_others = False
+
+    def __init__(self, entity: Entity, queue: TimerQueue) -> None:
+        timer = entity.rclpy
+        self.entity = entity
+        self._queue = queue
+        self.timer = timer
+        self.handle: Any = timer.handle
+        self.fd, self.urgency, self.is_counted = -1, ALWAYS, False
+        with self.handle:
+            self._next_call = NextCall(self.handle.pointer)
+        self._until, self._call, self._period = timer_functions(timer)
+        self._clock: Any = timer.clock
+        self._is_steady = timer.clock.clock_type == ClockType.STEADY_TIME
+        self.may_be_simulated = timer.clock.clock_type == ClockType.ROS_TIME
+        self._offset = 0
+        self.last_period = timer.timer_period_ns
+        self.due = 0
+        self.entry = 0
+        self.simulated = False
+
+    def listen(self) -> None:
+        """Have rcl announce resets, and begin to ask when it is due."""
+        with self.handle:
+            set_listener('timer', self.handle.pointer, self.fd)
+        self._queue.add(self)
+
+    def ignore(self) -> bool:
+        """End what ``listen`` has begun; return False if the timer is just being destroyed."""
+        self._queue.remove(self)
+        try:
+            with self.handle:
+                clear_listener('timer', self.handle.pointer)
+            return True
+        except InvalidHandle:
+            return False
+
+    def collect(self) -> None:
+        """Ask when it is due, as it was reset."""
+        self._queue.look_at(self)
+
+    def next_due(self) -> int | None:
+        """Return when rcl is to call it next, monotonic ns; None while it is cancelled."""
+        at = self._next_call.read()
+        if at is None:
+            return None
+        if self._is_steady:
+            return at
+        offset = time.time_ns() - _now()
+        if abs(offset - self._offset) > TOLERANCE_NS:
+            self._offset = offset
+        return at - self._offset
+
+    def is_simulated(self) -> bool:
+        """Return whether the time of its clock is simulated now."""
+        return self.may_be_simulated and bool(self._clock.ros_time_is_active)
+
+    def is_due(self) -> bool:
+        """Return whether rcl says that it is due."""
+        until = self._until()
+        return until is not None and until <= 0
+
+    def call(self) -> Work | None:
+        """Have rcl move it on; return its execution, None if it has no callback."""
+        info = self._call()
+        callback = self.timer.callback
+        if callback is None:
+            return None
+        return Work(self.entity, with_timer_info(self.timer, callback, info))
+
+    def period(self) -> int:
+        """Return its period, ns."""
+        return self._period()
+
+
+class TimerQueue:
+    """
+    Timers by due time; all methods under one lock.
+
+    :param on_jump: called, from any thread, when the clock of a timer has jumped: ``fire`` is to
+        be called soon.
+    :param on_retimed: called when a timer has another period than before.
+    :param on_error: gets what rcl raises.
+    :ivar has_new: whether there are new due times since that was set to False.
+    :ivar has_jumped: whether the clock of a timer has jumped since ``fire``.
+    """
+
+    def __init__(
+        self, on_jump: Callable[[], None], on_retimed: Callable[[], None],
+        on_error: Callable[[BaseException], None],
+    ) -> None:
+        self._on_jump = on_jump
+        self._on_retimed = on_retimed
+        self._on_error = on_error
+        self._timers: dict[int, TimerSource] = {}
+        self._heap: list[tuple[int, int, TimerSource]] = []
+        self._entries = 0
+        self._jumps: dict[int, tuple[Clock, JumpHandle]] = {}
+        self.has_jumped = self.has_new = False
+
+    # --- which timers there are ------------------------------------------------------------------
+
+    def add(self, source: TimerSource) -> None:
+        """Begin to ask for a timer."""
+        self._timers[id(source)] = source
+        if source.may_be_simulated:
+            self._watch(source.timer.clock)
+        self.look_at(source)
+
+    def remove(self, source: TimerSource) -> None:
+        """Ask for a timer no more."""
+        self._timers.pop(id(source), None)
+        source.entry = 0
+        clock = source.timer.clock
+        if source.may_be_simulated and all(
+                each.timer.clock is not clock for each in self._timers.values()):
+            self._watch_no_more(clock)
+
+    def _watch(self, clock: Clock) -> None:
+        """Notice jumps of a clock.  A clock only borrows its jump callbacks, so this must end."""
+        if id(clock) not in self._jumps:
+            threshold = JumpThreshold(
+                min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1),
+                on_clock_change=True)
+            try:
+                handle = clock.create_jump_callback(threshold, post_callback=self._jump)
+            except InvalidHandle:
+                return  # its node is being destroyed
+            self._jumps[id(clock)] = clock, handle
+
+    def _watch_no_more(self, clock: Clock) -> None:
+        watched = self._jumps.pop(id(clock), None)
+        if watched is not None:
+            try:
+                watched[1].unregister()
+            except InvalidHandle:
+                pass
+
+    def _jump(self, _: Any) -> None:
+        if not self.has_jumped:
+            self.has_jumped = True
+            self._on_jump()
+
+    def clear(self) -> None:
+        """Forget all timers."""
+        for source in list(self._timers.values()):
+            self.remove(source)
+
+    # --- time ------------------------------------------------------------------------------------
+
+    def next_due(self) -> int:
+        """Return when to ``fire`` next (monotonic ns), 0 for never."""
+        heap = self._heap
+        while heap and heap[0][2].entry != heap[0][1]:
+            heappop(heap)
+        return heap[0][0] if heap else 0
+
+    def next_due_of(self, wanted: Callable[[Entity], bool]) -> int:
+        """Return when to ``fire`` next for those timers that are wanted, 0 for never."""
+        return min((due for due, entry, source in self._heap
+                    if source.entry == entry and wanted(source.entity)), default=0)
+
+    def look_at(self, source: TimerSource) -> None:
+        """Ask rcl when a timer is due: it is new, or was reset."""
+        try:
+            with source.handle:
+                self._look_at(source)
+        except RCL_ERRORS as error:
+            self._failed(source, error)
+
+    def _look_at(self, source: TimerSource) -> None:
+        source.simulated = source.is_simulated()
+        if source.simulated:
+            source.entry = 0
+            if source.is_due():
+                self._push(source, 0)
+            return
+        due = source.next_due()
+        if due is None:
+            source.entry = 0
+        elif not source.entry or due != source.due:
+            self._push(source, due)
+
+    def _push(self, source: TimerSource, due: int) -> None:
+        self._entries += 1
+        source.due, source.entry = due, self._entries
+        heappush(self._heap, (due, self._entries, source))
+        self.has_new = True
+        if len(self._heap) > 2 * len(self._timers) + 8:  # timers that are reset again and again
+            self._heap = [each for each in self._heap if each[2].entry == each[1]]
+            heapify(self._heap)
+
+    def fire(self) -> Iterator[Fired]:
+        """Yield the timers that are due, each once, also those that come due meanwhile."""
+        if self.has_jumped:
+            self.has_jumped = False
+            for source in list(self._timers.values()):
+                if source.may_be_simulated:
+                    self.look_at(source)
+        heap = self._heap
+        last = self._entries  # an entry made meanwhile is of the next round
+        while heap and heap[0][1] <= last and heap[0][0] <= _now():
+            _, entry, source = heappop(heap)
+            if source.entry != entry:
+                continue
+            source.entry = 0
+            try:
+                with source.handle:
+                    fired = self._fire(source)
+            except RCL_ERRORS as error:
+                self._failed(source, error)
+                continue
+            if fired is not None:
+                yield fired
+
+    def _fire(self, source: TimerSource) -> Fired | None:
+        """Call a timer if rcl says that it is due, and push its next due time."""
+        if source.simulated:  # as of the last jump of its clock, which ``fire`` looks at first
+            return self._fire_simulated(source)
+        due, now = source.next_due(), _now()
+        if due is None:
+            return None
+        if due > now:  # it was reset, or its period has changed
+            self._push(source, due)
+            return None
+        work = source.call()
+        after, period = source.next_due(), source.period()
+        if period != source.last_period:
+            source.last_period = period
+            self._on_retimed()
+        if after is None:
+            return None
+        if period <= 0:
+            self._push(source, now + ZERO_PERIOD_NS)
+            return None if work is None else (source, work, now, 0)
+        self._push(source, after)
+        missed = max(0, (after - due + period // 2) // period - 1)
+        return None if work is None else (source, work, due, missed)
+
+    def _fire_simulated(self, source: TimerSource) -> Fired | None:
+        if not source.is_due():
+            return None
+        work = source.call()
+        if source.is_due():  # several periods in one jump: rcl has skipped all but a last one
+            self._push(source, 0)
+        return None if work is None else (source, work, _now(), 0)
+
+    def _failed(self, source: TimerSource, error: Exception) -> None:
+        """Sort an exception of rcl out: the timer is gone or cancelled, or it is an error."""
+        source.entry = 0
+        try:
+            with source.handle:  # what is read of rcl's memory is there
+                is_cancelled = source.next_due() is None
+        except InvalidHandle:
+            self._timers.pop(id(source), None)
+        else:
+            if not is_cancelled:
+                self._on_error(error)

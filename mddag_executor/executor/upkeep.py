@@ -1,0 +1,303 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Keeps registry, sources and trace up to date with what the nodes have.
+
+Nodes notify the executor that something has changed (``Executor.wake``), not what.  So everything
+is brought up to date at once, by the thread that spins; if entities are made in a row, not again
+for each of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import threading
+import time
+from typing import Any
+
+from mddag_executor.executor import publishing
+from mddag_executor.executor.at_once import AtOnce
+from mddag_executor.executor.compat import (
+    ends_sleep,
+    is_builtin,
+    is_of_wait_for_message,
+)
+from mddag_executor.executor.entity import (
+    CLIENT,
+    Entity,
+    GUARD,
+    SERVICE,
+    SUBSCRIPTION,
+    TIMER,
+    WAITABLE,
+)
+from mddag_executor.executor.listeners import ListenerError
+from mddag_executor.executor.recorder import Recorder
+from mddag_executor.executor.registry import Registry
+from mddag_executor.executor.snapshot import is_qos_event, snapshot
+from mddag_executor.executor.sources import ClientSource, ServiceSource, SubscriptionSource
+from mddag_executor.executor.timers import TimerSource
+from mddag_executor.executor.waitables import EventsSource, WaitableSource, WaitSetThread
+from mddag_executor.executor.workers import LocalDelivery, WorkerPool
+from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
+
+REFRESH_REST = 3
+"""After a refresh, rest for so many times what it took."""
+
+AnySource = SubscriptionSource | ServiceSource | ClientSource | TimerSource
+
+
+class Upkeep:
+    """
+    What the executor's nodes have, as sources.
+
+    :param nodes: returns the nodes.
+    :param executor: in which futures run their callbacks.
+    :ivar changed: whether there may be something new (see ``change``).
+    """
+
+    def __init__(
+        self, nodes: Callable[[], list[Any]], registry: Registry, pool: WorkerPool,
+        at_once: AtOnce, recorder: Recorder | None, context: Context, executor: Any,
+        wait_sets: WaitSetThread, fail: Callable[[BaseException], None],
+    ) -> None:
+        self.changed = True
+        self.has_waitables = False
+        self._nodes = nodes
+        self._registry = registry
+        self._pool = pool
+        self._at_once = at_once
+        self._recorder = recorder
+        self._context = context
+        self._executor = executor
+        self._wait_sets = wait_sets
+        self._fail = fail
+        self._lock = threading.RLock()
+        self._refresh_at = 0.0
+        self._sources: dict[Entity, AnySource | WaitableSource] = {}
+        self._deliveries: dict[str, LocalDelivery] = {}
+        self._events: WaitableSource | None = None
+        self._unlistened: list[Entity] = []
+        # whose listeners were cleared though they may be back at the next refresh
+        self._silent: list[Entity] = []
+
+    def change(self) -> None:
+        """Take note that entities may have come or gone."""
+        self.changed = True
+        self._pool.is_current = False
+
+    def rest_s(self) -> float | None:
+        """Return after how many seconds to ``refresh``; None: nothing has changed."""
+        return max(0.0, self._refresh_at - time.monotonic()) if self.changed else None
+
+    def refresh(self) -> None:
+        """Bring all up to date if anything may have changed."""
+        with self._lock:
+            if not self.changed:
+                return
+            start = time.monotonic()
+            self.changed = False
+            self._refresh()
+            self._pool.is_current = not self.changed  # meanwhile
+            end = time.monotonic()
+            self._refresh_at = end + REFRESH_REST * (end - start)
+
+    def stop_listening(self) -> None:
+        """
+        Clear the listeners of what the nodes do not have any more; an entity has only one.
+
+        The rest is left to the next ``refresh``.
+        """
+        with self._lock:
+            present = {id(entity) for lists in snapshot(self._nodes()).values()
+                       for some in lists for entity in some}
+            gone = [each for each in self._registry.by_id.values()
+                    if id(each.rclpy) not in present and each not in self._silent]
+            with self._pool.lock:
+                for entity in gone:
+                    self._forget(entity)
+            self._silent += gone
+            self._refresh_waitables([], gone)
+
+    def _refresh(self) -> None:
+        pool, registry, engine = self._pool, self._registry, self._pool.engine
+        nodes = self._nodes()
+        found = snapshot(nodes)
+        with pool.lock:
+            now = pool.tick()
+            added, gone = registry.refresh(found)
+            lost = set(gone)
+            back = [each for each in self._silent if each not in lost]
+            self._silent = []
+            if engine.other_processes is not None and (added or gone):
+                engine.other_processes.host(
+                    registry.hosted(), registry.subscriptions(), engine.record, now)
+            for entity in gone:
+                self._forget(entity)
+                engine.remove(entity, now)
+            if self._recorder is not None:
+                self._recorder.entities(nodes, added)
+            for entity in added:
+                entity.since = now
+            for entity in (*added, *back):
+                try:
+                    self._listen(entity)
+                except InvalidHandle:
+                    pass  # destroyed meanwhile: the next refresh forgets it
+            pool.arm()
+        self._refresh_waitables([*added, *back], gone)
+
+    # --- sources ---------------------------------------------------------------------------------
+
+    def _listen(self, entity: Entity) -> None:
+        """Make the source of an entity; the caller has the engine's lock."""
+        pool, loop, inbox = self._pool, self._pool.loop, self._pool.inbox
+        source: AnySource
+        if entity.kind == TIMER:
+            if entity.callback is None and ends_sleep(entity.rclpy.callback):
+                loop = self._at_once.loop
+                source = TimerSource(entity, self._at_once.timers)
+            else:
+                source = TimerSource(entity, pool.timers)
+            loop.add(source, f'timers {entity.node}')
+        elif entity.kind == SUBSCRIPTION:
+            if is_of_wait_for_message(entity.rclpy):
+                return
+            if entity.at_once:
+                loop = self._at_once.loop
+                source = SubscriptionSource(entity, loop, self._at_once)
+            else:
+                source = SubscriptionSource(entity, loop, inbox)
+            loop.add(source)
+        elif entity.kind == SERVICE:
+            source = ServiceSource(entity, loop, inbox)
+            loop.add(source, f'services {entity.node}' if is_builtin(entity.rclpy) else '')
+        elif entity.kind == CLIENT:
+            loop = self._at_once.loop
+            source = ClientSource(
+                entity, loop, self._at_once, self._executor, self._at_once.note_run)
+            loop.add(source)
+        else:
+            return
+        self._sources[entity] = source
+        try:
+            source.listen()
+        except ListenerError as error:
+            self._fail(error)
+        if loop is not pool.loop:
+            return
+        if isinstance(source, SubscriptionSource) and source.is_counted:
+            before = self._deliveries.get(entity.label)
+            self._deliver(entity.label, (*(before.sources if before else ()), source))
+            entity.classify = lambda: pool.classify(source)
+
+    def _deliver(self, topic: str, sources: tuple[SubscriptionSource, ...]) -> None:
+        """Have publishing threads of this process take for these subscriptions of a topic."""
+        new = LocalDelivery(sources, self._pool) if sources else None
+        publishing.replace_delivery(topic, self._deliveries.pop(topic, None), new)
+        if new is not None:
+            self._deliveries[topic] = new
+
+    def _forget(self, entity: Entity) -> None:
+        """Let go of the source of an entity; the caller has the engine's lock."""
+        source = self._sources.pop(entity, None)
+        delivery = self._deliveries.get(entity.label)
+        if delivery is not None and source in delivery.sources:
+            self._deliver(
+                entity.label, tuple(each for each in delivery.sources if each is not source))
+        if source is None or isinstance(source, WaitableSource):
+            if source is not None:
+                self._sources[entity] = source  # later, without the lock
+            return
+        entity.classify = None
+        source.ignore()
+        for loop in (self._pool.loop, self._at_once.loop):
+            if loop.has(source):
+                loop.remove(source)
+
+    # --- waitables -------------------------------------------------------------------------------
+
+    def _refresh_waitables(self, added: list[Entity], gone: list[Entity]) -> None:
+        """Make and forget what asks code of others, without the engine's lock."""
+        if not any(each.kind in (WAITABLE, GUARD) for each in (*added, *gone)):
+            return
+        for entity in gone:
+            source = self._sources.pop(entity, None)
+            if isinstance(source, WaitableSource):
+                self._drop(source)
+        registry = self._registry
+        present = [e for e in registry.by_id.values()
+                   if e.kind in (WAITABLE, GUARD) and e not in self._silent]
+        events = [e for e in present if e.kind == WAITABLE and is_qos_event(e.rclpy)]
+        if any(e.kind == WAITABLE and is_qos_event(e.rclpy) for e in (*added, *gone)):
+            if self._events is not None:
+                dropped, self._events = self._events, None
+                self._drop(dropped)
+            self._events = self._listen_to(events, EventsSource) if events else None
+        left = [e for e in self._unlistened if e in present]
+        for entity in added:
+            if entity.kind == GUARD:
+                left.append(entity)
+            elif entity.kind == WAITABLE and not is_qos_event(entity.rclpy):
+                source = self._listen_to([entity])
+                if source is None:
+                    left.append(entity)
+                else:
+                    self._sources[entity] = source
+        if self._events is None:
+            left += [e for e in events if e not in left]
+        self._unlistened = left
+        self.has_waitables = len(present) > len(events)
+        self._wait_sets.update(left)
+
+    def _listen_to(
+        self, entities: list[Entity], kind: type[WaitableSource] = WaitableSource
+    ) -> WaitableSource | None:
+        """Return the source of waitables; None: there are no listeners for them."""
+        pool = self._pool
+        alive = []
+        for entity in entities:
+            try:
+                with entity.rclpy:
+                    alive.append(entity)
+            except InvalidHandle:
+                pass  # destroyed meanwhile
+        try:
+            source = kind(
+                alive, self._context, self._executor, pool.post, pool.call_at, self._fail)
+        except InvalidHandle:
+            self.changed = True
+            return None
+        except ListenerError:
+            return None
+        if isinstance(source, EventsSource):
+            source.note = self._registry.note_event
+        with pool.lock:
+            pool.loop.add(source)
+        try:
+            source.listen()
+        except (InvalidHandle, ListenerError) as error:
+            self._drop(source)
+            self.changed |= isinstance(error, InvalidHandle)
+            return None
+        return source
+
+    def _drop(self, source: WaitableSource) -> None:
+        source.ignore()
+        with self._pool.lock:
+            self._pool.loop.remove(source)
+
+    def clear(self) -> None:
+        """Let go of everything, at the end."""
+        with self._lock:
+            with self._pool.lock:
+                for entity in list(self._sources):
+                    self._forget(entity)
+            for source in list(self._sources.values()):
+                if isinstance(source, WaitableSource):
+                    self._drop(source)
+            self._sources.clear()
+            if self._events is not None:
+                self._drop(self._events)
+                self._events = None

@@ -1,0 +1,171 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What is done with the core's decisions: counted, reported to the user, written to the trace."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import threading
+from typing import Any, Protocol
+
+from mddag_executor.core import Tables, Tally
+from mddag_executor.core.state import (
+    ABORTED,
+    Decision,
+    DROP,
+    EXPIRED,
+    JOB_END,
+    SINK_FAILED,
+    SINK_IN_TIME,
+    SINK_LATE,
+    SINK_OVERDUE,
+)
+from mddag_executor.core.stops import LEAST_NS, Stops
+from mddag_executor.core.tally import VERDICTS
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.jobs import Origin
+from msg_graph import TaskSet
+
+KEEP_RESPONSES = 2_000
+KEEP_ABORTED = 4096
+
+
+@dataclass(frozen=True)
+class DeadlineMiss:
+    """
+    A sink that missed its deadline; times in ns since the epoch.
+
+    ``kind`` is ``overdue`` if it had not completed at its deadline: that is reported then,
+    whatever comes of it later.  It is ``late`` if the executor learnt of the completion first, at
+    the time ``completed_ns`` (else None).  Before the deadline it is ``expired``, ``aborted``, or
+    ``failed`` (a callback of the job raised) if the job can no longer complete.
+    """
+
+    dag: str
+    vertex: str
+    job: int
+    release_ns: int
+    deadline_ns: int
+    completed_ns: int | None
+    kind: str
+
+
+class Record(Protocol):
+    """Where trace events go (see ``mddag_executor.trace.TraceWriter.record``)."""
+
+    def __call__(self, event: str, timestamp: int, vtid: int, /, *fields: Any) -> None:
+        """Record one event."""
+
+
+class Verdicts:
+    """
+    The run's counts, misses and mddag trace events.
+
+    :param record: where trace events go; None records nothing.
+    :param on_miss: gets every miss under the engine's lock, so it must not wait.
+    """
+
+    def __init__(
+        self, task_set: TaskSet | None, tables: Tables, record: Record | None,
+        on_miss: Callable[[DeadlineMiss], None] | None,
+    ) -> None:
+        self.tally = Tally(task_set, tables, KEEP_RESPONSES)
+        self.stops = Stops()
+        #: By DAG: how many misses are explained by stops of the machine.
+        self.in_stops = [0] * tables.n_dags
+        #: How many misses were reported, each of them once.
+        self.missed = 0
+        self._last_missed = -1, -1
+        self.record = record
+        self._dags = task_set.dags if task_set is not None else ()
+        self._tables = tables
+        self._on_miss = on_miss
+        #: Called with DAG and release of each job that starts.
+        self.on_release: Callable[[int, int], None] | None = None
+        self._aborted: dict[tuple[int, int], None] = {}
+
+    def add(self, decisions: list[Decision], now: int) -> list[int]:
+        """Count decisions of a core; return the executions that it dropped."""
+        dropped = []
+        for kind, dag, vertex, job, deadline, time in decisions:
+            if kind == DROP:
+                dropped.append(deadline)
+            elif kind == JOB_END:
+                self._ended(dag, job, deadline, now)
+            elif kind == SINK_OVERDUE:
+                self._report(kind, dag, vertex, job, deadline, None)
+            elif kind != SINK_IN_TIME:
+                self._missed(kind, dag, vertex, job, deadline, time, now)
+        self.tally.add(decisions)  # last: it knows what was overdue before
+        return dropped
+
+    def _ended(self, dag: int, job: int, end: int, now: int) -> None:
+        if end == ABORTED:
+            self._aborted[(dag, job)] = None
+            if len(self._aborted) > KEEP_ABORTED:
+                del self._aborted[next(iter(self._aborted))]
+        if self.record is not None and end in (ABORTED, EXPIRED):
+            self.record(
+                'abort' if end == ABORTED else 'expire', now, threading.get_native_id(), dag, job)
+
+    def was_aborted(self, dag: int, job: int) -> bool:
+        """Return whether a job was aborted (the last few thousand are remembered)."""
+        return (dag, job) in self._aborted
+
+    def _missed(
+        self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int, now: int,
+    ) -> None:
+        if self.record is not None:
+            self.record(
+                'deadline', now, threading.get_native_id(), dag,
+                self._tables.index_in_dag[vertex], job, deadline, time)
+        completed = time if kind == SINK_LATE else None
+        # what failed is its callback's doing
+        if kind != SINK_FAILED:
+            release = deadline - self._tables.sink_deadline[vertex]
+            self.in_stops[dag] += self.stops.missed(release, deadline, time, dag)
+        if (vertex, job) not in self.tally.overdue:
+            self._report(kind, dag, vertex, job, deadline, completed)
+
+    def _report(
+        self, kind: int, dag: int, vertex: int, job: int, deadline: int, completed: int | None
+    ) -> None:
+        self.missed += 1
+        self._last_missed = vertex, job
+        if self._on_miss is not None:
+            self._on_miss(DeadlineMiss(
+                self._dags[dag].name, self.tally.vertex_name(vertex), job,
+                deadline - self._tables.sink_deadline[vertex], deadline, completed,
+                VERDICTS[kind]))
+
+    def last_missed(self) -> tuple[str, str, int, int]:
+        """Return DAG, sink, job and relative deadline of the last miss; there has been one."""
+        vertex, job = self._last_missed
+        return (self._dags[self._tables.dag_of[vertex]].name, self.tally.vertex_name(vertex), job,
+                self._tables.sink_deadline[vertex])
+
+    def released(self, dag: int, job: int, release: int, now: int, judged: bool) -> None:
+        """Note that a job was released."""
+        if judged:
+            self.tally.released(dag)
+        if self.on_release is not None:
+            self.on_release(dag, release)
+        if self.record is not None:
+            self.record('job_release', now, threading.get_native_id(), dag, job, release)
+
+    def stopped(self, begin: int, end: int) -> None:
+        """Note that no thread of the process ran for a while, which has just ended."""
+        for dag in self.stops.stopped(begin, end) if end - begin >= LEAST_NS else ():
+            self.in_stops[dag] += 1
+        if self.record is not None:
+            self.record('stop', end, threading.get_native_id(), begin, end)
+
+    def dropped(self, entity: Entity, origin: Origin, reason: str, now: int) -> None:
+        """Note that an execution was dropped."""
+        entity.dropped += 1
+        if self.record is not None:
+            _, dag, job, vertex = origin
+            self.record(
+                'drop', now, threading.get_native_id(), entity.address, dag,
+                self._tables.index_in_dag[vertex] if dag >= 0 else -1, job, reason)

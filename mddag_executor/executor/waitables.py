@@ -1,0 +1,322 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Waitables: actions, QoS events, and those of a user's own; and guard conditions.
+
+Theory of operation
+-------------------
+1.  A waitable consists of rcl entities, which a wait set shows when the waitable has been added to
+    it.  Each of these gets the listener of its kind, so a waitable is a source like others
+    (``WaitableSource``).  When something has arrived, the waitable is asked with a wait set of its
+    own that does not wait.  The QoS events of all nodes share one such source, as hardly ever
+    anything happens to them.  To set the listener of an event marks what happened before as known,
+    so a wait set does not show it any more: all events are taken, and those whose counts are what
+    they were are dropped.
+2.  A timer within a waitable (the expiry of an action's goals) is asked for when it is due next.
+3.  rcl has no listener for guard conditions.  For these, for a user's waitables that consist of
+    any, and for rclpy's condition that a signal triggers, one thread waits in a wait set
+    (``WaitSetThread``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+import threading
+import time
+from typing import Any
+import weakref
+
+from mddag_executor.executor import compat
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.listeners import clear_listener, ListenerError, NextCall, set_listener
+from mddag_executor.executor.loop import ALWAYS
+from mddag_executor.executor.shutdown import call_at_shutdown, is_over, join, stop_at_exit
+from mddag_executor.executor.sources import MOST_AT_ONCE
+from mddag_executor.executor.waitsets import FilledSet
+from mddag_executor.executor.work import Work
+from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
+from rclpy.guard_condition import GuardCondition
+from rclpy.waitable import Waitable
+
+_SENDER_CHECKS, _SENDER_CHECK_S = 500, 0.001
+
+Post = Callable[[list[Work]], None]
+"""Makes executions ready; not to be called under the engine's lock."""
+
+
+def executions_of(entity: Entity, executor: Any) -> list[Work]:
+    """
+    Take what a waitable has ready; return the executions that handle it.
+
+    An action client forgets the callback of a goal's feedback when the goal's result has come.  So
+    each feedback is an execution of its own, with the callback that it is for.
+    """
+    waitable = entity.rclpy
+    data = waitable.take_data()
+    compat.attach_futures(waitable, executor)
+    found = [Work(entity, callback, (message,))
+             for callback, message in compat.feedback_taken(waitable, data, MOST_AT_ONCE)]
+    if data or not found:
+        is_early = compat.sender_is_behind(waitable, data)
+        execute = partial(_execute_late, waitable) if is_early else waitable.execute
+        found.append(Work(entity, execute, (data,)))
+    return found
+
+
+def _execute_late(client: Any, data: Any) -> Any:
+    """Execute an action client's work once the thread that has sent the request has noted it."""
+    for _ in range(_SENDER_CHECKS):
+        if not compat.sender_is_behind(client, data):
+            break
+        time.sleep(_SENDER_CHECK_S)
+    return client.execute(data)
+
+
+class WaitableSource:
+    """
+    Some waitables that share a descriptor.
+
+    :param entities: those of the waitables.
+    :param post: gets their executions.
+    :param at: has ``collect`` called at a time (monotonic ns).
+    :raises ListenerError: when they consist of something that has no listener.
+    :raises InvalidHandle: when one of them has been destroyed.
+    """
+
+    asks_others = True
+
+    def __init__(
+        self, entities: Iterable[Entity], context: Context, executor: Any, post: Post,
+        at: Callable[[int, Callable[[], None]], None], fail: Callable[[BaseException], None],
+    ) -> None:
+        self.fd, self.urgency, self.is_counted = -1, ALWAYS, False
+        self._by_id = {id(entity.rclpy): entity for entity in entities}
+        self._executor = executor
+        self._post = post
+        self._at = at
+        self._fail = fail
+        self._set = FilledSet(context, [entity.rclpy for entity in entities])
+        self._timers: list[NextCall] = []
+        self._has_parts = False
+        self._set.parts(self._add_part)
+        if not self._has_parts:
+            raise ListenerError('nothing has no listener')  # it is ready when something else is
+        self._lock = threading.Lock()
+        self._has_more = False
+        self._ignored = False
+
+    def _add_part(self, kind: str, address: int) -> None:
+        self._has_parts = True
+        if kind == 'guard_condition':
+            raise ListenerError('a guard condition has no listener')
+        if kind == 'timer':
+            self._timers.append(NextCall(address))
+
+    def listen(self) -> None:
+        """
+        Have the middleware announce what arrives.
+
+        :raises ListenerError: when it cannot.
+        :raises InvalidHandle: when one of them has been destroyed.
+        """
+        with self._lock:  # what is announced meanwhile must not fill the wait set, too
+            self._set.parts(lambda kind, address: set_listener(kind, address, self.fd))
+        if self._has_more:
+            self.collect()
+
+    def ignore(self) -> bool:
+        """End what ``listen`` has begun, and wait until nobody collects from it."""
+        self._ignored = True
+        with self._lock:
+            try:
+                self._set.parts(clear_listener)
+            except InvalidHandle:
+                pass  # those destroyed write no more
+        return True
+
+    def collect(self) -> None:
+        """Take what is there; not to be called under the engine's lock."""
+        self._has_more = True
+        while self._has_more and not self._ignored and self._lock.acquire(blocking=False):
+            try:
+                self._has_more = False
+                self._collect()
+            except InvalidHandle:
+                pass  # destroyed: the next refresh forgets it
+            except Exception as error:
+                self._fail(error)
+            finally:
+                self._lock.release()
+
+    def _collect(self) -> None:
+        found: list[Work] = []
+
+        def take(waitable: Waitable) -> None:
+            found.extend(executions_of(self._by_id[id(waitable)], self._executor))
+
+        for _ in range(MOST_AT_ONCE):
+            before = len(found)
+            self._set.wait(0, take)
+            if len(found) == before:
+                break
+        else:  # there may be more, after the others have had their turn
+            self._at(time.monotonic_ns(), self.collect)
+        if found:
+            self._post(found)
+        with self._set.held():
+            times = [timer.until() for timer in self._timers]
+        for until in times:
+            if until is not None and until > 0:  # else its handling is posted, which resets it
+                self._at(time.monotonic_ns() + until, self.collect)
+
+
+_known: weakref.WeakKeyDictionary[Entity, list[int]] = weakref.WeakKeyDictionary()
+"""The counts of each QoS event when it was taken last."""
+
+
+class EventsSource(WaitableSource):
+    """
+    Some QoS events (rclpy's ``EventHandler``) that share a descriptor.
+
+    :ivar note: called with each event that has happened, and its status.
+    """
+
+    note: Callable[[Any, Any], None]
+
+    def _collect(self) -> None:
+        found: list[Work] = []
+
+        def take(event: Waitable) -> None:
+            entity = self._by_id[id(event)]
+            status = event.take_data()
+            values = {name: getattr(status, name) for name in dir(status) if '_count' in name}
+            counts = [value for name, value in values.items() if not name.endswith('_change')]
+            before = _known.get(entity, [0] * len(counts))
+            _known[entity] = counts
+            if counts != before or any(
+                    value for name, value in values.items() if name.endswith('_change')):
+                self.note(event, status)
+                found.append(Work(entity, event.execute, (status,)))
+
+        self._set.wait(None, take)
+        if found:
+            self._post(found)
+
+
+class WaitSetThread:
+    """
+    A thread that waits for what has no listener.
+
+    :param post: gets the executions.
+    :param on_signal: called when rclpy's condition for signals is triggered.
+    """
+
+    def __init__(
+        self, context: Context, executor: Any, signals: GuardCondition | None, post: Post,
+        on_signal: Callable[[], None], fail: Callable[[BaseException], None],
+    ) -> None:
+        self._context = context
+        self._executor = executor
+        self._signals = signals
+        self._post = post
+        self._on_signal = on_signal
+        self._fail = fail
+        self._guard = GuardCondition(None, None, context)
+        self._entities: list[Entity] = []
+        self._changed = False
+        self._ending = False
+        self._applied = threading.Event()
+        self._thread: threading.Thread | None = None
+        call_at_shutdown(context, self.wake)
+
+    def update(self, entities: list[Entity]) -> None:
+        """
+        Set the guard conditions and waitables to wait for.
+
+        Returns when nothing is taken any more of those that it waited for before.
+        """
+        if entities == self._entities:
+            return
+        self._entities = entities
+        self._changed = True
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._applied.clear()
+            self.wake()
+            while self._changed and self._thread.is_alive() and not self._applied.wait(0.1):
+                pass
+
+    def wake(self) -> None:
+        """End the present wait."""
+        try:
+            self._guard.trigger()
+        except InvalidHandle:
+            pass
+
+    def start(self) -> None:
+        """Begin to wait; nothing happens when it has begun before."""
+        if self._thread is None or not self._thread.is_alive() and not self._ending:
+            stop_at_exit(self)
+            self._changed = True
+            self._thread = threading.Thread(
+                target=self._run, name='mddag-wait-set', daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread."""
+        self._ending = True
+        self.wake()
+        if self._thread is not None:
+            join(self._thread)
+
+    def _run(self) -> None:
+        waiting: FilledSet | None = None
+        by_id: dict[int, Entity] = {}
+        while not self._ending and not is_over(self._context):
+            try:
+                if self._changed or waiting is None:
+                    self._changed = False
+                    waiting = None  # lets go of those before
+                    by_id = {id(each.rclpy): each for each in self._entities}
+                    waiting = self._build(self._entities)
+                    self._applied.set()
+                self._wait(waiting, by_id)
+            except Exception as error:
+                waiting = None
+                if is_over(self._context):
+                    break
+                if not isinstance(error, InvalidHandle):
+                    self._fail(error)
+                time.sleep(0.001)  # something is being destroyed; no busy loop if it stays
+        self._applied.set()
+        self._on_signal()
+
+    def _build(self, entities: list[Entity]) -> FilledSet:
+        own = [self._guard] + ([self._signals] if self._signals is not None else [])
+        alive = []
+        for entity in entities:
+            try:
+                held = entity.rclpy if isinstance(entity.rclpy, Waitable) else entity.rclpy.handle
+                with held:
+                    alive.append(entity.rclpy)
+            except InvalidHandle:
+                continue
+        return FilledSet(
+            self._context, [each for each in alive if isinstance(each, Waitable)],
+            [*own, *(each for each in alive if not isinstance(each, Waitable))])
+
+    def _wait(self, waiting: FilledSet, by_id: dict[int, Entity]) -> None:
+        found: list[Work] = []
+
+        def take(waitable: Waitable) -> None:
+            found.extend(executions_of(by_id[id(waitable)], self._executor))
+
+        for guard in waiting.wait(-1, take):
+            entity = by_id.get(id(guard))
+            if guard is self._signals:
+                self._on_signal()
+            elif entity is not None and guard.callback is not None:
+                found.append(Work(entity, guard.callback))
+        if found:
+            self._post(found)

@@ -1,0 +1,142 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+An rcl wait set that is made once, and filled again for each wait.
+
+Used of ``_rclpy.WaitSet``: the constructor with the number of each kind, ``pointer``,
+``clear_entities``, ``add_guard_condition``, ``wait`` and ``get_ready_entities``; of handles:
+``pointer``.  Seen in 7.1 and 9.1.  ``rcl_wait_set_t`` is public (``rcl/wait.h``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+import ctypes
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
+from rclpy.guard_condition import GuardCondition
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.waitable import NumberOfEntities, Waitable
+
+_KINDS = ('subscription', 'guard_condition', 'timer', 'client', 'service', 'event')
+
+
+class _RclWaitSet(ctypes.Structure):
+    """The public fields of ``rcl_wait_set_t``: for each kind an array of pointers, its size."""
+
+    _fields_ = [
+        field for kind in _KINDS
+        for field in ((kind, ctypes.POINTER(ctypes.c_void_p)), (f'n_{kind}', ctypes.c_size_t))]
+
+
+class FilledSet:
+    """
+    A wait set over waitables and guard conditions.
+
+    They are held while it waits, so that they are not destroyed.
+
+    :raises InvalidHandle: when one of them has been destroyed.
+    """
+
+    def __init__(
+        self, context: Context, waitables: Iterable[Waitable],
+        guards: Iterable[GuardCondition] = (),
+    ) -> None:
+        self.waitables = list(waitables)
+        self._guards = {}
+        self._held = [context.handle, *self.waitables]
+        counts = NumberOfEntities()
+        for guard in guards:
+            handle: Any = guard.handle
+            with handle:
+                self._guards[handle.pointer] = guard
+            self._held.append(handle)
+        with _Held(self._held):
+            for waitable in self.waitables:
+                counts += waitable.get_num_entities()
+            self._set = _rclpy.WaitSet(
+                counts.num_subscriptions, counts.num_guard_conditions + len(self._guards),
+                counts.num_timers, counts.num_clients, counts.num_services, counts.num_events,
+                context.handle)
+
+    def held(self) -> AbstractContextManager[None]:
+        """
+        Keep all of it from being destroyed while entered.
+
+        :raises InvalidHandle: when one of all has been destroyed.
+        """
+        return _Held(self._held)
+
+    def parts(self, call: Callable[[str, int], None]) -> None:
+        """
+        Call a function with kind and address of each rcl entity that the waitables consist of.
+
+        Kinds are ``subscription``, ``guard_condition``, ``timer``, ``client``, ``service``,
+        ``event``.
+
+        :raises InvalidHandle: when one of them has been destroyed.
+        """
+        with _Held(self._held):
+            self._fill()
+            filled = _RclWaitSet.from_address(self._set.pointer)
+            for kind in _KINDS:
+                for index in range(getattr(filled, f'n_{kind}')):
+                    address = getattr(filled, kind)[index]
+                    if address is not None and address not in self._guards:
+                        call(kind, address)
+
+    def _fill(self) -> None:
+        self._set.clear_entities()
+        for guard in self._guards.values():
+            self._set.add_guard_condition(guard.handle)
+        for waitable in self.waitables:
+            waitable.add_to_wait_set(self._set)
+
+    def wait(
+        self, timeout_ns: int | None, take: Callable[[Waitable], None],
+    ) -> list[GuardCondition]:
+        """
+        Wait until something is ready, or for a time (negative: for ever).
+
+        With None it does not wait, and everything counts as ready.
+
+        A waitable keeps in itself what ``is_ready`` has found, for ``take_data``; so the one is
+        called right after the other.
+
+        :param take: called with each waitable that is ready.
+        :return: the guard conditions that were triggered.
+        :raises InvalidHandle: when one of all has been destroyed.
+        """
+        with _Held(self._held):
+            self._fill()
+            if timeout_ns is not None:
+                self._set.wait(timeout_ns)
+            for waitable in self.waitables:
+                if waitable.is_ready(self._set):
+                    take(waitable)
+            ready = self._set.get_ready_entities('guard_condition')
+            return [self._guards[address] for address in ready if address in self._guards]
+
+
+class _Held(AbstractContextManager[None]):
+    """Keeps several handles from being destroyed while it is entered."""
+
+    def __init__(self, handles: Iterable[Any]) -> None:
+        self._handles = handles
+        self._entered: list[Any] = []
+
+    def __enter__(self) -> None:
+        try:
+            for handle in self._handles:
+                handle.__enter__()
+                self._entered.append(handle)
+        except InvalidHandle:
+            self.__exit__()
+            raise
+
+    def __exit__(self, *_: object) -> None:
+        while self._entered:
+            self._entered.pop().__exit__(None, None, None)

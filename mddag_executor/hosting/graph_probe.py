@@ -1,0 +1,239 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A draft of the system that runs now, from the ROS graph and from the rates of its topics.
+
+Theory of operation
+-------------------
+The ROS graph shows which node publishes, subscribes and serves what. It does not show timers,
+of callback groups, nor which callback publishes a topic. So:
+
+1. A node that subscribes a topic has a callback for it, and so for a service. Each of a node's
+   callbacks may publish what the node publishes.
+2. A node that subscribes and serves nothing is supposed to have one timer, which publishes all
+   that the node does, as often as the most frequent of its topics comes. So the probe listens to
+   these topics for a while, without looking into the messages.
+
+A topic's rate is that of its messages' source timestamps, divided by the number of its publishers.
+Messages that were lost on the way count, by their sequence numbers: images are often published as
+best effort. So nothing needs to spin: messages are taken by polling, of all topics alike. What
+every node has anyway is left out, and so are hidden nodes (``_…``). Nodes are looked for until the
+end, as they are found one by one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import import_module
+import time
+from typing import Any
+
+from mddag_executor.executor.compat import message_taker
+from msg_graph.binding import is_background
+from msg_graph.draft import Draft, DraftCallback, DraftNode
+from msg_graph.drift import Releases
+from msg_graph.language import NODE, SERVICE, TOPIC
+import rclpy
+from rclpy.context import Context
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import try_shutdown
+
+_LEAST_MESSAGES = 3
+_STEP_S = 0.2
+_POLL_S = 0.02
+_DEPTH = 200  # so up to 10,000 messages a second of one topic
+
+
+@dataclass
+class Endpoints:
+    """What a node publishes, subscribes and serves: names with their types."""
+
+    publishes: dict[str, str] = field(default_factory=dict)
+    subscribes: dict[str, str] = field(default_factory=dict)
+    serves: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class Seen(Releases):
+    """
+    The messages of a topic by their source timestamps.
+
+    :ivar lost: how many were published between them and did not come.
+    """
+
+    lost: int = 0
+    _number: int | None = None
+
+    def message(self, stamp: int, number: int | None = None) -> None:
+        """Count a message; its number is its publisher's, and useless with several publishers."""
+        self.add(stamp)
+        if number is not None and self._number is not None and number > self._number:
+            self.lost += number - self._number - 1
+        self._number = number
+
+    def interval_ns(self, publishers: int = 1) -> int | None:
+        """Return the mean time between two messages; None with too few of them."""
+        lost = self.lost if publishers == 1 else 0
+        if self.count < 2 or self.count + lost < _LEAST_MESSAGES or self.last <= self.first:
+            return None
+        return self.mean_ns(lost)
+
+
+@dataclass
+class Probe:
+    """
+    What was found.
+
+    :ivar nodes: endpoints by node.
+    :ivar seen: messages by topic.
+    :ivar publishers: number of publishers by topic.
+    :ivar warnings: what could not be found out, one line each.
+    """
+
+    nodes: dict[str, Endpoints] = field(default_factory=dict)
+    seen: dict[str, Seen] = field(default_factory=dict)
+    publishers: Counter[str] = field(default_factory=Counter)
+    warnings: list[str] = field(default_factory=list)
+
+    def warn(self, text: str) -> None:
+        """Add a warning that is not there yet."""
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+
+def probe(seconds: float, tick: Callable[[float], None] | None = None) -> Probe:
+    """
+    Look at the ROS graph of this domain.
+
+    :param seconds: how long; most of it goes to measuring rates.
+    :param tick: gets now and then for how many seconds it has been looking.
+    """
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = Node(
+            '_mddag_graph_probe', context=context, use_global_arguments=False,
+            enable_rosout=False, start_parameter_services=False)
+        try:
+            return _look(node, context, seconds, tick or (lambda _: None))
+        finally:
+            node.destroy_node()
+    finally:
+        try_shutdown(context=context)
+
+
+def _look(node: Node, context: Context, seconds: float, tick: Callable[[float], None]) -> Probe:
+    begin = time.monotonic()
+    found = Probe()
+    subscriptions: list[tuple[Any, Seen]] = []
+    looked = begin - _STEP_S
+    while (now := time.monotonic()) < begin + seconds:
+        if now - looked >= _STEP_S:
+            looked = now
+            _nodes(node, found)
+            subscriptions += _listen(node, found)
+        for subscription, seen in subscriptions:
+            _take(subscription, seen)
+        tick(now - begin)
+        time.sleep(min(_POLL_S, max(0.0, begin + seconds - time.monotonic())))
+    return found
+
+
+def _take(subscription: Any, seen: Seen) -> None:
+    """Count what has come; nothing is deserialised."""
+    take = message_taker(subscription)
+    with subscription.handle:
+        for _ in range(_DEPTH):
+            taken = take()
+            if taken is None:
+                return
+            about = taken[1]
+            seen.message(about['source_timestamp'] or about['received_timestamp'],
+                         about['publication_sequence_number'])
+
+
+def _nodes(node: Node, found: Probe) -> None:
+    """Add which nodes there are, and what they publish, subscribe and serve."""
+    names = [f'{namespace.rstrip("/")}/{name}'
+             for name, namespace in node.get_node_names_and_namespaces()
+             if not name.startswith('_')]
+    for full, count in sorted(Counter(names).items()):
+        if NODE.check(full) is not None:
+            found.warn(f'{full}: left out, this is no valid node name')
+            continue
+        if count > 1:
+            found.warn(
+                f'{full}: {count} nodes have this name; they are taken for one: rename them')
+        namespace, _, name = full.rpartition('/')
+        endpoints = found.nodes.setdefault(full, Endpoints())
+        for get, target, kind in (
+            (node.get_publisher_names_and_types_by_node, endpoints.publishes, TOPIC),
+            (node.get_subscriber_names_and_types_by_node, endpoints.subscribes, TOPIC),
+            (node.get_service_names_and_types_by_node, endpoints.serves, SERVICE),
+        ):
+            try:
+                listed = get(name, namespace or '/')
+            except Exception as error:  # rclpy raises several kinds where the node has just ended
+                found.warn(f'{full}: {error}')
+                continue
+            target.update((each, types[0]) for each, types in listed
+                          if types and not is_background(each, full) and kind.check(each) is None)
+    found.publishers = Counter(
+        topic for endpoints in found.nodes.values() for topic in endpoints.publishes)
+
+
+def _listen(node: Node, found: Probe) -> list[tuple[Any, Seen]]:
+    """Subscribe every new topic whose rate is needed, as best effort."""
+    qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT,
+                     durability=DurabilityPolicy.VOLATILE)
+    types = {topic: kind for endpoints in found.nodes.values()
+             if not (endpoints.subscribes or endpoints.serves)
+             for topic, kind in endpoints.publishes.items()}
+    subscriptions = []
+    for topic, kind in sorted(types.items()):
+        if topic in found.seen:
+            continue
+        seen = found.seen[topic] = Seen()
+        try:
+            subscription = node.create_subscription(
+                _message_type(kind), topic, lambda _: None, qos, raw=True,
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        except Exception as error:  # whatever the package of the type raises when it is imported
+            found.warn(
+                f'{topic}: its rate is not known: its type {kind} cannot be used here ({error})')
+        else:
+            subscriptions.append((subscription, seen))
+    return subscriptions
+
+
+def _message_type(kind: str) -> Any:
+    """Return the class of a type as `std_msgs/msg/String`: other nodes say it, so nothing else."""
+    match kind.split('/'):
+        case [package, 'msg', name] if package.isidentifier() and name.isidentifier():
+            return getattr(import_module(f'{package}.msg'), name)
+    raise ValueError('this is no name of a message type')
+
+
+def draft_of(found: Probe) -> Draft:
+    """Return what is known of the system, and what is supposed (rules 1 and 2)."""
+    nodes = []
+    for name, endpoints in sorted(found.nodes.items()):
+        starts = [*(('subscription', topic) for topic in sorted(endpoints.subscribes)),
+                  *(('service', service) for service in sorted(endpoints.serves))]
+        published = sorted(endpoints.publishes)
+        callbacks = [DraftCallback(name, f'callback_{i}', kind, [start], maybe=list(published))
+                     for i, (kind, start) in enumerate(starts)]
+        if not callbacks:
+            intervals = [interval * found.publishers[topic] for topic in published
+                         if topic in found.seen and (interval := found.seen[topic].interval_ns(
+                             found.publishers[topic])) is not None]
+            callbacks = [DraftCallback(
+                name, 'callback_0', 'timer', publishes=published, guessed=True,
+                interval_ns=min(intervals, default=None))]
+        nodes.append(DraftNode(name, {callback.name: callback for callback in callbacks}))
+    return Draft('the nodes that ran', nodes)

@@ -1,0 +1,318 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A run of synthetic nodes: how long their callbacks execute, and the figures from what they noted.
+
+Theory of operation
+-------------------
+As in the paper's experiment, each vertex gets **one** execution time for the whole run, drawn from
+its declared quantiles.  Then all of them are scaled by one factor so that the normalised
+utilisation, sum(C / T) / workers, is what was asked for.  One such draw is one point of the
+experiment: whether its deadlines can be met at all depends on the draw
+(``ExecutionPlan.infeasible``), so a figure measured with one seed speaks for that seed.
+
+The nodes themselves write the ledger, so any executor can be measured with the same yardstick,
+and an executor cannot embellish its figures: each body appends how long it took, each sink
+appends (release, completion).  Appending to a list is one indivisible step in CPython, so no lock
+is taken in a callback.
+
+*Due* are the nominal releases (first release plus k periods) whose deadline lies inside the
+measured window, whether or not the executor ever noticed them.  Of these a sink is *on time* when
+it completed by its deadline, *late* when it completed after it, and *missing* when it has not
+completed when the ledger is closed.  A release that an executor skipped, a message that got lost
+and a job that still waits are all missing.  What was not yet due at the window's end is not
+counted either way.
+
+CPU for each callback is all CPU that the process took during the window (executor, middleware,
+interpreter, publishing, emulation of short bodies), divided by the vertices that executed in it.
+In ``spin`` mode the CPU that the bodies were to take is subtracted.  Legs of a sync callback
+that do not complete the join are not counted as callbacks: their cost is overhead.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+import math
+import random
+import time
+from typing import Any, Literal, NamedTuple
+
+from mddag_executor.clocks import epoch_offset_ns
+from mddag_executor.core.tally import quantiles_us, SinkTally
+from mddag_executor.errors import MddagError
+from mddag_executor.simulate.workload import draw_execution_times
+from mddag_executor.simulate.workload import utilisation as normalised
+from msg_graph import Dag, TaskSet, Vertex
+from msg_graph.model import path_lengths
+
+Body = Literal['sleep', 'spin', 'native']
+Mode = Literal[Body, 'mixed']
+BODIES: tuple[Body, ...] = ('sleep', 'spin', 'native')
+
+_EARLY_NS = 1_000_000
+"""How much before its nominal time a release may be noted: clocks are read twice (ns)."""
+
+
+class PlanError(MddagError):
+    """An execution plan that cannot be made from this declaration."""
+
+
+class Infeasible(NamedTuple):
+    """A sink whose critical path, its own time included, is longer than its deadline."""
+
+    vertex: str
+    critical_path_ns: int
+    deadline_ns: int
+
+
+class ExecutionPlan:
+    """
+    The execution time of each vertex for one run.
+
+    :param task_set: the declared DAG tasks.
+    :param seed: the same seed gives the same draw, on every machine and Python version.
+    :param utilisation: normalised utilisation to scale to; None takes the draw as it is.
+    :param workers: the number of workers that the utilisation is normalised to.
+    :param mode: what executions do: one of ``BODIES``, or ``mixed``, which draws it for each
+        callback.
+    :raises PlanError: when a utilisation is asked for and no execution time is declared.
+    """
+
+    def __init__(
+        self,
+        task_set: TaskSet,
+        seed: int = 0,
+        utilisation: float | None = None,
+        workers: int = 7,
+        mode: Mode = 'sleep',
+    ) -> None:
+        self.seed = seed
+        self.workers = workers
+        self.mode: Mode = mode
+        self.task_set = task_set
+        drawn = draw_execution_times(task_set, seed, undeclared=0)
+        self.factor = 1.0
+        if utilisation is not None:
+            if not (utilisation > 0 and math.isfinite(utilisation)):
+                raise PlanError(
+                    f'utilisation {utilisation}: this is no number above zero: give one as 0.6')
+            before = normalised(task_set, drawn, workers)
+            if before == 0:
+                raise PlanError(
+                    f'{task_set.file}: no callback has an execution time, so there is nothing to '
+                    'scale: declare execution_time, or leave the utilisation out')
+            self.factor = utilisation / before
+        self._times = [[round(c * self.factor) for c in dag] for dag in drawn]
+
+    @property
+    def utilisation(self) -> float:
+        """Return the normalised utilisation that results: sum(C / T) / workers."""
+        return normalised(self.task_set, self._times, self.workers)
+
+    def execution_ns(self, dag: int, vertex: int) -> int:
+        """Return the execution time of a vertex, by DAG index and local index, ns."""
+        return self._times[dag][vertex]
+
+    def body(self, vertex: Vertex) -> Body:
+        """Return what the execution of a vertex does."""
+        if self.mode == 'mixed':
+            return random.Random(f'{self.seed} {vertex.callback.key}').choice(BODIES)
+        return self.mode
+
+    def infeasible(self) -> list[Infeasible]:
+        """Return the sinks that no scheduler can serve in time."""
+        found = []
+        for dag in self.task_set.dags:
+            ends = path_lengths(dag, self._times[dag.index])
+            for vertex in (dag.vertices[sink] for sink in dag.sinks):
+                deadline = vertex.deadline_ns
+                if deadline is not None and ends[vertex.index] > deadline:
+                    found.append(Infeasible(vertex.name, ends[vertex.index], deadline))
+        return found
+
+
+class Reading(NamedTuple):
+    """What is counted at one instant: ns since the epoch, CPU of the process (ns), bodies run."""
+
+    at_ns: int
+    cpu_ns: int
+    bodies: Sequence[int]
+
+
+class Ledger:
+    """
+    What is noted of one run of synthetic nodes; as JSON, its ``vars`` are for ``of_processes``.
+
+    ``durations[dag][vertex]`` takes how long each body took (ns), ``completions[dag][vertex]`` of
+    a sink (release, completion) in ns since the epoch, ``delays[dag]`` when a timer started that
+    is a source, and by how much after its release.  ``misattributed`` takes (vertex name, release
+    by the message, release by the executor) where these differ, ``unattributed`` the names of
+    vertices that ran as no job, ``dropped_joins`` those of joins that were given up.
+
+    :param keep: how much of each to keep, the last; None: all.
+    :ivar window: the readings between which the run is measured.
+    """
+
+    def __init__(self, task_set: TaskSet, keep: int | None = None) -> None:
+        self.durations: list[list[deque[int]]] = [
+            [deque(maxlen=keep) for _ in d.vertices] for d in task_set.dags]
+        self.completions: list[list[deque[tuple[int, int]]]] = [
+            [deque(maxlen=keep) for _ in d.vertices] for d in task_set.dags]
+        self.delays: list[deque[tuple[int, int]]] = [
+            deque(maxlen=keep) for _ in task_set.dags]
+        self.misattributed: deque[tuple[str, int, int]] = deque(maxlen=keep)
+        self.unattributed: deque[str] = deque(maxlen=keep)
+        self.dropped_joins: deque[str] = deque(maxlen=keep)
+        self.first_release: list[int | None] = [None for _ in task_set.dags]
+        self.window = Reading(0, 0, ()), Reading(0, 0, ())
+        self.warm_up_ns = 0
+        self.clock_offset_ns = epoch_offset_ns()
+        #: Executions up to this long were emulated busily, longer ones by sleep.
+        self.busy_below_ns = 0
+        #: By so much the same release may differ: each process has a trace clock of its own.
+        self.tolerance_ns = 0
+
+    def reading(self) -> Reading:
+        """Read the counters now."""
+        return Reading(
+            at_ns=time.monotonic_ns() + self.clock_offset_ns,
+            cpu_ns=time.process_time_ns(),
+            bodies=[len(vertex) for dag in self.durations for vertex in dag])
+
+    @classmethod
+    def of_processes(cls, task_set: TaskSet, parts: Sequence[dict[str, Any]]) -> Ledger:
+        """
+        Return the ledger of a run from those of its processes, of one at least.
+
+        The window is that in which all of them measured; what each counted in its own, which is
+        hardly another one, counts for its part of that.
+        """
+        whole = cls(task_set)
+        for part in parts:
+            for dag, first in enumerate(part['first_release']):
+                if first is not None:
+                    whole.first_release[dag] = first
+                whole.delays[dag].extend(part['delays'][dag])
+                for name in ('durations', 'completions'):
+                    for vertex, entries in zip(getattr(whole, name)[dag], part[name][dag]):
+                        vertex.extend(entries)
+            for name in ('misattributed', 'unattributed', 'dropped_joins'):
+                getattr(whole, name).extend(part[name])
+            for name in ('busy_below_ns', 'warm_up_ns'):
+                setattr(whole, name, max(getattr(whole, name), part[name]))
+        windows = [[Reading(*each) for each in part['window']] for part in parts]
+        begin = max(start.at_ns for start, _ in windows)
+        until = max(begin, min(end.at_ns for _, end in windows))
+        cpu = 0
+        bodies = [0] * len(task_set.vertices)
+        for start, end in windows:
+            share = (until - begin) / max(1, end.at_ns - start.at_ns)
+            cpu += round((end.cpu_ns - start.cpu_ns) * share)
+            for i, (before, after) in enumerate(zip(start.bodies, end.bodies)):
+                bodies[i] += round((after - before) * share)
+        whole.window = Reading(begin, 0, [0] * len(bodies)), Reading(until, cpu, bodies)
+        return whole
+
+
+def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:
+    """
+    Judge what came due in the window.
+
+    :return: the figures of ``python -m benchmarks live --json`` (``sink_jobs_due``, ``on_time``,
+        …, ``cpu_us_per_callback``), the window, and for each DAG and sink due, on_time, late,
+        missing and the response times (completion minus nominal release, ns) of the completed.
+    """
+    start, end = ledger.window
+    dags = {dag.name: {'sinks': {
+        vertex.name: _judge(ledger, dag, vertex, start.at_ns, end.at_ns)
+        for vertex in (dag.vertices[sink] for sink in dag.sinks)}} for dag in plan.task_set.dags}
+    sums = totals(sink for dag in dags.values() for sink in dag['sinks'].values())
+    due = sums['sink_jobs_due']
+    return {
+        'mode': plan.mode, 'seed': plan.seed, 'workers': plan.workers,
+        'utilisation': plan.utilisation, 'utilisation_taken': _taken(ledger, plan),
+        'window_start_ns': start.at_ns, 'window_ns': end.at_ns - start.at_ns,
+        'warm_up_ns': ledger.warm_up_ns, **sums,
+        'on_time_ratio': sums['on_time'] / due if due else None,
+        **_throughput(ledger, plan, start, end),
+        'source_delay_us': quantiles_us([d for delays in ledger.delays for _, d in list(delays)]),
+        'attribution': {
+            'wrong': len(ledger.misattributed), 'none': len(ledger.unattributed)},
+        'incomplete_joins_dropped': len(ledger.dropped_joins), 'dags': dags}
+
+
+def totals(sinks: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Return the sums of ``judge_sink``."""
+    sums = dict.fromkeys(('sink_jobs_due', 'on_time', 'late', 'missing'), 0)
+    for sink in sinks:
+        for name in sums:
+            sums[name] += sink['due' if name == 'sink_jobs_due' else name]
+    return sums
+
+
+def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> dict[str, Any]:
+    """Return one sink's verdicts about the deadlines within ]start, end]."""
+    deadline, period = vertex.deadline_ns or 0, dag.period_ns
+    first = ledger.first_release[dag.index]
+    if first is None:
+        return judge_sink(deadline, (), {})
+    completed: dict[int, int] = {}
+    for release, completion in list(ledger.completions[dag.index][vertex.index]):
+        job = (release - first + min(_EARLY_NS, period // 4)) // period
+        completed.setdefault(first + job * period, completion)
+    first_job = max(0, (start - deadline - first) // period + 1)
+    return judge_sink(
+        deadline, range(first + first_job * period, end - deadline + 1, period), completed)
+
+
+def judge_sink(
+    deadline: int, due: Sequence[int], completed: Mapping[int, int]
+) -> dict[str, Any]:
+    """
+    Return the verdicts about a sink.
+
+    :param due: the releases of its jobs; ``completed``: when those completed, by release.
+    """
+    tally = SinkTally(deadline, None)
+    for release in due:
+        if release in completed:
+            response = completed[release] - release
+            tally.done(response, response > deadline)
+    return {
+        'relative_deadline_ns': deadline, 'due': len(due),
+        'on_time': tally.completed - tally.late, 'late': tally.late,
+        'missing': len(due) - tally.completed, 'response_ns': tally.result()['response_ns']}
+
+
+def _throughput(
+    ledger: Ledger, plan: ExecutionPlan, start: Reading, end: Reading
+) -> dict[str, Any]:
+    counts = [after - before for before, after in zip(start.bodies, end.bodies)]
+    callbacks = sum(counts)
+    cpu = end.cpu_ns - start.cpu_ns
+    # CPU that the emulation itself takes is execution, not overhead.
+    times = [plan.execution_ns(v.dag, v.index) for v in plan.task_set.vertices]
+    bodies = [plan.body(v) for v in plan.task_set.vertices]
+    cpu -= sum(n * t for v, (n, t) in enumerate(zip(counts, times))
+               if bodies[v] != 'sleep' or t <= ledger.busy_below_ns)
+    seconds = (end.at_ns - start.at_ns) / 1e9
+    return {
+        'callbacks': callbacks,
+        'callbacks_per_s': callbacks / seconds if seconds > 0 else 0.0,
+        'cpu_us_per_callback': max(0, cpu) / 1000 / callbacks if callbacks else None}
+
+
+def _taken(ledger: Ledger, plan: ExecutionPlan) -> float:
+    """
+    Return the normalised utilisation from the mean times that the bodies really took.
+
+    What never ran counts with its planned time, so a starving executor looks no better.
+    """
+    total = 0.0
+    for vertex in plan.task_set.vertices:
+        durations = ledger.durations[vertex.dag][vertex.index]
+        mean = sum(durations) / len(durations) if durations else plan.execution_ns(
+            vertex.dag, vertex.index)
+        total += mean / plan.task_set.dags[vertex.dag].period_ns
+    return total / plan.workers

@@ -1,0 +1,137 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The synthetic nodes of a declaration under one of rclpy's executors, to compare with.
+
+``measure_peer`` runs them in a process of its own, and those of a declaration with ``processes:``
+in one process for each, all at the same time.  The nodes measure themselves (``measure``), as they
+do under this program's executor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+import gc
+import json
+import sys
+import time
+from typing import Any
+
+from mddag_executor.hosting.child import answer, ChildError, run_child, Tick
+from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Mode
+from mddag_executor.hosting.session import Session
+from mddag_executor.hosting.synthetic import no_job, SyntheticWorkload
+from msg_graph import load
+import rclpy
+from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from rclpy.utilities import ok as context_ok
+
+WARM_UP_S = 1.0
+PATIENCE_S = 90.0
+"""What a process may take besides its window and warm-up: discovery and the end."""
+
+
+def make_peer(name: str, workers: int) -> Executor:
+    """Return an executor of rclpy: ``single``, ``multi`` or ``events``."""
+    if name == 'multi':
+        return MultiThreadedExecutor(workers)
+    return SingleThreadedExecutor() if name == 'single' else EventsExecutor()
+
+
+def spin_events_executor(executor: Executor) -> None:
+    """Spin rclpy's EventsExecutor, whose ``spin`` does not dispatch without a timeout (7.1.5)."""
+    while context_ok():
+        executor.spin_until_future_complete(Future(), 1000.0)
+
+
+class UnfinishedSession(Session):
+    """
+    A session whose executor is not shut down: the process ends instead.
+
+    rclpy's executors cannot be stopped in an orderly way while callbacks wait for their pool.
+    """
+
+    def __init__(self, executor: Executor) -> None:
+        """Make a session that knows how to spin each executor."""
+        is_native = not isinstance(executor, Executor)  # only EventsExecutor is
+        super().__init__(
+            executor, partial(spin_events_executor, executor) if is_native else None)
+
+    def end(self) -> None:
+        """Let a moment pass for what just completes."""
+        if not self.stopped:
+            self.stop()
+            time.sleep(0.05)
+
+    def check(self, measured: bool) -> None:
+        """
+        Check that a run was measured to its end.
+
+        :raises BaseException: what has ended it instead.
+        """
+        if self.error is not None:
+            raise self.error
+        if not measured:
+            raise ChildError('the run was ended before anything was measured: run it again')
+
+
+def run_nodes(
+    executor: Executor, workload: SyntheticWorkload, seconds: float, warm_up_s: float = WARM_UP_S
+) -> None:
+    """Run synthetic nodes under any executor; what they measure is in their ledger."""
+    for node in workload.nodes:
+        executor.add_node(node)
+    session = UnfinishedSession(executor)
+    # for all executors alike: a full collection would stop every thread for 25 ms
+    gc.collect()
+    gc.freeze()
+    with session:
+        measured = workload.run(session, seconds, warm_up_s=warm_up_s)
+    session.check(measured)
+
+
+def measure_peer(
+    executor: str, graph: str, workers: int, *, seconds: float, seed: int, utilisation: float,
+    mode: Mode, tick: Tick | None = None,
+) -> dict[str, Any]:
+    """
+    Run the nodes of a declaration under an executor of rclpy; return what ``measure`` does.
+
+    :param executor: ``single``, ``multi`` or ``events``.
+    :param seconds: how long to measure, after ``WARM_UP_S``.
+    :raises ChildError: when the run cannot be made.
+    """
+    task_set = load(graph)
+    names: Iterable[str | None] = [p.name for p in task_set.processes] or [None]
+    plan = seed, utilisation, workers, mode
+
+    def part(name: str | None) -> dict[str, Any]:
+        request = {'executor': executor, 'graph': graph, 'seconds': seconds, 'process': name,
+                   'plan': plan}
+        return run_child(
+            [sys.executable, '-m', 'mddag_executor.hosting.peers', json.dumps(request)], executor,
+            seconds + WARM_UP_S + PATIENCE_S, tick if len(task_set.processes) < 2 else None)
+
+    with ThreadPoolExecutor(max(1, len(task_set.processes))) as threads:
+        ledgers = list(threads.map(part, names))
+    return measure(Ledger.of_processes(task_set, ledgers), ExecutionPlan(task_set, *plan))
+
+
+def run(request: dict[str, Any]) -> dict[str, Any]:
+    """Run nodes in this process; return their ledger."""
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    task_set = load(request['graph'])
+    plan = ExecutionPlan(task_set, *request['plan'])
+    workload = SyntheticWorkload(
+        task_set, plan, current_job=no_job, process=request['process'])
+    run_nodes(make_peer(request['executor'], plan.workers), workload, request['seconds'])
+    return vars(workload.ledger)
+
+
+if __name__ == '__main__':
+    answer(lambda: run(json.loads(sys.argv[1])))

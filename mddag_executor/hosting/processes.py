@@ -1,0 +1,395 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A run of several processes: starting, watching and ending them, and the result of all.
+
+Theory of operation
+-------------------
+The processes put themselves into groups of their own, so that Ctrl-C reaches the supervisor only,
+which passes it on, and they end when the supervisor does, even if that was killed
+(``belong_to_parent``).  They stay in its session, which has its share of the CPUs.
+
+What they print is passed on line by line, each line with the name of its process before it.  An
+error line of one that then ends with status 2 is the supervisor's error.
+
+A process that ends ahead of the run's end has *died*, unless its status is 0.  Then all end, or
+the others go on (``goes_on``).  The run ends when nothing runs any more.
+
+It does end: what does not end ``END_TIMEOUT_S`` after another one has ended in order, because the
+run was over, is asked to end (SIGTERM); what has not ended as long after it was asked is killed.
+Both are said, in one line that names the process.
+
+The run makes a folder with the declaration as all processes are to have it.  Each process leaves
+there, under its process id, what came of it.  Sinks are judged where they are, so the run's
+verdicts are put together by the core (``core.tally.of_processes``); callbacks are counted where
+they are; rules that need all of them (drift, what the synthetic nodes measured) get the sum of
+what was observed.
+
+Synthetic nodes start together in all processes, as they do in one.  So each process notes in the
+folder that its nodes are *made*; when those of all are, it waits until publishers and
+subscriptions have met; then it notes when it is *ready*, and starts ``LEAD_NS`` after the last of
+these times.  However long another process takes for that, it is waited for; but not if it has
+*ended*, which the run notes: then nobody is waited for any more.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import threading
+import time
+from typing import Any, BinaryIO, TextIO
+
+from mddag_executor.core.tally import of_processes
+from mddag_executor.errors import MddagError
+from mddag_executor.executor.entity import COUNTS
+from mddag_executor.hosting.child import signal_at_end_of
+from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure
+from mddag_executor.hosting.session import MATCH_TIMEOUT_S, Session
+from msg_graph import TaskSet
+from msg_graph.binding import Entity
+from msg_graph.drift import drift, Observed, Releases
+
+END_TIMEOUT_S = 20.0
+_LOOK_S = 0.02
+_BAD_INPUT = 2
+LEAD_NS = 100_000_000
+
+Results = Sequence[tuple[str, Mapping[str, Any]]]
+"""The name of each process that has left a result, and that."""
+
+
+class ProcessError(MddagError):
+    """What a process of the run found wrong with its input."""
+
+
+def belong_to_parent(parent: int) -> None:
+    """Leave Ctrl-C to the process that started this one, and end when it ends (on Linux)."""
+    os.setpgrp()
+    signal_at_end_of(parent, signal.SIGTERM)
+
+
+@dataclass
+class Run:
+    """
+    One process, from its start to its end.
+
+    :ivar name: of the process in the declaration.
+    :ivar status: its exit status, negative for a signal; None while it runs.
+    :ivar asked: it was asked to end; ``killed``: it did not, and was killed.
+    """
+
+    name: str
+    process: subprocess.Popen[bytes]
+    status: int | None = None
+    asked: bool = False
+    killed: bool = False
+    _words: deque[str] = field(default_factory=lambda: deque(maxlen=50))
+    _errors: list[str] = field(default_factory=list)
+    _threads: list[threading.Thread] = field(default_factory=list)
+
+    @property
+    def died(self) -> bool:
+        """Return whether it ended by an exception, a signal or an error."""
+        # asked to end while it started: ahead of its own handler, or its nodes cannot start then
+        as_asked = self.asked and self.status in (-signal.SIGTERM, _BAD_INPUT)
+        return self.status not in (None, 0) and not as_asked
+
+    @property
+    def said(self) -> str:
+        """Return the last line that it wrote to standard error."""
+        lines = (*self._words, *self._errors)
+        return next((line for line in reversed(lines) if line.strip()), '')
+
+    @property
+    def how(self) -> str:
+        """Return how it ended."""
+        if self.status is not None and self.status < 0:
+            try:
+                return f'was ended by {signal.Signals(-self.status).name}'
+            except ValueError:
+                return f'was ended by signal {-self.status}'
+        return f'ended with status {self.status}'
+
+
+class Supervisor:
+    """
+    Runs processes.
+
+    :param command: returns the command line of a process, by its name.
+    :param goes_on: whether the others go on when one ends by itself.
+    :param out: where standard output goes; ``err``: standard error.
+    :param on_end: called with each that has ended.
+    """
+
+    def __init__(
+        self, command: Callable[[str], Sequence[str]], goes_on: bool, out: TextIO, err: TextIO,
+        on_end: Callable[[Run], None],
+    ) -> None:
+        self.runs: list[Run] = []
+        self._command = command
+        self._goes_on = goes_on
+        self._out, self._err = out, err
+        self._on_end = on_end
+        self._lock = threading.Lock()
+        self._stop = False
+        self._asked_at: float | None = None
+        self._over_at: float | None = None
+
+    def stop(self, hurried: bool = False) -> None:
+        """Let the run end; from any thread, also from a signal's handler."""
+        self._stop = True
+
+    def run(self, names: Sequence[str], seconds: float | None) -> None:
+        """
+        Run processes until all have ended.
+
+        :param seconds: so long they run by themselves: one that ends in order later takes no other
+            along; None: for ever.
+        :raises ProcessError: when one finds its input wrong.
+        """
+        begin = time.monotonic()
+        try:
+            for name in names:
+                self._start(name)
+            while any(run.status is None for run in self.runs):
+                time.sleep(_LOOK_S)
+                now = time.monotonic()
+                for run in self.runs:
+                    if run.status is None and run.process.poll() is not None:
+                        is_over = seconds is not None and now - begin >= seconds
+                        self._ended(run, now, is_over)
+                self._end_if_asked(now)
+        finally:
+            for run in self.runs:
+                if run.status is None:
+                    run.process.kill()
+                    self._reap(run)
+
+    def _start(self, name: str) -> None:
+        process = subprocess.Popen(
+            self._command(name), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, env={**os.environ, 'PYTHONUNBUFFERED': '1'})
+        run = Run(name, process)
+        self.runs.append(run)
+        for source, target in ((process.stdout, self._out), (process.stderr, self._err)):
+            assert source is not None
+            thread = threading.Thread(
+                target=self._pass_on, args=(run, source, target), daemon=True,
+                name=f'output of {name}')
+            run._threads.append(thread)
+            thread.start()
+
+    def _pass_on(self, run: Run, source: BinaryIO, target: TextIO) -> None:
+        """Pass on what a process prints."""
+        for raw in source:
+            line = raw.decode(errors='replace').rstrip('\r\n')
+            if target is self._err:
+                if line.startswith('error: '):
+                    run._errors.append(line)
+                    continue
+                run._words.append(line)
+            self._print(f'[{run.name}] {line}', target)
+
+    def _print(self, line: str, target: TextIO) -> None:
+        with self._lock:
+            try:
+                target.write(f'{line}\n')
+                target.flush()
+            except (OSError, ValueError):
+                pass  # nobody reads it any more: the process goes on
+
+    def _reap(self, run: Run) -> None:
+        run.status = run.process.wait()
+        for thread in run._threads:
+            thread.join(1.0)  # what it has started itself may hold its output open
+        if run.status != _BAD_INPUT:
+            for line in run._errors:
+                self._print(f'[{run.name}] {line}', self._err)
+
+    def _ended(self, run: Run, now: float, is_over: bool) -> None:
+        self._reap(run)
+        if run.status == _BAD_INPUT and not run.asked:
+            raise ProcessError(f'process {run.name}: {run.said.removeprefix("error: ")}')
+        self._on_end(run)
+        if is_over and not run.died and self._over_at is None:
+            self._over_at = now
+        if not self._goes_on and (run.died or not is_over):
+            self._stop = True
+
+    def _end_if_asked(self, now: float) -> None:
+        """Ask all to end, once, also those that should have ended; kill what then does not."""
+        running = [run for run in self.runs if run.status is None]
+        late = self._over_at is not None and now - self._over_at > END_TIMEOUT_S
+        if (self._stop or late) and self._asked_at is None:
+            self._asked_at = now
+            for run in running:
+                if not self._stop:
+                    self._print(f'warning: process {run.name} has not ended with the others: it '
+                                'is asked to', self._err)
+                run.asked = True
+                run.process.terminate()
+            self._stop = True
+        elif self._asked_at is not None and now - self._asked_at > END_TIMEOUT_S:
+            for run in running:
+                if not run.killed:
+                    self._print(f'warning: process {run.name} has not ended within '
+                                f'{END_TIMEOUT_S:g} s: it is killed', self._err)
+                    run.killed = True
+                    run.process.kill()
+
+
+@dataclass(frozen=True)
+class Part:
+    """
+    A process of a run, as it sees itself.
+
+    :ivar parent: the process id of the run.
+    :ivar text: the declaration.
+    """
+
+    folder: Path
+    parent: int
+    text: str
+
+    @classmethod
+    def make(cls, folder: str, text: str) -> None:
+        """Prepare the folder of a run."""
+        Path(folder, 'run.json').write_text(json.dumps({'parent': os.getpid(), 'text': text}))
+
+    @classmethod
+    def read(cls, folder: str) -> Part:
+        """Return what a process is to know."""
+        return cls(Path(folder), **json.loads(Path(folder, 'run.json').read_text()))
+
+    def leave(self, result: Any) -> None:
+        """Leave what came of this process."""
+        path = self.folder / f'{os.getpid()}.json'
+        part = path.with_suffix('.part')
+        part.write_text(json.dumps(result, default=list))
+        part.replace(path)
+
+    @staticmethod
+    def ended(folder: str, name: str) -> None:
+        """Note, in the run, that a process has ended."""
+        Path(folder, f'{name}.ended').touch()
+
+    def start_together(
+        self, name: str, names: Sequence[str], session: Session,
+        unmatched: Callable[[], list[str]], patience_s: float = MATCH_TIMEOUT_S,
+    ) -> int:
+        """
+        Wait for the instant at which all processes start, and return it (monotonic ns).
+
+        Not if the run is to end.
+
+        :param unmatched: returns the topics where publishers and subscriptions have not met yet;
+            ``patience_s``: for how long to wait until more of them have.
+        :raises mddag_executor.hosting.session.SessionError: when they do not meet.
+        """
+        self._come_to('made', name, names, session)
+        session.wait_until_matched(
+            lambda: [] if self._is_left_alone() else unmatched(), patience_s)
+        at = self._come_to('ready', name, names, session) + LEAD_NS
+        session.wait(max(0, at - time.monotonic_ns()) / 1e9)
+        return at
+
+    def _is_left_alone(self) -> bool:
+        return any(self.folder.glob('*.ended'))
+
+    def _come_to(self, step: str, name: str, names: Sequence[str], session: Session) -> int:
+        """Wait until all processes have come to a step; return when the last one did."""
+        own = self.folder / f'{name}.{step}'
+        part = own.with_suffix('.part')
+        part.write_text(str(time.monotonic_ns()))
+        part.replace(own)
+        paths = [self.folder / f'{each}.{step}' for each in names]
+        while not (all(path.exists() for path in paths) or self._is_left_alone()):
+            if session.wait(0.01):
+                break
+        return max(int(path.read_text()) for path in paths if path.exists())
+
+
+def left(folder: str, pid: int) -> Any:
+    """Return what a process has left, None where that is nothing."""
+    try:
+        return json.loads(Path(folder, f'{pid}.json').read_text())
+    except FileNotFoundError:
+        return None
+
+
+def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) -> dict[str, Any]:
+    """
+    Return the result of a run from those of its processes.
+
+    :param plan: of the synthetic nodes, where they are such.
+    """
+    parts = [result for _, result in results]
+    callbacks = _callbacks(parts)
+    ledgers = [part['ledger'] for part in parts if part['ledger'] is not None]
+    every = {process.name for process in task_set.processes}
+    return {
+        **of_processes(task_set, results),
+        'stops': {key: sum(part['stops'][key] for part in parts)
+                  for key in ('count', 'total_ns', 'misses')},
+        'callbacks': callbacks,
+        **{key: sum(part[key] for part in parts)
+           for key in ('undeclared', 'queue', 'idle_workers', 'lent')},
+        'dropped': {name: c['dropped'] for name, c in callbacks.items() if c['dropped']},
+        'unattributed': {key: sum(part['unattributed'][key] for part in parts)
+                         for key in ('unknown', 'doubtful')},
+        'never_ran': [c.key for c in task_set.callbacks
+                      if not callbacks.get(c.key, {'ran': 0})['ran']],
+        # only what all of them measured has a window
+        'measured': None if plan is None or {
+            name for name, part in results if part['ledger'] is not None} != every else measure(
+                Ledger.of_processes(task_set, ledgers), plan),
+        'drift': [each.result() for each in drift(task_set, _observed(task_set, results))]}
+
+
+def _callbacks(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the counts of all callbacks; some of the executors' own have the same names."""
+    callbacks: dict[str, Any] = {}
+    for part in parts:
+        for name, counts in part['callbacks'].items():
+            mine = callbacks.get(name)
+            if mine is None:
+                callbacks[name] = dict(counts)
+                continue
+            for key in (*COUNTS, 'waiting'):
+                mine[key] += counts[key]
+            mine['holds_interpreter'] |= counts['holds_interpreter']
+            mine['interpreter_share'] = max(
+                mine['interpreter_share'], counts['interpreter_share'], key=lambda s: s or 0.0)
+    return callbacks
+
+
+def _observed(task_set: TaskSet, results: Results) -> Observed:
+    """Return what was observed of the whole system: releases, where they happened."""
+    whole = Observed()
+    homes = {dag.vertices[dag.source].callback.key: task_set.process_of(
+        dag.vertices[dag.source].callback.node) for dag in task_set.dags}
+    undeclared: list[Entity] = []
+    publishes: dict[str, set[str]] = {}
+    for name, result in results:
+        part = result['observed']
+        whole.duration_ns = max(whole.duration_ns, part['duration_ns'])
+        for key, releases in part['releases'].items():
+            if homes.get(key) == name:
+                whole.releases[key] = Releases(**releases)
+        for name_of in ('got', 'ran'):
+            sums = getattr(whole, name_of)
+            for key, count in part[name_of].items():
+                sums[key] = sums.get(key, 0) + count
+        for key, topics in part['publishes'].items():
+            publishes.setdefault(key, set()).update(topics)
+        undeclared += [Entity(*entity) for entity in part['undeclared']]
+    whole.publishes = {**publishes}
+    whole.undeclared = undeclared
+    return whole

@@ -1,0 +1,611 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Real rclpy nodes made from a declaration.
+
+Theory of operation
+-------------------
+One rclpy node for each declared node, with exactly the declared callbacks and publishers.  A
+callback executes for its planned time and then publishes on all of its topics, over the middleware
+like any node.
+
+Every message is a ``std_msgs/Header``.  Its stamp is the *release* of the job, passed on
+unchanged from the source to the sinks, and its ``frame_id`` is ``DAG#INDEX``: the DAG and the
+local index of the vertex that published it.  So a callback that several publishers start (OR)
+knows which of its vertices it runs as.  A sync callback (AND) has one subscription for each topic;
+it executes in the leg that brings the last of the messages with equal stamps.  Incomplete joins
+are kept for the last ``JOIN_LIMIT`` jobs, then dropped and counted.
+
+A source takes its release from the executor (``current_job``) when ours runs it.  Under another
+executor it is the nominal due time of the timer: rcl keeps timers on an exact grid, start plus n
+periods, and leaves out what it missed, so the release that a call stands for is the next due time
+that the timer named at the call before.  A late call does not make a release later.
+
+Sources that are no timers get a stand-in sensor: one thread (node ``/mddag_sensors``, with
+publishers and clients only, given to no executor, so it takes no worker) publishes on their topics
+or calls their services at the nominal releases.  A service's request is a
+``rcl_interfaces/ListParameters``, whose ``depth`` carries the release (ns) as a stamp would.
+
+Queue edges (``reads:``) start nothing and are not subscribed to.  QoS is reliable, keep last 10:
+deep enough that nothing is lost unless a callback falls ten periods behind.  Callbacks without a
+declared group may overlap themselves (one ``ReentrantCallbackGroup`` for each node), as jobs do in
+the paper; each declared group is a ``MutuallyExclusiveCallbackGroup`` of its node.  The nodes have
+no services for parameters and types and no rosout publisher, so that a hundred of them start
+within a second.
+
+``sleep`` stands for work outside of Python (a GPU, a C++ library that releases the interpreter
+lock): it takes a worker but no CPU, so the CPU that the process does take is overhead.
+``spin`` takes CPU and the interpreter lock: all bodies together have at most one core.
+``native`` takes CPU without the lock, as numpy or OpenCV.
+
+All timers are started together, only when every publisher has met its subscribers, so that no
+release is lost to discovery; the DAGs' first releases are one period after that instant.  Then
+``WARM_UP_S`` pass before the measured window begins.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+import hashlib
+import statistics
+import threading
+import time
+from typing import Any
+
+from mddag_executor.hosting.measure import Body, ExecutionPlan, Ledger
+from mddag_executor.hosting.session import Session, Tick
+from msg_graph import Callback, TaskSet, Vertex
+from rcl_interfaces.srv import ListParameters
+from rclpy.callback_groups import (
+    CallbackGroup,
+    MutuallyExclusiveCallbackGroup,
+    ReentrantCallbackGroup,
+)
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
+from std_msgs.msg import Header
+
+QOS = QoSProfile(
+    reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=10)
+SENSORS_NODE = '/mddag_sensors'
+WARM_UP_S = 1.0
+JOIN_LIMIT = 64
+"""Incomplete joins that a sync vertex keeps; the oldest is dropped and counted."""
+SENSOR = '#sensor '
+"""What the ``frame_id`` of a stand-in sensor's message starts with; its topic follows."""
+_LEAD_NS = 20_000_000
+_CLOCKS_NS = 1_000_000
+"""Well above what the clocks of two processes differ by, and below any period."""
+
+Emulate = Callable[[int], None]
+"""Executes for that many nanoseconds in the calling thread."""
+CurrentJob = Callable[[], Any]
+"""Returns None, or what has the ``release_ns`` of the job that the calling thread runs."""
+
+
+def quiet_node(full_name: str, context: Context | None = None, **parameters: bool) -> Node:
+    """Make a node without the services and topics that every node has."""
+    namespace, _, name = full_name.rpartition('/')
+    # Without the process' arguments: a remapped node would not be the declared one any more.
+    return Node(
+        name, namespace=namespace or '/', context=context, enable_rosout=False,
+        start_parameter_services=False, use_global_arguments=False,
+        parameter_overrides=[Parameter(key, value=value) for key, value in {
+            'start_type_description_service': False, **parameters}.items()])
+
+
+def typical_oversleep_ns(samples: int = 100, asked_ns: int = 300_000) -> int:
+    """Measure by how much time.sleep() is late on this machine when it is idle: the median, ns."""
+    late = []
+    for _ in range(samples):
+        start = time.monotonic_ns()
+        time.sleep(asked_ns / 1e9)
+        late.append(time.monotonic_ns() - start - asked_ns)
+    return max(0, int(statistics.median(late)))
+
+
+def sleeper(oversleep_ns: int) -> Emulate:
+    """
+    Make a function that takes a worker for some time without taking CPU.
+
+    It asks time.sleep() for less by what this machine typically adds, so that the mean is right
+    when the machine isn't overloaded.  What is shorter than that (about 70 us under Linux, whose
+    timer slack is 50 us) is waited out busily.  When the machine is overloaded, executions get
+    longer: that is so for real callbacks too, and it is not hidden.
+
+    :param oversleep_ns: the typical oversleep.
+    """
+    monotonic_ns, sleep = time.monotonic_ns, time.sleep
+
+    def emulate(execution_ns: int) -> None:
+        if execution_ns > oversleep_ns:
+            sleep((execution_ns - oversleep_ns) * 1e-9)
+            return
+        end = monotonic_ns() + execution_ns
+        while monotonic_ns() < end:
+            pass
+
+    return emulate
+
+
+def spinner() -> Emulate:
+    """Make a function that takes that much CPU time of the calling thread."""
+    thread_time_ns = time.thread_time_ns
+
+    def emulate(execution_ns: int) -> None:
+        end = thread_time_ns() + execution_ns
+        while thread_time_ns() < end:
+            pass
+
+    return emulate
+
+
+def native() -> Emulate:
+    """
+    Make a function that takes about that much CPU time in C, without the interpreter lock.
+
+    How much C does in a time is measured first (some milliseconds), and then goes by what it did
+    lately: the speed of a virtual machine changes by a tenth.
+    """
+    def compute(iterations: int) -> None:
+        hashlib.pbkdf2_hmac('sha256', b'password', b'salt', iterations)
+
+    def taken(iterations: int) -> int:
+        before = time.thread_time_ns()
+        compute(iterations)
+        return time.thread_time_ns() - before
+
+    few, many = (min(taken(n) for _ in range(5)) for n in (1, 2000))
+    each = max(1, many - few) / 1999
+
+    def emulate(execution_ns: int) -> None:
+        nonlocal each
+        iterations = max(1, round((execution_ns - few) / each))
+        took = taken(iterations)
+        if iterations >= 500:
+            each += ((took - few) / iterations - each) / 16
+
+    return emulate
+
+
+def no_job() -> None:
+    """Stand for ``current_job`` under executors that know no jobs."""
+
+
+def stamped(release: int, sender: str = '') -> Header:
+    """Make a message that carries a release (ns since the epoch)."""
+    message = Header(frame_id=sender)
+    message.stamp.sec, message.stamp.nanosec = divmod(release, 1_000_000_000)
+    return message
+
+
+def release_of(message: Header) -> int:
+    """Return the release that a message carries, ns since the epoch."""
+    stamp = message.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+class Role:
+    """
+    A callback as one vertex: what it does for a message of that DAG.
+
+    :ivar senders: the ``frame_id`` of the messages that it waits for.
+    :ivar waiting: of a sync the incomplete joins: which messages have come, by release.
+    :param sender: the ``frame_id`` of the messages that it publishes.
+    """
+
+    def __init__(
+        self, vertex: Vertex, senders: list[str], sender: str, execution_ns: int,
+        publishers: list[Publisher], emulate: Emulate, ledger: Ledger,
+    ) -> None:
+        self.vertex = vertex
+        self.senders = senders
+        self.waiting: dict[int, set[str]] = {}
+        self._ledger = ledger
+        self._sender = sender
+        self._execution_ns = execution_ns
+        self._publishers = publishers
+        self._emulate = emulate
+        self._durations = ledger.durations[vertex.dag][vertex.index]
+        self._completions = ledger.completions[vertex.dag][vertex.index]
+        self._lock = threading.Lock()
+
+    def is_whole(self, release: int, sender: str) -> bool:
+        """Note a message of a sync; return whether it was the last one of its job."""
+        with self._lock:
+            seen = self.waiting.setdefault(release, set())
+            seen.add(sender)
+            if len(seen) == len(self.senders):
+                del self.waiting[release]
+                return True
+            if len(self.waiting) > JOIN_LIMIT:
+                del self.waiting[next(iter(self.waiting))]
+                self._ledger.dropped_joins.append(self.vertex.name)
+            return False
+
+    def execute(self, message: Header, release: int) -> None:
+        """Execute the body, publish, and note the completion of a sink."""
+        monotonic_ns = time.monotonic_ns
+        start = monotonic_ns()
+        self._emulate(self._execution_ns)
+        self._durations.append(monotonic_ns() - start)
+        message.frame_id = self._sender
+        for publisher in self._publishers:
+            publisher.publish(message)
+        if self.vertex.deadline_ns is not None:
+            self._completions.append((release, monotonic_ns() + self._ledger.clock_offset_ns))
+
+
+class Grid:
+    """
+    Nominal due times of a started timer, ns since the epoch.
+
+    ``release`` is to be called once in each call of the timer.
+    """
+
+    def __init__(self, timer: Timer, clock_offset_ns: int) -> None:
+        self._timer = timer
+        self._offset = clock_offset_ns
+        self._period = timer.timer_period_ns
+        self._lock = threading.Lock()
+        # Of several readings the one with the least time between the clocks is the best.
+        readings = []
+        for _ in range(3):
+            before = time.monotonic_ns()
+            left = timer.time_until_next_call()
+            after = time.monotonic_ns()
+            readings.append((after - before, (before + after) // 2 + left))
+        self._first = self._next = min(readings)[1]
+
+    @property
+    def first_release(self) -> int:
+        """Return the first due time."""
+        return int(self._first + self._offset)
+
+    def release(self) -> int:
+        """Return the due time that this call of the timer stands for."""
+        with self._lock:
+            release = self._next
+            left = self._timer.time_until_next_call()
+            if left is not None:  # else it was cancelled meanwhile
+                periods = round((time.monotonic_ns() + left - self._first) / self._period)
+                self._next = self._first + periods * self._period
+        return int(release + self._offset)
+
+
+def callback_of(
+    roles: list[Role], ledger: Ledger, current_job: CurrentJob
+) -> Callable[[Header], None]:
+    """
+    Make the callback of a subscription: the sender of a message says which vertex runs.
+
+    That of all legs of a sync executes the body in the last leg of a job.
+    """
+    by_sender = {sender: role for role in roles for sender in role.senders}
+    is_sync = bool(roles) and roles[0].vertex.callback.kind == 'sync'
+
+    def on_message(message: Header) -> None:
+        role = by_sender.get(message.frame_id)
+        if role is None:
+            return  # published by somebody outside of the declaration
+        release = release_of(message)
+        if is_sync and not role.is_whole(release, message.frame_id):
+            return
+        if current_job is not no_job:
+            release = attributed(role, release, ledger, current_job)
+            if not role.vertex.predecessors:
+                message = stamped(release)
+        role.execute(message, release)
+
+    return on_message
+
+
+def attributed(role: Role, release: int, ledger: Ledger, current_job: CurrentJob) -> int:
+    """
+    Compare the release that a message carries with the job that the executor runs it as.
+
+    :return: of a source the release that the executor says, otherwise the message's.
+    """
+    job = current_job()
+    if job is None:
+        ledger.unattributed.append(role.vertex.name)
+    elif not role.vertex.predecessors:
+        return int(job.release_ns)
+    elif abs(job.release_ns - release) > ledger.tolerance_ns:
+        ledger.misattributed.append((role.vertex.name, release, job.release_ns))
+    return release
+
+
+@dataclass
+class Sensor:
+    """Stand-in for what starts DAGs whose source is no timer, and what sends a release."""
+
+    dags: list[int]
+    period_ns: int
+    send: Callable[[int], None]
+
+
+class SyntheticWorkload:
+    """
+    The nodes of a declaration, their timers and stand-in sensors, and the books about them.
+
+    Use: add ``nodes`` to an executor, ``run``, ``destroy``; then ``measure`` judges the ledger.
+
+    :param task_set: the declaration.
+    :param plan: how long each vertex executes.
+    :param current_job: ``mddag_executor.executor.current_job`` under our executor; leave it out
+        under others.
+    :param context: where the nodes belong to; None is rclpy's default context.
+    :param keep: how much of each series the ledger keeps; None: all.
+    :param process: make only the nodes that the declaration puts into this process.
+    :ivar timers: by the DAG that they release.
+    """
+
+    def __init__(
+        self, task_set: TaskSet, plan: ExecutionPlan, *, current_job: CurrentJob = no_job,
+        context: Context | None = None, keep: int | None = None, process: str | None = None,
+    ) -> None:
+        self.task_set = task_set
+        self.plan = plan
+        self.ledger = Ledger(task_set, keep)
+        if process is not None:
+            self.ledger.tolerance_ns = _CLOCKS_NS
+        self._current_job = current_job
+        self._context = context
+        self._emulate: dict[Body, Emulate] = {}
+        bodies = {plan.body(vertex) for vertex in task_set.vertices}
+        if 'sleep' in bodies:
+            self.ledger.busy_below_ns = typical_oversleep_ns()  # takes 30 ms
+            self._emulate['sleep'] = sleeper(self.ledger.busy_below_ns)
+        if 'spin' in bodies:
+            self._emulate['spin'] = spinner()
+        if 'native' in bodies:
+            self._emulate['native'] = native()
+        # Timers on the steady clock: steps of the system's clock move no release.
+        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._nodes: dict[str, Node] = {}
+        self._sensor_node: Node | None = None
+        self._publishers: dict[tuple[str, str], Publisher] = {}
+        self._process = process
+        self._n_subscribers = Counter(t for c in task_set.callbacks for t in c.topics)
+        self._n_publishers = Counter(
+            t for _, t in {(c.node, t) for c in task_set.callbacks for t in c.publishes})
+        self._vertices: dict[str, list[Vertex]] = {}
+        for vertex in task_set.vertices:
+            self._vertices.setdefault(vertex.callback.key, []).append(vertex)
+        self.timers: dict[int, Timer] = {}
+        self._grids: dict[int, Grid] = {}
+        self._sensors: dict[str, Sensor] = {}
+        self._sensor_thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        for name in dict.fromkeys(callback.node for callback in task_set.callbacks):
+            if self._is_here(name):
+                self.make(name)
+        self._add_sensors()
+
+    @property
+    def nodes(self) -> list[Node]:
+        """Return the nodes that an executor is to run."""
+        return list(self._nodes.values())
+
+    def run(
+        self, session: Session, duration_s: float | None, tick: Tick | None = None,
+        warm_up_s: float = WARM_UP_S,
+        begin: Callable[[Session, Callable[[], list[str]]], object] = Session.wait_until_matched,
+    ) -> bool:
+        """
+        Run in a session that spins already, and end the session.
+
+        :param duration_s: length of the measured window, which begins ``warm_up_s`` after the
+            timers; None: until the session is stopped.
+        :param begin: waits until publishers and subscriptions have met, and for other processes.
+        :return: whether there is a window: the run was not stopped before it began.
+        :raises mddag_executor.hosting.session.SessionError: when they do not find each other.
+        """
+        ledger, was_measured = self.ledger, False
+        ledger.warm_up_ns = round(warm_up_s * 1e9)
+        try:
+            executors: Callable[[], list[str]] = getattr(session.executor, 'unmatched', list)
+            begin(session, lambda: self.unmatched() + executors())
+            if not session.stopped:
+                self.start(session.executor.wake)
+                if not session.wait(warm_up_s):
+                    start = ledger.reading()
+                    session.wait(duration_s, tick)
+                    ledger.window = start, ledger.reading()
+                    was_measured = True
+        finally:
+            self.stop()
+            session.end()
+        return was_measured
+
+    def unmatched(self) -> list[str]:
+        """Return the topics whose publishers and subscriptions have not all met yet."""
+        found = set()
+        for (_, topic), publisher in self._publishers.items():
+            if publisher.get_subscription_count() < self._n_subscribers[topic]:
+                found.add(topic)
+        for node in self._nodes.values():
+            for subscription in node.subscriptions:
+                wanted = self._n_publishers[subscription.topic_name]
+                if subscription.get_publisher_count() < wanted:
+                    found.add(subscription.topic_name)
+        return sorted(found)
+
+    def start(self, wake: Callable[[], None]) -> None:
+        """
+        Start all timers and sensors together.
+
+        :param wake: wakes the executor: a wait set that waits already does not see a timer start.
+        """
+        first = self.ledger.first_release
+        for dag in self.timers:
+            self.start_timer(dag)
+            first[dag] = self._grids[dag].first_release
+        wake()
+        if self._sensors:
+            now = time.monotonic_ns() + self.ledger.clock_offset_ns
+            for sensor in self._sensors.values():
+                for dag in sensor.dags:
+                    first[dag] = now + _LEAD_NS + sensor.period_ns
+            self._sensor_thread = threading.Thread(
+                target=self._run_sensors, name='mddag_sensors', daemon=True)
+            self._sensor_thread.start()
+
+    def start_timer(self, dag: int) -> None:
+        """Start the timer that releases a DAG, one period from now."""
+        self.timers[dag].reset()
+        self._grids[dag] = Grid(self.timers[dag], self.ledger.clock_offset_ns)
+
+    def stop(self) -> None:
+        """
+        Stop the sensors and whoever waits for the start.
+
+        Timers go on: rclpy's executors raise when a timer is cancelled that they are about to
+        call.  They end with the executor.
+        """
+        self._stop.set()
+        if self._sensor_thread is not None:
+            self._sensor_thread.join()
+
+    def destroy(self) -> None:
+        """Destroy the nodes."""
+        for node in (*self._nodes.values(), self._sensor_node):
+            if node is not None:
+                node.destroy_node()
+
+    def _run_sensors(self) -> None:
+        sensors = list(self._sensors.values())
+        first = self.ledger.first_release
+        due = [(first[sensor.dags[0]] or 0, i) for i, sensor in enumerate(sensors)]
+        while True:
+            release, index = min(due)
+            left = release - self.ledger.clock_offset_ns - time.monotonic_ns()
+            if self._stop.wait(max(0, left) / 1e9):
+                return
+            sensors[index].send(release)
+            due[index] = (release + sensors[index].period_ns, index)
+
+    def make(self, name: str) -> Node:
+        """Make a declared node with its entities, perhaps again; its timers have not started."""
+        node = self._nodes[name] = quiet_node(name, self._context)
+        for key in [key for key in self._publishers if key[0] == name]:
+            del self._publishers[key]
+        groups: dict[str, CallbackGroup] = {}
+        for callback in self.task_set.callbacks:
+            if callback.node != name:
+                continue
+            kind = MutuallyExclusiveCallbackGroup if callback.group else ReentrantCallbackGroup
+            group = groups.setdefault(callback.group or '', kind())
+            publishers = [self._publisher(node, topic) for topic in callback.publishes]
+            roles = [self._role(v, publishers) for v in self._vertices.get(callback.key, ())]
+            if callback.kind == 'timer':
+                self._add_timer(node, group, callback, roles[0])
+            elif callback.kind == 'service':
+                self._add_service(node, group, callback, roles[0])
+            else:
+                on_message = callback_of(roles, self.ledger, self._current_job)
+                for topic in callback.topics:
+                    node.create_subscription(Header, topic, on_message, QOS, callback_group=group)
+        return node
+
+    def _publisher(self, node: Node, topic: str) -> Publisher:
+        # Callbacks of a node that publish the same topic share the publisher, as members do.
+        key = (node.get_fully_qualified_name(), topic)
+        if key not in self._publishers:
+            self._publishers[key] = node.create_publisher(Header, topic, QOS)
+        return self._publishers[key]
+
+    def _role(self, vertex: Vertex, publishers: list[Publisher]) -> Role:
+        name = self.task_set.dags[vertex.dag].name
+        senders = [f'{name}#{index}' for index in vertex.predecessors]
+        return Role(
+            vertex, senders or [SENSOR + topic for topic in vertex.callback.topics],
+            f'{name}#{vertex.index}', self.plan.execution_ns(vertex.dag, vertex.index),
+            publishers, self._emulate[self.plan.body(vertex)], self.ledger)
+
+    def _add_timer(
+        self, node: Node, group: CallbackGroup, callback: Callback, role: Role
+    ) -> None:
+        dag = role.vertex.dag
+        grids, current_job = self._grids, self._current_job
+        offset = self.ledger.clock_offset_ns
+        delays = self.ledger.delays[dag]
+
+        def on_timer() -> None:
+            start = time.monotonic_ns() + offset
+            job = current_job()
+            release = grids[dag].release() if job is None else job.release_ns
+            delays.append((start, start - release))
+            role.execute(stamped(release), release)
+
+        timer = node.create_timer(
+            (callback.timer_period_ns or 0) / 1e9, on_timer, callback_group=group,
+            clock=self._clock, autostart=False)
+        # Once more, exactly: seconds as a float may lose a nanosecond.
+        timer.timer_period_ns = callback.timer_period_ns or 0
+        self.timers[dag] = timer
+
+    def _add_service(
+        self, node: Node, group: CallbackGroup, callback: Callback, role: Role
+    ) -> None:
+        current_job = self._current_job
+
+        def on_request(
+            request: ListParameters.Request, response: ListParameters.Response
+        ) -> ListParameters.Response:
+            job = current_job()
+            release = request.depth if job is None else job.release_ns
+            role.execute(stamped(release), release)
+            return response
+
+        node.create_service(
+            ListParameters, callback.service or '', on_request, callback_group=group)
+
+    def _is_here(self, node: str) -> bool:
+        return self._process in (None, self.task_set.process_of(node))
+
+    def _add_sensors(self) -> None:
+        """Make what starts the DAGs whose sources are no timers."""
+        first: dict[str, Callback] = {}
+        for vertex in self.task_set.vertices:
+            if vertex.predecessors or vertex.callback.kind == 'timer':
+                continue
+            # One message on a topic releases all DAGs that wait for it, in other processes, too.
+            start = vertex.callback.service or vertex.callback.topics[0]
+            self._n_publishers[start] += start not in first
+            if not self._is_here(first.setdefault(start, vertex.callback).node):
+                continue
+            if self._sensor_node is None:
+                self._sensor_node = quiet_node(SENSORS_NODE, self._context)
+            period = vertex.callback.period_ns or 0
+            if start not in self._sensors:
+                make = self._requests if vertex.callback.service else self._messages
+                self._sensors[start] = Sensor([], period, make(start))
+            sensor = self._sensors[start]
+            # (Of two periods the shorter one sets the pace.)
+            sensor.period_ns = min(sensor.period_ns, period)
+            sensor.dags.append(vertex.dag)
+
+    def _messages(self, topic: str) -> Callable[[int], None]:
+        assert self._sensor_node is not None
+        publisher = self._publisher(self._sensor_node, topic)
+        return lambda release: publisher.publish(stamped(release, SENSOR + topic))
+
+    def _requests(self, service: str) -> Callable[[int], None]:
+        assert self._sensor_node is not None
+        client = self._sensor_node.create_client(ListParameters, service)
+
+        def send(release: int) -> None:
+            future = client.call_async(ListParameters.Request(depth=release))
+            client.remove_pending_request(future)  # nobody waits for the answer
+
+        return send

@@ -1,0 +1,100 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A part of a recording, by time.
+
+Theory of operation
+-------------------
+1. The jobs that were released within the range are judged, the first time included and the last
+   one not.  They keep all that belongs to them, also what happened after the range, so each has
+   the verdict and the response times that it has in the whole recording.
+2. The part ends when the last of these jobs was done or given up, but not before the range does.
+   What ran until then is kept as well, as far as it ended within the part: it may be why a job
+   was late.  Other jobs of which something is kept are not judged.
+3. Rows are whole.  An execution that had begun before the range and ended in it is in the part.
+4. Times stay on the clock of the recording; ``start`` becomes the begin of the range.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from mddag_executor.recording.head import ReplayError
+from mddag_executor.recording.tables import (
+    JobNumbers,
+    Mask,
+    pick,
+    Recording,
+    RowNumbers,
+    WITHDRAWN,
+)
+import numpy as np
+
+
+def cut(recording: Recording, begin: int, end: int) -> Recording:
+    """
+    Return what happened in a range of time.
+
+    :param begin: of the range, ns after the start of the recording; ``end``: likewise.
+    :raises ValueError: when the range is empty or begins before the recording.
+    :raises mddag_executor.replay.ReplayError: when it begins after the recording.
+    """
+    if not 0 <= begin < end:
+        raise ValueError(f'from {begin} to {end} ns is no range of time')
+    if recording.start is None:     # nothing happened
+        return recording
+    length = recording.end - recording.start
+    if begin > length:
+        raise ReplayError(
+            recording.name, f'it ends {length / 1e9:.3f} s after its first release',
+            'give an earlier time')
+    begin, end = recording.start + begin, recording.start + end
+    table, released = recording.executions, recording.releases
+    jobs = JobNumbers(released)
+    in_range = (released['release'] >= begin) & (released['release'] < end)
+    judged = jobs.marked(in_range)
+    own = judged[jobs.of(table)]
+    ends = recording.job_ends
+    until = max(
+        min(end, recording.end), *(int(times.max(initial=begin)) for times in (
+            table['end'][own], ends['time'][judged[jobs.of(ends)]])))
+    last = max(until, end)      # what no DAG declares may run after the end of the recording
+
+    begun = np.where(table['ready'] >= 0, table['ready'], table['start'])
+    begun = np.where(begun >= 0, begun, table['end'])
+    kept = own | ((begun < last) & ((table['end'] >= begin) | (table['end'] < 0)))
+    seen = judged | jobs.marked((released['release'] >= begin) & (released['release'] < last))
+    seen[jobs.of(table)[kept]] = True
+    seen[-1] = False
+    sent, takes = recording.publications, recording.takes
+    executions = RowNumbers(kept)
+    of_kept = executions.has(sent['execution']) | (
+        (sent['execution'] < 0) & (sent['time'] >= begin) & (sent['time'] < last))
+    takes = pick(takes, executions.has(takes['execution']))
+    for message in (table['message'][kept] if recording.links else table['message'][:0],
+                    takes['message']):
+        of_kept[message[message >= 0]] = True
+    messages = RowNumbers(of_kept)
+    table, sent = pick(table, kept), pick(sent, of_kept)
+    sent['execution'] = executions.new(sent['execution'])
+    if recording.links:
+        table['message'] = messages.new(table['message'])
+    takes['execution'] = executions.new(takes['execution'])
+    takes['message'] = messages.new(takes['message'])
+    stops, drops = recording.stops, recording.drops
+    return replace(
+        recording, releases=pick(released, seen[jobs.of(released)]), executions=table,
+        publications=sent, takes=takes, job_ends=pick(ends, seen[jobs.of(ends)]),
+        stops=pick(stops, (stops['start'] < last) & (stops['end'] > begin)),
+        drops=pick(drops, (drops['time'] >= begin) & (drops['time'] < last)),
+        misses=pick(recording.misses, judged[jobs.of(recording.misses)]),
+        start=begin, end=until, judged_releases=(begin, end),
+        unjudged=None if recording.unjudged is None else _withdrawn(recording, jobs, judged))
+
+
+def _withdrawn(recording: Recording, jobs: JobNumbers, judged: Mask) -> dict[int, int]:
+    """Return by DAG how many of the judged jobs were withdrawn."""
+    ends = recording.job_ends
+    mine = ends[(ends['reason'] == WITHDRAWN) & judged[jobs.of(ends)]]
+    dags, counts = np.unique(mine['dag'], return_counts=True)
+    return dict(zip(dags.tolist(), counts.tolist()))

@@ -1,0 +1,114 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Tables of a recording for data frames: Arrow, Parquet, pandas.
+
+Names stand in place of numbers (as dictionaries), and no value in place of ``UNKNOWN``.  Times and
+durations are whole nanoseconds; the metadata of a column says so (``unit``).  The metadata of the
+schema has the version of the tables (``mddag.tables``), which changes when the meaning of a column
+does.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mddag_executor.recording.tables import (
+    LEG,
+    NOTHING,
+    REASONS,
+    Recording,
+    TABLES,
+    UNKNOWN,
+    VERTEX,
+)
+import numpy as np
+
+VERSION = '1'
+FILES = frozenset(f'{name}.parquet' for name in TABLES)
+"""The files that ``write_tables`` writes."""
+_TIMES = {'release', 'noticed', 'ready', 'began', 'start', 'end', 'busy', 'cpu', 'time',
+          'source_timestamp', 'deadline', 'completed'}
+_COMPLETES = {NOTHING: 'nothing', LEG: 'leg', VERTEX: 'vertex'}
+# What is used only to put tables together.
+_INNER = {'order'}
+
+
+def arrow_table(recording: Recording, name: str) -> Any:
+    """
+    Return a table of a recording as an Arrow table.
+
+    :param name: one of ``TABLES``.
+    :raises KeyError: for another name.
+    """
+    import pyarrow
+    kind, rows = TABLES[name], getattr(recording, name)
+    arrays, fields = [], []
+    for column in kind.names or ():
+        if column in _INNER:
+            continue
+        values = rows[column]
+        metadata = {'unit': 'ns'} if column in _TIMES else None
+        array = _names(recording, name, column, values)
+        if array is None:
+            values = np.ascontiguousarray(values)
+            unknown = values == UNKNOWN if values.dtype.kind == 'i' else None
+            if column == 'leg':
+                unknown = None
+            array = pyarrow.array(values, mask=unknown if unknown is not None and unknown.any()
+                                  else None)
+        arrays.append(array)
+        fields.append(pyarrow.field(column, array.type, metadata=metadata))
+    return pyarrow.table(arrays, schema=pyarrow.schema(
+        fields, metadata={'mddag.tables': VERSION, 'mddag.recording': recording.name}))
+
+
+def _names(recording: Recording, table: str, column: str, values: Any) -> Any:
+    """Return a column of numbers that stand for names; None for another one."""
+    import pyarrow
+    task_set = recording.task_set
+    if column in ('dag', 'vertex'):
+        names = [each.name for each in (
+            task_set.dags if column == 'dag' else task_set.vertices)]
+        codes = values.astype(np.int32)
+    elif column in ('callback', 'publisher'):
+        numbers, codes = np.unique(values, return_inverse=True)
+        names = [_name(recording, column, each) for each in numbers.tolist()]
+    elif column == 'reason':
+        names = list(recording.drop_reasons if table == 'drops' else REASONS)
+        codes = values.astype(np.int32)
+    elif column == 'completes':
+        names, codes = [_COMPLETES[each] for each in sorted(_COMPLETES)], values
+    else:
+        return None
+    codes = codes.astype(np.int32)
+    unknown = codes < 0
+    different = list(dict.fromkeys(names))
+    if len(different) < len(names):     # some numbers have the same name
+        place = {name: i for i, name in enumerate(different)}
+        codes = np.array([place[name] for name in names] or [0], dtype=np.int32)[codes]
+    return pyarrow.DictionaryArray.from_arrays(
+        pyarrow.array(codes, mask=unknown if unknown.any() else None),
+        pyarrow.array(different, pyarrow.string()))
+
+
+def _name(recording: Recording, column: str, number: int) -> str:
+    if column == 'callback':
+        return recording.callback_name(number)
+    publisher = recording.who.every_publisher.get(number)
+    return 'unknown' if publisher is None else publisher.topic
+
+
+def pandas_frame(recording: Recording, name: str) -> Any:
+    """Return a table of a recording as a pandas data frame; see ``arrow_table``."""
+    return arrow_table(recording, name).to_pandas()
+
+
+def write_tables(recording: Recording, folder: Path) -> list[str]:
+    """Write each table as a Parquet file into a folder that is there; return their names."""
+    import pyarrow.parquet
+    for name in TABLES:
+        pyarrow.parquet.write_table(
+            arrow_table(recording, name), folder / f'{name}.parquet', compression='zstd')
+    return list(TABLES)

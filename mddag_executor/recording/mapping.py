@@ -1,0 +1,301 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a recording has, in the terms of the declaration that judges.
+
+Theory of operation: recorded with a declaration
+------------------------------------------------
+Events name DAGs and vertices by their index in the declaration that was recorded.  The one that
+judges may be another: other deadlines, another order, more or fewer callbacks.
+
+* A recorded DAG stands for the one whose source is the same callback (``/node:callback``).
+* Within it a vertex stands for the one of the same name, or, because names have ``@dag`` only
+  where several DAGs hold a callback, for the only one of the same callback.
+* The legs of a sync vertex are matched by their topics; with other topics it is another vertex.
+
+What stands for nothing ran as a callback that no DAG declares.  What nothing stands for has never
+run: its jobs were not released, its sinks not completed.
+
+Theory of operation: imported
+-----------------------------
+Callbacks are matched by node and by what starts them; ``msg_graph.binding`` has the rules.  A
+node that was started more than once, or in several processes, is matched each time; of several
+callbacks that look the same the first one declared is the first one made.
+
+Nothing in a recording of CARET or ros2_tracing says more.  There, where a node's timers have other
+periods than declared, but there are as many of them, they are matched by order, and that is said.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence, Set
+from dataclasses import replace
+from typing import NamedTuple
+
+from mddag_executor.core import legs_of
+from mddag_executor.recording.entities import Callback, Entities, Node
+from mddag_executor.recording.head import ReplayError
+from mddag_executor.recording.tables import Recording, Table
+from mddag_executor.text import counted, listed
+from msg_graph import Callback as Declared
+from msg_graph import Dag, format_duration, NO_GRAPH, TaskSet, Vertex
+from msg_graph.binding import Binder, entities_of, Entity, meant
+import numpy as np
+
+
+class Mapping:
+    """
+    Where the recorded DAGs and vertices are in the declaration that judges.
+
+    :param recorded: the declaration that it was recorded with.
+    :param judge: the declaration that judges; None: the recorded one.
+    """
+
+    def __init__(self, name: str, recorded: TaskSet, judge: TaskSet | None) -> None:
+        self.task_set = recorded if judge is None else judge
+        #: Whether the declaration that judges is the one that the run itself was judged by.
+        self.same = judge is None or judge.text == recorded.text
+        self.warnings: list[str] = []
+        first = _first_vertices(self.task_set)
+        if judge is not None and not self.same:
+            self._compare(name, recorded, judge)
+        by_source = {dag.vertices[dag.source].callback.key: dag for dag in self.task_set.dags}
+        #: By recorded DAG: the DAG that it stands for, or -1.
+        self.dag: list[int] = []
+        #: By recorded DAG and vertex: the global vertex that it stands for, or -1.
+        self.vertex: list[list[int]] = []
+        #: By recorded DAG, vertex and leg: the leg that it stands for.
+        self.leg: list[list[list[int]]] = []
+        for dag in recorded.dags:
+            target = by_source.get(dag.vertices[dag.source].callback.key)
+            self.dag.append(-1 if target is None else target.index)
+            self._add_vertices(dag, target, first)
+        self._report_unreleased()
+
+    def _add_vertices(self, dag: Dag, target: Dag | None, first: list[int]) -> None:
+        vertices: list[int] = []
+        legs: list[list[int]] = []
+        for vertex in dag.vertices:
+            match = None if target is None else _match(vertex, dag, target)
+            map_of_legs = []
+            if target is not None and match is not None:
+                map_of_legs = _legs(vertex, dag, match, target)
+            if target is None or match is None or not map_of_legs:
+                vertices.append(-1)
+            else:
+                vertices.append(first[target.index] + match.index)
+            legs.append(map_of_legs)
+        self.vertex.append(vertices)
+        self.leg.append(legs)
+
+    def _compare(self, name: str, recorded: TaskSet, judge: TaskSet) -> None:
+        """Find out which callbacks of the graph the trace does not have."""
+        known = [callback.key for callback in recorded.callbacks]
+        wanted = {callback.key for callback in judge.callbacks}
+        self.warnings += report_missing(name, judge, set(known), known, [
+            each for callback in recorded.callbacks if callback.key not in wanted
+            for each in entities_of(callback)])
+
+    def _report_unreleased(self) -> None:
+        if self.same:
+            return
+        missing = [dag.name for dag in self.task_set.dags if dag.index not in self.dag]
+        if missing:
+            self.warnings.append(
+                f'{self.task_set.file}: {counted(len(missing), "DAG")} without jobs, because the '
+                f'source is no source in the recording: {listed(missing)}')
+
+
+def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
+    """
+    Return a recording in terms of the declaration that judges.
+
+    :param judge: None: the recorded one.
+    :raises ReplayError: when the recording has none of its callbacks.
+    """
+    mapping = Mapping(recording.name, recording.recorded_set, judge)
+    warnings = [*recording.warnings, *mapping.warnings]
+    if mapping.task_set is recording.task_set or mapping.same:
+        return replace(
+            recording, task_set=mapping.task_set, same=recording.same, warnings=warnings)
+    dag = np.array([*mapping.dag, -1])
+    flat = [v if legs else -1 for vertices, of_legs in zip(mapping.vertex, mapping.leg)
+            for v, legs in zip(vertices, of_legs)]
+    vertex = np.array([*flat, -1])
+    n_legs = max((len(legs) for of_dag in mapping.leg for legs in of_dag), default=1)
+    leg = np.array([[*legs, *[-1] * (n_legs - len(legs))]
+                    for of_dag in mapping.leg for legs in of_dag] + [[-1] * n_legs])
+
+    def moved(table: Table) -> Table:
+        table = table.copy()
+        of = table['vertex'].copy()
+        if 'leg' in (table.dtype.names or ()):
+            known = (table['leg'] >= 0) & (table['leg'] < n_legs)
+            table['leg'][known] = leg[of[known], table['leg'][known]]
+        table['vertex'] = vertex[of]
+        if 'dag' in (table.dtype.names or ()):
+            table['dag'] = np.where(vertex[of] >= 0, dag[table['dag']], -1)
+        if 'completes' in (table.dtype.names or ()):
+            table['completes'][vertex[of] < 0] = 0
+        return table
+
+    def of_dags(table: Table) -> Table:
+        table = table.copy()
+        table['dag'] = dag[table['dag']]
+        if 'vertex' in (table.dtype.names or ()):
+            failed = table['vertex'] >= 0
+            table['vertex'] = np.where(failed, vertex[table['vertex']], -1)
+            table = table[~failed | (table['vertex'] >= 0)]
+        return table[table['dag'] >= 0]
+
+    hosted = [(order, mapping.dag[of], frozenset(int(vertex[v]) for v in vertices) - {-1})
+              for order, of, vertices in recording.hosted if mapping.dag[of] >= 0]
+    return replace(
+        recording, task_set=mapping.task_set, same=False, warnings=warnings, hosted=hosted,
+        executions=moved(recording.executions), publications=moved(recording.publications),
+        drops=moved(recording.drops), misses=moved(recording.misses),
+        releases=of_dags(recording.releases), job_ends=of_dags(recording.job_ends))
+
+
+def _first_vertices(task_set: TaskSet) -> list[int]:
+    first = [0]
+    for dag in task_set.dags:
+        first.append(first[-1] + len(dag.vertices))
+    return first
+
+
+def _match(vertex: Vertex, dag: Dag, target: Dag) -> Vertex | None:
+    """Return the vertex of a DAG that a vertex of a recorded one stands for."""
+    for other in target.vertices:
+        if other.name == vertex.name:
+            return other
+    key = vertex.callback.key
+    same = [other for other in target.vertices if other.callback.key == key]
+    alone = Counter(other.callback.key for other in dag.vertices)[key] == 1
+    return same[0] if alone and len(same) == 1 else None
+
+
+def _legs(vertex: Vertex, dag: Dag, other: Vertex, target: Dag) -> list[int]:
+    """Return for each leg of a vertex the leg of the other with its topic; none: no match."""
+    topics, theirs = (
+        [each.callback.topics[place] for place, _ in legs_of(each, of.vertices)]
+        for each, of in ((vertex, dag), (other, target)))
+    if max(len(topics), len(theirs)) <= 1:
+        return [0]
+    if sorted(topics) != sorted(theirs):
+        return []
+    places: dict[str, list[int]] = {}
+    for place, topic in enumerate(theirs):
+        places.setdefault(topic, []).append(place)
+    return [places[topic].pop(0) for topic in topics]
+
+
+def report_missing(
+    name: str, judge: TaskSet, found: Set[str], known: Sequence[str], others: Sequence[Entity]
+) -> list[str]:
+    """
+    Return the line about callbacks of a declaration that are not in a recording, if any.
+
+    :param found: the keys of those that are.
+    :param known: what is called how in the recording; ``others``: what stands for nothing.
+    :raises ReplayError: when it has none of them.
+    """
+    absent = [callback for callback in judge.callbacks if callback.key not in found]
+    if not absent:
+        return []
+    questions = ((c.key, meant(c, others)) for c in absent)
+    question = next((f'{key}: {each}' for key, each in questions if each is not None), None)
+    if len(absent) == len(judge.callbacks):
+        has = f'it has {listed(known)}' if known else 'it does not say what its callbacks are'
+        raise ReplayError(
+            name, f'none of the callbacks of {judge.file} is in it: {has}',
+            question or 'give the graph of the nodes that were recorded, or none')
+    return [f'{name}: not in it: {len(absent)} of the {len(judge.callbacks)} callbacks of '
+            f'{judge.file}, which count as never completed: {listed([c.key for c in absent])}'
+            + ('' if question is None else f': {question}')]
+
+
+class Target(NamedTuple):
+    """A declared callback that a recorded one stands for, and the leg of it that it is."""
+
+    callback: Declared
+    leg: int
+    topic: str
+
+
+def nodes_of(who: Entities) -> list[list[Callback]]:
+    """Return the timers, subscriptions and services of each node, as they were made."""
+    found: dict[Node, list[Callback]] = {}
+    for each in sorted(who.made, key=lambda c: (c.made, c.number)):
+        if each.node is not None:
+            found.setdefault(each.node, []).append(each)
+    return list(found.values())
+
+
+def match(callbacks: list[Callback], declared: TaskSet) -> dict[int, Target]:
+    """Return by number which declared callbacks those of a node are."""
+    binder = Binder(declared)
+    found: dict[int, Target] = {}
+    for each in callbacks:
+        bound = None if each.entity is None or not each.number else binder.bind(each.entity)
+        if bound is not None:
+            leg = bound.topics.index(each.start) if each.start in bound.topics else 0
+            found[each.number] = Target(bound, leg, each.start if bound.topics else '')
+    return found
+
+
+def declared_keys(who: Entities, declared: TaskSet) -> dict[int, str]:
+    """Return by callback's number the key of the declared one that it is."""
+    return {number: target.callback.key for callbacks in nodes_of(who)
+            for number, target in match(callbacks, declared).items()}
+
+
+class Matching:
+    """
+    Which declared callbacks those of an imported recording are.
+
+    :param who: is who in it.
+    :param threads: the processes and threads that ran callbacks.
+    :param judge: the declaration that judges; None: there is none.
+    """
+
+    def __init__(
+        self, name: str, who: Entities, threads: Set[tuple[int, int]], judge: TaskSet | None
+    ) -> None:
+        self.task_set = judge or NO_GRAPH
+        self.warnings: list[str] = []
+        #: By number of a recorded callback.
+        self.target: dict[int, Target] = {}
+        self._other_periods: list[str] = []
+        if judge is None:
+            return
+        for callbacks in nodes_of(who):
+            self.target.update(self._match(callbacks, judge))
+        found = {target.callback.key for target in self.target.values()}
+        self.warnings += report_missing(
+            name, judge, found, [c.label for c in who.every if c.kind != 'service'],
+            [c.entity for c in who.every if c.entity is not None and c.number not in self.target])
+        if self._other_periods:
+            self.warnings.append(
+                f'{name}: {counted(len(self._other_periods), "timer")} with another '
+                f'period than declared: {listed(self._other_periods)}')
+        processes = len({pid for pid, _ in threads})
+        if processes > 1:
+            self.warnings.append(
+                f'{name}: {processes} processes ran callbacks, each with workers of its own: '
+                f'{counted(len(threads), "thread")} are taken together')
+
+    def _match(self, callbacks: list[Callback], judge: TaskSet) -> dict[int, Target]:
+        found = match(callbacks, judge)
+        node, known = callbacks[0].node_name, {t.callback.key for t in found.values()}
+        timers = [c for c in judge.callbacks
+                  if c.node == node and c.kind == 'timer' and c.key not in known]
+        left = [c for c in callbacks
+                if c.kind == 'timer' and c.number and c.number not in found]
+        for one, callback in zip(timers, left) if len(timers) == len(left) else ():
+            found[callback.number] = Target(one, 0, '')
+            self._other_periods.append(
+                f'{one.key} ({format_duration(callback.period)} instead of '
+                f'{format_duration(one.timer_period_ns or 0)})')
+        return found

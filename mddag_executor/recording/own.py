@@ -1,0 +1,777 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A trace of this executor as a recording.
+
+Theory of operation
+-------------------
+1. The file is read chunk by chunk, in the order of the file.  Whole chunks before damage are used.
+   No event is left out because its time looks strange.
+2. The executor writes an execution as four events next to each other: ``dispatch``,
+   ``callback_start``, ``callback_end`` and, unless it was suspended or no DAG declares it,
+   ``complete``.  Where they stand like that they are one row at once.
+3. What is left (traces of simulations have the events in the order of time) is joined thread by
+   thread in the order of the file: an end belongs to the dispatch before it, a ``complete`` to the
+   execution that ended last in its thread, if DAG, vertex and job agree.
+4. A ``complete`` without an execution is a row without a start; a dispatch without an end is a
+   row without an end.
+5. Rows of one vertex, job and readiness up to the one that completes are pieces of one execution.
+6. A publication belongs to the execution that ran in its thread at that time.
+7. The core saw its events in the order of their times; events of equal time are in the order of
+   the file.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from mddag_executor.core import legs_of, NEVER
+from mddag_executor.memory import give_back
+from mddag_executor.recording.entities import Entities, OWN_INIT_EVENTS
+from mddag_executor.recording.head import declared, Head, named_errors, no_end, TASK_SET
+from mddag_executor.recording.tables import (
+    ABORTED,
+    ALL_LEGS,
+    DROPS,
+    EXECUTIONS,
+    EXPIRED,
+    FAILED,
+    groups,
+    Growing,
+    Ints,
+    JOB_ENDS,
+    LEG,
+    Mask,
+    MISSES,
+    NOTHING,
+    pick,
+    PUBLICATIONS,
+    Recording,
+    RELEASES,
+    rows,
+    sort_by,
+    STOPS,
+    Table,
+    UNKNOWN,
+    VERTEX,
+)
+from mddag_executor.text import counted
+from mddag_executor.trace import TraceReader
+from mddag_executor.trace.errors import renamed
+from mddag_executor.trace.events import Event, Events
+from msg_graph import TaskSet
+import numpy as np
+
+_DISPATCH, _START, _END, _COMPLETE = (
+    'mddag:dispatch', 'ros2:callback_start', 'ros2:callback_end', 'mddag:complete')
+_PUBLISH, _RELEASE = 'ros2:rclcpp_publish', 'mddag:job_release'
+_DEADLINE, _FAIL, _EXPIRE, _ABORT, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN, _JUDGE_FROM = (
+    f'mddag:{name}' for name in (
+        'deadline', 'fail', 'expire', 'abort', 'lost', 'stop', 'drop', 'hosted', 'shutdown',
+        'judge_from'))
+_NUMBERS = (_DISPATCH, _START, _END, _COMPLETE, _PUBLISH, _RELEASE, _DEADLINE, _FAIL, _EXPIRE,
+            _ABORT, _LOST, _STOP, _JUDGE_FROM, _SHUTDOWN)
+_JOB_ENDS = {_EXPIRE: EXPIRED, _ABORT: ABORTED, _FAIL: FAILED}
+_CORE = (_RELEASE, _COMPLETE, _DEADLINE, *_JOB_ENDS)
+"""Events at which the executor's core saw something: the run lasts at least until there."""
+
+Progress = Callable[[int], None]
+
+
+def read_own(
+    reader: TraceReader, name: str, head: Head, progress: Progress | None = None
+) -> Recording:
+    """
+    Return the recording that a trace of this executor holds.
+
+    :param name: what messages call the trace.
+    :param head: of the trace.
+    :param progress: called now and then with the number of events read so far.
+    """
+    with named_errors(reader.path, name):
+        source = _Source(reader, name, head, Entities(by_address=True))
+        found = source.read(progress)
+        found.warnings = [*source.doubts(), *end_lines(found)]
+    del source      # what it holds is more than the tables
+    give_back()
+    return found
+
+
+def read_process(
+    reader: TraceReader, name: str, head: Head, who: Entities, edit: Callable[[Event], Event],
+    progress: Progress | None = None,
+) -> tuple[Recording, Ints]:
+    """
+    Return what the trace of one of several processes holds.
+
+    :param who: gets to know who is who in it; ``edit``: changes the events that say so.
+    :return: the recording; and the times of what the core saw, by place in the order.
+    """
+    with named_errors(reader.path, name):
+        source = _Source(reader, name, head, who, edit)
+        found = source.read(progress)
+        found.warnings = source.doubts()
+        return found, source.seen_at
+
+
+def end_lines(found: Recording) -> list[str]:
+    """Return what is missing of a run as a whole, one line each."""
+    name, lines = found.name, []
+    if not found.shut_down:
+        lines.append(no_end(name))
+    if found.lost:
+        lines.append(
+            f'{name}: {counted(found.lost, "event")} lost while recording: jobs may be '
+            'missing, or count as late that were not')
+    if not len(found.releases):
+        lines.append(f'{name}: no job was released in it')
+    return lines
+
+
+class _Kind:
+    """The rows of one kind of event, and their places in the file."""
+
+    def __init__(self) -> None:
+        self.rows: list[Table] = []
+        self.places: list[Ints] = []
+
+    def add(self, found: Table, places: Ints) -> None:
+        self.rows.append(found)
+        self.places.append(places)
+
+    def joined(self) -> tuple[Table | None, Ints]:
+        """Return them, as the first ones are typed; None: there are none."""
+        if not self.rows:
+            return None, np.empty(0, dtype=np.int64)
+        names = self.rows[0].dtype.names
+        assert names is not None
+        kind = np.dtype([(each, np.result_type(*(part.dtype[each] for part in self.rows)))
+                         for each in names])
+        table = np.empty(sum(map(len, self.rows)), dtype=kind)
+        at = 0
+        for part in self.rows:
+            for each in names:
+                table[each][at:at + len(part)] = part[each]
+            at += len(part)
+        return table, np.concatenate(self.places)
+
+
+class _Source:
+    """Reads one trace."""
+
+    def __init__(
+        self, reader: TraceReader, name: str, head: Head, who: Entities,
+        edit: Callable[[Event], Event] | None = None,
+    ) -> None:
+        self._reader, self._name, self._head, self._edit = reader, name, head, edit
+        self._task_set = declared(head, name)
+        self._numbering = _Numbering(self._task_set)
+        self._who = who
+        #: The times of what the core saw, by place in the order.
+        self.seen_at = np.empty(0, dtype=np.int64)
+        self._kinds: dict[str, _Kind] = {}
+        # executions, where their dispatches, ends and completions are, and when these were seen
+        self._executions = Growing(EXECUTIONS)
+        self._dispatch_at: list[Ints] = []
+        self._end_at: list[Ints] = []
+        self._complete_at: list[Ints] = []
+        self._seen: list[Ints] = []
+        self._last_seen = 0
+        self._others: list[tuple[int, Event]] = []
+        self._strange: Counter[str] = Counter()
+
+    def read(self, progress: Progress | None) -> Recording:
+        base = 0
+        for events in self._reader.chunks({
+                *_NUMBERS, *OWN_INIT_EVENTS, TASK_SET, _DROP, _HOSTED}):
+            self._chunk(events, base)
+            base += len(events)
+            if progress is not None:
+                progress(base)
+        give_back()     # what the chunks needed
+        return self._recording()
+
+    # --- chunks ----------------------------------------------------------------------------------
+
+    def _chunk(self, events: Events, base: int) -> None:
+        found: dict[str, tuple[Table, Ints]] = {}
+        for (kind,), of_kind, places in events.tables():
+            if kind not in _NUMBERS:
+                self._others += [(base + place, (kind, *row)) for place, row in zip(
+                    places.tolist(), of_kind.tolist())]
+            elif kind in found:     # a second channel of that kind
+                self._kind(kind).add(of_kind, base + places)
+            else:
+                found[kind] = of_kind, places
+        for place, event in events.others():
+            if None in event:
+                self._strange[f'{event[0]} without some of its fields'] += 1
+            elif event[0] in _NUMBERS:
+                self._kind(event[0]).add(_one_row(event), np.array([base + place]))
+            else:
+                self._others.append((base + place, event))
+        if _DISPATCH in found:
+            self._adjacent(found, len(events), base)
+        for kind, (of_kind, places) in found.items():
+            if len(of_kind):
+                # a copy: what is left of a chunk must not keep it in memory
+                self._kind(kind).add(of_kind.copy(), base + places)
+
+    def _kind(self, name: str) -> _Kind:
+        return self._kinds.setdefault(name, _Kind())
+
+    def _adjacent(
+        self, found: dict[str, tuple[Table, Ints]], length: int, base: int
+    ) -> None:
+        """Take the events out that stand next to each other as they were recorded (rule 2)."""
+        dispatch, at = found[_DISPATCH]
+        parts: list[tuple[Table, Ints, Ints]] = []      # rows, places, row by dispatch
+        fits = np.ones(len(at), dtype=np.bool_)
+        for step, kind in enumerate((_START, _END, _COMPLETE), 1):
+            if kind not in found:
+                if kind != _COMPLETE:
+                    return
+                parts.append((dispatch, at, np.full(len(at), -1)))
+                continue
+            of_kind, places = found[kind]
+            if len(places) == len(at) and (places == at + step).all():
+                which = np.arange(len(at))
+            else:
+                row_at = np.full(length + 5, -1)
+                row_at[places] = np.arange(len(places))
+                which = row_at[at + step]
+                if kind == _COMPLETE:       # several legs at once are put together later
+                    which = np.where(row_at[at + step + 1] < 0, which, -1)
+            there = which >= 0
+            same = there.copy()
+            for field in ('vtid', 'callback'):
+                same &= of_kind[field][which] == dispatch[field]
+            if kind == _COMPLETE:
+                for field in ('dag', 'vertex', 'job'):
+                    same &= of_kind[field][which] == dispatch[field]
+                which = np.where(same, which, -1)
+            else:
+                fits &= same
+            parts.append((of_kind, places, which))
+        (_, _, started), (ends, end_at, ended), (completes, complete_at, completed) = parts
+        if not fits.any():
+            return
+        if not fits.all():
+            taken = np.flatnonzero(fits)
+            started, ended, completed = started[taken], ended[taken], completed[taken]
+            dispatched, dispatched_at = dispatch[taken], at[taken]
+        else:
+            dispatched, dispatched_at = dispatch, at
+        table = self._rows(dispatched, dispatched['timestamp'], ends['timestamp'][ended])
+        self._dispatch_at.append(base + dispatched_at)
+        self._end_at.append(base + end_at[ended])
+        whole = completed >= 0
+        if whole.all():
+            self._complete(table, completes[completed])
+            self._complete_at.append(base + complete_at[completed])
+            self._seen.append(completes['timestamp'][completed].astype(np.int64))
+        else:
+            places, seen = (np.full(len(table), UNKNOWN) for _ in range(2))
+            if whole.any():
+                done = table[whole]
+                self._complete(done, completes[completed[whole]])
+                table[whole] = done
+                places[whole] = base + complete_at[completed[whole]]
+                seen[whole] = completes['timestamp'][completed[whole]]
+            self._complete_at.append(places)
+            self._seen.append(seen)
+        self._executions.add(table)
+        found[_DISPATCH] = dispatch[~fits], at[~fits]
+        for kind, which in ((_START, started), (_END, ended), (_COMPLETE, completed[whole])):
+            if kind in found:
+                of_kind, places = found[kind]
+                if len(which) == len(of_kind):
+                    found[kind] = of_kind[:0], places[:0]
+                else:
+                    rest = np.ones(len(of_kind), dtype=np.bool_)
+                    rest[which] = False
+                    found[kind] = of_kind[rest], places[rest]
+
+    def _rows(self, dispatch: Table, start: Any, end: Any) -> Table:
+        """Return rows of executions that were dispatched."""
+        table = np.zeros(len(dispatch), dtype=EXECUTIONS)
+        dag, vertex = self._numbering.of(dispatch['dag'], dispatch['vertex'])
+        table['callback'], table['thread'] = dispatch['callback'], dispatch['vtid']
+        table['dag'], table['vertex'], table['job'] = dag, vertex, dispatch['job']
+        ready = dispatch['ready']
+        strange = (ready < 0) | (ready > start)
+        if strange.any():
+            self._left_out(_DISPATCH, 'before it was ready', strange)
+            ready = np.where(strange, start, ready)
+        table['worker'], table['ready'] = dispatch['worker'], ready
+        table['start'] = table['began'] = start
+        table['end'] = end
+        table['busy'] = table['end'] - table['start']
+        table['cpu'] = table['message'] = table['order'] = UNKNOWN
+        return table
+
+    def _complete(self, table: Table, complete: Table) -> None:
+        """Fill in what executions completed."""
+        table['leg'] = complete['leg']
+        table['completes'] = np.where(complete['last_leg'], VERTEX, LEG)
+        table['cpu'] = complete['cpu_time']
+        table['holds_gil'] = complete['held_interpreter']
+
+    # --- putting together ------------------------------------------------------------------------
+
+    def _recording(self) -> Recording:
+        head, task_set = self._head, self._task_set
+        found = Recording(
+            self._name, head, task_set, task_set, self._who, workers_each=head.workers)
+        self._entities()
+        executions, complete_at, seen = self._all_executions()
+        found.executions = executions
+        found.publications = self._publications(executions)
+        released, released_at = self._kind(_RELEASE).joined()
+        found.releases, released_at = self._releases(released, released_at)
+        found.job_ends, ends_at = self._job_ends()
+        found.misses = self._misses()
+        stops, _ = self._kind(_STOP).joined()
+        if stops is not None:
+            found.stops = rows(
+                STOPS, len(stops), start=stops['begin'], end=stops['end'])
+            found.notices_stops = int(stops['end'].min())
+        lost, _ = self._kind(_LOST).joined()
+        found.lost = 0 if lost is None else int(sum(lost['count'].tolist()))
+        self._set_end(found)
+        self._put_in_order(found, [
+            (found.releases, found.releases['noticed'], released_at),
+            (found.job_ends, found.job_ends['time'], ends_at)], seen, complete_at)
+        begun = [found.releases['release'], executions['ready'][
+            (executions['end'] >= 0) & (executions['start'] >= 0)]]
+        found.start = min((int(each.min()) for each in begun if len(each)), default=None)
+        return found
+
+    def _entities(self) -> None:
+        self._others.sort(key=lambda each: each[0])
+        for _, event in self._others:
+            if event[0] in OWN_INIT_EVENTS:
+                self._who.take(event if self._edit is None else self._edit(event))
+            elif event[0] == TASK_SET and event[4] != self._head.yaml:
+                self._strange[f'{TASK_SET} with another declaration'] += 1
+
+    def _all_executions(self) -> tuple[Table, Ints, Ints]:
+        """Return all executions; where completions stand in the file, and when they were seen."""
+        rest, began_at, rest_at = self._by_thread()
+        none = np.full(len(rest), UNKNOWN)
+        self._executions.add(rest)
+        dispatch_at = _joined(self._dispatch_at, began_at)
+        end_at = _joined(self._end_at, rest_at)
+        complete_at = _joined(self._complete_at, none)
+        seen = _joined(self._seen, none)
+        self._last_seen = int(seen.max(initial=0))
+        table = self._executions.table()
+        more, more_at, more_seen = self._completions(table, dispatch_at, complete_at, seen)
+        _pieces(table, end_at)
+        if len(more):
+            del table       # which is in the memory that grows
+            self._executions.add(more)
+            table = self._executions.table()
+            complete_at = np.concatenate([complete_at, more_at])
+            seen = np.concatenate([seen, more_seen])
+        return table, complete_at, seen
+
+    def _by_thread(self) -> tuple[Table, Ints, Ints]:
+        """Return executions whose events do not stand together, and where begins and ends are."""
+        found = [self._kind(kind).joined() for kind in (_DISPATCH, _START, _END)]
+        dispatch = found[0][0]
+        if dispatch is None:
+            self._left_out(_END, 'of an execution that was not dispatched',
+                           np.ones(len(found[2][1]), dtype=np.bool_))
+            none = np.empty(0, dtype=np.int64)
+            return rows(EXECUTIONS), none, none
+        line = _Line([each for each, _ in found], [at for _, at in found])
+        is_dispatch, is_end = line.kind == 0, line.kind == 2
+        before = line.before(is_dispatch | is_end)
+        runs = (before >= 0) & is_dispatch[before]
+        same = runs & (line.callback == line.callback[before])
+        started = line.latest((line.kind == 1) & same)
+        ended = np.flatnonzero(is_end & same)
+        self._left_out(_END, 'of an execution that was not dispatched', is_end & ~same)
+        by = before[ended]
+        start, last = line.time[by], started[ended]
+        start = np.where(last > by, line.time[np.maximum(last, 0)], start)
+        of = dispatch[line.row[by]]
+        table = self._rows(of, start, line.time[ended])
+        open_ones = np.ones(len(dispatch), dtype=np.bool_)
+        open_ones[line.row[by]] = False
+        still = dispatch[open_ones]
+        running = self._rows(still, still['timestamp'], UNKNOWN)
+        running['busy'] = UNKNOWN
+        still_at = found[0][1][open_ones]
+        return (np.concatenate([table, running]),
+                np.concatenate([line.place[by], still_at]),
+                np.concatenate([line.place[ended], still_at]))
+
+    def _completions(
+        self, table: Table, dispatch_at: Ints, complete_at: Ints, seen: Ints
+    ) -> tuple[Table, Ints, Ints]:
+        """Give executions the completions that do not follow them; return those of none."""
+        complete, at = self._kind(_COMPLETE).joined()
+        if complete is None:
+            return rows(EXECUTIONS), at, at
+        ended = np.flatnonzero((table['end'] >= 0) & (complete_at < 0))
+        # the execution that was dispatched last in the thread
+        thread = np.r_[table['thread'][ended], complete['vtid'].astype(np.int64)]
+        place = np.r_[dispatch_at[ended], at]
+        order = sort_by(thread, place)
+        which = np.where(order < len(ended), order, -1)
+        last = np.maximum.accumulate(np.where(which >= 0, np.arange(len(order)), -1))
+        of = np.full(len(complete), -1)
+        is_complete = order >= len(ended)
+        same = (last >= 0) & is_complete
+        same[same] = thread[order[last[same]]] == thread[order[same]]
+        of[order[same] - len(ended)] = ended[order[last[same]]]
+        dag, vertex = self._numbering.of(complete['dag'], complete['vertex'])
+        good = (of >= 0) & (dag >= 0)
+        for column, values in (('dag', dag), ('vertex', vertex), ('job', complete['job'])):
+            good[good] = table[column][of[good]] == values[good]
+        # one execution may complete several legs, one after the other
+        mine = np.flatnonzero(good)
+        mine = mine[np.argsort(of[mine], kind='stable')]
+        begins, until = groups(of[mine])
+        taken = np.zeros(len(complete), dtype=np.bool_)
+        if len(mine):
+            row, last_leg = of[mine[begins]], mine[until - 1]
+            changed = pick(table, row)
+            self._complete(changed, complete[last_leg])
+            legs = np.add.reduceat(1 << np.clip(complete['leg'][mine], 0, 62).astype(np.int64),
+                                   begins)
+            n_legs = np.array(self._numbering.n_legs)[changed['vertex']]
+            every = (until - begins > 1) & (until - begins == n_legs) & (
+                legs == (1 << np.minimum(n_legs, 62)) - 1)
+            changed['leg'][every] = ALL_LEGS
+            table[row] = changed
+            complete_at[row], seen[row] = at[last_leg], complete['timestamp'][last_leg]
+            taken[last_leg] = True
+            taken[mine] |= np.repeat(every, until - begins)
+        rest = np.flatnonzero(~taken)
+        known = dag[rest] >= 0
+        if not known.all():
+            self._strange[f'{_COMPLETE} of a vertex that is not declared'] += int((~known).sum())
+            rest = rest[known]
+        more = rows(
+            EXECUTIONS, len(rest), callback=complete['callback'][rest], dag=dag[rest],
+            vertex=vertex[rest], job=complete['job'][rest], thread=complete['vtid'][rest],
+            worker=UNKNOWN, ready=UNKNOWN, began=UNKNOWN, start=UNKNOWN,
+            end=complete['completed'][rest], busy=UNKNOWN, message=UNKNOWN)
+        self._complete(more, complete[rest])
+        return more, at[rest], complete['timestamp'][rest].astype(np.int64)
+
+    def _publications(self, executions: Table) -> Table:
+        published, _ = self._kind(_PUBLISH).joined()
+        if published is None:
+            return rows(PUBLICATIONS)
+        time = published['timestamp'].astype(np.int64)
+        order = np.argsort(time, kind='stable')
+        published, time = published[order], time[order]
+        by = running_at(executions, published['vtid'].astype(np.int64), time)
+        return rows(
+            PUBLICATIONS, len(published), publisher=published['publisher_handle'].view(np.int64)
+            if published['publisher_handle'].dtype == np.uint64 else published['publisher_handle'],
+            execution=by, time=time, source_timestamp=UNKNOWN,
+            vertex=np.where(by >= 0, executions['vertex'][by], UNKNOWN))
+
+    def _releases(self, released: Table | None, at: Ints) -> tuple[Table, Ints]:
+        if released is None:
+            return rows(RELEASES), at
+        order = sort_by(released['timestamp'], at)
+        released, at = released[order], at[order]
+        good = (released['dag'] >= 0) & (released['dag'] < len(self._task_set.dags))
+        self._left_out(_RELEASE, 'of a DAG that is not declared', ~good)
+        again = np.zeros(len(released), dtype=np.bool_)
+        for dag in range(len(self._task_set.dags)):
+            mine = np.flatnonzero(good & (released['dag'] == dag))
+            newest = np.maximum.accumulate(np.r_[-1, released['job'][mine]])
+            again[mine] = released['job'][mine] <= newest[:-1]
+        self._left_out(_RELEASE, 'of a job that is not newer than the last', again)
+        good &= ~again
+        released, at = released[good], at[good]
+        release, noticed = released['release'], released['timestamp']
+        to_come = (release < 0) | (release > noticed)
+        self._left_out(_RELEASE, 'of a release that is still to come', to_come)
+        return rows(
+            RELEASES, len(released), dag=released['dag'], job=released['job'],
+            release=np.where(to_come, noticed, release), noticed=noticed), at
+
+    def _left_out(self, name: str, why: str, which: Mask) -> None:
+        count = int(which.sum())
+        if count:
+            self._strange[f'{name} {why}'] += count
+
+    def _job_ends(self) -> tuple[Table, Ints]:
+        tables, places = [rows(JOB_ENDS)], [np.empty(0, dtype=np.int64)]
+        for kind, reason in _JOB_ENDS.items():
+            found, at = self._kind(kind).joined()
+            if found is None:
+                continue
+            good = (found['dag'] >= 0) & (found['dag'] < len(self._task_set.dags))
+            self._left_out(kind, 'of a DAG that is not declared', ~good)
+            vertex = np.full(len(found), UNKNOWN)
+            if kind == _FAIL:
+                vertex = self._numbering.of(found['dag'], found['vertex'])[1]
+                good &= vertex >= 0
+            tables.append(rows(
+                JOB_ENDS, int(good.sum()), dag=found['dag'][good], vertex=vertex[good],
+                job=found['job'][good], time=found['timestamp'][good], reason=reason))
+            places.append(at[good])
+        return np.concatenate(tables), np.concatenate(places)
+
+    def _misses(self) -> Table:
+        found, at = self._kind(_DEADLINE).joined()
+        if found is None:
+            return rows(MISSES)
+        dag, vertex = self._numbering.of(found['dag'], found['vertex'])
+        return rows(MISSES, len(found), dag=dag, vertex=vertex, job=found['job'],
+                    deadline=found['deadline'], completed=found['completed'])
+
+    def _set_end(self, found: Recording) -> None:
+        """Find out when the run ended, and take in the events that come singly."""
+        last = 0
+        for kind in _CORE:
+            each, _ = self._kind(kind).joined() if kind != _COMPLETE else (None, None)
+            if each is not None and len(each):
+                last = max(last, int(each['timestamp'].max()))
+        last = max(last, self._last_seen)
+        left, _ = self._kind(_COMPLETE).joined()
+        if left is not None:
+            last = max(last, int(left['timestamp'].max()))
+        drops, reasons, hosted = [], dict[str, int](), []
+        for place, event in self._others:
+            if event[0] == _DROP:
+                _, now, _, _, _, dag, vertex, job, reason = event
+                number = reasons.setdefault(reason, len(reasons))
+                drops.append((self._numbering.one(dag, vertex), job, now, number))
+            elif event[0] == _HOSTED:
+                vertices = self._hosted(event)
+                if vertices is not None:
+                    hosted.append((event[1], place, event[4], vertices))
+            if event[0] in (_DROP, _HOSTED):
+                last = max(last, event[1])
+        vertex, job, time, reason = zip(*drops) if drops else ((), (), (), ())
+        found.drops = rows(DROPS, len(drops), vertex=vertex, job=job, time=time, reason=reason)
+        found.drop_reasons = tuple(reasons)
+        judging, judging_at = self._kind(_JUDGE_FROM).joined()
+        changes = []
+        if judging is not None:
+            last = max(last, int(judging['timestamp'].max()))
+            for now, release, place in zip(*(each.tolist() for each in (
+                    judging['timestamp'], judging['release'], judging_at))):
+                if 0 <= release <= NEVER:
+                    changes.append((now, place, release))
+                else:
+                    self._strange[f'{_JUDGE_FROM} an impossible time'] += 1
+        self._changes, self._hosting = sorted(changes), sorted(hosted, key=lambda h: h[:2])
+        last = min(last, NEVER - 1)     # a run that never ends cannot be rescheduled
+        found.end = found.judged_until = last
+        self._shutdown_at: tuple[int, int] | None = None
+        shutdown, shutdown_at = self._kind(_SHUTDOWN).joined()
+        if shutdown is not None:
+            now, judged = int(shutdown['timestamp'][0]), int(shutdown['end'][0])
+            if last <= now < NEVER and 0 <= judged <= now:
+                found.end, found.judged_until, found.shut_down = now, judged, True
+                self._shutdown_at = now, int(shutdown_at[0])
+            else:
+                self._strange[f'{_SHUTDOWN} at an impossible time'] += 1
+        if found.end == 0:
+            found.end = found.judged_until = min(max(0, self._head.time), NEVER - 1)
+
+    def _hosted(self, event: Event) -> frozenset[int] | None:
+        dag, text = event[4:6]
+        words = text.split(',') if text else []
+        found = [self._numbering.one(dag, int(word)) if word.isascii() and word.isdigit() else -1
+                 for word in words]
+        if not 0 <= dag < len(self._task_set.dags) or -1 in found:
+            self._strange[f'{_HOSTED} of a vertex that is not declared'] += 1
+            return None
+        return frozenset(found)
+
+    def _put_in_order(
+        self, found: Recording, core: list[tuple[Table, Any, Ints]], seen: Ints,
+        complete_at: Ints,
+    ) -> None:
+        """Give what the core saw its places in the order (rule 7)."""
+        done = np.flatnonzero(complete_at >= 0)
+        single = [(time, place) for time, place, *_ in (*self._changes, *self._hosting)]
+        if self._shutdown_at is not None:
+            single.append(self._shutdown_at)
+        times = np.concatenate([
+            seen[done], *(each for _, each, _ in core),
+            np.array([time for time, _ in single], dtype=np.int64)])
+        places = np.concatenate([
+            complete_at[done], *(at for _, _, at in core),
+            np.array([place for _, place in single], dtype=np.int64)])
+        rank = np.empty(len(times), dtype=np.int64)
+        in_order = sort_by(times, places)
+        rank[in_order] = np.arange(len(times))
+        self.seen_at = times[in_order]
+        found.executions['order'][done] = rank[:len(done)]
+        at = len(done)
+        for table, _, _ in core:
+            table['order'] = rank[at:at + len(table)]
+            at += len(table)
+        ranks = iter(rank[at:].tolist())
+        found.judge_from = [(next(ranks), release) for *_, release in self._changes]
+        found.hosted = [(next(ranks), dag, vertices) for *_, dag, vertices in self._hosting]
+        if self._shutdown_at is not None:
+            found.judged_order = next(ranks)
+
+    def doubts(self) -> list[str]:
+        """Return what is wrong with the trace, one line each."""
+        name, path = self._name, self._reader.path
+        lines = [renamed(text, path, name) for text in self._reader.warnings]
+        if self._strange:
+            what, n = min(self._strange.items(), key=lambda item: (-item[1], item[0]))
+            lines.append(
+                f'{name}: left out: {counted(sum(self._strange.values()), "event")} that make no '
+                f'sense, most often ({n}) {what}')
+        return lines
+
+
+def _joined(parts: list[Ints], last: Ints) -> Ints:
+    """Return parts in one piece; they are taken out of their list."""
+    found: Ints = np.concatenate([*parts, last])
+    parts.clear()
+    return found
+
+
+class _Numbering:
+    """Turns a DAG and the place of a vertex in it to the vertex's number over all DAGs."""
+
+    def __init__(self, task_set: TaskSet) -> None:
+        self._sizes = np.array([*(len(dag.vertices) for dag in task_set.dags), 0])
+        self._first = np.r_[0, np.cumsum(self._sizes)[:-1]]
+        #: By vertex how many legs it has.
+        self.n_legs = [max(1, len(legs_of(vertex, dag.vertices)))
+                       for dag in task_set.dags for vertex in dag.vertices] + [1]
+
+    def of(self, dag: Any, vertex: Any) -> tuple[Ints, Ints]:
+        """Return DAGs and vertices, -1 where there is no such vertex."""
+        known = (dag >= 0) & (dag < len(self._sizes) - 1)
+        at = np.where(known, dag, -1)
+        known &= (vertex >= 0) & (vertex < self._sizes[at])
+        return np.where(known, dag, -1), np.where(known, self._first[at] + vertex, -1)
+
+    def one(self, dag: int, vertex: int) -> int:
+        """Return a vertex, -1 where there is none."""
+        if not 0 <= dag < len(self._sizes) - 1 or not 0 <= vertex < self._sizes[dag]:
+            return -1
+        return int(self._first[dag]) + vertex
+
+
+class _Line:
+    """Events of threads, thread by thread and in the order of the file."""
+
+    def __init__(self, tables: list[Table | None], places: list[Ints]) -> None:
+        parts = [(number, table, at) for number, (table, at) in enumerate(zip(tables, places))
+                 if table is not None]
+        thread = np.concatenate([table['vtid'].astype(np.int64) for _, table, _ in parts])
+        place = np.concatenate([at for *_, at in parts])
+        order = sort_by(thread, place)
+        self.thread, self.place = thread[order], place[order]
+        self.kind = np.concatenate([
+            np.full(len(table), number) for number, table, _ in parts])[order]
+        self.row = np.concatenate([np.arange(len(table)) for _, table, _ in parts])[order]
+        self.time = np.concatenate([table['timestamp'] for _, table, _ in parts])[order]
+        self.callback = np.concatenate([table['callback'] for _, table, _ in parts])[order]
+        self._numbers = np.arange(len(order))
+        begins = np.r_[True, self.thread[1:] != self.thread[:-1]]
+        self._begin = np.maximum.accumulate(np.where(begins, self._numbers, 0))
+
+    def latest(self, which: Mask) -> Ints:
+        """Return by event the last one so far of its thread that is one of these, or -1."""
+        found = np.maximum.accumulate(np.where(which, self._numbers, -1))
+        return np.where(found >= self._begin, found, -1)
+
+    def before(self, which: Mask) -> Ints:
+        """Return the same of those before the event."""
+        found = np.r_[-1, np.maximum.accumulate(np.where(which, self._numbers, -1))[:-1]]
+        return np.where(found >= self._begin, found, -1)
+
+
+def _pieces(table: Table, end_at: Ints) -> None:
+    """
+    Count the pieces of executions that were suspended (rule 5).
+
+    :param end_at: where their ends stand in the file.
+    """
+    suspended = (table['completes'] == NOTHING) & (table['vertex'] >= 0)
+    undeclared = table['vertex'] < 0
+    if suspended.any():
+        mine = np.flatnonzero(table['vertex'] >= 0)
+        keys = _hashed(table['vertex'][mine], table['job'][mine], table['ready'][mine])
+        some = np.unique(_hashed(*(table[name][suspended] for name in ('vertex', 'job', 'ready'))))
+        _number_pieces(table, mine[np.isin(keys, some)], 'job', end_at)
+    if undeclared.any():
+        _number_pieces(table, np.flatnonzero(undeclared), 'callback', end_at)
+
+
+def _hashed(vertex: Any, job: Any, ready: Any) -> Ints:
+    found: Ints = (vertex.astype(np.int64) * 31 + job) * 0x9E3779B97F4A7C1 + ready
+    return found
+
+
+def _number_pieces(table: Table, mine: Ints, of: str, end_at: Ints) -> None:
+    """Count pieces among some rows; those of one agree in vertex, readiness and a column."""
+    columns = [table[name][mine] for name in (of, 'vertex', 'ready')]
+    order = sort_by(*columns, end_at[mine])
+    mine = mine[order]
+    same = np.zeros(len(mine), dtype=np.bool_)
+    same[1:] = table['completes'][mine[:-1]] == NOTHING
+    for column in columns:
+        values = column[order]
+        same[1:] &= values[1:] == values[:-1]
+    if not same.any():
+        return
+    begin = np.maximum.accumulate(np.where(same, 0, np.arange(len(mine))))
+    table['piece'][mine] = np.arange(len(mine)) - begin
+    table['began'][mine] = table['start'][mine[begin]]
+    total = np.cumsum(table['busy'][mine])
+    ended = table['end'][mine] >= 0     # what runs is the last piece
+    table['busy'][mine[ended]] = (total - total[begin] + table['busy'][mine[begin]])[ended]
+
+
+def running_at(executions: Table, thread: Ints, time: Ints) -> Ints:
+    """
+    Return the rows of the executions that ran in threads at some times, -1 where none did.
+
+    :param time: ascending.
+    """
+    found = np.full(len(time), UNKNOWN)
+    ran = np.flatnonzero((executions['end'] >= 0) & (executions['start'] >= 0))
+    threads = executions['thread'][ran]
+    for number in np.unique(thread).tolist():
+        asked = np.flatnonzero(thread == number)
+        mine = ran[threads == number]
+        if not len(mine):
+            continue
+        start, end = executions['start'][mine], executions['end'][mine]
+        order = sort_by(start, -end)
+        mine, start, end = mine[order], start[order], end[order]
+        at = np.searchsorted(start, time[asked], 'right') - 1
+        # what ran inside another may have ended before
+        for _ in range(32):
+            outer = (at >= 0) & (end[np.maximum(at, 0)] < time[asked])
+            if not outer.any():
+                break
+            at[outer] -= 1
+        good = (at >= 0) & (end[np.maximum(at, 0)] >= time[asked])
+        found[asked[good]] = mine[at[good]]
+    return found
+
+
+def _one_row(event: Event) -> Table:
+    """Return an event as a table of one row."""
+    from mddag_executor.trace.schema import EVENTS, PREAMBLE
+    names = [name for name, _ in PREAMBLE] + [name for name, _ in EVENTS[event[0]].fields]
+    table = np.empty(1, dtype=[(name, 'i8') for name in names])
+    for name, value in zip(names, event[1:]):
+        table[name] = value - 2 ** 64 if value >= 2 ** 63 else value
+    return table

@@ -1,0 +1,325 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A recording: tables with named columns, and who is who.
+
+Theory of operation
+-------------------
+1. A recording of any kind is the same few numpy structured arrays.  A source (``own``,
+   ``collected``, …) builds them once; an analysis is a function of them and never learns which
+   source they come from.
+2. Times are int64 nanoseconds on the clock of the recording.  ``UNKNOWN`` (-1) is a time or number
+   that is not recorded.
+3. DAGs and vertices are those of ``Recording.task_set``.  A vertex is numbered over all DAGs; -1
+   is a callback that no DAG declares.  ``mapping.judged_by`` returns the same recording in terms
+   of another task set.
+4. A row of ``executions`` is one run of a callback on a thread.  A coroutine that was suspended
+   has several rows: ``piece`` counts them, ``began`` is the start of the first, ``busy`` the time
+   of all rows so far.  The row that completes a vertex therefore has the values of the whole
+   execution.
+5. ``leg`` is which message of a sync callback the execution was for, ``ALL_LEGS`` if one execution
+   stands for all.  ``completes`` says whether it ended a leg or made the vertex whole.
+6. ``order`` is the place in the sequence in which the executor's core learned of releases,
+   completions and ends of jobs.  It breaks ties between equal times.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from mddag_executor.recording.entities import Entities
+    from mddag_executor.recording.head import Head
+    from msg_graph import Process, TaskSet
+
+Table = npt.NDArray[Any]
+Ints = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+UNKNOWN = -1
+"""A time or number that is not recorded."""
+ALL_LEGS = -1
+"""One execution for all legs of a sync callback."""
+
+# What an execution completes.
+NOTHING, LEG, VERTEX = range(3)
+
+EXPIRED, ABORTED, FAILED, WITHDRAWN = range(4)
+REASONS = ('expired', 'aborted', 'failed', 'withdrawn')
+"""Why a job ended: names of the values of ``job_ends['reason']``."""
+
+
+def _table(**columns: str) -> np.dtype[Any]:
+    return np.dtype(list(columns.items()))
+
+
+RELEASES = _table(
+    process='i2', dag='i4', job='i8', release='i8', noticed='i8', order='i8')
+EXECUTIONS = _table(
+    process='i2', callback='i8', dag='i2', vertex='i4', job='i8', leg='i2', piece='i4',
+    thread='i4', worker='i2', ready='i8', began='i8', start='i8', end='i8', busy='i8', cpu='i8',
+    holds_gil='?', completes='i1', message='i4', order='i4')
+PUBLICATIONS = _table(
+    process='i2', publisher='i8', execution='i8', vertex='i4', time='i8', source_timestamp='i8')
+TAKES = _table(execution='i8', message='i8', time='i8')
+JOB_ENDS = _table(
+    process='i2', dag='i4', vertex='i4', job='i8', time='i8', reason='i1', order='i8')
+DROPS = _table(process='i2', vertex='i4', job='i8', time='i8', reason='i2')
+MISSES = _table(dag='i4', vertex='i4', job='i8', deadline='i8', completed='i8')
+STOPS = _table(process='i2', start='i8', end='i8')
+
+TABLES = {
+    'releases': RELEASES, 'executions': EXECUTIONS, 'publications': PUBLICATIONS,
+    'job_ends': JOB_ENDS, 'stops': STOPS, 'takes': TAKES, 'drops': DROPS, 'misses': MISSES}
+"""The tables of a recording with the types of their columns."""
+
+
+def rows(kind: np.dtype[Any], length: int = 0, **columns: Any) -> Table:
+    """Return a table of a type: the given columns, 0 in the others."""
+    table = np.zeros(length, dtype=kind)
+    for name, values in columns.items():
+        table[name] = values
+    return table
+
+
+def pick(table: Table, which: Any) -> Table:
+    """Return some rows; numpy itself copies them column by column, which is slow."""
+    plain = table.view(f'V{table.dtype.itemsize}')
+    found: Table = plain[which].view(table.dtype)
+    return found
+
+
+class Growing:
+    """A table that grows by many rows at a time, in one piece of memory."""
+
+    def __init__(self, kind: np.dtype[Any]) -> None:
+        self._rows = np.empty(0, dtype=f'V{kind.itemsize}')
+        self._kind = kind
+        self._count = 0
+
+    def add(self, table: Table) -> None:
+        """Add rows."""
+        count = self._count + len(table)
+        if count > len(self._rows):
+            self._rows.resize(max(count, 1024, len(self._rows) * 5 // 4), refcheck=False)
+        self._rows[self._count:count] = table.view(self._rows.dtype)
+        self._count = count
+
+    def table(self) -> Table:
+        """Return the table; no more rows are to come."""
+        self._rows.resize(self._count, refcheck=False)
+        found: Table = self._rows.view(self._kind)
+        return found
+
+
+class Rows:
+    """
+    Rows of a table while it grows.
+
+    :param names: of the columns that are filled, in the order of the values of ``add``.
+    """
+
+    def __init__(self, kind: np.dtype[Any], *names: str) -> None:
+        self._kind, self._names = kind, names
+        self.columns = {name: array('q') for name in names}
+        self._add = [column.append for column in self.columns.values()]
+
+    def __len__(self) -> int:
+        """Return how many rows there are."""
+        return len(self.columns[self._names[0]])
+
+    def add(self, *values: int) -> int:
+        """Add a row; return its number."""
+        for append, value in zip(self._add, values):
+            append(value)
+        return len(self) - 1
+
+    def table(self) -> Table:
+        """Return the table."""
+        return rows(self._kind, len(self), **{
+            name: np.frombuffer(column, dtype=np.int64)
+            for name, column in self.columns.items()})
+
+
+@dataclass
+class Recording:
+    """
+    A recording in memory.
+
+    :ivar name: what messages call it.
+    :ivar head: with what it was recorded: policy, workers, …
+    :ivar task_set: what DAGs and vertices are numbered by.
+    :ivar recorded_set: the DAG tasks that it was recorded with.
+    :ivar declared: whether the recording itself has a declaration.
+    :ivar imported: whether another executor ran it.
+    :ivar same: whether ``task_set`` is what the recorded run itself was judged by.
+    :ivar start: the first release, or when the first execution became ready, ns; None: neither.
+    :ivar end: the end of the run, ns.
+    :ivar judged_until: when the run was judged, ns: what was open then and past its deadline has
+        missed it.
+    :ivar judge_from: from which place in the order on which releases are judged.
+    :ivar judged_releases: from when on releases are judged, and until when, ns; None: all are.
+    :ivar hosted: from which place in the order on which vertices of a DAG the process has.
+    :ivar drop_reasons: names of the values of ``drops['reason']``.
+    :ivar lost: events that the recorder or tracer lost.
+    :ivar notices_stops: from this time on stops are recorded, ns; None: they are not.
+    :ivar processes: how many processes it is of, each with ``workers_each`` workers.
+    :ivar placed: which nodes ran in which process; empty: all in one.
+    :ivar worker_names: what workers are called, where that is more than a number.
+    :ivar links: whether ``message`` says which publication started an execution; else the job
+        does.
+    :ivar callback_vertex: by callback a vertex of the declared callback that it is, for executions
+        that belong to no job.
+    :ivar unjudged: by DAG how many jobs were withdrawn; None: not known of this source.
+    :ivar warnings: what is missing or doubtful, one line each.
+    """
+
+    name: str
+    head: Head
+    task_set: TaskSet
+    recorded_set: TaskSet
+    who: Entities
+    declared: bool = True
+    imported: bool = False
+    same: bool = True
+    releases: Table = field(default_factory=lambda: rows(RELEASES))
+    executions: Table = field(default_factory=lambda: rows(EXECUTIONS))
+    publications: Table = field(default_factory=lambda: rows(PUBLICATIONS))
+    job_ends: Table = field(default_factory=lambda: rows(JOB_ENDS))
+    stops: Table = field(default_factory=lambda: rows(STOPS))
+    takes: Table = field(default_factory=lambda: rows(TAKES))
+    drops: Table = field(default_factory=lambda: rows(DROPS))
+    misses: Table = field(default_factory=lambda: rows(MISSES))
+    start: int | None = None
+    end: int = 0
+    shut_down: bool = False
+    judged: bool = True
+    judged_until: int = 0
+    judged_order: int = 2 ** 62 - 1
+    judge_from: Sequence[tuple[int, int]] = ()
+    judged_releases: tuple[int, int] | None = None
+    hosted: Sequence[tuple[int, int, frozenset[int]]] = ()
+    drop_reasons: Sequence[str] = ()
+    lost: int = 0
+    notices_stops: int | None = None
+    processes: int = 1
+    workers_each: int = 0
+    placed: Sequence[Process] = ()
+    worker_names: Sequence[str] = ()
+    links: bool = False
+    callback_vertex: dict[int, int] = field(default_factory=dict)
+    unjudged: dict[int, int] | None = None
+    warnings: list[str] = field(default_factory=list)
+    _keys: dict[int, str] | None = field(default=None, init=False, repr=False)
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Return how many executions were dropped for which reason."""
+        counts = np.bincount(self.drops['reason'], minlength=len(self.drop_reasons))
+        return Counter({
+            name: n for name, n in zip(self.drop_reasons, counts.tolist()) if n})
+
+    def callback_name(self, number: int) -> str:
+        """Return what a callback is called: as declared, or by its node and what starts it."""
+        if self._keys is None:
+            table, keys = self.executions, dict[int, str]()
+            declared = table[table['vertex'] >= 0]
+            numbers, first = np.unique(declared['callback'], return_index=True)
+            for each, vertex in zip(numbers.tolist(), declared['vertex'][first].tolist()):
+                keys[each] = self.task_set.vertices[vertex].callback.key
+            self._keys = keys
+        return self._keys.get(number) or self.who.name(number)
+
+    def cut(self, begin: int, end: int) -> Recording:
+        """
+        Return what happened in a range of time; see ``recording.cut``.
+
+        :param begin: of the range, ns after the start of the recording; ``end``: likewise.
+        :raises ValueError: when the range is empty or begins before the recording.
+        """
+        from mddag_executor.recording.cut import cut
+        return cut(self, begin, end)
+
+    def to_arrow(self, name: str) -> Any:
+        """Return one of ``TABLES`` as an Arrow table, with names in place of numbers."""
+        from mddag_executor.recording.frames import arrow_table
+        return arrow_table(self, name)
+
+    def to_pandas(self, name: str) -> Any:
+        """Return one of ``TABLES`` as a pandas data frame, with names in place of numbers."""
+        from mddag_executor.recording.frames import pandas_frame
+        return pandas_frame(self, name)
+
+
+class JobNumbers:
+    """
+    Numbers jobs over all DAGs; the last number is for what belongs to none.
+
+    :param released: the releases of the jobs.
+    """
+
+    def __init__(self, released: Table) -> None:
+        self._released = released
+        self._numbers = np.unique(released['job'])
+        self._dags = int(released['dag'].max(initial=-1)) + 1
+        self.none = self._dags * len(self._numbers)
+
+    def of(self, table: Table) -> Ints:
+        """Return the numbers of the jobs that rows belong to."""
+        if not self.none:
+            return np.zeros(len(table), dtype=np.int64)
+        dag = table['dag'].astype(np.int64)
+        at = np.minimum(
+            np.searchsorted(self._numbers, table['job']), len(self._numbers) - 1)
+        known = (dag >= 0) & (dag < self._dags) & (self._numbers[at] == table['job'])
+        return np.where(known, dag * len(self._numbers) + at, self.none)
+
+    def marked(self, which: Mask) -> Mask:
+        """Return by number whether it is a job of some of the releases."""
+        found = np.zeros(self.none + 1, dtype=np.bool_)
+        found[self.of(self._released)[which]] = True
+        return found
+
+
+class RowNumbers:
+    """
+    New numbers of rows of which some are left out.
+
+    :param kept: which are not.
+    """
+
+    def __init__(self, kept: Mask) -> None:
+        self._new = np.append(np.where(kept, np.cumsum(kept) - 1, UNKNOWN), UNKNOWN)
+
+    def new(self, rows: Any) -> Ints:
+        """Return the new numbers, ``UNKNOWN`` for rows that are left out or not known."""
+        found: Ints = self._new[rows]
+        return found
+
+    def has(self, rows: Any) -> Mask:
+        """Return which rows are kept."""
+        kept: Mask = self._new[rows] >= 0
+        return kept
+
+
+def sort_by(*columns: Any) -> Ints:
+    """Return the stable order of rows by several columns, the first one first."""
+    order: Ints = np.lexsort(columns[::-1]) if len(columns) > 1 \
+        else np.argsort(columns[0], kind='stable')
+    return order
+
+
+def groups(values: Any) -> tuple[Ints, Ints]:
+    """Return where each run of equal values begins in a sorted column, and where it ends."""
+    if not len(values):
+        none = np.empty(0, dtype=np.int64)
+        return none, none
+    begins = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
+    return begins, np.r_[begins[1:], len(values)]

@@ -1,0 +1,469 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The verdicts of a recording, computed from its tables.
+
+Theory of operation
+-------------------
+The rules are those of the scheduler core (``core.rules``, 1, 2, 6, 8 and 10), for all jobs at
+once; ``test/replay/test_deadlines.py`` holds the two against each other.
+
+1. A vertex has completed with the completion that made the last of its legs whole.
+2. A job ends when all its sinks have completed, or before that when it expired, was aborted or
+   failed as recorded.  What completes afterwards does not count.
+3. A sink that completed by its absolute deadline is in time, after it late.  If the job ended
+   before, the sink has the verdict of that end.  If the run ended past the deadline, the sink
+   is overdue.
+4. Jobs that are released before ``judge_from``, as it was at the time of the verdict, or outside
+   of ``judged_releases`` are not judged.
+5. Which vertices a process expects (``hosted``) holds for the jobs that are released afterwards.
+
+The misses that the executor recorded must be the ones found here; if they are not, the recording
+lacks something or this program is wrong, and ``Judged.differences`` says so.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, cast, NamedTuple
+
+from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core.state import (
+    ABORTED,
+    COMPLETED,
+    ELSEWHERE,
+    EXPIRED,
+    FAILED,
+    HERE,
+    LATE,
+    LEADS_OUT,
+    SINK_ABORTED,
+    SINK_COMPLETED,
+    SINK_EXPIRED,
+    SINK_FAILED,
+    SINK_IN_TIME,
+    SINK_LATE,
+    SINK_MISSED,
+)
+from mddag_executor.recording import tables as recorded
+from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by, Table
+from mddag_executor.replay.tolerances import MissTally
+from mddag_executor.text import counted
+from msg_graph import TaskSet
+import numpy as np
+
+VERDICTS = np.dtype([
+    ('kind', 'i1'), ('dag', 'i4'), ('sink', 'i4'), ('job', 'i8'), ('release', 'i8'),
+    ('deadline', 'i8'), ('completed', 'i8'), ('until', 'i8'), ('row', 'i8'), ('order', 'i8')])
+"""
+Columns of the table of verdicts, one row for each judged job at each sink, in order.
+
+``kind`` is one of the core's decisions, ``completed`` -1 if the sink never completed, ``until``
+the completion or the time at which the job was given up, ``row`` the job's row in ``Jobs``.
+"""
+
+_ENDS = {
+    recorded.EXPIRED: (EXPIRED, SINK_EXPIRED), recorded.ABORTED: (ABORTED, SINK_ABORTED),
+    recorded.FAILED: (FAILED, SINK_FAILED)}
+
+
+class Jobs(NamedTuple):
+    """
+    The jobs of one DAG, by row, in the order of their releases.
+
+    ``done`` and ``done_order`` have for each job and vertex of the DAG the row of the execution
+    that completed it (-1: none) and its place in the order.  ``ended`` is the place in the order
+    at which the job was given up.
+    """
+
+    number: Ints
+    release: Ints
+    released: Ints
+    done: Ints
+    done_order: Ints
+    ended: Ints
+
+    def rows_of(self, jobs: Any) -> Ints:
+        """Return the rows of jobs, -1 of those that are not there."""
+        return look_up(self.number, jobs)
+
+
+class Judged:
+    """
+    What came of the deadlines of a recording.
+
+    :ivar verdicts: a table of ``VERDICTS``; ``tally`` has its sums.
+    :ivar jobs: by DAG.
+    :ivar contradictions: events that contradict earlier ones.
+    """
+
+    def __init__(self, recording: Recording, skip: int = 0) -> None:
+        task_set = recording.task_set
+        self._recording, self.task_set, self.skip = recording, task_set, skip
+        self.tables = Tables.build(task_set, legs=True, groups=False)
+        self.contradictions = 0
+        self._outcomes: list[tuple[int, Ints, Ints, Mask]] = []
+        self._judging = _Judging(recording, skip)
+        ends = _split(recording.job_ends, recording.job_ends['dag'], len(task_set.dags))
+        releases = _split(recording.releases, recording.releases['dag'], len(task_set.dags))
+        executions = recording.executions
+        completing = np.flatnonzero(
+            (executions['completes'] != recorded.NOTHING) & (executions['vertex'] >= 0))
+        completing = completing[sort_by(executions['order'][completing])]
+        dag_of = executions['dag'][completing]
+        by_dag = np.split(
+            completing[np.argsort(dag_of.astype(np.int16), kind='stable')],
+            np.cumsum(np.bincount(dag_of, minlength=len(task_set.dags)))[:-1])
+        self.jobs: list[Jobs] = []
+        found: list[Table] = []
+        for dag in range(len(task_set.dags)):
+            jobs, verdicts = self._judge(dag, releases[dag], by_dag[dag], ends[dag])
+            self.jobs.append(jobs)
+            found += verdicts
+        table = np.concatenate(found) if found else np.empty(0, dtype=VERDICTS)
+        self.verdicts = table[np.argsort(table['order'], kind='stable')]
+        self.tally = self._tally()
+
+    @property
+    def judge_from(self) -> int:
+        """Return the first release that is judged."""
+        return self._judging.last
+
+    @property
+    def missed(self) -> Table:
+        """Return the verdicts that are misses."""
+        found: Table = self.verdicts[self.verdicts['kind'] != SINK_IN_TIME]
+        return found
+
+    # --- judging ---------------------------------------------------------------------------------
+
+    def _judge(
+        self, dag: int, released: Table, completing: Ints, ends: Table
+    ) -> tuple[Jobs, list[Table]]:
+        released = released[sort_by(released['order'])]
+        first, last = self.tables.first_vertex[dag:dag + 2]
+        jobs = Jobs(
+            released['job'].copy(), released['release'].copy(), released['order'].copy(),
+            np.full((len(released), last - first), -1), np.full((len(released), last - first),
+                                                                NEVER),
+            np.full(len(released), NEVER))
+        reason, when = self._given_up(jobs, ends)
+        expected = self._expected(dag, jobs)
+        duplicates = self._complete(dag, jobs, completing, expected)
+        sinks = self.tables.sinks[self.tables.first_sink[dag]:self.tables.first_sink[dag + 1]]
+        local = np.array(sinks, dtype=np.int64) - first
+        here = expected[:, local] == HERE if expected is not None else \
+            np.ones((len(released), len(local)), dtype=np.bool_)
+        order = jobs.done_order[:, local]
+        done = order < jobs.ended[:, None]
+        deadline = jobs.release[:, None] + np.array(
+            [self.tables.sink_deadline[sink] for sink in sinks], dtype=np.int64)
+        completed = np.full(done.shape, -1)
+        completed[done] = self._recording.executions['end'][jobs.done[:, local][done]]
+        late = done & (completed > deadline)
+        # when the last of what ends here was done
+        closed = np.where(here, np.where(done, order, NEVER), -1).max(axis=1, initial=-1)
+        if expected is not None:
+            inner = expected == LEADS_OUT
+            closed = np.maximum(closed, np.where(
+                inner, np.where(jobs.done_order < jobs.ended[:, None], jobs.done_order, NEVER),
+                -1).max(axis=1, initial=-1))
+        closed[closed < 0] = NEVER      # nothing ends here
+        ended = np.minimum(jobs.ended, closed)
+        judged_order, judged_until = self._recording.judged_order, self._recording.judged_until
+        open_then = (jobs.released < judged_order) & (ended > judged_order)
+        overdue = here & (order > judged_order) & open_then[:, None] & (
+            deadline <= judged_until) if self._recording.judged else np.zeros_like(done)
+        given_up = here & ~done & (jobs.ended < NEVER)[:, None] & (
+            reason != recorded.WITHDRAWN)[:, None]
+        self.contradictions += int((duplicates[0] < ended[duplicates[1]]).sum())
+        self._late_ends(jobs, ends, ended)
+        places: Any = np.indices(done.shape)
+        row, sink = places
+        verdicts = []
+        kinds = np.full(len(jobs.release), SINK_MISSED)
+        for of, (_, kind) in _ENDS.items():
+            kinds[reason == of] = kind
+        choices: tuple[tuple[Mask, Any, Any, Any], ...] = (
+                (done & here, np.where(late, SINK_LATE, SINK_IN_TIME), order, completed),
+                (given_up, np.broadcast_to(kinds[:, None], done.shape),
+                 np.broadcast_to(jobs.ended[:, None], done.shape),
+                 np.broadcast_to(when[:, None], done.shape)),
+                (overdue, np.full(done.shape, SINK_MISSED),
+                 np.full(done.shape, min(judged_order, NEVER)),
+                 np.full(done.shape, judged_until)))
+        for which, verdict, at, until in choices:
+            which = which & self._judging.is_judged(at, jobs.release[:, None])
+            if not which.any():
+                continue
+            table = np.zeros(int(which.sum()), dtype=VERDICTS)
+            table['kind'], table['dag'] = verdict[which], dag
+            table['sink'] = first + local[sink[which]]
+            table['row'] = row[which]
+            table['job'], table['release'] = (
+                each[table['row']] for each in (jobs.number, jobs.release))
+            table['deadline'], table['order'] = deadline[which], at[which]
+            table['until'] = until[which]
+            table['completed'] = np.where(
+                table['kind'] <= max(SINK_COMPLETED), completed[which], -1)
+            verdicts.append(table)
+        outcome: Ints = np.where(
+            (late & here).any(axis=1) | overdue.any(axis=1), LATE, COMPLETED)
+        for of, (end, _) in _ENDS.items():
+            outcome[(jobs.ended <= closed) & (reason == of)] = end
+        over = (ended < NEVER) & ~((jobs.ended <= closed) & (reason == recorded.WITHDRAWN))
+        self._outcomes.append((
+            dag, outcome, jobs.released,
+            over & self._judging.is_judged(ended, jobs.release)))
+        return jobs, verdicts
+
+    def _given_up(self, jobs: Jobs, ends: Table) -> tuple[Ints, Ints]:
+        """Note when jobs ended as recorded; return why, and at which time."""
+        reason, when = np.full(len(jobs.number), -1), np.full(len(jobs.number), -1)
+        ends = ends[sort_by(ends['order'])][::-1]
+        row = jobs.rows_of(ends['job'])
+        known = (row >= 0) & (ends['order'] > jobs.released[np.maximum(row, 0)]) if len(
+            jobs.number) else np.zeros(len(ends), dtype=np.bool_)
+        row, ends = row[known], ends[known]
+        # of several the first one, which is written last
+        jobs.ended[row] = ends['order']
+        reason[row], when[row] = ends['reason'], ends['time']
+        return reason, when
+
+    def _late_ends(self, jobs: Jobs, ends: Table, ended: Ints) -> None:
+        """Count ends of jobs that were not open."""
+        if not self._recording.same or not len(ends):
+            return
+        ends = ends[ends['reason'] <= recorded.ABORTED]
+        row = jobs.rows_of(ends['job'])
+        known = row >= 0
+        open_ones = np.zeros(len(ends), dtype=np.bool_)
+        at = row[known]
+        open_ones[known] = (ends['order'][known] > jobs.released[at]) & (
+            ends['order'][known] <= ended[at])
+        self.contradictions += int((~open_ones).sum())
+
+    def _expected(self, dag: int, jobs: Jobs) -> Ints | None:
+        """Return by job and vertex where it is expected; None: all of them here (rule 5)."""
+        changes = [(order, vertices) for order, of, vertices in self._recording.hosted
+                   if of == dag]
+        if not changes:
+            return None
+        first, last = self.tables.first_vertex[dag:dag + 2]
+        scheduler = Scheduler(self.tables, 1, propagate=False)
+        expected = np.full(jobs.done.shape, HERE)
+        for order, vertices in changes:
+            scheduler.expect(dag, [int(v in vertices) for v in range(first, last)])
+            expected[jobs.released > order] = scheduler.state.expected[first:last]
+        return expected
+
+    def _complete(
+        self, dag: int, jobs: Jobs, completing: Ints, expected: Ints | None
+    ) -> tuple[Ints, Ints]:
+        """
+        Fill in which executions completed which vertices (rule 1).
+
+        :return: the places in the order of completions of what had completed before, and the rows
+            of their jobs.
+        """
+        executions = self._recording.executions
+        first = self.tables.first_vertex[dag]
+        row = jobs.rows_of(executions['job'][completing])
+        order = executions['order'][completing]
+        known = row >= 0
+        if len(jobs.number):
+            known &= order > jobs.released[np.maximum(row, 0)]
+        if not known.all():
+            # of a job that was not released before; else of one that has ended
+            newest = np.maximum.accumulate(np.r_[-1, jobs.number])
+            before = newest[np.searchsorted(jobs.released, order)]
+            self.contradictions += int(
+                (~known & (executions['job'][completing] > before)).sum())
+            row, order, completing = row[known], order[known], completing[known]
+        open_ones = order < jobs.ended[row]
+        row, order, completing = row[open_ones], order[open_ones], completing[open_ones]
+        vertex = executions['vertex'][completing] - first
+        n_legs = np.array(self.tables.n_legs[first:first + jobs.done.shape[1]])
+        single = n_legs[vertex] == 1
+        # the first completion of each, which is written last
+        places, orders = jobs.done.reshape(-1), jobs.done_order.reshape(-1)
+        cell = row * jobs.done.shape[1] + vertex
+        duplicate = np.zeros(len(cell), dtype=np.bool_)
+        mine = np.flatnonzero(single)[::-1]
+        places[cell[mine]] = completing[mine]
+        orders[cell[mine]] = order[mine]
+        duplicate[mine] = places[cell[mine]] != completing[mine]
+        if len(mine) < len(cell):
+            self._complete_legs(
+                jobs, np.flatnonzero(~single), cell, order, completing, n_legs, duplicate)
+        if expected is not None:
+            no_legs = np.array(self.tables.n_predecessors[first:first + jobs.done.shape[1]]) > 0
+            elsewhere = (expected == ELSEWHERE) & no_legs
+            jobs.done[elsewhere], jobs.done_order[elsewhere] = -1, NEVER
+        return order[duplicate], row[duplicate]
+
+    def _complete_legs(
+        self, jobs: Jobs, mine: Ints, cell: Ints, order: Ints, completing: Ints, n_legs: Ints,
+        duplicate: Mask,
+    ) -> None:
+        """Fill in which vertices of several legs have completed."""
+        leg = self._recording.executions['leg'][completing[mine]].astype(np.int64)
+        width, n = int(n_legs.max()), jobs.done.shape[1]
+        legs = n_legs[cell[mine] % n]
+        good = (leg < legs) & (leg >= recorded.ALL_LEGS)
+        mine, leg, legs = mine[good], leg[good], legs[good]
+        every = leg == recorded.ALL_LEGS
+        number = np.r_[mine[~every], np.repeat(mine[every], legs[every])]
+        at = np.r_[leg[~every], np.concatenate(
+            [np.arange(each) for each in legs[every].tolist()] or [leg[:0]])]
+        back = np.argsort(number, kind='stable')[::-1]      # in the order of completion, reversed
+        number, at = number[back], at[back]
+        done_leg = np.full((jobs.done.size, width), -1)
+        done_leg[cell[number], at] = number
+        again = done_leg[cell[number], at] != number
+        duplicate[number[again]] = True
+        cells = np.unique(cell[mine])
+        of = done_leg[cells]
+        wanted = np.arange(width) < n_legs[cells % n][:, None]
+        whole = ((of >= 0) | ~wanted).all(axis=1)
+        last = np.where(wanted, of, -1).max(axis=1)[whole]      # numbers are in order
+        jobs.done.reshape(-1)[cells[whole]] = completing[last]
+        jobs.done_order.reshape(-1)[cells[whole]] = order[last]
+
+    # --- results ---------------------------------------------------------------------------------
+
+    def _tally(self) -> MissTally:
+        tally = MissTally(self.task_set, self.tables)
+        judging = self._judging
+        for dag, outcome, released, over in self._outcomes:
+            tally.jobs[dag] = int(judging.is_judged(released, self.jobs[dag].release).sum())
+            for end, n in Counter(outcome[over].tolist()).items():
+                tally.ends[dag][end] += n
+        for v, mine in zip(self.tables.sinks, self.by_sink()):
+            sink = tally.sinks[v]
+            kinds = np.bincount(mine['kind'], minlength=SINK_FAILED + 1).tolist()
+            sink.completed = kinds[SINK_IN_TIME] + kinds[SINK_LATE]
+            sink.late, sink.overdue = kinds[SINK_LATE] + kinds[SINK_MISSED], kinds[SINK_MISSED]
+            sink.expired, sink.failed, sink.aborted = (
+                kinds[kind] for kind in (SINK_EXPIRED, SINK_FAILED, SINK_ABORTED))
+            done = mine[mine['completed'] >= 0]
+            responses = np.sort(done['completed'] - done['release'])
+            if len(responses):
+                sink.shortest, sink.longest = int(responses[0]), int(responses[-1])
+            sink.responses = cast(Any, memoryview(responses))
+            missed = mine[mine['kind'] != SINK_IN_TIME]
+            tally.missed_jobs[v] = array('q', missed['job'].tobytes())
+        missed = self.missed
+        if len(missed):
+            first = missed[0]
+            if first['kind'] == SINK_MISSED:
+                overdue = missed[missed['kind'] == SINK_MISSED]
+                first = overdue[overdue['deadline'].argmin()]
+            tally.first_miss = {
+                'dag': self.task_set.dags[int(first['dag'])].name,
+                'vertex': tally.vertex_name(int(first['sink'])), 'job': int(first['job']),
+                'deadline_ns': int(first['deadline']),
+                'completed_ns': int(first['completed']) if first['kind'] == SINK_LATE else None}
+        return tally
+
+    def by_sink(self) -> Iterator[Table]:
+        """Yield the verdicts of each sink, in the order of ``tables.sinks``."""
+        order = np.argsort(self.verdicts['sink'].astype(np.int32), kind='stable')
+        sinks = self.verdicts['sink'][order]
+        for v in self.tables.sinks:
+            begin, end = np.searchsorted(sinks, (v, v + 1))
+            yield self.verdicts[order[begin:end]]
+
+    def differences(self) -> str | None:
+        """
+        Return how the recorded misses differ from those found, None if they do not.
+
+        Only of use if the end of the run is recorded: elsewhere the trace may be cut between a
+        completion and its verdict.
+        """
+        if self.skip or not self._recording.same:
+            return None  # what was recorded is of all jobs
+        missed, before = self.missed, self._recording.misses
+        columns = ('dag', 'sink', 'job', 'deadline', 'completed')
+        found = Counter(zip(*(missed[name].tolist() for name in columns)))
+        told = Counter(zip(*(before[name].tolist() for name in before.dtype.names or ())))
+        if found == told:
+            return None
+        more, less = found - told, told - found
+        example = min([*more, *less], key=lambda miss: miss[3])
+        name = 'an undeclared vertex' if example[1] < 0 else self.tally.vertex_name(example[1])
+        recorded_misses = counted(len(before), 'recorded miss', 'recorded misses')
+        return (f'the replay does not find {less.total()} of {recorded_misses}, and it finds '
+                f'{more.total()} that were not recorded: the first is job {example[2]} at {name}')
+
+
+class _Judging:
+    """From which release on jobs are judged, over the course of the run (rule 4)."""
+
+    def __init__(self, recording: Recording, skip: int) -> None:
+        changes = [(-1, -NEVER)]
+        events = [(order, release + skip) for order, release in recording.judge_from]
+        releases = recording.releases
+        if skip > 0 and len(releases):
+            first = int(releases['order'].argmin())
+            order = int(releases['order'][first])
+            if all(at > order for at, _ in events):
+                changes.append((order, int(releases['release'][first]) + skip))
+        changes += events
+        self._orders = np.array([order for order, _ in changes], dtype=np.int64)
+        self._releases = np.array([release for _, release in changes], dtype=np.int64)
+        self.last = changes[-1][1]
+        self._begin, self._end = recording.judged_releases or (-NEVER, NEVER)
+
+    def is_judged(self, order: Any, release: Any) -> Mask:
+        """Return whether jobs of some releases are judged at some places in the order."""
+        in_range = (release >= self._begin) & (release < self._end)
+        if len(self._orders) == 1:
+            judged: Mask = np.broadcast_to(
+                in_range & (release >= self._releases[0]),
+                np.broadcast_shapes(order.shape, release.shape))
+            return judged
+        at = np.searchsorted(self._orders, order, 'right') - 1
+        judged = in_range & (release >= self._releases[at])
+        return judged
+
+
+def _split(table: Table, dag: Any, n_dags: int) -> list[Table]:
+    """Return the rows of each DAG."""
+    order = np.argsort(dag, kind='stable')
+    borders = np.searchsorted(dag[order], np.arange(n_dags + 1))
+    return [table[order[begin:end]] for begin, end in zip(borders, borders[1:])]
+
+
+def look_up(numbers: Ints, wanted: Any) -> Ints:
+    """Return the places of numbers, -1 of those that are not there."""
+    if not len(numbers):
+        return np.full(len(wanted), -1)
+    order = None
+    if (numbers[1:] < numbers[:-1]).any():
+        order = np.argsort(numbers, kind='stable')
+        numbers = numbers[order]
+    if numbers[-1] - numbers[0] == len(numbers) - 1:    # without a gap
+        at = wanted - numbers[0]
+        there = (wanted >= numbers[0]) & (wanted <= numbers[-1])
+    else:
+        at = np.minimum(np.searchsorted(numbers, wanted), len(numbers) - 1)
+        there = numbers[at] == wanted
+    at = np.where(there, at, 0)
+    return np.where(there, at if order is None else order[at], -1)
+
+
+def judge(recording: Recording, skip: int = 0) -> Judged:
+    """
+    Return what came of the deadlines of a recording.
+
+    :param skip: how long after the first release jobs are not judged (a warm-up), ns.
+    """
+    return Judged(recording, skip)
+
+
+def names_of(task_set: TaskSet) -> list[str]:
+    """Return the names of all vertices."""
+    return [vertex.name for vertex in task_set.vertices]

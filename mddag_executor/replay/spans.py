@@ -1,0 +1,47 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Spans of time: how long any of many lasts within another."""
+
+from __future__ import annotations
+
+from mddag_executor.recording.tables import Ints
+import numpy as np
+
+
+class Spans:
+    """
+    Spans from starts to ends, ns.
+
+    Sums of times would not fit 64 bits; so times count from the first one, and sums of them are
+    taken modulo 2**64.  What is asked for is a difference that does fit.
+    """
+
+    def __init__(self, starts: Ints, ends: Ints) -> None:
+        self._starts, self._ends = np.sort(starts), np.sort(ends)
+        self._origin = int(self._starts[0]) if len(starts) else 0
+        self._sums = [np.r_[0, np.cumsum(each - self._origin)]
+                      for each in (self._starts, self._ends)]
+
+    def within(self, begins: Ints, ends: Ints) -> Ints:
+        """Return how long they lasted within each span of time, added up, ns."""
+        found: Ints = np.maximum(0, self._before(ends) - self._before(begins))
+        return found
+
+    def _before(self, times: Ints) -> Ints:
+        total = np.zeros(len(times), dtype=np.int64)
+        near = times - self._origin
+        for sign, each, sums in zip((1, -1), (self._starts, self._ends), self._sums):
+            number = np.searchsorted(each, times, 'right')
+            total += sign * (near * number - sums[number])
+        return total
+
+
+def crowded(starts: Ints, ends: Ints, least: int) -> tuple[Ints, Ints]:
+    """Return the starts and ends of the times at which at least so many spans last."""
+    times = np.concatenate([starts, ends])
+    step = np.repeat([1, -1], len(starts))
+    order = np.lexsort((step, times))       # at one instant what ends goes first
+    times, count = times[order], np.cumsum(step[order])
+    full = count >= least
+    before = np.r_[False, full[:-1]]
+    return times[full & ~before], times[~full & before]

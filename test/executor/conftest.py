@@ -1,0 +1,106 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What the tests of the executor share: executors that spin in a thread of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import contextlib
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from mddag_executor import MultiDeadlineExecutor
+import pytest
+from rclpy.node import Node
+
+
+class Spinning:
+    """An executor that spins in a thread until it is left; keeps what spin raised."""
+
+    def __init__(self, executor: MultiDeadlineExecutor) -> None:
+        self.executor = executor
+        self.error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        try:
+            self.executor.spin()
+        except BaseException as error:
+            self.error = error
+
+    def __enter__(self) -> Spinning:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *args: object) -> None:
+        assert self.executor.shutdown(30.0)
+        self.join()
+
+    def join(self) -> None:
+        """Wait until spin has ended."""
+        self._thread.join(30.0)
+        assert not self._thread.is_alive(), 'spin did not end'
+
+
+def wait_for(condition: Callable[[], Any], seconds: float = 15.0) -> bool:
+    """Wait until something is true; return whether it became so."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.002)
+    return True
+
+
+def is_idle(executor: MultiDeadlineExecutor) -> bool:
+    """Tell whether nothing runs or waits."""
+    statistics = executor.statistics()
+    return bool(not statistics['queue'] and statistics['idle_workers'] == statistics['workers'])
+
+
+def interrupted(program: str, *arguments: str) -> tuple[int, str, str]:
+    """Run a program that prints ``ready``, then SIGINT it; return exit status, output, errors."""
+    process = subprocess.Popen(
+        [sys.executable, '-c', program, *arguments], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == 'ready\n', process.communicate()[1]
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=10)
+    finally:
+        process.kill()
+        process.wait()
+    return process.returncode, out, err
+
+
+@pytest.fixture
+def make_executor(ros_context: Any) -> Iterator[Callable[..., Any]]:
+    """Give a function that makes executors; they are shut down afterwards."""
+    with contextlib.ExitStack() as stack:
+        def make(*args: Any, **kwargs: Any) -> MultiDeadlineExecutor:
+            kwargs.setdefault('context', ros_context)
+            executor = MultiDeadlineExecutor(*args, **kwargs)
+            stack.callback(executor.shutdown, 5.0)
+            return executor
+        yield make
+
+
+@pytest.fixture
+def make_node(ros_context: Any) -> Iterator[Callable[..., Node]]:
+    """Give a function that makes nodes; they are destroyed afterwards."""
+    nodes: list[Node] = []
+
+    def make(name: str = 'node', **kwargs: Any) -> Node:
+        kwargs.setdefault('start_parameter_services', False)
+        kwargs.setdefault('enable_rosout', False)
+        nodes.append(Node(name, context=ros_context, **kwargs))
+        return nodes[-1]
+    yield make
+    for node in nodes:
+        with contextlib.suppress(Exception):
+            node.destroy_node()

@@ -1,0 +1,312 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What users have asked rclpy and rclcpp for, by issue, as far as no other test here has it.
+
+Here: turns, timers, simulated time; tasks and ends in ``test_asked_for_ends``.  Elsewhere: bounded
+queues (rclcpp#3213) and synchronous calls (rclpy#1211, #1398) in ``test_executor``, groups of
+callbacks (rclpy#850) in ``test_groups``, rates (rclpy#1126) in ``test_rates``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+import threading
+import time
+from typing import Any
+
+from builtin_interfaces.msg import Time as TimeMessage
+from mddag_executor.executor import current_job
+from msg_graph import loads
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.duration import Duration
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Header
+
+from .conftest import Spinning, wait_for
+
+MS = 1_000_000
+
+
+# --- starvation ----------------------------------------------------------------------------------
+
+
+def test_those_that_are_always_ready_do_not_starve_others(make_executor, make_node):
+    """
+    One worker, far more to do than it can, and still everybody gets his turn (rclcpp#2645).
+
+    The declared timer's key is 5 ms after its release and so smaller than that of what becomes
+    ready at the same time, 100 ms after that; but after 100 ms those are the older ones.
+    """
+    graph = loads("""
+mddag: 1
+nodes:
+  - node: /greedy
+    callbacks: [{name: tick, timer: 1ms, dag: greedy, deadline: 5ms}]
+""")
+    greedy, modest = make_node('greedy'), make_node('modest')
+    runs: Counter[str] = Counter()
+
+    def note(name: str, seconds: float = 0.0) -> Any:
+        def run(*_: Any) -> None:
+            runs[name] += 1
+            time.sleep(seconds)
+        return run
+
+    greedy.create_timer(0.001, note('greedy', 0.003))
+    group = ReentrantCallbackGroup()
+    publisher = modest.create_publisher(Header, '/topic', 10)
+    modest.create_subscription(Header, '/topic', note('message'), 10, callback_group=group)
+    modest.create_timer(0.005, lambda: publisher.publish(Header()), group)
+    modest.create_timer(0.01, note('timer'), group)
+    executor = make_executor(graph, num_workers=1)
+    executor.add_node(greedy)
+    executor.add_node(modest)
+
+    def again() -> None:  # and one that makes itself ready again and again
+        runs['task'] += 1
+        executor.create_task(again)
+
+    with Spinning(executor):
+        executor.create_task(again)
+        assert wait_for(lambda: min(runs[n] for n in (
+            'greedy', 'message', 'timer', 'task')) >= 10, 10.0), runs
+
+
+def test_all_of_one_group_get_their_turn(make_executor, make_node):
+    """Also where their callbacks exclude each other, on several workers (rclcpp#2702)."""
+    node = make_node()
+    group = MutuallyExclusiveCallbackGroup()
+    runs: Counter[int] = Counter()
+
+    def note(number: int) -> Any:
+        def run(_: Header) -> None:
+            runs[number] += 1
+            time.sleep(0.002)
+        return run
+
+    publishers = []
+    for number in range(5):
+        node.create_subscription(Header, f'/t{number}', note(number), 10, callback_group=group)
+        publishers.append(node.create_publisher(Header, f'/t{number}', 10))
+    others = ReentrantCallbackGroup()
+
+    def publish() -> None:
+        for publisher in publishers:
+            publisher.publish(Header())
+
+    node.create_timer(0.002, publish, others)
+    executor = make_executor(num_workers=3)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: min(runs[n] for n in range(5)) >= 20, 10.0), runs
+        counts = [runs[number] for number in range(5)]
+    # In the order of becoming ready: a queue that is full has its ten, like the others.
+    assert max(counts) - min(counts) <= 12
+
+
+def slow_and_quick(node: Any) -> Counter[str]:
+    """Give a node a timer that takes longer than its period, and quick callbacks."""
+    runs: Counter[str] = Counter()
+
+    def slow() -> None:
+        runs['slow'] += 1
+        time.sleep(0.01)
+
+    def quick(_: Header) -> None:
+        runs['quick'] += 1
+
+    publisher = node.create_publisher(Header, '/topic', 10)
+    node.create_subscription(Header, '/topic', quick, 10)
+    node.create_timer(0.002, slow)
+    node.create_timer(0.005, lambda: publisher.publish(Header()))
+    return runs
+
+
+def test_a_slow_timer_does_not_monopolise(make_executor, make_node):
+    """Its subscriptions run as well, though it is always due (rclcpp#2402)."""
+    node = make_node()
+    runs = slow_and_quick(node)
+    executor = make_executor(num_workers=2)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: min(runs['slow'], runs['quick']) >= 10), runs
+
+
+def test_a_slow_timer_does_not_monopolise_a_loop_of_spin_once(make_executor, make_node):
+    """One callback at a time, and none for ever the same (rclcpp#2402)."""
+    node = make_node()
+    runs = slow_and_quick(node)
+    executor = make_executor()
+    executor.add_node(node)
+
+    def ran() -> bool:
+        executor.spin_once(0.1)
+        return min(runs['slow'], runs['quick']) >= 10
+    assert wait_for(ran), runs
+
+
+# --- timers --------------------------------------------------------------------------------------
+
+
+def test_an_overrun_gives_no_burst_and_the_phase_is_kept(make_executor, make_node):
+    """Missed periods are skipped and counted, and releases stay on the grid (rclcpp#2771)."""
+    graph = loads("""
+mddag: 1
+nodes:
+  - node: /source
+    callbacks: [{name: tick, timer: 20ms, dag: alone, deadline: 20ms}]
+""")
+    node = make_node('source')
+    starts: list[float] = []
+    releases: list[int] = []
+
+    def tick() -> None:
+        job = current_job()
+        assert job is not None
+        starts.append(time.monotonic())
+        releases.append(job.release_ns)
+        if len(starts) == 3:
+            time.sleep(0.13)
+
+    node.create_timer(0.02, tick)
+    executor = make_executor(graph, num_workers=2)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(starts) >= 10)
+    # of what it missed one release may have waited, and nothing more
+    after = [b - a for a, b in zip(starts[3:], starts[4:])]
+    stops = executor.statistics()['stops']['count']  # of the machine
+    assert sum(gap < 0.002 for gap in after) <= 1 + stops, after
+    # (the first may have been due before the executor began to look after the timer)
+    for release in releases[1:]:
+        assert abs((release - releases[1] + 10 * MS) % (20 * MS) - 10 * MS) < 2 * MS, releases
+    counts = executor.statistics()['callbacks']['/source:tick']
+    assert counts['skipped'] >= 4
+    jobs = round((releases[-1] - releases[0]) / (20 * MS)) + 1
+    assert executor.statistics()['dags']['alone']['jobs'] >= jobs
+
+
+# --- simulated time ------------------------------------------------------------------------------
+
+
+class Simulation:
+    """A node with simulated time and somebody who tells it the time."""
+
+    def __init__(self, make_node: Any) -> None:
+        self.node = make_node(
+            'simulated', parameter_overrides=[Parameter('use_sim_time', value=True)])
+        self._publisher = make_node('clock').create_publisher(
+            Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+
+    def matched(self) -> bool:
+        return wait_for(lambda: self._publisher.get_subscription_count() == 1)
+
+    def set_clock(self, now: int) -> bool:
+        """Tell the time until the node has it."""
+        message = Clock(clock=TimeMessage(sec=now // 10**9, nanosec=now % 10**9))
+        clock = self.node.get_clock()
+        return any(
+            self._publisher.publish(message)
+            or wait_for(lambda: clock.now().nanoseconds == now, 0.1) for _ in range(20))
+
+
+def test_the_clock_goes_on_while_all_workers_are_busy(make_executor, make_node):
+    """As it does without simulated time (rclpy#792)."""
+    simulation = Simulation(make_node)
+    executor = make_executor()
+    executor.add_node(simulation.node)
+    gate, together = threading.Event(), threading.Barrier(8)
+
+    def busy() -> None:
+        together.wait(5.0)
+        gate.wait(10.0)
+
+    with Spinning(executor):
+        assert simulation.matched()
+        for _ in range(7):
+            executor.create_task(busy)
+        together.wait(5.0)
+        try:
+            assert simulation.set_clock(5 * 10**9)
+            assert simulation.set_clock(6 * 10**9)
+        finally:
+            gate.set()
+
+
+def test_every_worker_may_sleep_on_the_simulated_clock(make_executor, make_node, ros_context):
+    """They would wait for a clock that waits for them (rclpy#792)."""
+    simulation = Simulation(make_node)
+    node = simulation.node
+    executor = make_executor()
+    executor.add_node(node)
+    clock = node.get_clock()
+    ends: list[bool] = []
+
+    def sleep() -> None:
+        ends.append(clock.sleep_for(Duration(seconds=1), context=ros_context))
+
+    slept: list[bool] = []
+
+    def sleep_in_the_group_of_the_clock() -> None:
+        timer.cancel()
+        slept.append(clock.sleep_for(Duration(seconds=1), context=ros_context))
+
+    with Spinning(executor):
+        assert simulation.matched() and simulation.set_clock(10**9)
+        timer = node.create_timer(1e-3, sleep_in_the_group_of_the_clock)
+        for _ in range(6):
+            executor.create_task(sleep)
+        assert wait_for(lambda: len(ends) == 6 and slept or simulation.set_clock(
+            clock.now().nanoseconds + 200 * MS) and False)
+    assert ends == [True] * 6 and slept == [True]
+
+
+def test_every_worker_may_sleep_with_a_rate(make_executor, make_node):
+    """The timer that ends their sleep needs no worker (the same for ``create_rate``)."""
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+    together = threading.Barrier(7)
+    rates = [node.create_rate(100) for _ in range(7)]
+
+    def sleep(rate: Any) -> int:
+        together.wait(5.0)
+        for _ in range(3):
+            rate.sleep()
+        return 1
+
+    tasks = [executor.create_task(sleep, rate) for rate in rates]
+    with Spinning(executor):
+        done = wait_for(lambda: all(task.done() for task in tasks))
+        for rate in rates:
+            rate.destroy()
+    assert done and [task.result() for task in tasks] == [1] * 7
+
+
+def test_a_clock_that_jumps_back_does_not_stall_timers(make_executor, make_node):
+    """They go on with the clock as it is then (rclpy#1490, rclcpp#2535)."""
+    simulation = Simulation(make_node)
+    calls: list[int] = []
+    clock = simulation.node.get_clock()
+    executor = make_executor()
+    executor.add_node(simulation.node)
+
+    def run(start: int, steps: int) -> None:
+        for step in range(1, steps + 1):
+            assert simulation.set_clock(start + step * 10 * MS)
+            time.sleep(0.002)
+
+    with Spinning(executor):
+        assert simulation.matched() and simulation.set_clock(100 * 10**9)
+        simulation.node.create_timer(0.05, lambda: calls.append(clock.now().nanoseconds))
+        time.sleep(0.1)
+        run(100 * 10**9, 20)
+        assert wait_for(lambda: len(calls) >= 3)
+        for back in (50 * 10**9, 10**9):
+            before = len(calls)
+            run(back, 20)
+            assert wait_for(lambda n=before: len(calls) >= n + 3)
+            assert calls[-1] < back + 10**9

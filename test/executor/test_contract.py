@@ -1,0 +1,208 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What rclpy's executors promise: as the global executor, and several at once.
+
+The rest of their contract: nodes and entities in ``test_contract_nodes``, kinds of callbacks in
+``test_executor``; spinning, time-outs, shutdowns and what ``rclpy.spin`` raises in ``test_spin``.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+
+from mddag_executor import MultiDeadlineExecutor
+import pytest
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.task import Future
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from .conftest import interrupted, Spinning, wait_for
+
+
+def counting(node: Node, period: float = 0.005) -> list[int]:
+    """Give a node a timer; return what grows with its calls."""
+    calls: list[int] = []
+    node.create_timer(period, lambda: calls.append(threading.get_native_id()))
+    return calls
+
+
+def goes_on(calls: list[int]) -> bool:
+    before = len(calls)
+    return wait_for(lambda: len(calls) >= before + 3)
+
+
+# --- as the global executor, and as a context manager --------------------------------------------
+
+
+@pytest.fixture
+def as_global(make_executor, monkeypatch):
+    executor = make_executor()
+    monkeypatch.setattr(rclpy, '__executor', executor)
+    assert rclpy.get_global_executor() is executor
+    return executor
+
+
+def test_rclpy_spin_as_the_global_executor(as_global, make_node, ros_context):
+    """And on all workers, as with ``executor.spin()``."""
+    node, together = make_node(), threading.Barrier(3)
+    group = ReentrantCallbackGroup()
+    met: list[int] = []
+
+    def meet() -> None:
+        if not met:
+            met.append(together.wait(5.0))
+            rclpy.try_shutdown(context=ros_context)
+
+    for _ in range(3):
+        node.create_timer(0.01, meet, group)
+    rclpy.spin(node)
+    assert met and as_global.get_nodes() == []
+
+
+def test_rclpy_spin_once_as_the_global_executor(as_global, make_node):
+    node = make_node()
+    calls = counting(node)
+    for count in range(1, 4):
+        rclpy.spin_once(node, timeout_sec=5.0)
+        assert calls == [threading.get_native_id()] * count
+        assert as_global.get_nodes() == []
+    node.destroy_timer(next(iter(node.timers)))
+    begin = time.monotonic()
+    rclpy.spin_once(node, timeout_sec=0.05)
+    assert time.monotonic() - begin >= 0.05
+
+
+def test_rclpy_spin_until_future_complete_as_the_global_executor(as_global, make_node):
+    node, future = make_node(), Future()
+    node.create_timer(0.01, lambda: future.set_result('done') if not future.done() else None)
+    rclpy.spin_until_future_complete(node, future, timeout_sec=5.0)
+    assert future.result() == 'done' and as_global.get_nodes() == []
+    rclpy.spin_until_future_complete(node, Future(), timeout_sec=0.05)
+    node.create_service(Trigger, '/ask', lambda request, response: response)
+    asked = node.create_client(Trigger, '/ask')
+    assert asked.wait_for_service(5.0)
+    answer = asked.call_async(Trigger.Request())
+    rclpy.spin_until_future_complete(node, answer, timeout_sec=5.0)
+    assert answer.done()
+
+
+def test_a_with_statement_shuts_it_down(make_executor, make_node):
+    node = make_node()
+    calls = counting(node)
+    with make_executor() as executor:
+        assert isinstance(executor, MultiDeadlineExecutor)
+        executor.add_node(node)
+        executor.spin_once(5.0)
+    assert len(calls) == 1
+    executor.spin()  # which ends at once
+    executor.spin_once(5.0)
+    assert len(calls) == 1
+    with pytest.raises(RuntimeError, match='shut down'):
+        executor.add_node(make_node('late'))
+
+
+# --- several at once -----------------------------------------------------------------------------
+
+
+def test_several_executors_in_one_context(make_executor, make_node):
+    """Each runs its own nodes, they talk to each other, and one may go."""
+    executors = [make_executor(num_workers=2) for _ in range(3)]
+    nodes = [make_node(f'node_{number}') for number in range(3)]
+    calls = [counting(node) for node in nodes]
+    for executor, node in zip(executors, nodes):
+        executor.add_node(node)
+    nodes[0].create_service(
+        Trigger, '/ask', lambda request, response: response,
+        callback_group=ReentrantCallbackGroup())
+    client = nodes[1].create_client(Trigger, '/ask', callback_group=ReentrantCallbackGroup())
+    with Spinning(executors[0]), Spinning(executors[1]) as second:
+        with Spinning(executors[2]):
+            assert all(goes_on(some) for some in calls)
+            assert client.wait_for_service(5.0)
+            task = executors[1].create_task(client.call, Trigger.Request(), 5.0)
+            assert wait_for(task.done) and task.result() is not None
+        count = len(calls[2])
+        assert goes_on(calls[0]) and goes_on(calls[1])
+        assert len(calls[2]) == count
+        executors[1].add_node(nodes[2])  # it goes to another one
+        assert goes_on(calls[2])
+    assert second.error is None
+    assert not set(calls[0]) & set(calls[1])
+
+
+def test_several_contexts_in_one_process(make_executor, make_node, ros_context):
+    """One is shut down, the other goes on; what signals do is not touched."""
+    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    other = Context()
+    rclpy.init(context=other)
+    second = make_executor(context=other)
+    far = Node('far', context=other, start_parameter_services=False, enable_rosout=False)
+    near = make_node('near')
+    of_far, of_near = counting(far), counting(near)
+    first = make_executor()
+    first.add_node(near)
+    second.add_node(far)
+    heard: list[Header] = []
+    near.create_subscription(Header, '/across', heard.append, 10)
+    publisher = far.create_publisher(Header, '/across', 10)
+    with Spinning(first) as spinning:
+        ended = Spinning(second)
+        with ended:
+            assert goes_on(of_far) and goes_on(of_near)
+            assert wait_for(lambda: publisher.publish(Header()) or heard)
+            rclpy.shutdown(context=other)
+            ended.join()
+        assert isinstance(ended.error, ExternalShutdownException)
+        assert ros_context.ok() and goes_on(of_near)
+    assert spinning.error is None
+    assert handlers == (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM))
+
+
+CONTEXTS = """
+import sys, threading
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException
+from mddag_executor import MultiDeadlineExecutor
+
+def spin(name, executor):
+    try:
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException) as end:
+        ends.append((name, type(end).__name__))
+
+ends, executors, events = [], {}, []
+rclpy.init()
+other = Context()
+rclpy.init(context=other)
+for name, context in ('own', None), ('other', other):
+    node = rclpy.create_node(name, context=context)
+    executor = executors[name] = MultiDeadlineExecutor(context=context)
+    executor.add_node(node)
+    ran = threading.Event()
+    events.append(ran)
+    node.create_timer(0.01, ran.set)
+threading.Thread(target=lambda: [e.wait() for e in events] and print('ready', flush=True)).start()
+thread = threading.Thread(target=spin, args=('other', executors['other']))
+thread.start()
+spin('own', executors['own'])
+thread.join()
+print(sorted(ends))
+"""
+
+
+def test_a_signal_ends_the_executors_of_all_contexts():
+    status, out, err = interrupted(CONTEXTS)
+    assert status == 0, err
+    assert out in (
+        "[('other', 'ExternalShutdownException'), ('own', 'KeyboardInterrupt')]\n",
+        "[('other', 'ExternalShutdownException'), ('own', 'ExternalShutdownException')]\n")
+    assert 'Traceback' not in err  # a busy machine skips periods of the timers, which is logged

@@ -1,0 +1,439 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Messages between callbacks of one process: taken by who publishes, and none is lost."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.executor import publishing, work, workers
+from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.work import Work
+from msg_graph import loads
+import pytest
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
+from std_msgs.msg import Header
+
+from .conftest import is_idle, Spinning, wait_for
+
+CHAIN = """
+mddag: 1
+nodes:
+  - node: /node
+    callbacks:
+      - {name: tick, timer: 20ms, publishes: [/one]}
+      - {name: step, subscription: /one, publishes: [/two]}
+      - {name: sink, subscription: /two, deadline: 20ms}
+"""
+
+
+def in_a_thread(function: Any, *args: Any) -> None:
+    """Call something in a thread of its own, and wait for its end."""
+    thread = threading.Thread(target=function, args=args)
+    thread.start()
+    thread.join()
+
+
+def sees_all(publisher: Any, count: int = 1) -> bool:
+    return wait_for(lambda: publisher.get_subscription_count() == count)
+
+
+def test_the_publishing_thread_takes(make_executor, make_node):
+    """So it is known when ``publish`` returns, though all workers are busy."""
+    node, got, go_on = make_node(), [], threading.Event()
+    node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 10)
+    publisher = node.create_publisher(Header, '/a', 10)
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    publisher.publish(Header(frame_id='before'))
+    with Spinning(executor):
+        assert wait_for(lambda: got == ['before'])
+        executor.create_task(go_on.wait, 15.0)
+        assert wait_for(lambda: not executor.statistics()['idle_workers'])
+        queues = []
+        for number in range(3):
+            in_a_thread(publisher.publish, Header(frame_id=str(number)))
+            queues.append(executor.statistics()['queue'])
+        go_on.set()
+        assert wait_for(lambda: len(got) == 4)
+    assert queues == [1, 2, 3]
+    publisher.publish(Header(frame_id='after'))
+    assert got == ['before', '0', '1', '2']
+
+
+FOREIGN = """
+import time, rclpy
+from std_msgs.msg import Header
+rclpy.init()
+node = rclpy.create_node('foreign')
+publisher = node.create_publisher(Header, '/a', 1000)
+while not publisher.get_subscription_count():
+    time.sleep(0.01)
+for number in range(200):
+    publisher.publish(Header(frame_id=f'foreign:{number}'))
+    time.sleep(0.001)
+publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=10))
+rclpy.shutdown()
+"""
+
+
+def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
+    make_executor, make_node,
+):
+    node, got = make_node('here'), []
+    node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 1000)
+    publisher = node.create_publisher(Header, '/a', 1000)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert sees_all(publisher)
+        with subprocess.Popen([sys.executable, '-c', FOREIGN]) as foreign:
+            number = 0
+            while foreign.poll() is None:
+                # in the end only the other one publishes: nobody here takes for it then
+                if 'foreign:100' not in got:
+                    publisher.publish(Header(frame_id=f'here:{number}'))
+                    number += 1
+                time.sleep(0.001)
+        assert foreign.returncode == 0
+        assert wait_for(lambda: len(got) >= number + 200), len(got)
+    for name, count in (('here', number), ('foreign', 200)):
+        mine = [int(text.split(':')[1]) for text in got if text.startswith(f'{name}:')]
+        assert mine == list(range(count))
+
+
+def test_nothing_is_lost_while_publishers_come_and_go(make_executor, make_node):
+    node, other = make_node('here'), make_node('elsewhere')
+    got: list[int] = []
+    node.create_subscription(Header, '/a', lambda m: got.append(int(m.frame_id)), 5000)
+    publisher = node.create_publisher(Header, '/a', 5000)
+    executor = make_executor()
+    executor.add_node(node)
+    done = threading.Event()
+
+    def come_and_go() -> None:
+        while not done.is_set():
+            foreign = other.create_publisher(Header, '/a', 10)
+            time.sleep(0.015)
+            other.destroy_publisher(foreign)
+            time.sleep(0.015)
+
+    with Spinning(executor):
+        assert sees_all(publisher)
+        thread = threading.Thread(target=come_and_go)
+        thread.start()
+        for number in range(600):
+            publisher.publish(Header(frame_id=str(number)))
+            time.sleep(0.0005)
+        done.set()
+        thread.join()
+        assert wait_for(lambda: len(got) >= 600), len(got)
+    assert got == list(range(600))
+
+
+@pytest.mark.parametrize('depth', [5000, 0])
+def test_several_threads_publish_and_each_ones_order_is_kept(make_executor, make_node, depth):
+    """Also where only a part of a long queue waits in Python: 0 stands for KEEP_ALL."""
+    qos = QoSProfile(depth=depth) if depth else QoSProfile(history=HistoryPolicy.KEEP_ALL)
+    node, got = make_node(), []
+    node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), qos)
+    publishers = [node.create_publisher(Header, '/a', qos) for _ in range(4)]
+    executor = make_executor()
+    executor.add_node(node)
+
+    def publish(publisher: Any, name: int) -> None:
+        for number in range(200):
+            publisher.publish(Header(frame_id=f'{name}:{number}'))
+
+    with Spinning(executor):
+        assert all(sees_all(p) for p in publishers)
+        threads = [
+            threading.Thread(target=publish, args=(p, i)) for i, p in enumerate(publishers)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert wait_for(lambda: len(got) >= 800), len(got)
+    for name in range(4):
+        mine = [int(text.split(':')[1]) for text in got if text.startswith(f'{name}:')]
+        assert mine == list(range(200))
+
+
+ASYNCHRONOUS = """
+import threading, time, rclpy
+from std_msgs.msg import Header
+from mddag_executor import MultiDeadlineExecutor
+rclpy.init()
+node = rclpy.create_node('slow')
+got = []
+node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 100)
+publisher = node.create_publisher(Header, '/a', 100)
+executor = MultiDeadlineExecutor()
+executor.add_node(node)
+thread = threading.Thread(target=executor.spin)
+thread.start()
+while not publisher.get_subscription_count():
+    time.sleep(0.01)
+def publish():
+    for number in range(50):
+        publisher.publish(Header(frame_id=str(number)))
+        time.sleep(0.001)
+publishing = threading.Thread(target=publish)
+publishing.start()
+publishing.join()
+end = time.monotonic() + 10
+while len(got) < 50 and time.monotonic() < end:
+    time.sleep(0.01)
+print(len(got), got == [str(n) for n in range(50)])
+executor.shutdown()
+thread.join()
+rclpy.shutdown()
+"""
+
+
+def test_a_middleware_that_delivers_later_loses_nothing():
+    done = subprocess.run(
+        [sys.executable, '-c', ASYNCHRONOUS], capture_output=True, text=True, timeout=60,
+        env={**os.environ, 'RMW_FASTRTPS_PUBLICATION_MODE': 'ASYNCHRONOUS'}, check=False)
+    assert done.stdout == '50 True\n', done
+
+
+def test_a_message_from_before_the_subscription_comes_first(make_executor, make_node):
+    node, got = make_node(), []
+    late = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = node.create_publisher(Header, '/late', late)
+    publisher.publish(Header(frame_id='early'))
+    node.create_subscription(Header, '/late', lambda m: got.append(m.frame_id), late)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: got == ['early'])
+        publisher.publish(Header(frame_id='now'))
+        assert wait_for(lambda: got == ['early', 'now'])
+
+
+def test_a_destroyed_subscription_is_no_harm(make_executor, make_node):
+    node, got = make_node(), []
+    first = node.create_subscription(Header, '/a', lambda m: got.append('first'), 10)
+    node.create_subscription(Header, '/a', lambda m: got.append('second'), 10)
+    publisher = node.create_publisher(Header, '/a', 10)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        publisher.publish(Header())
+        assert wait_for(lambda: len(got) == 2)
+        first.destroy()
+        publisher.publish(Header())
+        assert wait_for(lambda: got.count('second') == 2)
+        node.destroy_subscription(first)
+        publisher.publish(Header())
+        assert wait_for(lambda: got.count('second') == 3)
+        node.destroy_node()
+        executor.wake()
+        assert wait_for(lambda: not publishing._deliveries.get('/a'))
+    assert spinning.error is None
+    assert got.count('first') == 1
+
+
+def test_a_chain_goes_on_in_one_thread_when_callbacks_end_after_publishing(
+    make_executor, make_node, monkeypatch,
+):
+    monkeypatch.setattr(workers, 'SOON_NS', 10 ** 9)  # on the busiest machine
+    monkeypatch.setattr(workers, 'WAKE_GUARD_NS', 10 ** 9)
+    node, threads = make_node(), []
+    one, two = node.create_publisher(Header, '/one', 1), node.create_publisher(Header, '/two', 1)
+    group = ReentrantCallbackGroup()
+    here: list[int] = []
+
+    def tick() -> None:
+        here[:] = [threading.get_ident()]
+        one.publish(Header())
+
+    def step(_: Any) -> None:
+        here.append(threading.get_ident())
+        two.publish(Header())
+
+    def sink(_: Any) -> None:
+        threads.append((*here, threading.get_ident()))
+
+    node.create_timer(0.02, tick, callback_group=group)
+    node.create_subscription(Header, '/one', step, 1, callback_group=group)
+    node.create_subscription(Header, '/two', sink, 1, callback_group=group)
+    executor = make_executor(loads(CHAIN, 'chain.yaml'))
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(threads) >= 40, 20)
+    assert executor.statistics()['undeclared'] == 0
+    same = [len(set(idents)) == 1 for idents in threads[10:]]
+    assert sum(same) > len(same) / 2
+
+
+@pytest.mark.parametrize('waits', ['always', 'seldom'])
+def test_work_does_not_wait_for_a_callback_that_goes_on_after_publishing(
+    make_executor, make_node, waits,
+):
+    """It waits until its message has been heard: nobody else would start that callback."""
+    node, group, heard, waited = make_node(), ReentrantCallbackGroup(), threading.Event(), []
+    publisher = node.create_publisher(Header, '/one', 10)
+    calls = iter(range(10 ** 6))
+
+    def tick() -> None:
+        heard.clear()
+        publisher.publish(Header())
+        if waits == 'always' or next(calls) % 10 == 9:
+            waited.append(heard.wait(15.0))
+
+    node.create_timer(0.005, tick)
+    node.create_subscription(Header, '/one', lambda m: heard.set(), 10, callback_group=group)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(waited) >= 10, 40.0)
+    assert all(waited)
+
+
+def test_what_was_left_to_a_callback_is_looked_at_though_the_timer_is_armed_anew(
+        make_executor, monkeypatch):
+    pool = make_executor()._pool
+    me = workers.WorkerThread(pool, None)
+    me.published, me.work = 1, Work(Entity('task', None, '', None, -1, 0, ''), print)
+    monkeypatch.setattr(work.current, 'running', me)
+    with pool.stepping():
+        before = time.monotonic_ns()
+        pool.report(pool.engine.ready, Work(me.work.entity, print))
+        guard = pool.loop.timer.at
+        pool.arm()  # as for timers that have come
+        assert before < pool.loop.timer.at == guard
+        assert pool._turn(me, False, [])
+
+
+def test_subscriptions_of_one_message_are_chosen_among_by_deadline(make_executor, make_node):
+    node, order = make_node(), []
+    graph = """
+mddag: 1
+nodes:
+  - node: /node
+    callbacks:
+      - {name: tick, timer: 50ms, publishes: [/one]}
+      - {name: patient, subscription: /one, deadline: 50ms}
+  - node: /other
+    callbacks:
+      - {name: urgent, subscription: /one, deadline: 10ms}
+"""
+    other = make_node('other')
+    publisher = node.create_publisher(Header, '/one', 1)
+    node.create_timer(0.05, lambda: publisher.publish(Header()))
+    node.create_subscription(Header, '/one', lambda m: order.append('patient'), 1)
+    other.create_subscription(Header, '/one', lambda m: order.append('urgent'), 1)
+    executor = make_executor(loads(graph, 'graph.yaml'), num_workers=1)
+    executor.add_node(node)
+    executor.add_node(other)
+    with Spinning(executor):
+        assert wait_for(lambda: len(order) >= 12)
+    assert order[:12] == ['urgent', 'patient'] * 6
+
+
+@pytest.mark.parametrize('takes_first', [True, False])
+def test_counts_are_the_same_with_and_without(make_executor, make_node, monkeypatch, takes_first):
+    """Also where the workers take all: one declaration, one result."""
+    if not takes_first:
+        monkeypatch.setattr(publishing, 'replace_delivery', lambda *args: None)
+    node, got = make_node(), []
+    one = node.create_publisher(Header, '/one', 10)
+    two = node.create_publisher(Header, '/two', 10)
+    node.create_timer(0.02, lambda: one.publish(Header()))
+    node.create_subscription(Header, '/one', lambda m: two.publish(Header()), 10)
+    node.create_subscription(Header, '/two', lambda m: got.append(1), 10)
+    executor = make_executor(loads(CHAIN, 'chain.yaml'))
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(got) >= 20)
+    statistics = executor.statistics()
+    assert statistics['undeclared'] == 0
+    assert statistics['unattributed'] == {'unknown': 0, 'doubtful': 0}
+    assert statistics['callbacks']['/node:sink']['ran'] == len(got)
+
+
+def two_executors(
+    ros_context: Any, make_node: Any
+) -> tuple[list[MultiDeadlineExecutor], list[Any], list[list[str]]]:
+    """Return two executors, each with a node that subscribes to /a, and what these get."""
+    executors = [MultiDeadlineExecutor(context=ros_context) for _ in range(2)]
+    nodes, got = [make_node('first'), make_node('second')], [[], []]
+    for executor, node, heard in zip(executors, nodes, got):
+        node.create_subscription(
+            Header, '/a', lambda m, heard=heard: heard.append(m.frame_id), 100)
+        executor.add_node(node)
+    return executors, nodes, got
+
+
+def test_two_executors_subscribe_and_each_gets_its_own(ros_context, make_node):
+    (first, second), nodes, got = two_executors(ros_context, make_node)
+    publisher = nodes[0].create_publisher(Header, '/a', 100)
+    with Spinning(first), Spinning(second):
+        assert sees_all(publisher, 2)
+        for number in range(50):
+            publisher.publish(Header(frame_id=str(number)))
+        assert wait_for(lambda: all(len(ids) >= 50 for ids in got)), list(map(len, got))
+    assert got[0] == got[1] == [str(number) for number in range(50)]
+    assert not publishing._deliveries.get('/a')
+
+
+def test_a_publishing_callback_wakes_the_workers_of_another_executor(ros_context, make_node):
+    """That it will end soon is no reason: it takes from its own executor only."""
+    (first, second), nodes, got = two_executors(ros_context, make_node)
+    publisher = nodes[0].create_publisher(Header, '/a', 100)
+    waited = []
+
+    def publish() -> None:
+        before = len(got[1])
+        publisher.publish(Header())
+        waited.append(wait_for(lambda: len(got[1]) > before or len(waited) >= 5))
+
+    with Spinning(first), Spinning(second):
+        assert sees_all(publisher, 2)
+        nodes[0].create_timer(0.001, publish)
+        assert wait_for(lambda: len(waited) >= 5, 60.0)
+    assert all(waited)
+
+
+def test_a_message_of_a_publisher_that_was_there_for_a_moment_does_not_wait(
+    make_executor, make_node,
+):
+    node, other, got = make_node('here'), make_node('elsewhere'), []
+    node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 10)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        foreign = other.create_publisher(Header, '/a', 10)
+        assert sees_all(foreign)
+        foreign.publish(Header(frame_id='brief'))
+        other.destroy_publisher(foreign)
+        assert wait_for(lambda: got == ['brief'])
+
+
+def test_what_nobody_subscribes_to_is_published_as_ever(make_executor, make_node):
+    node, got = make_node(), []
+    publisher = node.create_publisher(Header, '/a', 10)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        executor.create_task(publisher.publish, Header(frame_id='to nobody'))
+        assert wait_for(lambda: is_idle(executor))
+        with pytest.raises(TypeError):
+            publisher.publish('no message')
+        subscription = node.create_subscription(
+            Header, '/a', lambda m: got.append(m.frame_id), 10)
+        assert sees_all(publisher)
+        with pytest.raises(TypeError):
+            publisher.publish('no message')
+        publisher.publish(Header(frame_id='to one'))
+        assert wait_for(lambda: got == ['to one'])
+        node.destroy_subscription(subscription)

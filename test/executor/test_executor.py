@@ -1,0 +1,578 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""The executor against real rclpy: each kind of callback, tasks, groups, queues, arguments."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+import gc
+import os
+import sys
+import threading
+import time
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.errors import MddagError
+from mddag_executor.trace import TraceWriter
+import pytest
+import rclpy
+from rclpy.action import ActionClient, ActionServer
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.serialization import deserialize_message
+from rclpy.task import Future
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
+
+from .conftest import is_idle, Spinning, wait_for
+
+
+def publish_when_matched(publisher: Any, message: Any, count: int = 1) -> None:
+    assert wait_for(lambda: publisher.get_subscription_count() > 0)
+    for _ in range(count):
+        publisher.publish(message)
+
+
+def test_timer_runs_at_its_rate(make_executor, make_node):
+    node, calls = make_node(), []
+    begin = time.monotonic()
+    node.create_timer(0.01, lambda: calls.append(time.monotonic()))
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: len(calls) >= 30)
+    end = time.monotonic()
+    assert spinning.error is None
+    [counts] = executor.statistics()['callbacks'].values()
+    periods = counts['ready'] + counts['skipped']  # a busy machine skips some
+    assert (calls[-1] - calls[0]) / 0.01 - 1 <= periods <= (end - begin) / 0.01
+
+
+def test_subscriptions_of_each_kind(make_executor, make_node):
+    node = make_node()
+    got: dict[str, list[Any]] = {'plain': [], 'info': [], 'raw': [], 'async': []}
+
+    async def coroutine(message: Header) -> None:
+        got['async'].append(message.frame_id)
+
+    node.create_subscription(Header, '/plain', lambda m: got['plain'].append(m.frame_id), 10)
+    node.create_subscription(Header, '/info', lambda m, i: got['info'].append((m, i)), 10)
+    node.create_subscription(Header, '/raw', got['raw'].append, 10, raw=True)
+    node.create_subscription(Header, '/async', coroutine, 10)
+    publishers = {name: node.create_publisher(Header, f'/{name}', 10) for name in got}
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        for publisher in publishers.values():
+            publish_when_matched(publisher, Header(frame_id='x'))
+        assert wait_for(lambda: all(got.values())), got
+    assert got['plain'] == got['async'] == ['x']
+    message, info = got['info'][0]
+    assert message.frame_id == 'x' and info['source_timestamp'] > 0
+    assert deserialize_message(got['raw'][0], Header).frame_id == 'x'
+
+
+def test_service_and_client_from_a_coroutine(make_executor, make_node):
+    node, answers = make_node(), []
+
+    async def answer(request: Any, response: Any) -> Any:
+        response.success, response.message = True, 'yes'
+        return response
+
+    node.create_service(Trigger, '/ask', answer)
+    client = node.create_client(Trigger, '/ask')
+    group = MutuallyExclusiveCallbackGroup()  # a coroutine keeps its group while it waits
+
+    async def ask() -> None:
+        answers.append((await client.call_async(Trigger.Request())).message)
+
+    timer = node.create_timer(0.01, ask, group)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(answers) >= 3)
+        timer.cancel()
+    assert set(answers) == {'yes'}
+
+
+def test_a_callback_that_waits_may_lend_its_worker(make_executor, make_node):
+    node, event, seen = make_node(), threading.Event(), []
+
+    def wait() -> None:
+        waiting.cancel()
+        with executor.lend():
+            seen.append(event.wait(15.0))
+
+    waiting = node.create_timer(0.01, wait, ReentrantCallbackGroup())
+    node.create_timer(0.02, event.set, ReentrantCallbackGroup())
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    with executor.lend():  # elsewhere it does nothing
+        pass
+    with Spinning(executor):
+        assert wait_for(lambda: bool(seen), 30.0)
+    assert seen == [True]
+
+
+def test_synchronous_calls_from_all_workers_at_once(make_executor, make_node):
+    """A worker that waits lends its place: rclpy#1211 and #1398 hang here."""
+    node = make_node()
+    group, answers, together = ReentrantCallbackGroup(), [], threading.Barrier(7)
+    node.create_service(
+        Trigger, '/ask', lambda request, response: response, callback_group=group)
+    client = node.create_client(Trigger, '/ask', callback_group=group)
+
+    def ask() -> None:
+        together.wait(5.0)
+        answers.append(client.call(Trigger.Request(), timeout_sec=5.0))
+
+    executor = make_executor()
+    executor.add_node(node)
+    assert client.wait_for_service(5.0)
+    with Spinning(executor) as spinning:
+        for _ in range(7):
+            executor.create_task(ask)
+        assert wait_for(lambda: len(answers) == 7)
+    assert spinning.error is None
+    assert None not in answers
+    assert executor.statistics()['lent'] == 7
+
+
+def test_two_synchronous_calls_in_one_callback_inside_spin_once(make_executor, make_node):
+    """The same one callback at a time (rclpy#1211)."""
+    node, answers = make_node(), []
+    node.create_service(Trigger, '/ask', lambda request, response: response)
+    client = node.create_client(Trigger, '/ask', callback_group=ReentrantCallbackGroup())
+
+    def ask_twice() -> None:
+        for _ in range(2):
+            answers.append(client.call(Trigger.Request(), timeout_sec=5.0))
+
+    executor = make_executor()
+    executor.add_node(node)
+    assert client.wait_for_service(5.0)
+    executor.create_task(ask_twice)
+    executor.spin_once(1.0)
+    assert len(answers) == 2 and None not in answers
+
+
+def test_shutdown_does_not_wait_for_the_second_call_of_a_callback(make_executor, make_node):
+    """As it does not for the first: nobody would answer it any more."""
+    node, done = make_node(), threading.Event()
+    group = ReentrantCallbackGroup()
+    node.create_service(Trigger, '/ask', lambda request, response: response)
+    client = node.create_client(Trigger, '/ask', callback_group=group)
+    nobody = node.create_client(Trigger, '/nobody', callback_group=group)
+
+    def ask_twice() -> None:
+        client.call(Trigger.Request(), timeout_sec=5.0)
+        nobody.call(Trigger.Request())
+        done.set()
+
+    executor = make_executor()
+    executor.add_node(node)
+    assert client.wait_for_service(5.0)
+    executor.create_task(ask_twice)
+    try:
+        with Spinning(executor):
+            assert wait_for(lambda: nobody._pending_requests)
+            assert executor.shutdown(2.0)
+    finally:
+        for future in list(nobody._pending_requests.values()):
+            future.set_result(None)
+    assert done.wait(5.0)
+
+
+def test_action_with_feedback_result_and_cancel(make_executor, make_node):
+    node, feedback = make_node(), []
+
+    async def execute(goal: Any) -> Any:
+        for i in range(3):
+            goal.publish_feedback(Fibonacci.Feedback(sequence=[i]))
+        if goal.request.order == 99:
+            while not goal.is_cancel_requested:
+                await asleep(executor, node)
+            goal.canceled()
+            return Fibonacci.Result()
+        goal.succeed()
+        return Fibonacci.Result(sequence=[goal.request.order])
+
+    server = ActionServer(
+        node, Fibonacci, 'fibonacci', execute, callback_group=ReentrantCallbackGroup(),
+        cancel_callback=lambda goal: rclpy.action.CancelResponse.ACCEPT)
+    client = ActionClient(node, Fibonacci, 'fibonacci', callback_group=ReentrantCallbackGroup())
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert client.wait_for_server(5.0)
+        # The server may see the client later than the client the server: what it publishes until
+        # then is gone.
+        assert wait_for(lambda: wait_for(lambda: feedback, 0.1) or client.send_goal_async(
+            Fibonacci.Goal(order=1), feedback_callback=feedback.append) is None)
+        assert wait_for(lambda: len(feedback) % 3 == 0)
+        feedback.clear()
+        handles = [
+            client.send_goal_async(Fibonacci.Goal(order=n), feedback_callback=feedback.append)
+            for n in (3, 4, 99)]
+        assert wait_for(lambda: all(h.done() for h in handles))
+        assert all(h.result().accepted for h in handles)
+        # Before the results: rclpy's client ignores feedback of a goal whose result has come.
+        assert wait_for(lambda: len(feedback) == 9)
+        results = [h.result().get_result_async() for h in handles]
+        assert wait_for(lambda: results[0].done() and results[1].done())
+        assert [list(r.result().result.sequence) for r in results[:2]] == [[3], [4]]
+        handles[2].result().cancel_goal_async()
+        assert wait_for(results[2].done)
+    assert len(feedback) == 9
+    assert spinning.error is None
+    server.destroy()
+    client.destroy()
+
+
+async def asleep(executor: MultiDeadlineExecutor, node: Any) -> None:
+    """Await a future that a timer completes."""
+    future = Future(executor=executor)
+    timer = node.create_timer(0.005, lambda: future.set_result(None))
+    await future
+    node.destroy_timer(timer)
+
+
+def test_tasks_functions_coroutines_and_futures_across_them(make_executor):
+    executor = make_executor()
+    future = Future(executor=executor)
+    order = []
+
+    async def waits() -> str:
+        order.append('waits')
+        value = await future
+        order.append('has it')
+        return f'{value}!'
+
+    waiting = executor.create_task(waits)
+    plain = executor.create_task(lambda a, b: a + b, 1, b=2)
+    with Spinning(executor):
+        assert wait_for(plain.done) and plain.result() == 3
+        assert wait_for(lambda: order == ['waits']) and not waiting.done()
+        future.set_result('value')
+        assert wait_for(waiting.done)
+    assert waiting.result() == 'value!' and order == ['waits', 'has it']
+
+
+def test_a_task_made_before_spin_runs_before_messages_that_wait(make_executor, make_node):
+    """As rclpy's executors have it."""
+    node, ran = make_node(), []
+    node.create_subscription(Header, '/topic', lambda _: ran.append('message'), 10)
+    publisher = node.create_publisher(Header, '/topic', 10)
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    publish_when_matched(publisher, Header())
+    time.sleep(0.1)
+    executor.create_task(ran.append, 'task')
+    with Spinning(executor):
+        assert wait_for(lambda: len(ran) == 2)
+    assert ran == ['task', 'message']
+
+
+def test_create_task_wakes_an_idle_executor(make_executor):
+    executor = make_executor()
+    with Spinning(executor):
+        time.sleep(0.2)
+        task = executor.create_task(lambda: None)
+        assert wait_for(task.done)
+
+
+def test_add_node_wakes_an_idle_executor(make_executor, make_node):
+    executor = make_executor()
+    calls: list[int] = []
+    with Spinning(executor):
+        time.sleep(0.2)
+        node = make_node()
+        node.create_timer(0.001, lambda: calls.append(1))
+        assert executor.add_node(node)
+        assert not executor.add_node(node)
+        assert wait_for(lambda: calls)
+        assert executor.get_nodes() == [node]
+        executor.remove_node(node)
+        assert executor.get_nodes() == []
+        assert wait_for(lambda: stays(calls))
+
+
+def stays(calls: list[Any]) -> bool:
+    before = len(calls)
+    time.sleep(0.05)
+    return len(calls) == before
+
+
+def test_entities_created_and_destroyed_while_it_spins(make_executor, make_node):
+    """What is destroyed meanwhile neither runs nor fails (rclpy#1206)."""
+    node, calls = make_node(), []
+    executor = make_executor()
+    executor.add_node(node)
+    publisher = node.create_publisher(Header, '/topic', 10)
+    with Spinning(executor) as spinning:
+        for _ in range(20):
+            calls.clear()
+            subscription = node.create_subscription(Header, '/topic', calls.append, 10)
+            assert wait_for(lambda: publisher.get_subscription_count() == 1)
+            assert wait_for(lambda: publisher.publish(Header()) or calls)
+            node.destroy_subscription(subscription)
+            assert wait_for(lambda: publisher.get_subscription_count() == 0)
+    assert spinning.error is None
+
+
+def test_a_node_destroyed_while_it_spins_and_one_made_instead(make_executor, make_node):
+    executor = make_executor()
+    total = 0
+    with Spinning(executor) as spinning:
+        for _ in range(20):
+            calls: list[int] = []
+            node = make_node()
+            node.create_timer(0.001, lambda some=calls: some.append(1))
+            executor.add_node(node)
+            assert wait_for(lambda some=calls: len(some) >= 3)
+            node.destroy_node()
+            assert wait_for(lambda some=calls: stays(some))
+            total += len(calls)
+    assert spinning.error is None
+    counts = executor.statistics()['callbacks']
+    assert counts['/node: <lambda> (timer 1ms)']['ran'] == total
+    assert len(executor._registry._retired) <= 1
+
+
+def test_mutually_exclusive_group_is_kept(make_executor, make_node):
+    node = make_node()
+    group, running, most, ran = MutuallyExclusiveCallbackGroup(), [0], [0], []
+    lock = threading.Lock()
+
+    def exclusive(message: Header) -> None:
+        with lock:
+            running[0] += 1
+            most[0] = max(most[0], running[0])
+        time.sleep(0.005)
+        with lock:
+            running[0] -= 1
+        ran.append(message)
+
+    for _ in range(6):
+        node.create_subscription(Header, '/topic', exclusive, 10, callback_group=group)
+    publisher = node.create_publisher(Header, '/topic', 10)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: publisher.get_subscription_count() == 6)
+        for _ in range(3):
+            publisher.publish(Header())
+        assert wait_for(lambda: len(ran) == 18)
+    assert most[0] == 1
+
+
+def test_reentrant_group_fills_all_workers(make_executor):
+    executor = make_executor()
+    together = threading.Barrier(7)
+    tasks = [executor.create_task(together.wait, 5.0) for _ in range(7)]
+    with Spinning(executor):
+        assert wait_for(lambda: all(t.done() for t in tasks))
+    assert sorted(t.result() for t in tasks) == list(range(7))
+
+
+def test_never_more_than_the_workers(make_executor):
+    executor = make_executor(num_workers=3)
+    running, most = set(), [0]
+
+    def work() -> None:
+        running.add(threading.get_ident())
+        most[0] = max(most[0], len(running))
+        time.sleep(0.01)
+        running.discard(threading.get_ident())
+
+    tasks = [executor.create_task(work) for _ in range(30)]
+    with Spinning(executor):
+        assert wait_for(lambda: all(t.done() for t in tasks))
+    assert most[0] == 3
+
+
+def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):
+    """A bounded queue, the policy is that of its QoS: the oldest goes (rclcpp#3213)."""
+    node, got, gate = make_node(), [], threading.Event()
+    group = MutuallyExclusiveCallbackGroup()
+
+    def slow(message: Header) -> None:
+        got.append(message.stamp.sec)
+        gate.wait(5.0)
+
+    node.create_subscription(Header, '/topic', slow, 3, callback_group=group)
+    publisher = node.create_publisher(Header, '/topic', 100)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        publish_when_matched(publisher, Header(stamp=Time(sec=0)))
+        assert wait_for(lambda: got == [0])
+        for second in range(1, 11):
+            publisher.publish(Header(stamp=Time(sec=second)))
+            time.sleep(0.01)
+        gate.set()
+        assert wait_for(lambda: len(got) >= 4)
+        assert stays(got)
+    assert got == [0, 8, 9, 10]
+    assert sum(executor.statistics()['dropped'].values()) == 7
+
+
+def test_no_message_is_lost(make_executor, make_node):
+    node, got = make_node(), []
+    node.create_subscription(
+        Header, '/topic', lambda m: got.append(m.stamp.sec), 1000,
+        callback_group=ReentrantCallbackGroup())
+    publisher = node.create_publisher(Header, '/topic', 1000)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: publisher.get_subscription_count() > 0)
+        for i in range(1000):
+            publisher.publish(Header(stamp=Time(sec=i)))
+            if i % 50 == 0:
+                time.sleep(0.01)
+        assert wait_for(lambda: len(got) == 1000)
+    assert sorted(got) == list(range(1000))
+
+
+@pytest.mark.parametrize('kwargs, says', [
+    ({'num_workers': 0}, 'give at least 1'),
+    ({'policy': 'nonsense'}, 'choose one of'),
+    ({'worker_policy': 'SCHED_NONSENSE'}, 'give one of'),
+    ({'worker_priority': 5}, 'give worker_policy'),
+    ({'worker_cpus': {4096}}, 'choose from'),
+    ({'trace': '/nowhere/at/all.mcap'}, '/nowhere/at/all.mcap'),
+])
+def test_bad_arguments_say_what_to_do(ros_context, kwargs, says):
+    with pytest.raises(MddagError, match=says):
+        MultiDeadlineExecutor(context=ros_context, **kwargs)
+
+
+def test_a_destroyed_subscription_does_not_run_what_it_has_queued(make_executor, make_node):
+    """Not even when it is just dispatched while the executor takes note; hence the rounds."""
+    node, got = make_node(), []
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    publisher = node.create_publisher(Header, '/topic', 10)
+    begun, gate = threading.Semaphore(0), threading.Semaphore(0)
+
+    def hold() -> None:
+        begun.release()
+        gate.acquire(timeout=15.0)
+
+    with Spinning(executor):
+        for _ in range(200):
+            subscription = node.create_subscription(Header, '/topic', got.append, 10)
+            assert wait_for(lambda: publisher.get_subscription_count() == 1)
+            executor.create_task(hold)
+            assert begun.acquire(timeout=15.0)
+            assert wait_for(
+                lambda: publisher.publish(Header()) or executor.statistics()['queue'] > 0)
+            node.destroy_subscription(subscription)
+            gate.release()
+            assert wait_for(lambda: is_idle(executor) and not publisher.get_subscription_count())
+    assert got == []
+
+
+def test_a_node_that_is_destroyed_before_the_executor_looks_at_it_harms_nobody(
+        make_executor, make_node):
+    node, ran = make_node(), []
+    node.create_timer(0.001, lambda: ran.append(1))
+    executor = make_executor()
+    executor.add_node(node)
+    for spins in (False, True):
+        with Spinning(executor) if spins else nullcontext():
+            for number in range(20):
+                gone = rclpy.create_node(f'gone_{number}', context=node.context)
+                executor.add_node(gone)
+                gone.destroy_node()
+            assert not spins or wait_for(lambda: len(ran) > 10)
+
+
+def test_executors_that_are_shut_down_leave_no_files(ros_context):
+    """Neither those that have spun nor those that were only stepped."""
+    def files() -> int:
+        return len(os.listdir('/proc/self/fd'))
+
+    def use(spin: bool) -> None:
+        executor = MultiDeadlineExecutor(num_workers=1, context=ros_context)
+        if spin:
+            executor.spin_until_future_complete(executor.create_task(lambda: None))
+        else:
+            executor.spin_once(0.0)
+        executor.shutdown()
+
+    use(True)  # what the process keeps
+    before = files()
+    for spin in (False, True) * 5:
+        use(spin)
+    gc.collect()
+    assert files() <= before
+
+
+def test_statistics_while_entities_come_and_go(make_executor, make_node):
+    """No exception, and nothing that has been counted is lost."""
+    node, errors, counts = make_node(), [], [0]
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    ended = threading.Event()
+
+    def ask() -> None:
+        while not ended.is_set():
+            try:
+                callbacks = executor.statistics()['callbacks']
+            except RuntimeError as error:
+                errors.append(error)
+                return
+            counts.append(sum(each['ran'] for each in callbacks.values()))
+
+    interval = sys.getswitchinterval()
+    asking = threading.Thread(target=ask)
+    try:
+        with Spinning(executor) as spinning:
+            sys.setswitchinterval(1e-6)
+            asking.start()
+            for number in range(100):
+                # each period has a name of its own in the counts
+                timers = [node.create_timer((1_000_000 + 20 * number + i) / 1e9, lambda: None)
+                          for i in range(20)]
+                assert wait_for(lambda n=number: counts[-1] >= 10 * n or errors), spinning.error
+                for timer in timers:
+                    node.destroy_timer(timer)
+            ended.set()
+            asking.join()
+    finally:
+        ended.set()
+        sys.setswitchinterval(interval)
+    assert errors == []
+    assert counts == sorted(counts)
+
+
+def test_who_shuts_down_second_waits_until_the_trace_is_closed(
+        make_executor, make_node, monkeypatch, tmp_path):
+    closing, go_on, closed = threading.Event(), threading.Event(), []
+    close = TraceWriter.close
+
+    def late(writer: Any, *args: Any) -> None:
+        closing.set()
+        go_on.wait(30.0)
+        close(writer, *args)
+        closed.append(1)
+
+    monkeypatch.setattr(TraceWriter, 'close', late)
+    executor = make_executor(trace=tmp_path / 'run.mcap')
+    executor.add_node(make_node())
+    executor.spin_once(0.0)
+    seen: list[list[int]] = []
+    first, second = (threading.Thread(
+        target=lambda: (executor.shutdown(), seen.append([*closed]))) for _ in range(2))
+    first.start()
+    assert closing.wait(15.0)
+    second.start()
+    second.join(0.2)
+    go_on.set()
+    for thread in (first, second):
+        thread.join()
+    assert seen == [[1], [1]]

@@ -1,0 +1,374 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Callback groups of a user's own class are asked, as rclpy's executors do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import threading
+from typing import Any
+
+from mddag_executor.executor import current_job
+from mddag_executor.replay import replay
+from mddag_executor.trace import read_events
+from msg_graph import loads
+import pytest
+from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.task import Future
+from std_msgs.msg import Int32
+from std_srvs.srv import Empty
+
+from .conftest import Spinning, wait_for
+
+
+class Tokens(CallbackGroup):
+    """Lets so many callbacks run as it has tokens, and notes what it is asked and told."""
+
+    def __init__(self, tokens: int = 0) -> None:
+        super().__init__()
+        self.lock = threading.Lock()
+        self.tokens = tokens
+        self.asked = self.running = self.most = self.begun = self.ended = 0
+
+    def can_execute(self, entity: Any) -> bool:
+        with self.lock:
+            self.asked += 1
+            return self.tokens > 0
+
+    def beginning_execution(self, entity: Any) -> bool:
+        with self.lock:
+            if self.tokens == 0:
+                return False
+            self.tokens -= 1
+            self.begun += 1
+            self.running += 1
+            self.most = max(self.most, self.running)
+            return True
+
+    def ending_execution(self, entity: Any) -> None:
+        with self.lock:
+            self.ended += 1
+            self.running -= 1
+
+    def give(self, tokens: int = 1) -> None:
+        with self.lock:
+            self.tokens += tokens
+
+
+class AtMost(Tokens):
+    """Gives back the token of what ends: at most so many run at once."""
+
+    def ending_execution(self, entity: Any) -> None:
+        super().ending_execution(entity)
+        self.give()
+
+
+@pytest.fixture
+def node(make_node):
+    return make_node('gated')
+
+
+def test_a_timer_runs_as_often_as_its_group_lets_it(make_executor, node):
+    """The throttled example of ros2/examples: another callback gives the tokens."""
+    group, ran, ticks = Tokens(3), [], []
+    node.create_timer(0.001, lambda: ran.append(len(ticks)), callback_group=group)
+
+    def tick() -> None:
+        ticks.append(1)
+        if len(ticks) % 10 == 0:
+            group.give()
+
+    node.create_timer(0.004, tick)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: len(ticks) > 60)
+    assert spinning.error is None
+    assert 3 < len(ran) <= 3 + len(ticks) // 10
+    assert group.begun == group.ended == len(ran) and group.asked > len(ran)
+    (gated,) = [counts for name, counts in executor.statistics()['callbacks'].items()
+                if name.endswith('(timer 1ms)')]
+    assert gated['ran'] == len(ran) and gated['dropped'] == 0 < gated['skipped']
+
+
+def test_it_is_asked_again_though_no_callback_ends(make_executor, node):
+    group, ran = Tokens(), []
+    node.create_timer(0.001, lambda: ran.append(1), callback_group=group)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: group.asked > 2)
+        assert not ran
+        group.give(5)
+        assert wait_for(lambda: len(ran) == 5)
+
+
+@pytest.mark.parametrize('workers', [1, 3])
+def test_a_group_that_always_refuses_stops_nobody_else(make_executor, node, workers):
+    group, ran, refused = Tokens(), [], []
+    node.create_timer(0.001, lambda: refused.append(1), callback_group=group)
+    node.create_subscription(Int32, '/shut', refused.append, 5, callback_group=group)
+    node.create_timer(0.001, lambda: ran.append(1))
+    publisher = node.create_publisher(Int32, '/shut', 5)
+    executor = make_executor(num_workers=workers)
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: publisher.get_subscription_count() == 1)
+        for i in range(20):
+            publisher.publish(Int32(data=i))
+        assert wait_for(lambda: len(ran) > 50 and group.asked > 50)
+    assert spinning.error is None and not refused and group.ended == 0
+
+
+def test_messages_that_wait_are_as_many_as_the_qos_says_and_keep_their_order(make_executor, node):
+    group, got = Tokens(), []
+    node.create_subscription(
+        Int32, '/gated', lambda m: got.append(m.data), 3, callback_group=group)
+    publisher = node.create_publisher(Int32, '/gated', 50)
+    executor = make_executor()
+    executor.add_node(node)
+
+    def count(what: str) -> int:
+        return int(sum(c[what] for name, c in executor.statistics()['callbacks'].items()
+                       if name.startswith('/gated: ')))
+
+    with Spinning(executor):
+        assert wait_for(lambda: publisher.get_subscription_count() == 1)
+        for i in range(10):
+            publisher.publish(Int32(data=i))
+            assert wait_for(lambda i=i: count('ready') > i)
+        assert wait_for(lambda: count('dropped') == 7)
+        group.give(50)
+        assert wait_for(lambda: len(got) == 3)
+    assert got == [7, 8, 9]
+
+
+def test_callbacks_of_one_entity_run_at_once_where_the_group_lets_them(make_executor, node):
+    group, inside = AtMost(2), threading.Barrier(2)
+    got: list[int] = []
+
+    def callback(message: Int32) -> None:
+        inside.wait(5.0)
+        got.append(message.data)
+
+    node.create_subscription(Int32, '/pairs', callback, 20, callback_group=group)
+    publisher = node.create_publisher(Int32, '/pairs', 20)
+    executor = make_executor(num_workers=4)
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: publisher.get_subscription_count() == 1)
+        for i in range(10):
+            publisher.publish(Int32(data=i))
+        assert wait_for(lambda: len(got) == 10)
+    assert spinning.error is None and group.most == 2 and sorted(got) == list(range(10))
+
+
+def test_the_end_is_told_when_a_callback_raises(make_executor, node):
+    group = AtMost(1)
+
+    def callback() -> None:
+        raise ValueError('on purpose')
+
+    node.create_timer(0.001, callback, callback_group=group)
+    executor = make_executor()
+    executor.add_node(node)
+    with pytest.raises(ValueError, match='on purpose'):
+        executor.spin()
+    assert wait_for(lambda: group.begun == group.ended >= 1)
+    with pytest.raises(ValueError, match='on purpose'):
+        executor.spin_once(5.0)
+    assert group.begun == group.ended >= 2
+
+
+@pytest.mark.parametrize('method', ['can_execute', 'beginning_execution', 'ending_execution'])
+def test_what_a_group_raises_comes_out_of_spin(make_executor, node, monkeypatch, method):
+    group = AtMost(1)
+
+    def broken(entity: Any) -> bool:
+        raise ValueError('a broken group')
+
+    monkeypatch.setattr(group, method, broken)
+    node.create_timer(0.001, lambda: None, callback_group=group)
+    executor = make_executor()
+    executor.add_node(node)
+    with pytest.raises(ValueError, match='a broken group'):
+        executor.spin()
+
+
+def test_a_coroutine_ends_when_it_has_run_to_its_end(make_executor, node):
+    group, future, steps = AtMost(1), Future(), []
+
+    async def callback(message: Int32) -> None:
+        steps.append(('begins', message.data))
+        await future
+        steps.append(('ends', message.data))
+
+    node.create_subscription(Int32, '/awaits', callback, 5, callback_group=group)
+    publisher = node.create_publisher(Int32, '/awaits', 5)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: publisher.get_subscription_count() == 1)
+        publisher.publish(Int32(data=1))
+        assert wait_for(lambda: len(steps) == 1)
+        publisher.publish(Int32(data=2))
+        asked = group.asked
+        assert wait_for(lambda: group.asked > asked + 1)
+        assert steps == [('begins', 1)] and group.ended == 0
+        future.set_result(None)
+        assert wait_for(lambda: len(steps) == 4 and group.ended == 2)
+    assert spinning.error is None
+    assert steps == [('begins', 1), ('ends', 1), ('begins', 2), ('ends', 2)]
+
+
+def test_a_single_step_goes_on_to_what_may_run(make_executor, node):
+    group, ran = Tokens(), []
+    node.create_timer(0.001, lambda: ran.append('gated'), callback_group=group)
+    executor = make_executor()
+    executor.add_node(node)
+    for _ in range(5):
+        executor.spin_once(0.01)
+    assert not ran and group.asked > 0
+    node.create_timer(0.001, lambda: ran.append('free'))
+    for _ in range(50):
+        executor.spin_once(0.01)
+    assert set(ran) == {'free'}
+    group.give()
+    assert wait_for(lambda: executor.spin_once(0.01) or 'gated' in ran)
+    assert ran.count('gated') == 1 == group.ended
+
+
+def test_a_spin_goes_on_with_what_a_step_left(make_executor, node):
+    group, ran = Tokens(), []
+    node.create_timer(0.001, lambda: ran.append(1), callback_group=group)
+    executor = make_executor()
+    executor.add_node(node)
+    assert wait_for(lambda: executor.spin_once(0.01) or group.asked)
+    group.give()
+    with Spinning(executor):
+        assert wait_for(lambda: ran)
+
+
+def test_a_service_waits_for_its_group(make_executor, node, make_node):
+    group = Tokens()
+    node.create_service(Empty, '/gated_service', lambda _, answer: answer, callback_group=group)
+    client = make_node('asks').create_client(Empty, '/gated_service')
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert client.wait_for_service(5.0)
+        client.call_async(Empty.Request())
+        assert wait_for(lambda: group.asked > 3)
+        assert group.begun == 0
+        group.give()
+        assert wait_for(lambda: group.ended == 1)
+
+
+def test_a_destroyed_entity_that_waits_for_its_group_is_forgotten(make_executor, node):
+    group, ran = Tokens(), []
+    timer = node.create_timer(0.001, lambda: ran.append(1), callback_group=group)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: group.asked > 2)
+        node.destroy_timer(timer)
+        node.create_timer(0.001, lambda: ran.append(2))
+        assert wait_for(lambda: 2 in ran)
+        group.give(10)
+        assert wait_for(lambda: len(ran) > 20)
+    assert spinning.error is None and 1 not in ran
+    waiting = [c['waiting'] for c in executor.statistics()['callbacks'].values()]
+    assert sum(waiting) <= 1
+
+
+def test_a_declared_callback_completes_its_jobs_when_its_group_lets_it(
+        make_executor, make_node, tmp_path: Path) -> None:
+    group, trace = Tokens(), tmp_path / 'run.mcap'
+    source, sink = make_node('source'), make_node('sink')
+    publisher = source.create_publisher(Int32, '/a', 100)
+    jobs: list[Any] = []
+    ran: list[tuple[int, int]] = []
+
+    def tick() -> None:
+        jobs.append(current_job())
+        publisher.publish(Int32(data=jobs[-1].job))
+
+    def last(message: Int32) -> None:
+        ran.append((current_job().job, message.data))
+
+    timer = source.create_timer(0.01, tick, autostart=False)
+    sink.create_subscription(Int32, '/a', last, 100, callback_group=group)
+    executor = make_executor(loads("""
+mddag: 1
+nodes:
+  - node: /source
+    callbacks: [{name: tick, timer: 10ms, publishes: [/a], dag: chain, max_active_jobs: 100}]
+  - node: /sink
+    callbacks: [{name: last, subscription: /a, deadline: 60s}]
+"""), trace=trace)
+    executor.add_node(source)
+    executor.add_node(sink)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: publisher.get_subscription_count() == 1)
+        timer.reset()
+        executor.wake()
+        assert wait_for(lambda: len(jobs) >= 10)
+        timer.cancel()
+        group.give(3)
+        assert wait_for(lambda: len(ran) == 3)
+        assert wait_for(lambda: executor.statistics()['queue'] == len(jobs) - 3)
+        group.give(100)
+        assert wait_for(lambda: len(ran) == len(jobs))
+    assert spinning.error is None
+    assert sorted(ran) == [(job.job, job.job) for job in jobs]
+    completed = executor.statistics()['dags']['chain']['sinks']['/sink:last']['completed']
+    assert completed == len(jobs) == group.ended
+    recorded = replay(trace)
+    assert recorded.warnings == []
+    assert recorded.result()['dags']['chain']['sinks']['/sink:last']['completed'] == len(jobs)
+    assert ['reentrant'] == [
+        event['group_type_name'] for event in read_events(trace)
+        if event['_name'] == 'ros2_caret:add_callback_group'
+        and event['callback_group_addr'] == id(group)]
+
+
+class Noting(MutuallyExclusiveCallbackGroup):
+    """Is rclpy's own, and notes what has ended."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ended: list[Any] = []
+
+    def ending_execution(self, entity: Any) -> None:
+        self.ended.append(entity)
+        super().ending_execution(entity)
+
+
+def test_a_group_that_changes_one_of_rclpys_is_asked_and_still_exclusive(make_executor, node):
+    group, running, most = Noting(), [], []
+
+    def callback() -> None:
+        running.append(1)
+        most.append(len(running))
+        running.pop()
+
+    timers = [node.create_timer(0.001, callback, callback_group=group) for _ in range(3)]
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: all(group.ended.count(timer) > 5 for timer in timers))
+    assert spinning.error is None and set(most) == {1} and len(group.ended) == len(most)
+
+
+def test_rclpys_own_executor_asks_the_same(ros_context, node):
+    """What the tests above take for granted."""
+    group, ran = Tokens(2), []
+    node.create_timer(0.001, lambda: ran.append(1), callback_group=group)
+    executor = MultiThreadedExecutor(2, context=ros_context)
+    executor.add_node(node)
+    assert wait_for(lambda: executor.spin_once(0.01) or group.ended == 2)
+    for _ in range(5):
+        executor.spin_once(0.01)
+    executor.shutdown()
+    assert len(ran) == 2

@@ -1,0 +1,553 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Callbacks that hold the GIL: one at a time, most urgent first, and never a deadlock."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from mddag_executor.executor import gil, publishing
+from mddag_executor.executor.gil import (
+    GilCheck,
+    GilHabit,
+    LAST_CHECK_NS,
+    Schedule,
+    times_preempted,
+)
+import msg_graph
+import pytest
+from rclpy.callback_groups import ReentrantCallbackGroup
+from std_msgs.msg import Header
+
+from .conftest import Spinning, wait_for
+
+NAMES = ('a', 'b', 'c', 'd')
+MS = 1_000_000
+
+
+def graph(holds: str, deadlines: tuple[int, ...] = (50, 50, 50, 50)) -> msg_graph.TaskSet:
+    """Declare a subscription for each name; ``holds`` is what they say of the interpreter."""
+    return msg_graph.loads('mddag: 1\nnodes:\n  - node: /node\n    callbacks:\n' + ''.join(
+        f'      - {{name: {name}, subscription: /{name}, dag: {name}, period: 100ms, '
+        f'deadline: {deadline}ms, holds_interpreter: {holds}}}\n'
+        for name, deadline in zip(NAMES, deadlines)), 'g.yaml')
+
+
+def compute(ms: float) -> None:
+    """Take so much CPU, in Python."""
+    end = time.thread_time_ns() + int(ms * MS)
+    while time.thread_time_ns() < end:
+        pass
+
+
+class Bodies:
+    """Callbacks that note when they run; one for each name."""
+
+    def __init__(self, node: Any, body: Any) -> None:
+        self.ran: list[str] = []
+        self.at_once = 0
+        self._running = 0
+        self._lock = threading.Lock()
+        self._body = body
+        group = ReentrantCallbackGroup()
+        self.publishers = {name: node.create_publisher(Header, f'/{name}', 100) for name in NAMES}
+        for name in NAMES:
+            node.create_subscription(
+                Header, f'/{name}', lambda message, name=name: self._run(name), 100,
+                callback_group=group)
+
+    def _run(self, name: str) -> None:
+        with self._lock:
+            self._running += 1
+            self.at_once = max(self.at_once, self._running)
+            self.ran.append(name)
+        self._body(name)
+        with self._lock:
+            self._running -= 1
+
+    def publish(self, *names: str) -> None:
+        for name in names:
+            self.publishers[name].publish(Header())
+
+
+@pytest.mark.parametrize('holds, at_once', [('true', 1), ('false', 4)])
+def test_as_many_run_at_once_as_the_declaration_says(
+    make_executor, make_node, holds, at_once,
+):
+    node = make_node()
+    gate = threading.Barrier(4) if at_once == 4 else None
+
+    def body(name: str) -> None:
+        if gate is not None:
+            gate.wait(20.0)  # passes only when all four are there
+        compute(5)
+
+    bodies = Bodies(node, body)
+    executor = make_executor(graph(holds))
+    executor.add_node(node)
+    with Spinning(executor):
+        bodies.publish(*NAMES)
+        assert wait_for(lambda: len(bodies.ran) == 4, 20.0)
+    assert bodies.at_once == 1 if at_once == 1 else bodies.at_once >= at_once
+
+
+def test_what_is_held_back_runs_in_the_order_of_deadlines(make_executor, make_node):
+    node = make_node()
+    begun, go_on = threading.Event(), threading.Event()
+
+    def body(name: str) -> None:
+        if name == 'a' and not begun.is_set():
+            begun.set()
+            while not go_on.is_set():  # computes
+                pass
+
+    bodies = Bodies(node, body)
+    executor = make_executor(graph('true', (5_000, 60_000, 20_000, 40_000)))
+    executor.add_node(node)
+    with Spinning(executor):
+        bodies.publish('a')
+        assert begun.wait(5.0)
+        bodies.publish('b', 'd', 'c')
+        assert wait_for(lambda: executor.statistics()['queue'] == 3)
+        go_on.set()
+        assert wait_for(lambda: len(bodies.ran) == 4)
+    assert bodies.ran == ['a', 'c', 'd', 'b']
+
+
+def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_node):
+    """
+    A camera computes until the 1 kHz callback has run thrice meanwhile, so it must let it.
+
+    Its deadline is far: once it were late it would be the more urgent one.
+    """
+    node, ticks, seen = make_node(), [], []
+    group = ReentrantCallbackGroup()
+    node.create_timer(0.001, lambda: ticks.append(None), callback_group=group)
+
+    def capture() -> None:
+        before, end = len(ticks), time.monotonic() + 50.0
+        while len(ticks) < before + 3 and len(seen) < 3 and time.monotonic() < end:  # computes
+            pass
+        seen.append(len(ticks) - before)
+
+    node.create_timer(0.1, capture, callback_group=group)
+    executor = make_executor(msg_graph.loads(
+        'mddag: 1\nnodes:\n  - node: /node\n    callbacks:\n'
+        '      - {name: step, timer: 1ms, dag: step, deadline: 1ms, holds_interpreter: true}\n'
+        '      - {name: capture, timer: 100ms, dag: camera, deadline: 60s, '
+        'holds_interpreter: true}\n',
+        'g.yaml'))
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(seen) >= 3, 160.0)
+    assert min(seen[:3]) >= 3
+
+
+def test_one_that_waits_for_another_gives_the_interpreter_back(make_executor, make_node):
+    """Declared as computing, but it waits for one that is held back: no deadlock."""
+    node = make_node()
+    done, waited = threading.Event(), []
+
+    def body(name: str) -> None:
+        if name == 'a':
+            compute(3)
+            waited.append(done.wait(20.0))
+        else:
+            done.set()
+
+    bodies = Bodies(node, body)
+    executor = make_executor(graph('true'))
+    executor.add_node(node)
+    with Spinning(executor):
+        bodies.publish('a')
+        assert wait_for(lambda: bodies.ran == ['a'])
+        bodies.publish('b')
+        assert wait_for(lambda: waited, 20.0)
+    assert waited == [True]
+
+
+def test_who_computes_is_learnt_and_shown(make_executor, make_node):
+    node, ran = make_node(), []
+    node.create_timer(0.01, lambda: (compute(3), ran.append('computes')))
+    node.create_timer(0.011, lambda: (time.sleep(0.003), ran.append('sleeps')),
+                      callback_group=ReentrantCallbackGroup())
+    executor = make_executor()
+    executor.add_node(node)
+
+    def found() -> dict[str, tuple[bool, float | None]]:
+        return {name: (count['holds_interpreter'], count['interpreter_share'])
+                for name, count in executor.statistics()['callbacks'].items()
+                if count['kind'] == 'timer'}
+
+    with Spinning(executor):
+        assert wait_for(lambda: [holds for holds, _ in found().values()] == [True, False], 20.0)
+        ran.clear()
+        assert wait_for(lambda: ran.count('sleeps') > 10 and ran.count('computes') > 10, 20.0)
+        (_, computing), (_, sleeping) = found().values()
+    # on a busy machine it is not known how much it would have computed without the others
+    assert computing is None or computing > 0.5
+    assert sleeping is None or sleeping < 0.5
+
+
+def test_the_switch_interval_is_given_back(make_executor, make_node):
+    node, seen = make_node(), []
+    node.create_timer(0.001, lambda: seen.append(sys.getswitchinterval()))
+    executor = make_executor()
+    executor.add_node(node)
+    before = sys.getswitchinterval()
+    with Spinning(executor):
+        assert wait_for(lambda: seen)
+    assert seen[0] == pytest.approx(0.001) and sys.getswitchinterval() == before
+
+
+def learnt(*executions: tuple[float, float, float], habit: GilHabit | None = None) -> int:
+    """
+    Return whether a callback holds the GIL after these executions.
+
+    Each is how long it took, and how long its thread and all others computed meanwhile, in ms.
+    """
+    habit = habit or GilHabit()
+    for execution in executions:
+        habit.ran(*(int(ms * MS) for ms in execution))
+    return habit.holds
+
+
+def test_the_share_of_cpu_in_the_duration_decides():
+    assert learnt() == 0
+    assert learnt((10, 9.5, 0)) == 1
+    assert learnt((10, 0.2, 0)) == 0
+    assert learnt(*[(10, 9.5, 0)] * 3, *[(10, 0.2, 0)] * 20) == 0
+    assert learnt(*[(10, 0.2, 0)] * 3, *[(10, 9.5, 0)] * 30) == 1
+    assert learnt(*[(0.001, 0.001, 0)] * 20) == 0  # too short to matter
+
+
+def test_two_that_fight_for_the_lock_are_both_found_out():
+    assert learnt((20, 10, 10)) == 1
+    assert learnt((70, 10, 60)) == 1
+    assert learnt((20, 0.2, 15)) == 0  # sleeps while others compute
+
+
+def test_who_sleeps_is_not_thought_to_compute_because_others_do():
+    habit = GilHabit()
+    for _ in range(500):
+        assert learnt((1.4, 0.1, 0.5), habit=habit) == 0
+
+
+def test_who_sleeps_while_others_always_compute_is_seldom_thought_to_compute():
+    """Others that no executor knows: a thread of a driver, or one that hashes all the time."""
+    habit = GilHabit()
+    assert learnt(*[(10, 0.6, 0)] * 20, habit=habit) == 0
+    found = [learnt((10, 0.6, 10), habit=habit) for _ in range(100)]
+    assert sum(found) < 20  # for one execution now and then, to find out
+
+
+def test_who_starves_is_not_thought_to_wait():
+    habit = GilHabit()
+    assert learnt(*[(10, 9.5, 0)] * 20, habit=habit) == 1
+    for _ in range(50):
+        habit.ran(40 * MS, 10 * MS, 0, starved=True)
+        assert habit.holds and habit.share > 0.9
+    habit = GilHabit()
+    assert learnt(*[(10, 0.2, 0)] * 20, habit=habit) == 0
+    found = []
+    for _ in range(100):
+        habit.ran(40 * MS, 10 * MS, 0, starved=True)
+        found.append(habit.holds)
+    assert 0 < sum(found) < 20 and habit.share < 0.1
+
+
+def test_a_thread_knows_how_often_it_was_preempted():
+    """One that shares a CPU with another process."""
+    cpu, found = min(os.sched_getaffinity(0)), []
+
+    def share() -> None:
+        os.sched_setaffinity(0, {cpu})
+        before = times_preempted()
+        found.append(wait_for(lambda: compute(5) or times_preempted() > before))
+
+    program = f'import os\nos.sched_setaffinity(0, [{cpu}])\nwhile True: pass'
+    hog = subprocess.Popen([sys.executable, '-c', program])
+    try:
+        thread = threading.Thread(target=share)
+        thread.start()
+        thread.join()
+    finally:
+        hog.kill()
+        hog.wait()
+    assert found == [True]
+
+
+def test_what_is_declared_is_not_measured():
+    assert learnt(*[(10, 0.2, 0)] * 20, habit=GilHabit(True)) == 1
+    assert learnt(*[(10, 9.5, 0)] * 20, habit=GilHabit(False)) == 0
+
+
+def test_how_long_it_takes_is_known_lately():
+    habit = GilHabit(True)
+    learnt((10, 10, 0), habit=habit)
+    assert habit.mean_ns == 10 * MS
+    learnt(*[(2, 2, 0)] * 60, habit=habit)
+    assert 2 * MS <= habit.mean_ns < 3 * MS
+
+
+def test_a_thread_that_is_asleep_waits():
+    check, go_on, subject = GilCheck(), threading.Event(), object()
+    thread = threading.Thread(target=go_on.wait)
+    thread.start()
+    assert thread.ident is not None and thread.native_id is not None
+    now = time.monotonic_ns()
+    check.begin(subject, now, 0)
+    assert now < check.at <= now + 5 * MS
+    assert not check.waits(thread.ident, thread.native_id, time.monotonic_ns())
+    before = gil.schedule_of(thread.native_id)
+    try:
+        assert wait_for(lambda: check.waits(  # it may not be asleep yet
+            thread.ident, thread.native_id, time.monotonic_ns()))
+        after = gil.schedule_of(thread.native_id)
+        assert after.is_asleep and after.slices >= before.slices > 0
+        assert after.delay_ns >= before.delay_ns >= 0
+    finally:
+        go_on.set()
+        thread.join()
+    check.end()
+    assert check.at == 0
+
+
+def test_what_the_kernel_says_of_a_thread_that_runs():
+    before = gil.schedule_of(threading.get_native_id())
+    assert not before.is_asleep
+    time.sleep(0.001)
+    assert gil.schedule_of(threading.get_native_id()).slices > before.slices
+    assert gil.schedule_of(0) == Schedule(0, -1, True)  # there is none
+
+
+def waits(
+    monkeypatch: pytest.MonkeyPatch, *steps: tuple[float, float, float, int, bool],
+) -> list[bool]:
+    """
+    Return what each check says after the first one, 10 ms after the one before.
+
+    Each step is for how long the thread computed, all others did, and it got no CPU (ms); how
+    often it got one; and whether it is asleep.
+    """
+    own, process, delay, slices, asleep = 0.0, 0.0, 0.0, 5, True
+    monkeypatch.setattr(gil, 'cpu_ns', lambda ident: int(own * MS))
+    monkeypatch.setattr(gil, 'process_time_ns', lambda: int(process * MS))
+    monkeypatch.setattr(gil, 'schedule_of', lambda tid: Schedule(int(delay * MS), slices, asleep))
+    check, found = GilCheck(), []
+    check.begin(check, 0, 0)
+    assert not check.waits(1, 1, 10 * MS)
+    for number, step in enumerate(steps, 2):
+        own, process = own + step[0], process + step[0] + step[1]
+        delay, slices, asleep = delay + step[2], slices + step[3], step[4]
+        now = number * 10 * MS
+        found.append(check.waits(1, 1, now))
+        assert now < check.at <= now + LAST_CHECK_NS
+    return found
+
+
+@pytest.mark.parametrize('step, expected', [
+    ((9.0, 0.0, 0.0, 3, True), False),  # computes
+    ((0.6, 0.0, 0.0, 3, True), False),  # a little
+    ((0.0, 0.0, 0.0, 0, True), True),  # is asleep
+    ((0.0, 20.0, 0.0, 0, True), True),  # while others compute
+    ((0.2, 0.0, 0.1, 9, True), True),  # polls
+    ((0.0, 0.0, 0.0, 0, False), False),  # has got no CPU yet
+    ((0.4, 0.0, 9.5, 1, True), False),  # has waited for one
+    ((0.3, 9.0, 0.1, 9, True), False),  # waits for the GIL, or polls
+])
+def test_a_thread_waits_if_it_neither_computes_nor_starves(monkeypatch, step, expected):
+    assert waits(monkeypatch, step) == [expected]
+
+
+def test_without_figures_of_the_kernel_the_cpu_time_decides(monkeypatch):
+    assert waits(monkeypatch, (0.0, 0.0, 0.0, -6, True)) == [True]
+    assert waits(monkeypatch, (0.0, 9.0, 0.0, -6, True)) == [False]
+    assert waits(monkeypatch, (1.0, 9.0, 0.0, -6, True)) == [False]
+
+
+def test_what_stays_unclear_gives_the_interpreter_back_in_the_end(monkeypatch):
+    unclear, computes = (0.0, 20.0, 0.0, 5, True), (5.0, 0.0, 0.0, 1, True)
+    most = gil.UNCLEAR_CHECKS
+    assert waits(monkeypatch, *[unclear] * most) == [False] * (most - 1) + [True]
+    assert waits(monkeypatch, *[unclear] * (most - 1), computes, unclear) == [False] * (most + 1)
+
+
+# --- what arrives beside a callback that computes for long ---------------------------------------
+
+BESIDE = """
+mddag: 1
+nodes:
+  - node: /node
+    callbacks:
+      - {name: long, subscription: /long, dag: long, period: 1s, deadline: 60s,
+         holds_interpreter: true}
+      - {name: urgent, subscription: /urgent, dag: urgent, period: 1s, deadline: 10ms,
+         holds_interpreter: true}
+      - {name: patient, subscription: /patient, dag: patient, period: 1s, deadline: 120s,
+         holds_interpreter: true}
+"""
+
+
+class Beside:
+    """
+    Three callbacks, one of which computes for long.
+
+    :ivar ran: what has happened, in order.
+    :ivar meanwhile: called, while the long one computes, until it returns true.
+    """
+
+    def __init__(self, executor: Any, node: Any) -> None:
+        self.ran: list[str] = []
+        self.begun = threading.Event()
+        self.meanwhile: Any = lambda: True
+        self.executor = executor
+        group = ReentrantCallbackGroup()
+        self.publishers = {
+            name: node.create_publisher(Header, f'/{name}', 10)
+            for name in ('long', 'urgent', 'patient')}
+        node.create_subscription(Header, '/long', self._long, 10, callback_group=group)
+        for name in ('urgent', 'patient'):
+            node.create_subscription(
+                Header, f'/{name}', lambda message, name=name: self.ran.append(name), 10,
+                callback_group=group)
+        executor.add_node(node)
+        assert wait_for(lambda: all(
+            p.get_subscription_count() == 1 for p in self.publishers.values()))
+
+    def publish(self, name: str) -> None:
+        self.publishers[name].publish(Header())
+
+    def _long(self, message: Header) -> None:
+        self.ran.append('begins')
+        self.begun.set()
+        compute(60)
+        end = time.monotonic() + 15.0
+        while not self.meanwhile() and time.monotonic() < end:
+            compute(1)
+        self.ran.append('ends')
+
+    def order(self, *names: str) -> list[str]:
+        """Publish some while the long one computes; return the order of all."""
+        self.ran.clear()
+        self.begun.clear()
+        self.publish('long')
+        assert self.begun.wait(15.0)
+        for name in names:
+            self.publish(name)
+        assert wait_for(lambda: len(self.ran) == 2 + len(names)), self.ran
+        return self.ran.copy()
+
+
+@pytest.fixture(params=['here', 'elsewhere'])
+def beside(request, make_executor, make_node, monkeypatch) -> Any:
+    """Give these callbacks; messages come from threads of this process, or as from elsewhere."""
+    if request.param == 'elsewhere':
+        monkeypatch.setattr(publishing, 'replace_delivery', lambda *args: None)
+    executor = make_executor(msg_graph.loads(BESIDE, 'g.yaml'))
+    found = Beside(executor, make_node())
+    with Spinning(executor):
+        for name in found.publishers:  # so it is known how long each takes
+            found.publish(name)
+        assert wait_for(lambda: len(found.ran) == 4), found.ran
+        yield found
+
+
+def test_an_arrival_with_an_earlier_deadline_starts_beside_a_long_callback(beside):
+    beside.meanwhile = lambda: 'urgent' in beside.ran
+    for _ in range(3):
+        assert beside.order('urgent') == ['begins', 'urgent', 'ends']
+
+
+def test_it_does_so_at_once(beside):
+    """The long one does not wait for it."""
+    for _ in range(20):  # on a busy machine the long one may have ended before
+        order = beside.order('urgent')
+        if order == ['begins', 'urgent', 'ends']:
+            break
+    assert order == ['begins', 'urgent', 'ends']
+
+
+def test_an_arrival_with_a_later_deadline_is_collected_after_a_long_callback(beside):
+    """
+    Its callback never begins before the long one has ended.
+
+    As nobody is to be woken for it, it may only be taken then; so it must not be overlooked.
+    """
+    for _ in range(3):
+        assert beside.order('patient') == ['begins', 'ends', 'patient']
+    assert beside.executor.statistics()['dropped'] == {}
+
+
+def test_of_two_arrivals_beside_a_long_callback_one_overtakes(beside):
+    beside.meanwhile = lambda: 'urgent' in beside.ran
+    for names in (('patient', 'urgent'), ('urgent', 'patient')):
+        assert beside.order(*names) == ['begins', 'urgent', 'ends', 'patient']
+
+
+@pytest.mark.parametrize('usual_ms', [50, 120])
+@pytest.mark.parametrize('beside', ['elsewhere'], indirect=True)
+def test_what_cannot_start_is_left_in_the_middleware(beside, usual_ms):
+    """While the long one computes for as long as usual, nobody wakes for the patient one."""
+    queued: list[int] = []
+
+    def meanwhile() -> bool:
+        queued.append(beside.executor.statistics()['queue'])
+        return True
+
+    beside.meanwhile = meanwhile
+    habit = next(each.habit for each in beside.executor._registry.by_id.values()
+                 if each.callback is not None and each.callback.name == 'long')
+    for _ in range(20):  # on a busy machine it may take longer than usual
+        habit.mean_ns = usual_ms * MS
+        assert beside.order('patient') == ['begins', 'ends', 'patient']
+        if queued[-1] == 0:
+            break
+    assert queued[-1] == 0
+
+
+def test_a_callback_that_releases_the_gil_starts_beside_a_long_one(make_executor, make_node):
+    node = make_node()
+    executor = make_executor(msg_graph.loads(
+        BESIDE.replace('120s,\n         holds_interpreter: true', '120s,\n         '
+                       'holds_interpreter: false'), 'g.yaml'))
+    beside = Beside(executor, node)
+    with Spinning(executor):
+        for name in beside.publishers:
+            beside.publish(name)
+        assert wait_for(lambda: len(beside.ran) == 4), beside.ran
+        beside.meanwhile = lambda: 'patient' in beside.ran
+        for _ in range(3):
+            assert beside.order('patient') == ['begins', 'patient', 'ends']
+
+
+def test_a_timer_that_is_due_beside_a_long_callback_runs_after_it(make_executor, make_node):
+    """And keeps its period: it was due while nobody was to be woken for it."""
+    node, ran = make_node(), []
+    group = ReentrantCallbackGroup()
+
+    def compute_long() -> None:
+        ran.append('begins')
+        compute(30)
+        ran.append('ends')
+
+    node.create_timer(0.1, compute_long, callback_group=group)
+    node.create_timer(0.01, lambda: ran.append('patient'), callback_group=group)
+    executor = make_executor(msg_graph.loads("""
+mddag: 1
+nodes:
+  - node: /node
+    callbacks:
+      - {name: long, timer: 100ms, dag: long, deadline: 5s, holds_interpreter: true}
+      - {name: patient, timer: 10ms, dag: patient, deadline: 20s, holds_interpreter: true}
+""", 'g.yaml'))
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: ran.count('ends') >= 5 and ran[-1] == 'patient', 30.0)
+    for before, after in zip(ran, ran[1:]):
+        assert before != 'begins' or after == 'ends', ran

@@ -1,0 +1,256 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Which publication a message comes from, and when nobody can say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import time
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.executor.jobs import (
+    Announced,
+    Jobs,
+    KEEP,
+    Origin,
+    Publication,
+    PublisherNumbers,
+    PublisherState,
+    ROUNDING_NS,
+)
+import msg_graph
+
+TOPIC = '/topic'
+GRAPH = """
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: tick, timer: 10ms, publishes: [/topic]}
+      - {name: end, subscription: /topic, deadline: 5ms}
+"""
+
+
+class Bench:
+    """Jobs whose publications are given, with a publisher or two."""
+
+    def __init__(self) -> None:
+        self.jobs = Jobs(msg_graph.loads(GRAPH, 'g.yaml'))
+        self.topic = self.jobs.topics[TOPIC]
+        self.publishers = [PublisherState(TOPIC), PublisherState(TOPIC)]
+
+    def published(self, begin: int, end: int | None, job: int, publisher: int = 0) -> None:
+        state = self.publishers[publisher]
+        state.count += 1
+        publication = Publication(begin, state.numbers, Origin(0, 0, job, publisher), state.count)
+        self.topic.publications.append(publication)
+        if end is not None:
+            publication.end = end
+
+    def job(self, stamp: int, sequence: int | None = None) -> Any:
+        origin = self.jobs.find(TOPIC, stamp, sequence)
+        return None if origin is None else origin.job
+
+
+def test_the_window_that_holds_the_stamp():
+    bench = Bench()
+    for job in range(KEEP):
+        bench.published(job * 1000, job * 1000 + 10, job)
+    assert [bench.job(job * 1000 + 5) for job in range(KEEP)] == list(range(KEEP))
+    assert bench.job(50_000 + 10 + ROUNDING_NS) == 50
+    assert bench.job(50_500) is None
+    assert bench.job(-5) is None
+    assert bench.jobs.unknown == 2
+
+
+def test_a_publication_that_has_not_returned_yet():
+    bench = Bench()
+    bench.published(1000, None, 7)
+    assert bench.job(1500) == 7
+
+
+def test_other_topics_and_empty_ones_are_unknown():
+    bench = Bench()
+    assert bench.job(5) is None
+    assert bench.jobs.find('/other', 5, None) is None
+    assert bench.jobs.unknown == 2
+
+
+def test_the_sequence_number_decides_between_publishers():
+    bench = Bench()
+    bench.published(0, 10, 1, publisher=0)
+    bench.published(1000, 1010, 2, publisher=1)
+    bench.published(2000, 2010, 3, publisher=1)
+    bench.published(3000, 3100, 4, publisher=0)
+    bench.published(3050, 3150, 5, publisher=1)
+    assert bench.job(3080) is None, 'without a number nobody knows'
+    assert bench.jobs.doubtful == 1
+    assert bench.job(3080, 2) == 4
+    assert bench.job(3080, 3) == 5
+    assert bench.job(3080, 9) is None
+    assert bench.jobs.doubtful == 2
+
+
+def test_publications_before_the_count_began_are_learnt():
+    """The middleware counts 100 more than we do for publisher 0; two messages in a row show it."""
+    bench = Bench()
+    bench.published(0, 10, 1, publisher=0)
+    assert bench.job(5, 101) is None
+    assert bench.job(5, 101) is None, 'the same one'
+    bench.published(20, 30, 2, publisher=0)
+    assert bench.job(25, 102) == 2
+    bench.published(100, 200, 3, publisher=0)
+    bench.published(110, 210, 4, publisher=1)
+    assert bench.job(150, 103) == 3
+    assert bench.job(150, 1) == 4
+
+
+def test_messages_of_a_stranger_in_the_window_are_nobody_s():
+    """Whatever its numbers are, and however often they differ alike."""
+    bench = Bench()
+    for job in range(1, 100):
+        bench.published(job * 1000, job * 1000 + 10, job)
+        for number in (3 * job + 1, job + 7):  # faster, and as fast
+            assert bench.job(job * 1000 + 5, number) is None
+        assert bench.job(job * 1000 + 6, job) == job
+    assert bench.jobs.unknown == 198
+
+
+def test_equal_numbers_of_two_publishers_stay_a_doubt():
+    bench = Bench()
+    bench.published(0, 10, 1, publisher=0)
+    bench.published(5, 15, 2, publisher=1)
+    assert bench.job(7, 1) is None
+
+
+def test_a_long_publication_is_found_behind_many_short_ones():
+    bench = Bench()
+    bench.published(0, 10 ** 12, 42, publisher=1)
+    for job in range(KEEP - 1):
+        bench.published(1_000_000 * job + 1, 1_000_000 * job + 2, job)
+    assert bench.job(500) == 42
+
+
+@given(st.lists(st.tuples(st.integers(1, 50), st.integers(0, 40)), min_size=1, max_size=60),
+       st.data())
+def test_it_never_guesses(steps, data):
+    """Against the definition: the answer is the only window with the stamp, or none."""
+    bench = Bench()
+    windows = []
+    now = 0
+    for job, (gap, length) in enumerate(steps):
+        now += gap
+        windows.append((now, now + length))
+        bench.published(now, now + length, job, publisher=job % 2)
+    stamp = data.draw(st.integers(0, now + 60))
+    holds = [job for job, (begin, end) in enumerate(windows)
+             if begin - ROUNDING_NS <= stamp <= end + ROUNDING_NS]
+    assert bench.job(stamp) == (holds[0] if len(holds) == 1 else None)
+
+
+def test_publish_notes_its_window_and_passes_exceptions_on():
+    bench = Bench()
+    state = bench.publishers[0]
+    state.count = 1
+    sent = []
+    bench.jobs.publish(
+        lambda publisher, msg: sent.append((publisher, msg)), 'p', 'm', state,
+        bench.topic, Origin(1, 2, 3, 4))
+    publication = bench.topic.publications[0]
+    assert sent == [('p', 'm')] and publication.begin <= publication.end
+    assert publication.sequence == 1 and publication.origin.job == 3
+
+    def fail(publisher: Any, msg: Any) -> None:
+        raise TypeError('no such message')
+
+    try:
+        bench.jobs.publish(fail, 'p', 'm', state, bench.topic, Origin(1, 2, 3, 4))
+    except TypeError:
+        pass
+    assert bench.topic.publications[1].end < 2 ** 62
+
+
+# --- publications of other processes -------------------------------------------------------------
+
+def announced(bench: Bench, begin: int, end: int, number: int, sequence: int,
+              publisher: PublisherNumbers) -> None:
+    bench.jobs.take_in(TOPIC, Publication(
+        begin, publisher, Announced((1, number), 0, 0, 0), sequence, end))
+
+
+def number(bench: Bench, stamp: int, sequence: int | None = None) -> int | None:
+    found = bench.jobs.find(TOPIC, stamp, sequence, counted=False)
+    return found.name[1] if isinstance(found, Announced) else None
+
+
+def test_an_announced_publication_is_found_by_its_window():
+    bench, publisher = Bench(), PublisherNumbers()
+    bench.published(0, 10, 5)
+    announced(bench, 1000, 1010, 7, 1, publisher)
+    assert (bench.job(5), number(bench, 1005, 1), number(bench, 500)) == (5, 7, None)
+    assert (bench.jobs.unknown, bench.jobs.doubtful) == (0, 0)
+
+
+def test_the_sequence_number_decides_between_announced_publications():
+    bench, one, other = Bench(), PublisherNumbers(), PublisherNumbers()
+    announced(bench, 0, 10, 1, 1, one)
+    announced(bench, 5, 15, 2, 2, other)
+    assert (number(bench, 7, 1), number(bench, 7, 2)) == (1, 2)
+    assert number(bench, 7, 9) is None
+
+
+def test_a_publication_here_and_one_elsewhere_at_once_are_a_doubt_if_their_numbers_agree():
+    bench, other = Bench(), PublisherNumbers()
+    bench.published(0, 10, 5)
+    announced(bench, 5, 15, 1, 9, other)
+    assert bench.job(7, 1) == 5 and number(bench, 7, 9) == 1
+    announced(bench, 5, 15, 1, 1, PublisherNumbers())
+    assert bench.jobs.find(TOPIC, 7, 1) is None and bench.jobs.doubtful == 1
+
+
+def test_what_began_long_ago_and_is_noted_late_hides_nothing():
+    """Its thread has waited for the interpreter between the two; it is just being sent."""
+    bench = Bench()
+    bench.published(0, 10, 1, publisher=0)
+    bench.published(5_000_000, 5_000_010, 2, publisher=0)
+    bench.published(1_000_000, None, 3, publisher=1)
+    assert bench.job(5_000_005, 2) == 2
+    assert bench.job(5_000_005, 1) == 3, 'the publisher that was late'
+
+
+def test_a_publication_within_another_of_its_publisher_has_no_number():
+    """A signal's handler publishes while a publication is being sent."""
+    bench = Bench()
+    state = bench.publishers[0]
+
+    def publish(job: int, send: Callable[[], None]) -> None:
+        state.count += 1
+        bench.jobs.publish(
+            lambda *_: send(), None, None, state, bench.topic, Origin(0, 0, job, 0))
+
+    stamps = []
+    publish(1, lambda: publish(2, lambda: stamps.append(time.time_ns())))
+    for number in (1, 2):
+        assert bench.job(stamps[0], number) is None
+    publish(3, lambda: stamps.append(time.time_ns()))
+    assert bench.job(stamps[1], 3) == 3
+
+
+def test_publications_that_overlap_are_announced_together_when_all_have_returned():
+    bench = Bench()
+    announced_to: list[list[int]] = []
+    bench.jobs.announce = lambda send, topic, several: announced_to.append(
+        [each.origin.job for each in several])  # type: ignore[union-attr]
+    bench.jobs.announce_on({TOPIC})
+
+    def publish(job: int, publisher: int, send: Callable[[], None] = lambda: None) -> None:
+        bench.jobs.publish(lambda *_: send(), None, None, bench.publishers[publisher],
+                           bench.topic, Origin(0, 0, job, publisher))
+
+    publish(1, 0)
+    publish(2, 0, lambda: publish(3, 1))
+    bench.jobs.announce_on(set())
+    publish(4, 0)
+    assert announced_to == [[1], [3, 2]]

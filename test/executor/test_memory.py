@@ -1,0 +1,267 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What executors and hosts keep of nodes, executors and entities that are gone: nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+import gc
+import os
+import threading
+from types import SimpleNamespace
+from typing import Any
+import weakref
+
+from mddag_executor.clocks import TraceClock
+from mddag_executor.executor import publishing, waitables
+from mddag_executor.executor.recorder import Recorder
+from msg_graph import loads
+import pytest
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
+from rclpy.task import Future
+from std_msgs.msg import Header
+from std_srvs.srv import Empty
+
+from .conftest import Spinning, wait_for
+
+GRAPH = """
+mddag: 1
+nodes:
+  - node: /source
+    callbacks: [{name: tick, timer: 10ms, publishes: [/chatter], dag: chain}]
+  - node: /sink
+    callbacks: [{name: heard, subscription: /chatter, deadline: 50ms}]
+"""
+CYCLES = 30
+# What is kept of the last ones: publications and response times, a few in a worker's frame.
+SETTLED = 5
+
+
+class Brief:
+    """Two nodes for a while: a declared chain, and everything else that a node can have."""
+
+    def __init__(
+        self, executor: Any, make_node: Callable[..., Any], made: list[weakref.ref[Any]]
+    ) -> None:
+        self.executor = executor
+        self.nodes = make_node('source'), make_node('sink')
+        source, sink = self.nodes
+        self.heard = 0
+        publisher = self._publisher = source.create_publisher(Header, 'chatter', 10)
+        group = MutuallyExclusiveCallbackGroup()
+        entities = [
+            publisher, group, source.create_timer(0.01, self._tick),
+            sink.create_subscription(Header, 'chatter', self._hear, 10, callback_group=group),
+            sink.create_service(Empty, 'empty', lambda request, response: response),
+            sink.create_client(Empty, 'empty'),
+            sink.create_guard_condition(lambda: None)]
+        made += [weakref.ref(thing) for thing in (self, *self.nodes, *entities)]
+        for node in self.nodes:
+            executor.add_node(node)
+
+    def _tick(self) -> None:
+        with suppress(InvalidHandle):  # destroyed while it runs
+            self._publisher.publish(Header())
+
+    def has_heard(self) -> bool:
+        return self.heard > 0
+
+    def _hear(self, message: Any) -> None:
+        self.heard += 1
+
+    def end(self) -> None:
+        for node in self.nodes:
+            node.destroy_node()
+            self.executor.remove_node(node)
+
+
+def sizes(*owners: Any) -> dict[str, int]:
+    """Return the sizes of everything that these have, and of what that has."""
+    found = {}
+    for owner in owners:
+        attributes = [*getattr(owner, '__dict__', {}).items(), *(
+            (name, getattr(owner, name)) for name in getattr(owner, '_fields', ()))]
+        for name, value in attributes:
+            if hasattr(value, '__len__') and not isinstance(value, str):
+                found[f'{type(owner).__name__}.{name}'] = len(value)
+    return found
+
+
+def used(scheduler: Any) -> dict[str, int]:
+    """Return how much of the core's tables is in use; the rest waits to be used again."""
+    state = scheduler.state
+    free = 0
+    for slot in state.free_slot:
+        while slot >= 0:
+            free, slot = free + 1, state.job_next[slot]
+    return {'jobs': len(state.job_next) - free,
+            'groups': len(state.group_owner) - len(scheduler._free_groups)}
+
+
+def tables(executor: Any) -> dict[str, int]:
+    engine, pool, at_once = executor._engine, executor._pool, executor._at_once
+    found = used(engine.scheduler) | sizes(
+        executor, engine, engine.jobs, engine.verdicts, executor._registry, executor._upkeep,
+        executor._wait_sets, pool, pool.timers)
+    for name, loop in (('pool', pool.loop), ('at_once', at_once.loop)):
+        found |= {f'{name}.{key}': size for key, size in sizes(loop).items()}
+    found |= {f'at_once.{key}': size for key, size in sizes(at_once.timers).items()}
+    return found | {
+        'deliveries': sum(map(len, publishing._deliveries.values())),
+        'events': len(waitables._known), 'descriptors': len(os.listdir('/proc/self/fd'))}
+
+
+def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context):
+    def make(name: str) -> Any:  # not by the fixture, which keeps its nodes
+        return Node(name, context=ros_context, enable_rosout=False,
+                    start_parameter_services=False)
+
+    executor = make_executor(loads(GRAPH))
+    made: list[weakref.ref[Any]] = []
+
+    def cycle(times: int) -> None:
+        for _ in range(times):
+            brief = Brief(executor, make, made)
+            assert wait_for(brief.has_heard, 15.0), spinning.error
+            brief.end()
+            gc.collect()  # else it depends on how busy the interpreter is
+
+    def nothing_left() -> bool:
+        gc.collect()
+        return len(executor._registry.by_id) == 0 and not executor._registry._retired
+
+    with Spinning(executor) as spinning:
+        cycle(SETTLED)
+        assert wait_for(nothing_left, 15.0)
+        before = tables(executor)
+        assert len(before) > 30
+        cycle(CYCLES)
+        assert wait_for(nothing_left, 15.0)
+
+        def grown() -> dict[str, tuple[int | None, int]]:
+            return {name: (before.get(name), size) for name, size in tables(executor).items()
+                    if size - before.get(name, 0) >= CYCLES // 5}
+        assert wait_for(lambda: not grown()), grown()
+
+        def left() -> list[Any]:
+            gc.collect()
+            return [thing() for thing in made[:-10 * SETTLED] if thing() is not None]
+        assert wait_for(lambda: not left()), left()
+    assert spinning.error is None
+
+
+@contextmanager
+def without_collector() -> Iterator[None]:
+    """Let only that be freed which nobody refers to."""
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
+def test_a_destroyed_node_is_freed_without_the_collector(make_executor, ros_context):
+    """Else it waits with all its handles: with many objects around that may take hours."""
+    executor = make_executor()
+    with Spinning(executor), without_collector():
+        node = Node('brief', context=ros_context, enable_rosout=False,
+                    start_parameter_services=False)
+        publisher = node.create_publisher(Header, 'chatter', 10)
+        subscription = node.create_subscription(Header, 'chatter', lambda message: None, 10)
+        things = [publisher, subscription, *publisher.event_handlers,
+                  *subscription.event_handlers, node.create_timer(100.0, print)]
+        n_things = len(things) - 1  # publishers are not kept
+        executor.add_node(node)
+        assert wait_for(lambda: len(executor._registry.by_id) >= n_things)
+        assert wait_for(lambda: executor._pool.is_current)
+        left = [weakref.ref(thing) for thing in (node, *things)]
+        assert len(left) > 6
+        node.destroy_node()
+        executor.remove_node(node)
+        del node, publisher, subscription, things
+        assert wait_for(lambda: all(thing() is None for thing in left)), [
+            thing() for thing in left if thing() is not None]
+
+
+def test_a_node_that_went_while_its_callback_ran_is_freed(make_executor, ros_context):
+    executor = make_executor()
+    started, go_on = threading.Event(), threading.Event()
+
+    def call() -> None:
+        started.set()
+        go_on.wait()
+
+    with Spinning(executor):
+        node = Node('brief', context=ros_context, enable_rosout=False,
+                    start_parameter_services=False)
+        left = weakref.ref(node.create_timer(0.01, call))
+        executor.add_node(node)
+        assert started.wait(5.0)
+        executor.remove_node(node)
+        node.destroy_node()
+        del node
+        assert wait_for(lambda: not executor._registry.by_id)
+        go_on.set()
+
+        def is_free() -> bool:
+            gc.collect()
+            return left() is None
+        assert wait_for(is_free)
+
+
+def test_a_spin_that_has_ended_holds_no_entities(make_executor, make_node):
+    executor = make_executor()
+    node = make_node()
+    timer = node.create_timer(100.0, print)
+    subscription = node.create_subscription(Header, 'chatter', lambda message: None, 10)
+    executor.add_node(node)
+    with without_collector():
+        executor.spin_until_future_complete(Future(), timeout_sec=0.2)
+        executor.remove_node(node)
+        executor.spin_until_future_complete(Future(), timeout_sec=0.2)
+        left = [weakref.ref(thing) for thing in (timer, subscription)]
+        node.destroy_timer(timer)
+        node.destroy_subscription(subscription)
+        del timer, subscription
+        assert [thing() for thing in left] == [None, None]
+
+
+class Thing:
+    """As much of a node or a publisher as the recorder looks at."""
+
+    publishers: tuple[Thing, ...] = ()
+    topic_name = '/topic'
+
+    qos_profile = SimpleNamespace(depth=10)
+
+    def get_name(self) -> str:
+        return 'node'
+
+    def get_namespace(self) -> str:
+        return '/'
+
+    def get_fully_qualified_name(self) -> str:
+        return '/node'
+
+
+@pytest.mark.parametrize('trace', ['out.mcap'])
+def test_what_gets_the_address_of_one_before_is_recorded(tmp_path, trace):
+    recorder = Recorder(str(tmp_path / trace), None, 'rad', 1, 100, 64, TraceClock())
+    recorded: list[tuple[str, int]] = []
+    recorder.record = lambda event, now, vtid, *fields: recorded.append((event, fields[0]))
+    for _ in range(20):
+        node = Thing()
+        node.publishers = (Thing(),)
+        for _ in range(3):
+            recorder.entities([node], [])
+        del node
+    recorder.writer.close()
+    for event in ('rcl_node_init', 'rcl_publisher_init'):
+        addresses = [address for name, address in recorded if name == event]
+        assert len(addresses) == 20
+        assert len(set(addresses)) < 20, 'no address came again: this tests nothing'
+    assert len(recorder._known) == 0

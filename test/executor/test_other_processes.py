@@ -1,0 +1,425 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+from mddag_executor.core import rules, Scheduler, Tables
+from mddag_executor.core.state import (
+    COMPLETED,
+    EXPIRED,
+    JOB_END,
+    LATE,
+    SINK_EXPIRED,
+    SINK_IN_TIME,
+    SINK_LATE,
+    SINK_MISSED,
+)
+from mddag_executor.executor import current_job
+from mddag_executor.executor.jobs import header_stamp
+from mddag_executor.replay import replay
+from mddag_executor.trace import read_events
+from msg_graph import loads
+import pytest
+from std_msgs.msg import Header
+
+from .conftest import is_idle, Spinning, wait_for
+
+CHAIN = """
+mddag: 1
+nodes:
+  - node: /sensor
+    callbacks: [{name: tick, timer: 20ms, publishes: [/raw], dag: chain,
+                 release_from: header_stamp}]
+  - node: /first
+    callbacks: [{name: relay, subscription: /raw, publishes: [/half]}]
+  - node: /second
+    callbacks: [{name: relay, subscription: /half, publishes: [/whole]}]
+  - node: /last
+    callbacks: [{name: sink, subscription: /whole, deadline: 100ms}]
+"""
+MS = 1_000_000
+
+
+# --- the core's rule 10 --------------------------------------------------------------------------
+
+FORK = """
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: source, timer: 20ms, publishes: [/a], dag: fork, release_from: header_stamp}
+      - {name: left, subscription: /a, publishes: [/b]}
+      - {name: right, subscription: /a, publishes: [/c]}
+      - {name: one, subscription: /b, deadline: 10ms}
+      - {name: two, subscription: /c, deadline: 20ms}
+"""
+SOURCE, LEFT, RIGHT, ONE, TWO = range(5)
+
+
+class Part:
+    """A core in one of several processes."""
+
+    def __init__(self, *here: int) -> None:
+        self.scheduler = Scheduler(
+            Tables.build(loads(FORK), legs=True, expire_after=100 * MS), 1, propagate=False)
+        self.scheduler.expect(0, [int(i in here) for i in range(5)])
+        self.slot = self.scheduler.release(0, 0, 0, 0)
+
+    def run(self, vertex: int, end: int) -> list[tuple[int, int]]:
+        """Run a vertex; return the kinds of decisions, and vertex or the job's end."""
+        x = self.scheduler.execution(self.slot, vertex)
+        scheduler = self.scheduler
+        rules.record(scheduler.tables, scheduler.state, scheduler.policy.key, x, end)
+        return self.decisions()
+
+    def decisions(self) -> list[tuple[int, int]]:
+        return [(d[0], d[4] if d[0] == JOB_END else d[2]) for d in self.scheduler.decisions()]
+
+
+def test_a_part_without_sinks_completes_when_all_that_lead_out_have():
+    part = Part(SOURCE, LEFT, RIGHT)
+    assert part.run(SOURCE, MS) == part.run(RIGHT, 2 * MS) == []
+    assert part.run(LEFT, 500 * MS) == [(JOB_END, COMPLETED)]  # nobody's deadline is here
+
+
+def test_what_publishes_to_another_process_keeps_its_job_open_while_it_runs():
+    part = Part(SOURCE, LEFT, ONE)  # the source goes on after it has started `left`
+    assert part.run(LEFT, MS) == []
+    assert part.run(ONE, 2 * MS) == [(SINK_IN_TIME, ONE)]
+    assert part.run(SOURCE, 3 * MS) == [(JOB_END, COMPLETED)]
+
+
+def test_sinks_are_judged_where_they_are_only():
+    part = Part(LEFT, ONE)
+    assert part.run(LEFT, MS) == []
+    assert part.run(ONE, 11 * MS) == [(SINK_LATE, ONE), (JOB_END, LATE)]
+    part = Part(TWO)
+    assert part.run(TWO, 11 * MS) == [(SINK_IN_TIME, TWO), (JOB_END, COMPLETED)]
+
+
+def test_a_part_that_is_left_and_entered_again_ends_with_its_sink():
+    part = Part(SOURCE, ONE)
+    assert part.run(SOURCE, MS) == []
+    assert part.run(ONE, 5 * MS) == [(SINK_IN_TIME, ONE), (JOB_END, COMPLETED)]
+
+
+def test_what_is_elsewhere_does_not_expire_here():
+    part = Part(SOURCE, LEFT, ONE)
+    part.scheduler.expire_idle(1000 * MS)
+    assert part.decisions() == [(SINK_EXPIRED, ONE), (JOB_END, EXPIRED)]
+    part = Part(SOURCE, RIGHT, TWO)
+    part.scheduler.finish(1000 * MS)
+    assert part.decisions() == [(SINK_MISSED, TWO)]
+
+
+def test_a_whole_dag_is_judged_as_ever():
+    part = Part(SOURCE, LEFT, RIGHT, ONE, TWO)
+    for vertex in (SOURCE, LEFT, RIGHT):
+        assert part.run(vertex, MS) == []
+    assert part.run(ONE, 2 * MS) == [(SINK_IN_TIME, ONE)]
+    assert part.run(TWO, 2 * MS) == [(SINK_IN_TIME, TWO), (JOB_END, COMPLETED)]
+
+
+# --- stamps --------------------------------------------------------------------------------------
+
+class Thing:
+    """A message of an odd kind."""
+
+    def __init__(self, **fields: Any) -> None:
+        self.__dict__.update(fields)
+
+
+@pytest.mark.parametrize('message', [
+    b'raw', Thing(), Thing(header=None), Thing(stamp=3.5), Thing(header=Thing(stamp='x')),
+    Header(), Thing(stamp=Thing(sec=None, nanosec=1))])
+def test_no_stamp(message: Any):
+    assert header_stamp(message) == -1
+
+
+def test_stamps_of_a_header_and_of_a_message_that_has_one():
+    header = Header()
+    header.stamp.sec, header.stamp.nanosec = 3, 7
+    assert header_stamp(header) == header_stamp(Thing(header=header)) == 3_000_000_007
+
+
+# --- two executors are as two processes ----------------------------------------------------------
+
+class Nodes:
+    """The nodes of CHAIN; jobs by node, each as (job, release, stamp)."""
+
+    def __init__(self, make_node: Any) -> None:
+        self.jobs: dict[str, list[Any]] = {}
+        self.stamps: list[int] = []
+        self.nodes = {n: make_node(n) for n in ('sensor', 'first', 'second', 'last')}
+        self.raw = self.nodes['sensor'].create_publisher(Header, '/raw', 50)
+        self.publishers = [self.raw]
+        for name, topic, to in (
+            ('first', '/raw', '/half'), ('second', '/half', '/whole'), ('last', '/whole', None),
+        ):
+            publisher = self.nodes[name].create_publisher(Header, to, 50) if to else None
+            self.nodes[name].create_subscription(
+                Header, topic, self._relay(name, publisher), 50)
+            if publisher is not None:
+                self.publishers.append(publisher)
+        self.timer = self.nodes['sensor'].create_timer(0.02, self._tick, autostart=False)
+
+    def _tick(self) -> None:
+        message = Header(stamp=self.nodes['sensor'].get_clock().now().to_msg())
+        self.stamps.append(header_stamp(message))
+        self.jobs.setdefault('sensor', []).append((current_job(), self.stamps[-1]))
+        self.raw.publish(message)
+
+    def _relay(self, name: str, publisher: Any) -> Callable[[Any], None]:
+        def relay(message: Any) -> None:
+            self.jobs.setdefault(name, []).append((current_job(), header_stamp(message)))
+            if publisher is not None:
+                publisher.publish(message)
+        return relay
+
+    def connected(self) -> bool:
+        """Tell whether all topics have met their subscriptions."""
+        return all(p.get_subscription_count() == 1 for p in self.publishers)
+
+    def run(self, *executors: Any) -> None:
+        """Start the timer when all are connected; return when all have run for 20 jobs."""
+        assert wait_for(self.connected)
+        self.timer.reset()
+        for executor in executors:
+            executor.wake()
+        assert wait_for(lambda: len(self.jobs.get('last', ())) >= 20)
+        self.timer.cancel()
+        assert wait_for(lambda: len(self.jobs['last']) == len(self.stamps)
+                        and all(map(is_idle, executors)))
+
+
+def in_two(
+    make_executor: Any, make_node: Any, text: str,
+    elsewhere: Sequence[str] = ('second', 'last'),
+) -> tuple[Nodes, Any, Any]:
+    """Run the chain's nodes, some of them in a second executor; return both."""
+    nodes = Nodes(make_node)
+    here, there = make_executor(loads(text)), make_executor(loads(text))
+    for name, node in nodes.nodes.items():
+        (there if name in elsewhere else here).add_node(node)
+    with Spinning(here), Spinning(there):
+        nodes.run(here, there)
+    return nodes, here, there
+
+
+def ends(executor: Any) -> dict[str, int]:
+    return executor.statistics()['dags']['chain']['ends']
+
+
+def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_executor, make_node):
+    nodes, up, down = in_two(make_executor, make_node, CHAIN.replace('100ms', '60s'))
+    n = len(nodes.stamps)
+    for name in ('second', 'last'):
+        assert [job.job for job, _ in nodes.jobs[name]] == list(range(n))
+        for job, stamp in nodes.jobs[name]:
+            assert abs(job.release_ns - stamp) < 2 * MS
+    assert [job.job for job, _ in nodes.jobs['first']] == [
+        job.job for job, _ in nodes.jobs['sensor']]
+    skipped = up.statistics()['callbacks']['/sensor:tick']['skipped']  # on a busy machine
+    for executor, expired in ((up, skipped), (down, 0)):
+        statistics = executor.statistics()
+        assert statistics['undeclared'] == 0 and statistics['never_ran'] == []
+        assert ends(executor) == {
+            'completed': n, 'late': 0, 'aborted': 0, 'expired': expired, 'failed': 0}
+    assert up.statistics()['dags']['chain']['sinks'] == {}
+    sink = down.statistics()['dags']['chain']['sinks']['/last:sink']
+    assert (sink['completed'], sink['late']) == (n, 0)
+    assert not up.statistics()['deadline_missed']
+
+
+def test_a_dag_leaves_and_comes_back_to_the_same_job(make_executor, make_node):
+    # nothing is late on a busy machine
+    nodes, outer, inner = in_two(
+        make_executor, make_node, CHAIN.replace('100ms', '60s'), elsewhere=('second',))
+    n = len(nodes.stamps)
+    # at home the release is the timer's due time, not the stamp
+    assert [job for job, _ in nodes.jobs['last']] == [job for job, _ in nodes.jobs['first']]
+    assert {(b.release_ns - a.release_ns) % (20 * MS) for (a, _), (b, _) in zip(
+        nodes.jobs['last'][1:], nodes.jobs['last'][2:])} == {0}
+    skipped = outer.statistics()['callbacks']['/sensor:tick']['skipped']
+    assert outer.statistics()['dags']['chain']['jobs'] == n + skipped
+    assert ends(outer)['completed'] == ends(inner)['completed'] == n
+    assert outer.statistics()['undeclared'] == inner.statistics()['undeclared'] == 0
+
+
+def test_without_the_declaration_messages_from_elsewhere_are_undeclared(
+        make_executor, make_node):
+    nodes, _, down = in_two(
+        make_executor, make_node,
+        CHAIN.replace(',\n                 release_from: header_stamp', ''))
+    assert {job for job, _ in nodes.jobs['last']} == {None}
+    assert down.statistics()['dags']['chain']['jobs'] == 0
+
+
+@pytest.fixture
+def lone(make_executor: Any, make_node: Any) -> Iterator[Any]:
+    """Give a spinning executor that has the last two nodes, a publisher on /half, and jobs."""
+    nodes = Nodes(make_node)
+    executor = make_executor(loads(CHAIN))
+    for name in ('second', 'last'):
+        executor.add_node(nodes.nodes[name])
+    half = make_node('elsewhere').create_publisher(Header, '/half', 50)
+    with Spinning(executor):
+        assert wait_for(lambda: half.get_subscription_count() == 1)
+        assert wait_for(lambda: nodes.publishers[-1].get_subscription_count() == 1)
+        yield executor, half, nodes
+
+
+def stamped(nanoseconds: int) -> Header:
+    message = Header()
+    message.stamp.sec, message.stamp.nanosec = divmod(nanoseconds, 1_000_000_000)
+    return message
+
+
+def test_a_message_without_a_stamp_is_undeclared(lone):
+    executor, half, nodes = lone
+    half.publish(Header())
+    assert wait_for(lambda: len(nodes.jobs.get('last', ())) == 1)
+    assert nodes.jobs['second'][0][0] is nodes.jobs['last'][0][0] is None
+    assert executor.statistics()['callbacks']['/second:relay']['unattributed'] == 1
+
+
+def test_a_second_message_of_a_job_that_has_ended_is_undeclared(lone):
+    executor, half, nodes = lone
+    stamp = time.time_ns()
+    half.publish(stamped(stamp))
+    assert wait_for(lambda: sum(ends(executor).values()) == 1)
+    half.publish(stamped(stamp))
+    assert wait_for(lambda: len(nodes.jobs.get('last', ())) == 2)
+    assert nodes.jobs['second'][0][0] is not None
+    assert nodes.jobs['second'][1][0] is None
+    assert executor.statistics()['dags']['chain']['jobs'] == 1
+
+
+def test_a_stamp_says_how_late_a_job_is_already(lone):
+    executor, half, nodes = lone
+    half.publish(stamped(time.time_ns() - 300 * MS))
+    assert wait_for(lambda: len(nodes.jobs.get('last', ())) == 1)
+    assert wait_for(lambda: ends(executor)['late'] == 1)
+    sink = executor.statistics()['dags']['chain']['sinks']['/last:sink']
+    assert sink['response_ns']['min'] >= 300 * MS
+
+
+def test_a_stamp_of_the_future_is_no_release_before_now(lone):
+    executor, half, nodes = lone
+    before = time.time_ns()
+    half.publish(stamped(before + 10_000 * MS))
+    assert wait_for(lambda: len(nodes.jobs.get('last', ())) == 1)
+    assert abs(nodes.jobs['last'][0][0].release_ns - before) < 1000 * MS
+
+
+def test_two_publishers_elsewhere_are_a_doubt(make_executor, make_node):
+    text = CHAIN + """
+  - node: /other
+    callbacks: [{name: tick, timer: 20ms, publishes: [/half], dag: other,
+                 release_from: header_stamp}]
+"""
+    nodes = Nodes(make_node)
+    executor = make_executor(loads(text))
+    executor.add_node(nodes.nodes['second'])
+    half = make_node('elsewhere').create_publisher(Header, '/half', 50)
+    with Spinning(executor):
+        assert wait_for(lambda: half.get_subscription_count() == 1)
+        half.publish(stamped(time.time_ns()))
+        assert wait_for(lambda: len(nodes.jobs.get('second', ())) == 1)
+    assert nodes.jobs['second'][0][0] is None
+    assert executor.statistics()['callbacks']['/second:relay']['unattributed'] == 1
+
+
+# --- two processes -------------------------------------------------------------------------------
+
+GUESTS = Path(__file__).resolve().parents[1] / 'hosting' / 'guests'
+
+
+class Run:
+    """A `mddag run` in a process of its own, until it is left."""
+
+    def __init__(self, folder: Path, name: str, nodes: list[str], **environment: str) -> None:
+        self.result = folder / f'{name}.json'
+        self.trace = folder / f'{name}.mcap'
+        path = os.pathsep.join([str(GUESTS), *filter(None, [os.environ.get('PYTHONPATH')])])
+        self._process = subprocess.Popen(
+            [sys.executable, '-m', 'mddag_executor', 'run', str(folder / 'graph.yaml'),
+             *(arg for node in nodes for arg in ('--node', f'relay:{node}')),
+             '--json', str(self.result), '--trace', str(self.trace)],
+            cwd=folder, env={**os.environ, 'PYTHONPATH': path, **environment},
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    def end(self) -> dict[str, Any]:
+        self._process.send_signal(signal.SIGINT)
+        _, errors = self._process.communicate(timeout=20)
+        assert self._process.returncode == 0, errors
+        result: dict[str, Any] = json.loads(self.result.read_text())
+        return result
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+
+@pytest.mark.parametrize(('takes', 'late'), [('0', False), ('0.12', True)])
+def test_two_processes_share_a_graph_and_the_sink_judges(
+        tmp_path: Path, takes: str, late: bool):
+    (tmp_path / 'graph.yaml').write_text(CHAIN)
+    mark = tmp_path / 'enough'
+    down = Run(tmp_path, 'down', ['second', 'last'], RELAY_TAKES=takes, RELAY_MARK=str(mark))
+    up = Run(tmp_path, 'up', ['sensor', 'first'])
+    try:
+        assert wait_for(mark.exists, 30.0)
+        upper, lower = up.end(), None
+        time.sleep(0.5)
+        lower = down.end()
+    finally:
+        up.kill()
+        down.kill()
+    assert upper['dags']['chain']['sinks'] == {} and not upper['deadline_missed']
+    due, releases = (
+        [e['release'] for e in read_events(str(run.trace)) if e['_name'] == 'mddag:job_release']
+        for run in (up, down))
+    # apart from releases that a busy machine skipped
+    skipped = len(due) - upper['callbacks']['/sensor:tick']['ran']
+    assert upper['dags']['chain']['ends']['expired'] <= skipped + 5
+    chain = lower['dags']['chain']
+    # the trace also has those that were released before the run began, which are not judged
+    early = len(releases) - chain['jobs']
+    assert 10 < chain['jobs'] <= len(releases) <= len(due)
+    assert lower['unattributed']['doubtful'] == 0 and lower['never_ran'] == []
+    counts = lower['callbacks']
+    assert counts['/second:relay']['unattributed'] == 0
+    sink = chain['sinks']['/last:sink']
+    judged = counts['/last:sink']['ran'] - counts['/last:sink']['unattributed']
+    # what expires while its sink waits, on a busy machine, runs and is not judged
+    assert judged - chain['ends']['expired'] - early - 5 <= sink['completed'] <= judged
+    assert sink['completed'] <= chain['jobs']
+    assert 0.8 * chain['jobs'] <= sink['completed']
+    if late:
+        assert sink['late'] == sink['completed'] and lower['deadline_missed']
+        assert sink['response_ns']['min'] >= 120 * MS
+    else:
+        assert sink['late'] <= sink['completed'] / 2
+    # each job here is one of there, a little later: the node's clock was read in its callback
+    after = sorted(min(r - d for d in due if r - d > -2 * MS) for r in releases)
+    assert after[len(after) // 2] < 15 * MS
+    hosted = [e['vertices'] for e in read_events(str(down.trace)) if e['_name'] == 'mddag:hosted']
+    assert hosted[-1] == '2,3'
+    for run, recorded in ((up, upper), (down, lower)):
+        replayed = replay(str(run.trace))
+        assert replayed.warnings == []
+        found = replayed.result()
+        assert found['deadline_missed'] == recorded['deadline_missed']
+        assert found['dags']['chain']['jobs'] == recorded['dags']['chain']['jobs']
+        assert found['dags']['chain']['ends'] == recorded['dags']['chain']['ends']

@@ -1,0 +1,403 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Spinning: what ends it, what comes out of it, one callback at a time, waiting inside."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+import gc
+import threading
+import time
+from typing import Any
+
+from mddag_executor.executor.loop import EventLoop
+import pytest
+import rclpy
+from rclpy.task import Future
+from rclpy.wait_for_message import wait_for_message
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from .conftest import is_idle, Spinning, wait_for
+from .pulse import Pulse
+
+
+@pytest.mark.parametrize(
+    'kind', ['timer', 'subscription', 'service', 'guard', 'waitable', 'task', 'coroutine'])
+def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
+    """The only worker ends the spin right after it: who swallows it is found out at once."""
+    node = make_node()
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    after: Future = Future(executor=executor)
+
+    def fail(*args: Any) -> None:
+        if not after.done():
+            executor.create_task(after.set_result, None)
+        raise ZeroDivisionError(kind)
+
+    async def fail_later(*args: Any) -> None:
+        fail()
+
+    if kind == 'timer':
+        node.create_timer(0.01, fail)
+    elif kind == 'subscription':
+        node.create_subscription(Header, '/topic', fail, 10)
+        publisher = node.create_publisher(Header, '/topic', 10)
+        node.create_timer(0.05, lambda: publisher.publish(Header()))
+    elif kind == 'service':
+        node.create_service(Trigger, '/ask', fail)
+        client = node.create_client(Trigger, '/ask')
+        node.create_timer(0.05, lambda: client.call_async(Trigger.Request()))
+    elif kind == 'guard':
+        node.create_guard_condition(fail).trigger()
+    elif kind == 'waitable':
+        pulse = Pulse(node, node.default_callback_group)
+        pulse.execute = fail_later  # type: ignore[method-assign]
+        node.add_waitable(pulse)
+        pulse.guard.trigger()
+    else:
+        executor.create_task(fail if kind == 'task' else fail_later)
+    with pytest.raises(ZeroDivisionError, match=kind):
+        executor.spin_until_future_complete(after, 5.0)
+
+
+def test_what_fails_when_it_is_taken_comes_out_of_spin(make_executor, make_node):
+    class Broken(Pulse):
+
+        def take_data(self) -> int:
+            raise ZeroDivisionError('taken')
+
+    node = make_node()
+    broken = Broken(node, node.default_callback_group)
+    node.add_waitable(broken)
+    executor = make_executor()
+    executor.add_node(node)
+    broken.guard.trigger()
+    with pytest.raises(ZeroDivisionError, match='taken'):
+        executor.spin_until_future_complete(Future(), 2.0)
+
+
+def test_it_spins_on_after_an_exception(make_executor):
+    executor = make_executor()
+    executor.create_task(lambda: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        executor.spin()
+    task = executor.create_task(lambda: 'fine')
+    executor.spin_until_future_complete(task, 5.0)
+    assert task.result() == 'fine'
+
+
+def test_an_exception_that_somebody_awaits_does_not_end_spin(make_executor):
+    """See also ``test_asked_for`` (rclpy#1215)."""
+    executor = make_executor()
+
+    async def fails() -> None:
+        raise KeyError('handled')
+
+    async def handles() -> str:
+        try:
+            await inner
+        except KeyError:
+            return 'handled'
+        return 'nothing came'
+
+    outer = executor.create_task(handles)
+    inner: Any = Future(executor=executor)
+    executor.spin_once(0.1)
+    task = executor.create_task(fails)
+    task.add_done_callback(lambda t: inner.set_exception(t.exception()))
+    executor.spin_until_future_complete(outer, 5.0)
+    assert outer.result() == 'handled'
+
+
+class Turn:
+    """What a coroutine may await as well: nothing that says when it is ready."""
+
+    def __await__(self) -> Iterator[None]:
+        yield
+
+
+@pytest.mark.parametrize('stepwise', [False, True])
+def test_a_coroutine_that_awaits_something_unknown_is_asked_again(make_executor, stepwise):
+    executor, turns = make_executor(), []
+
+    async def work() -> str:
+        for turn in range(5):
+            await Turn()
+            turns.append(turn)
+        return 'done'
+
+    task = executor.create_task(work)
+    if stepwise:
+        for _ in range(6):
+            executor.spin_once(0.1)
+    else:
+        executor.spin_until_future_complete(task, 3.0)
+    assert task.done() and task.result() == 'done' and turns == [0, 1, 2, 3, 4]
+    assert not getattr(executor, '_ready_tasks', ())  # rclpy's own, which nobody looks at here
+
+
+def test_spin_once_runs_one_callback_and_has_finished_it(make_executor, make_node):
+    node, calls = make_node(), []
+    for _ in range(3):
+        node.create_timer(0.001, lambda: calls.append(threading.get_ident()))
+    executor = make_executor()
+    executor.add_node(node)
+    time.sleep(0.01)
+    for count in range(1, 6):
+        executor.spin_once(1.0)
+        assert len(calls) == count
+    assert set(calls) == {threading.get_ident()}
+
+
+def test_spin_once_times_out(make_executor):
+    executor = make_executor()
+    begin = time.monotonic()
+    executor.spin_once(0.05)
+    assert time.monotonic() - begin >= 0.05
+    executor.spin_once(0)
+
+
+def test_spin_once_until_future_complete_ends_when_it_is_done(make_executor):
+    executor = make_executor()
+    future = Future()
+    threading.Timer(0.05, lambda: future.set_result(1)).start()
+    executor.spin_once_until_future_complete(future, 5.0)
+    assert future.done()
+
+
+def test_spin_until_future_complete_times_out(make_executor):
+    executor = make_executor()
+    begin = time.monotonic()
+    executor.spin_until_future_complete(Future(), 0.1)
+    assert time.monotonic() - begin >= 0.1
+
+
+@pytest.mark.parametrize('what', ['task', 'node', 'entity'])
+def test_what_is_new_wakes_a_spin_once_that_waits(make_executor, make_node, what):
+    executor, ran = make_executor(), threading.Event()
+    node = make_node()
+    if what == 'entity':
+        executor.add_node(node)
+    waiting = threading.Thread(target=executor.spin_once, args=(4.0,))
+    waiting.start()
+    time.sleep(0.2)
+    if what == 'task':
+        executor.create_task(ran.set)
+    else:
+        node.create_timer(0.001, ran.set)
+        executor.add_node(node)
+    try:
+        assert ran.wait(3.0)
+    finally:
+        waiting.join()
+
+
+def test_every_task_wakes_a_loop_of_spin_once_and_a_spin_after_it(make_executor, make_node):
+    """Not only the first one: what wakes has to be ready to wake again."""
+    executor, ran = make_executor(), [threading.Event() for _ in range(20)]
+
+    def loop() -> None:
+        while not ran[9].is_set():
+            executor.spin_once()
+        executor.spin_until_future_complete(done, 30.0)
+
+    done = Future()
+    thread = threading.Thread(target=loop)
+    thread.start()
+    try:
+        for event in ran:
+            time.sleep(0.01)  # it waits
+            executor.create_task(event.set)
+            assert event.wait(5.0)
+    finally:
+        done.set_result(None)
+        while thread.is_alive():  # where it waits for ever, it may do so for each of them
+            executor.wake()
+            ran[9].set()
+            thread.join(0.1)
+
+
+def test_a_wake_up_that_another_worker_hears_is_not_the_last_one(make_executor, monkeypatch):
+    """
+    One worker looks whether something has come, since nobody waits for it; now another one waits.
+
+    The first one hears what was to wake the second one.
+    """
+    looks, waits, rung, looked = (threading.Event() for _ in range(4))
+    wait = EventLoop.wait
+
+    def wait_in_this_order(self: EventLoop, timeout_s: float = -1) -> Any:
+        if threading.current_thread().name.startswith('mddag-worker') and go_on[0].is_set():
+            if timeout_s == 0 and not looks.is_set():
+                looks.set()
+                rung.wait(15.0)
+                events = wait(self, 0)
+                looked.set()
+                return events
+            if timeout_s == -1 and not looked.is_set():
+                waits.set()
+                looked.wait(15.0)
+        return wait(self, timeout_s)
+
+    monkeypatch.setattr(EventLoop, 'wait', wait_in_this_order)
+    executor = make_executor(num_workers=2)
+    go_on = threading.Event(), threading.Event()
+    with Spinning(executor):
+        for event in go_on:
+            executor.create_task(event.wait, 15.0)
+        assert wait_for(lambda: not executor.statistics()['idle_workers'])
+        go_on[0].set()
+        assert looks.wait(15.0)
+        go_on[1].set()
+        assert waits.wait(15.0)
+        task = executor.create_task(lambda: 'first')
+        rung.set()
+        for _ in range(3):
+            assert wait_for(task.done, 5.0)
+            assert wait_for(lambda: is_idle(executor))
+            task = executor.create_task(lambda: 'next')
+        assert wait_for(task.done, 5.0)
+
+
+def test_spinning_twice_is_an_error(make_executor):
+    executor = make_executor()
+    assert not executor.is_spinning
+    with Spinning(executor):
+        time.sleep(0.05)
+        assert executor.is_spinning
+        with pytest.raises(RuntimeError, match='already spinning'):
+            executor.spin_once(0)
+    assert not executor.is_spinning
+
+
+def test_shutdown_waits_for_a_running_callback(make_executor):
+    executor = make_executor()
+    begun, done = threading.Event(), []
+
+    def work() -> None:
+        begun.set()
+        time.sleep(0.2)
+        done.append(1)
+
+    executor.create_task(work)
+    with Spinning(executor):
+        assert begun.wait(5.0)
+        assert not executor.shutdown(0.01)
+        assert executor.shutdown(5.0)
+        assert done
+
+
+@pytest.mark.parametrize('end', ['shutdown', 'future'])
+def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros_context, end):
+    before = set(threading.enumerate())
+    node, calls = make_node(), []
+    done: Future = Future()
+
+    def tick() -> None:
+        calls.append(1)
+        if len(calls) > 10 and not done.done():
+            done.set_result(None)
+
+    node.create_timer(0.001, tick)
+    node.create_subscription(Header, '/topic', calls.append, 10)
+    node.create_guard_condition(lambda: calls.append(2)).trigger()
+    publisher = node.create_publisher(Header, '/topic', 10)
+    executor = make_executor()
+    executor.add_node(node)
+    if end == 'shutdown':
+        with Spinning(executor):
+            assert wait_for(lambda: publisher.get_subscription_count() and done.done())
+            publisher.publish(Header())
+    else:
+        executor.spin_until_future_complete(done, 5.0)
+    assert done.done() and ros_context.ok()
+
+    def left() -> set[str]:
+        names = {thread.name for thread in set(threading.enumerate()) - before}
+        if end == 'shutdown':
+            return names
+        # between two spins these wait for the next one
+        return {name for name in names if 'worker' not in name and 'wait-set' not in name}
+    assert wait_for(lambda: not left()), left()
+
+
+def test_freeze_gc_leaves_what_there_is_alone(make_executor):
+    before = gc.get_freeze_count()
+    executor = make_executor(freeze_gc=True)
+    try:
+        executor.spin_until_future_complete(Future(), 0.05)
+        assert gc.get_freeze_count() > before + 1000
+    finally:
+        gc.unfreeze()
+
+
+def test_rclpy_spin_uses_all_workers(make_executor, make_node, ros_context):
+    node, together = make_node(), threading.Barrier(7)
+    executor = make_executor()
+    tasks = [executor.create_task(together.wait, 5.0) for _ in range(7)]
+    tasks[0].add_done_callback(lambda _: ros_context.shutdown())
+    rclpy.spin(node, executor)
+    assert tasks[0].done()
+
+
+def test_wait_for_message_from_a_callback(make_executor, make_node, ros_context):
+    node = make_node()
+    publisher = node.create_publisher(Header, '/topic', 10)
+    node.create_timer(0.01, lambda: publisher.publish(Header(frame_id='it')))
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        found, message = wait_for_message(Header, node, '/topic', time_to_wait=5.0)
+    assert found and message.frame_id == 'it'
+
+
+def test_what_was_taken_is_not_lost_between_two_spin_once_of_rclpy(make_executor, make_node):
+    """``rclpy.spin_once`` adds the node, and removes it when one callback has run."""
+    node, heard = make_node(), []
+    executor = make_executor()
+    node.create_subscription(Header, '/burst', lambda m: heard.append(m.frame_id), 10)
+    publisher = node.create_publisher(Header, '/burst', 10)
+    assert wait_for(lambda: publisher.get_subscription_count() == 1)
+    for number in range(5):
+        publisher.publish(Header(frame_id=str(number)))
+    assert wait_for(lambda: rclpy.spin_once(node, executor=executor, timeout_sec=0.1)
+                    or len(heard) == 5)
+    assert heard == list('01234')
+    assert executor.statistics()['dropped'] == {}
+
+
+def test_a_rate_ends_a_spin_once(make_executor, make_node):
+    node, slept = make_node(), threading.Event()
+    executor = make_executor()
+    executor.add_node(node)
+    rate = node.create_rate(100.0)
+
+    def sleep() -> None:
+        rate.sleep()
+        slept.set()
+
+    thread = threading.Thread(target=sleep)
+    thread.start()
+    while not slept.is_set():
+        executor.spin_once()
+    thread.join()
+
+
+def test_a_coroutine_that_only_yields_goes_on_in_the_next_spin_once(make_executor, make_node):
+    node, steps = make_node(), []
+    executor = make_executor()
+    executor.add_node(node)
+
+    async def run() -> None:
+        steps.append(1)
+        await asyncio.sleep(0)
+        steps.append(2)
+
+    executor.create_task(run)
+    executor.spin_once(timeout_sec=5.0)
+    assert steps == [1]
+    executor.spin_once(timeout_sec=0)
+    assert steps == [1, 2]

@@ -1,0 +1,100 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What type checkers and editors know of the executor is what it does."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+import time
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints, is_typeddict, Union
+
+from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.executor.statistics_types import Statistics
+from msg_graph import loads
+import pytest
+
+from .conftest import Spinning, wait_for
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - {node: /n, callbacks: [{name: t, timer: 20ms, deadline: 1us}]}
+"""
+PROGRAM = """\
+from pathlib import Path
+
+from mddag_executor import MultiDeadlineExecutor
+
+with MultiDeadlineExecutor(
+        Path('graph.yaml'), trace=Path('run.mcap'), worker_cpus=[0]) as executor:
+    executor.spin()
+    sink = executor.statistics()['dags']['camera']['sinks']['/detector:detect']
+    response = sink['response_ns']
+    late: int = sink['late'] if response is None else response['p99']
+"""
+
+
+def check(value: Any, hint: Any, place: str) -> None:
+    """Find out whether a value has the type that is declared, with all keys and no other."""
+    if is_typeddict(hint):
+        hints = get_type_hints(hint)
+        assert isinstance(value, dict) and set(value) == set(hints), place
+        for key, inner in hints.items():
+            check(value[key], inner, f'{place}.{key}')
+    elif get_origin(hint) in (Union, UnionType):
+        kinds = [each for each in get_args(hint) if each is not NoneType]
+        if value is not None:
+            check(value, kinds[0], place)
+    elif get_origin(hint) is dict:
+        for key, inner in value.items():
+            assert isinstance(key, str), place
+            check(inner, get_args(hint)[1], f'{place}[{key}]')
+    elif get_origin(hint) is list:
+        for inner in value:
+            check(inner, get_args(hint)[0], place)
+    else:
+        assert isinstance(value, hint), f'{place}: {value!r}'
+
+
+def test_statistics_have_the_declared_types(
+    ros_context: Any, make_node: Any, tmp_path: Path
+) -> None:
+    trace = tmp_path / 'run.mcap'
+    with MultiDeadlineExecutor(
+            loads(GRAPH), context=ros_context, trace=trace,
+            worker_cpus=list(os.sched_getaffinity(0))) as executor:
+        assert isinstance(executor, MultiDeadlineExecutor)
+        check(executor.statistics(), Statistics, 'statistics')
+        node = make_node('n')
+        node.create_timer(0.02, lambda: time.sleep(0.001))
+        node.create_timer(0.01, lambda: None)
+        executor.add_node(node)
+        with Spinning(executor):
+            assert wait_for(lambda: executor.statistics()['first_miss'] is not None)
+        found = executor.statistics()
+    check(found, Statistics, 'statistics')
+    assert found['trace'] == {'path': str(trace), 'lost': 0, 'error': None}
+    assert found['dags']['/n']['sinks']['/n:t']['response_ns'] is not None
+    assert {'/n:t'} < set(found['callbacks'])
+
+
+@pytest.mark.linter
+@pytest.mark.skipif(sys.version_info[:2] != (3, 12), reason='mypy runs with Python 3.12 only')
+def test_a_program_of_a_user_is_checked(tmp_path: Path) -> None:
+    """Also from the environment of `make env`, where the package is installed editable."""
+    (tmp_path / 'program.py').write_text(PROGRAM)
+    done = subprocess.run(
+        [sys.executable, '-m', 'mypy', '--strict', '--cache-dir', tmp_path / 'cache',
+         'program.py'],
+        cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, ''), done.stdout
+    (tmp_path / 'program.py').write_text(PROGRAM.replace("['late']", "['missed']"))
+    done = subprocess.run(
+        [sys.executable, '-m', 'mypy', '--strict', '--cache-dir', tmp_path / 'cache',
+         'program.py'],
+        cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert 'TypedDict "SinkCounts" has no key "missed"' in done.stdout

@@ -1,0 +1,230 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Timers whose due time changes while the executor waits for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import threading
+from typing import Any
+
+import pytest
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+
+from .conftest import is_idle, Spinning, wait_for
+from .test_asked_for import Simulation
+
+MS = 1_000_000
+FAR_S = 3600.0
+
+
+class Stepping(Spinning):
+    """Spins by a loop of ``spin_once``."""
+
+    def _run(self) -> None:
+        try:
+            while not self.executor._is_shutdown:
+                self.executor.spin_once()
+        except BaseException as error:
+            self.error = error
+
+
+@pytest.fixture(params=[Spinning, Stepping], ids=['spin', 'spin_once'])
+def spinning(request: Any) -> Any:
+    """Give the ways of spinning."""
+    return request.param
+
+
+def waits_for_no_timer(executor: Any) -> bool:
+    """Tell whether the executor knows of all timers, and none is to become due."""
+    with executor._pool.lock:
+        return executor._pool.is_current and not executor._pool.timers.next_due()
+
+
+def test_a_timer_that_was_cancelled_runs_when_it_is_reset(make_executor, make_node, spinning):
+    node, ran = make_node(), []
+    timer = node.create_timer(0.01, lambda: ran.append(1), autostart=False)
+    executor = make_executor()
+    executor.add_node(node)
+    with spinning(executor):
+        for _ in range(5):
+            assert wait_for(lambda: waits_for_no_timer(executor))
+            count = len(ran)
+            timer.reset()
+            assert wait_for(lambda n=count: len(ran) >= n + 2)
+            timer.cancel()
+
+
+def test_a_callback_may_reset_another_timer_and_its_own(make_executor, make_node, spinning):
+    node, ran = make_node(), []
+
+    def first() -> None:
+        ran.append('first')
+        timers[0].cancel()
+        timers[1].reset()
+
+    def second() -> None:
+        ran.append('second')
+        timers[1].cancel()
+        timers[0].reset()
+
+    timers = [node.create_timer(0.005, first), node.create_timer(0.005, second, autostart=False)]
+    executor = make_executor()
+    executor.add_node(node)
+    with spinning(executor):
+        assert wait_for(lambda: len(ran) >= 12)
+    assert ran[:12] == ['first', 'second'] * 6
+
+
+def test_a_shortened_period_counts_from_the_reset_on(make_executor, make_node, spinning):
+    node, ran, others = make_node(), [], []
+    timer = node.create_timer(FAR_S, lambda: ran.append(1))
+    node.create_timer(0.01, lambda: others.append(1))
+    executor = make_executor()
+    executor.add_node(node)
+    with spinning(executor):
+        assert wait_for(lambda: others)
+        timer.timer_period_ns = 5 * MS
+        timer.reset()
+        assert wait_for(lambda: len(ran) >= 5)
+        timer.timer_period_ns = 3600 * 10**9
+        timer.reset()
+        assert wait_for(lambda: is_idle(executor))
+        count, before = len(ran), len(others)
+        assert wait_for(lambda: len(others) >= before + 5)
+        assert len(ran) - count <= 1  # it may just have been due
+
+
+def test_a_timer_that_is_reset_before_it_is_due_never_runs_and_costs_no_memory(
+    make_executor, make_node,
+):
+    """A watchdog."""
+    node, barked, resets = make_node(), [], []
+    watchdog = node.create_timer(60.0, lambda: barked.append(1))
+
+    def feed() -> None:
+        for _ in range(20):
+            watchdog.reset()
+        resets.append(1)
+
+    node.create_timer(0.001, feed)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(resets) >= 50)
+        assert len(executor._pool.timers._heap) < 50
+    assert not barked
+
+
+@pytest.mark.parametrize(
+    'kind', [ClockType.STEADY_TIME, ClockType.SYSTEM_TIME, ClockType.ROS_TIME])
+def test_timers_of_each_clock_run(make_executor, make_node, kind):
+    node, ran = make_node(), []
+    node.create_timer(0.01, lambda: ran.append(1), clock=Clock(clock_type=kind))
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(ran) >= 5)
+
+
+# --- simulated time ------------------------------------------------------------------------------
+
+class Simulated(Simulation):
+    """Simulated time, with an executor and a timer that notes its clock's time."""
+
+    def __init__(self, make_executor: Any, make_node: Any, start: int = 100 * 10**9) -> None:
+        super().__init__(make_node)
+        self.now = start
+        self.ran: list[int] = []
+        self.executor = make_executor()
+        self.executor.add_node(self.node)
+
+    def timer(self, period_s: float, **kwargs: Any) -> Any:
+        clock = self.node.get_clock()
+        return self.node.create_timer(
+            period_s, lambda: self.ran.append(clock.now().nanoseconds), **kwargs)
+
+    def step(self, ns: int) -> None:
+        self.now += ns
+        assert self.set_clock(self.now)
+
+    def is_idle(self) -> bool:
+        """Tell whether all that has to do with the present time is done."""
+        quiet = threading.Event()
+        self.executor.create_task(quiet.set)
+        return quiet.wait(15.0) and wait_for(
+            lambda: self.executor._pool.is_current and is_idle(self.executor))
+
+    def until(self, done: Callable[[], bool]) -> None:
+        assert wait_for(done), self.ran
+
+
+def test_a_timer_runs_by_simulated_time_and_by_nothing_else(make_executor, make_node):
+    simulated = Simulated(make_executor, make_node)
+    with Spinning(simulated.executor):
+        assert simulated.matched()
+        simulated.step(0)
+        simulated.timer(1.0)
+        assert simulated.is_idle()
+        start = simulated.now
+        for second in range(1, 6):
+            simulated.step(999 * MS)
+            assert simulated.is_idle() and len(simulated.ran) == second - 1
+            simulated.step(1 * MS)
+            simulated.until(lambda n=second: len(simulated.ran) == n)
+    assert simulated.ran == [start + second * 10**9 for second in range(1, 6)]
+
+
+def test_a_jump_over_several_periods_runs_the_timer_and_keeps_its_phase(
+    make_executor, make_node,
+):
+    simulated = Simulated(make_executor, make_node)
+    with Spinning(simulated.executor):
+        assert simulated.matched()
+        simulated.step(0)
+        simulated.timer(1.0)
+        assert simulated.is_idle()
+        simulated.step(10_500 * MS)
+        simulated.until(lambda: len(simulated.ran) >= 1)
+        assert simulated.is_idle()
+        count = len(simulated.ran)
+        assert count <= 2  # rcl skips the rest
+        simulated.step(499 * MS)
+        assert simulated.is_idle() and len(simulated.ran) == count
+        simulated.step(1 * MS)
+        simulated.until(lambda: len(simulated.ran) == count + 1)
+
+
+def test_a_timer_of_simulated_time_is_reset(make_executor, make_node):
+    simulated = Simulated(make_executor, make_node)
+    with Spinning(simulated.executor):
+        assert simulated.matched()
+        simulated.step(0)
+        timer = simulated.timer(1.0, autostart=False)
+        assert simulated.is_idle()
+        simulated.step(5 * 10**9)
+        assert simulated.is_idle() and not simulated.ran
+        timer.reset()
+        simulated.step(1 * 10**9)
+        simulated.until(lambda: len(simulated.ran) == 1)
+
+
+def test_a_node_may_turn_to_simulated_time_and_back(make_executor, make_node):
+    from rclpy.parameter import Parameter
+    simulated = Simulated(make_executor, make_node)
+    node = simulated.node
+    with Spinning(simulated.executor):
+        assert simulated.matched()
+        simulated.step(0)
+        simulated.timer(0.01)
+        assert simulated.is_idle() and not simulated.ran
+        node.set_parameters([Parameter('use_sim_time', value=False)])
+        simulated.until(lambda: len(simulated.ran) >= 3)
+        node.set_parameters([Parameter('use_sim_time', value=True)])
+        assert simulated.matched()
+        simulated.step(3600 * 10**9)
+        assert simulated.is_idle()
+        count = len(simulated.ran)
+        simulated.step(20 * MS)
+        simulated.until(lambda: len(simulated.ran) > count)

@@ -1,0 +1,360 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Actions, QoS events, guard conditions and waitables of a user's own."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from mddag_executor.executor import waitables
+import pytest
+from rclpy.action import ActionClient, ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.guard_condition import GuardCondition
+from rclpy.qos import QoSProfile
+from rclpy.waitable import NumberOfEntities, Waitable
+from std_msgs.msg import Header
+from test_msgs.action import Fibonacci
+
+from .conftest import is_idle, Spinning, wait_for
+from .pulse import Pulse
+
+SUCCEEDED, CANCELED = 4, 5
+
+
+class Counting:
+    """An action that counts up to its order, in a node of its own; and a client for it."""
+
+    def __init__(self, server_node: Any, client_node: Any, **kwargs: Any) -> None:
+        self.group = ReentrantCallbackGroup()
+        self.server = ActionServer(
+            server_node, Fibonacci, 'count', self._execute, callback_group=self.group,
+            cancel_callback=lambda request: CancelResponse.ACCEPT,
+            feedback_pub_qos_profile=QoSProfile(depth=100), **kwargs)
+        self.client = ActionClient(
+            client_node, Fibonacci, 'count', callback_group=self.group,
+            feedback_sub_qos_profile=QoSProfile(depth=100))
+
+    def _execute(self, goal: Any) -> Any:
+        feedback = Fibonacci.Feedback()
+        for number in range(goal.request.order):
+            feedback.sequence.append(number)
+            goal.publish_feedback(feedback)
+        if goal.request.order == 0:
+            wait_for(lambda: goal.is_cancel_requested)
+            goal.canceled()
+        else:
+            goal.succeed()
+        return Fibonacci.Result(sequence=feedback.sequence)
+
+    async def ask(self, order: int, cancels: bool = False) -> tuple[int, list[int], list[int]]:
+        """Return status, result and lengths of the feedback of a goal."""
+        lengths: list[int] = []
+        goal = await self.client.send_goal_async(
+            Fibonacci.Goal(order=order),
+            feedback_callback=lambda m: lengths.append(len(m.feedback.sequence)))
+        assert goal.accepted
+        if cancels:
+            await goal.cancel_goal_async()
+        answer = await goal.get_result_async()
+        return answer.status, list(answer.result.sequence), lengths
+
+    def destroy(self) -> None:
+        self.server.destroy()
+        self.client.destroy()
+
+
+@pytest.mark.parametrize('apart', [False, True])
+def test_many_goals_at_once(make_executor, make_node, apart):
+    """Client and server in one executor, or each in one of its own."""
+    nodes = [make_node('server'), make_node('client')]
+    counting = Counting(*nodes)
+    executors = [make_executor(), make_executor()] if apart else [make_executor()] * 2
+    for executor, node in zip(executors, nodes):
+        executor.add_node(node)
+    with Spinning(executors[1]) as spinning:
+        other = Spinning(executors[0])
+        if apart:
+            other.__enter__()
+        try:
+            assert counting.client.wait_for_server(15.0)
+            tasks = [executors[1].create_task(counting.ask(order)) for order in range(1, 9)]
+            tasks += [executors[1].create_task(counting.ask(0, True)) for _ in range(2)]
+            assert wait_for(lambda: all(task.done() for task in tasks))
+            assert wait_for(lambda: all(map(is_idle, executors)))
+        finally:
+            if apart:
+                other.__exit__()
+    assert spinning.error is None
+    for order, task in enumerate(tasks[:8], 1):
+        status, result, lengths = task.result()
+        assert (status, result) == (SUCCEEDED, [*range(order)])
+        assert sorted(lengths) == [*range(1, order + 1)]
+    assert [task.result()[0] for task in tasks[8:]] == [CANCELED] * 2
+    counting.destroy()
+
+
+def test_who_takes_as_much_as_may_be_at_once_looks_again(make_executor, make_node, monkeypatch):
+    monkeypatch.setattr(waitables, 'MOST_AT_ONCE', 1)
+    nodes = [make_node('server'), make_node('client')]
+    counting = Counting(*nodes)
+    server, client = make_executor(), make_executor()
+    server.add_node(nodes[0])
+    client.add_node(nodes[1])
+    server._upkeep.refresh()
+    source, = (each for each in server._upkeep._sources.values()
+               if isinstance(each, waitables.WaitableSource))
+    found: list[Any] = []
+    later: list[Any] = []
+    source._post, source._at = found.extend, lambda at, function: later.append(function)
+    with Spinning(client):
+        assert counting.client.wait_for_server(15.0)
+        for _ in range(3):
+            counting.client.send_goal_async(Fibonacci.Goal(order=1))
+        assert wait_for(lambda: source.collect() or found)
+        while later:
+            later.pop()()
+        assert len(found) == 3
+    counting.destroy()
+
+
+@pytest.mark.parametrize('stepwise', [False, True])
+def test_a_goal_expires_when_its_time_is_over(make_executor, make_node, stepwise):
+    """The timer is within the server; nothing else happens meanwhile."""
+    node = make_node()
+    counting = Counting(node, node, result_timeout=0.2)
+    executor = make_executor()
+    executor.add_node(node)
+
+    def known() -> int:
+        return len(counting.server._goal_handles)
+
+    for _ in range(2):
+        task = executor.create_task(counting.ask(2))
+        executor.spin_until_future_complete(task, 15.0)
+        assert task.result()[0] == SUCCEEDED and known() == 1
+        if stepwise:
+            end = time.monotonic() + 15.0
+            while known() and time.monotonic() < end:
+                executor.spin_once(0.05)
+        else:
+            with spun(executor):
+                assert wait_for(lambda: known() == 0)
+        assert known() == 0
+    counting.destroy()
+
+
+class spun:
+    """Spin in a thread while entered, without shutting the executor down."""
+
+    def __init__(self, executor: Any) -> None:
+        self._future = executor.create_future()
+        self._thread = threading.Thread(
+            target=executor.spin_until_future_complete, args=(self._future, 30.0))
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._future.set_result(None)
+        self._thread.join(30.0)
+        assert not self._thread.is_alive()
+
+
+def test_an_action_server_may_go_and_another_one_come(make_executor, make_node):
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        for _ in range(3):
+            counting = Counting(node, node)
+            assert counting.client.wait_for_server(15.0)
+            task = executor.create_task(counting.ask(3))
+            assert wait_for(task.done) and task.result()[0] == SUCCEEDED
+            counting.destroy()
+    assert spinning.error is None
+
+
+# --- QoS events ----------------------------------------------------------------------------------
+
+def test_a_deadline_that_nobody_keeps_is_told_again_and_again(make_executor, make_node):
+    node, told = make_node(), {'offered': [], 'requested': []}
+    qos = QoSProfile(depth=10, deadline=Duration(nanoseconds=50_000_000))
+    publisher = node.create_publisher(
+        Header, '/a', qos, event_callbacks=PublisherEventCallbacks(
+            deadline=lambda event: told['offered'].append(event.total_count)))
+    node.create_subscription(
+        Header, '/a', lambda message: None, qos, event_callbacks=SubscriptionEventCallbacks(
+            deadline=lambda event: told['requested'].append(event.total_count)))
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        publisher.publish(Header())
+        assert wait_for(lambda: all(len(counts) >= 3 for counts in told.values()))
+    for counts in told.values():
+        assert counts == sorted(set(counts)), 'each only once'
+
+
+def test_who_comes_and_goes_is_told(make_executor, make_node):
+    node, other, matched = make_node(), make_node('other'), []
+    node.create_subscription(
+        Header, '/a', lambda message: None, 10, event_callbacks=SubscriptionEventCallbacks(
+            matched=lambda event: matched.append(event.current_count)))
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        for number in range(1, 4):
+            publisher = other.create_publisher(Header, '/a', 10)
+            assert wait_for(lambda n=number: matched == [1, 0] * (n - 1) + [1])
+            other.destroy_publisher(publisher)
+            assert wait_for(lambda n=number: matched == [1, 0] * n)
+
+
+class Pair(Waitable):
+    """Two subscriptions; to add these to a wait set takes a while."""
+
+    def __init__(self, subscriptions: Any) -> None:
+        super().__init__(ReentrantCallbackGroup())
+        self.subscriptions = subscriptions
+        self.got: list[str] = []
+        self._places: list[int] = []
+        self._ready: list[Any] = []
+
+    def get_num_entities(self) -> NumberOfEntities:
+        return NumberOfEntities(num_subs=len(self.subscriptions))
+
+    def add_to_wait_set(self, wait_set: Any) -> None:
+        time.sleep(0.1)
+        self._places = [wait_set.add_subscription(s.handle) for s in self.subscriptions]
+
+    def is_ready(self, wait_set: Any) -> bool:
+        self._ready = [s for s, place in zip(self.subscriptions, self._places)
+                       if wait_set.is_ready('subscription', place)]
+        return bool(self._ready)
+
+    def take_data(self) -> list[str]:
+        taken = [s.handle.take_message(s.msg_type, False) for s in self._ready]
+        return [message[0].frame_id for message in taken if message is not None]
+
+    async def execute(self, data: list[str]) -> None:
+        self.got += data
+
+
+def test_something_arrives_while_the_listeners_of_a_waitable_are_set(
+    make_executor, make_node, monkeypatch
+):
+    """It must not look for it with the wait set that shows which listeners to set."""
+    set_listener = waitables.set_listener
+
+    def slowly(*args: Any) -> None:
+        set_listener(*args)
+        time.sleep(0.05)
+
+    monkeypatch.setattr(waitables, 'set_listener', slowly)
+    apart, node = make_node('apart'), make_node('node')
+    publishers = [apart.create_publisher(Header, topic, 10) for topic in ('/one', '/two')]
+    pair = Pair([
+        apart.create_subscription(Header, topic, print, 10) for topic in ('/one', '/two')])
+    assert wait_for(lambda: all(p.get_subscription_count() for p in publishers))
+    publishers[0].publish(Header(frame_id='before'))
+    executor = make_executor(num_workers=2)
+    with Spinning(executor) as spinning:
+        assert wait_for(executor.create_task(print).done)
+        node.add_waitable(pair)
+        executor.add_node(node)
+        assert wait_for(lambda: pair.got == ['before'] or spinning.error is not None)
+        publishers[1].publish(Header(frame_id='after'))
+        assert wait_for(lambda: pair.got == ['before', 'after'], 5.0), spinning.error
+
+
+def test_what_happened_before_the_executor_came_is_told(make_executor, make_node):
+    node, matched = make_node(), []
+    node.create_subscription(
+        Header, '/a', lambda message: None, 10, event_callbacks=SubscriptionEventCallbacks(
+            matched=lambda event: matched.append(event.current_count)))
+    publisher = node.create_publisher(Header, '/a', 10)
+    assert wait_for(lambda: publisher.get_subscription_count() == 1)
+    executor = make_executor()
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: matched == [1])
+
+
+# --- guard conditions, and waitables of a user's own ---------------------------------------------
+
+def wait_set_threads() -> int:
+    return sum(thread.name == 'mddag-wait-set' for thread in threading.enumerate())
+
+
+class Counted(Pulse):
+    """Counts its executions."""
+
+    def __init__(self, node: Any) -> None:
+        super().__init__(node, node.default_callback_group)
+        self.guard.destroy()  # its node had it for a moment
+        self.guard = GuardCondition(None, None, node.context)
+        self.executed = 0
+
+    async def execute(self, taken_data: int) -> None:
+        self.executed += 1
+
+
+@pytest.mark.parametrize('stepwise', [False, True])
+def test_each_trigger_of_a_guard_condition_is_noticed(make_executor, make_node, stepwise):
+    """While it spins guard conditions come and go."""
+    node = make_node()
+    executor = make_executor()
+    executor.add_node(node)
+
+    def triggered(guard: Any, done: Any) -> None:
+        guard.trigger()
+        if stepwise:
+            end = time.monotonic() + 15.0
+            while not done() and time.monotonic() < end:
+                executor.spin_once(5.0)
+        assert wait_for(done)
+
+    def rounds() -> None:
+        for _ in range(5):
+            calls: list[int] = []
+            guard = node.create_guard_condition(lambda calls=calls: calls.append(1))
+            for number in range(1, 21):
+                triggered(guard, lambda c=calls, n=number: len(c) == n)
+            waitable = Counted(node)
+            node.add_waitable(waitable)
+            for number in range(1, 21):
+                triggered(waitable.guard, lambda w=waitable, n=number: w.executed == n)
+            node.destroy_guard_condition(guard)
+            node.remove_waitable(waitable)
+            waitable.guard.destroy()
+
+    if stepwise:
+        rounds()
+    else:
+        with Spinning(executor) as spinning:
+            rounds()
+        assert spinning.error is None
+        assert wait_set_threads() == 0
+
+
+def test_a_guard_condition_that_a_callback_triggers(make_executor, make_node):
+    node, calls = make_node(), []
+    guards: list[Any] = []
+
+    def first() -> None:
+        calls.append('first')
+        guards[1].trigger()
+
+    guards += [node.create_guard_condition(first),
+               node.create_guard_condition(lambda: calls.append('second'))]
+    executor = make_executor(num_workers=1)
+    executor.add_node(node)
+    with Spinning(executor):
+        for number in range(1, 11):
+            guards[0].trigger()
+            assert wait_for(lambda n=number: len(calls) == 2 * n)
+    assert calls == ['first', 'second'] * 10

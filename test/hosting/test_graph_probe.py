@@ -1,0 +1,126 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Drafts of the system that runs now: what a graph gives, and a real one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+import re
+import threading
+from typing import Any
+
+from mddag_executor.hosting.graph_probe import draft_of, Endpoints, Probe, probe, Seen
+from msg_graph import loads
+from msg_graph.draft import declaration_of, MARK
+import pytest
+from rclpy.node import Node
+from std_msgs.msg import Empty, String
+
+MS = 1_000_000
+
+
+def seen(interval_ms: float) -> Seen:
+    """Return the messages of a second."""
+    return Seen(count=int(1000 / interval_ms) + 1, first=5,
+                last=5 + round(int(1000 / interval_ms) * interval_ms * MS))
+
+
+def test_intervals() -> None:
+    topic = Seen()
+    assert topic.interval_ns() is None
+    for stamp in (50, 30, 40):
+        topic.message(stamp)
+    assert (topic.count, topic.interval_ns()) == (3, 10)
+    assert Seen(3, 7, 7).interval_ns() is None
+    assert Seen(2, 1, 9).interval_ns() is None
+    image = Seen()
+    for number in (3, 7, 9):     # of seven that were published three came
+        image.message(number * 10, number)
+    assert (image.lost, image.interval_ns(), image.interval_ns(2)) == (4, 10, 30)
+
+
+def test_what_is_supposed() -> None:
+    found = Probe(
+        nodes={
+            '/source': Endpoints(publishes={'/in': 'a/b', '/slow': 'a/b', '/mute': 'a/b'}),
+            '/work': Endpoints(subscribes={'/in': 'a/b'}, publishes={'/out': 'a/b'},
+                               serves={'/serve': 'a/b'}),
+            '/other': Endpoints(publishes={'/out': 'a/b'}),
+            '/empty': Endpoints()},
+        seen={'/in': seen(10), '/slow': seen(100), '/mute': Seen(), '/out': seen(5)},
+        publishers=Counter({'/in': 1, '/slow': 1, '/mute': 1, '/out': 2}))
+    draft = draft_of(found)
+    assert [node.name for node in draft.nodes] == ['/empty', '/other', '/source', '/work']
+    empty, other, source, work = (
+        [(c.kind, c.starts, c.guessed, c.publishes, c.maybe, c.interval_ns)
+         for c in node.callbacks.values()] for node in draft.nodes)
+    # What is seen of it is its name: it may have timers.
+    assert empty == [('timer', [], True, [], [], None)]
+    assert source == [('timer', [], True, ['/in', '/mute', '/slow'], [], 10 * MS)]
+    assert work == [('subscription', ['/in'], False, [], ['/out'], None),
+                    ('service', ['/serve'], False, [], ['/out'], None)]
+    # Two publish it, so each every 10 ms.
+    assert other == [('timer', [], True, ['/out'], [], 10 * MS)]
+    text = declaration_of(draft)
+    assert f'timer: 10ms  # {MARK}: is this a timer?' in text
+    assert f'# timer: 100ms  # {MARK}: what starts it?' in text
+    assert f'# publishes: [/out]  # {MARK}: which callback publishes /out?' in text
+
+
+@pytest.fixture
+def system(make_node: Callable[..., Node]) -> Iterator[None]:
+    """Give a camera at 50 Hz, what works on its images, and a topic of a type that is nowhere."""
+    camera, worker = make_node('camera'), make_node('worker', namespace='/deep')
+    images = camera.create_publisher(String, '/image', 10)
+    results = worker.create_publisher(Empty, '/result', 10)
+    worker.create_subscription(String, '/image', lambda _: None, 10)
+    worker.create_publisher(Empty, '/never', 10)
+    end = threading.Event()
+
+    def run() -> None:
+        while not end.wait(0.02):
+            images.publish(String(data='x'))
+            results.publish(Empty())
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join()
+
+
+def test_a_real_system(system: None) -> None:
+    ticks: list[float] = []
+    found = probe(2.5, ticks.append)
+    assert set(found.nodes) >= {'/camera', '/deep/worker'}
+    assert not [warning for warning in found.warnings if 'rate' in warning]
+    assert found.nodes['/camera'].publishes == {'/image': 'std_msgs/msg/String'}
+    interval = found.seen['/image'].interval_ns()
+    assert interval is not None and interval > 15 * MS  # a busy machine may only be slower
+    assert ticks and ticks == sorted(ticks)
+    draft = draft_of(found)
+    draft.nodes = [node for node in draft.nodes if node.name in ('/camera', '/deep/worker')]
+    text = declaration_of(draft)
+    accepted = re.sub(rf'^( +)# (\w+: .*# {MARK})', r'\1\2', text, flags=re.MULTILINE)
+    task_set = loads(accepted)
+    assert task_set.callback('/camera:callback_0').publishes == ('/image',)
+    worker = task_set.callback('/deep/worker:callback_0')
+    assert worker.topics == ('/image',)
+    assert worker.publishes == ('/never', '/result')
+
+
+def test_types_that_are_not_there(
+        system: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mddag_executor.hosting import graph_probe
+
+    def broken(kind: str) -> Any:
+        raise ModuleNotFoundError(f'No module named {kind!r}')
+
+    monkeypatch.setattr(graph_probe, '_message_type', broken)
+    found = probe(0.8)
+    assert any(w.startswith('/image: its rate is not known: its type std_msgs/msg/String cannot')
+               for w in found.warnings)
+    assert found.seen['/image'].count == 0

@@ -1,0 +1,120 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Synthetic nodes under rclpy's executors, each run in a process of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from mddag_executor.hosting.child import ChildError, CrashError, run_child
+from mddag_executor.hosting.peers import measure_peer
+from mddag_executor.resources import find
+from msg_graph import GraphError
+import pytest
+
+GRAPH = """
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 20ms, publishes: [/x], execution_time: 1ms}]}
+  - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 500ms, execution_time: 1ms}]}
+"""
+
+CHILD = """
+from mddag_executor.hosting.child import answer
+import os, threading
+from pathlib import Path
+
+def run():
+    %s
+
+answer(run)
+"""
+
+
+def child(body: str) -> list[str]:
+    return [sys.executable, '-c', CHILD % body]
+
+
+@pytest.mark.parametrize('processes', ['', 'processes: {one: [/a], two: [/b]}\n'])
+def test_nodes_are_measured_as_one_run(tmp_path: Path, processes: str) -> None:
+    graph = tmp_path / 'graph.yaml'
+    graph.write_text(GRAPH + processes)
+    ticks: list[float] = []
+    result = measure_peer(
+        'single', str(graph), 2, seconds=1.0, seed=3, utilisation=0.05, mode='sleep',
+        tick=ticks.append)
+    assert 0 < result['on_time'] <= result['sink_jobs_due']
+    assert (result['seed'], result['workers'], result['mode']) == (3, 2, 'sleep')
+    assert result['utilisation'] == pytest.approx(0.05)
+    assert list(result['dags']['/a']['sinks']) == ['/b:s'] and result['callbacks'] > 0
+    assert bool(ticks) == (not processes)
+
+
+def test_what_native_code_prints_is_no_result() -> None:
+    # rclpy's EventsExecutor prints a warning about a clock with many timers.
+    result = measure_peer(
+        'events', str(find('config/autoware.yaml')), 7, seconds=0.5, seed=0, utilisation=0.3,
+        mode='sleep')
+    assert result['sink_jobs_due'] == result['on_time'] + result['late'] + result['missing'] > 0
+
+
+def test_what_is_wrong_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / 'bad.yaml').write_text(GRAPH.replace('500ms', '0ms'))
+    with pytest.raises(GraphError, match=r'bad.yaml:5: '):
+        measure_peer('multi', str(tmp_path / 'bad.yaml'), 2, seconds=1.0, seed=0, utilisation=0.1,
+                     mode='sleep')
+    (tmp_path / 'untimed.yaml').write_text(GRAPH.replace(', execution_time: 1ms', ''))
+    with pytest.raises(ChildError, match='untimed.yaml: no callback has an execution time'):
+        measure_peer('multi', str(tmp_path / 'untimed.yaml'), 2, seconds=1.0, seed=0,
+                     utilisation=0.1, mode='sleep')
+
+
+def test_a_child_returns_its_result_only() -> None:
+    body = 'os.write(1, b"native"); print("text"); return {"a": {1: (2,)}}'
+    assert run_child(child(body), 'it', 60.0) == {'a': {'1': [2]}}
+
+
+@pytest.mark.parametrize(('body', 'says'), [
+    ('raise ValueError("boom")', '^it: ValueError: boom$'),
+    ('os.kill(os.getpid(), 11)', '^it: it crashed with signal 11$'),
+    ('os._exit(3)', '^it: it ended with status 3$'),
+    ('os._exit(0)', "^it: it ended well but gave no result: b''$")])
+def test_a_crash_says_how(body: str, says: str) -> None:
+    with pytest.raises(CrashError, match=says):
+        run_child(child(body), 'it', 60.0)
+
+
+def test_a_child_that_hangs_is_killed() -> None:
+    body = 'import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); threading.Event().wait()'
+    with pytest.raises(CrashError, match='it: it did not end within 1 s and was killed'):
+        run_child(child(body), 'it', 1.0)
+
+
+@pytest.mark.parametrize('hangs', [
+    'threading.Event().wait()',
+    'import ctypes; ctypes.PyDLL(None).pause()'])  # with the interpreter: none of it runs any more
+def test_a_child_does_not_outlive_who_wants_its_result(tmp_path: Path, hangs: str) -> None:
+    mark = tmp_path / 'pid'
+    body = (f'Path({str(mark)!r} + "x").write_text(str(os.getpid())); '
+            f'os.rename({str(mark)!r} + "x", {str(mark)!r}); {hangs}')
+    parent = subprocess.Popen([sys.executable, '-c', (
+        'from mddag_executor.hosting.child import run_child; '
+        f'run_child({child(body)!r}, "it", 60.0)')])
+    try:
+        end = time.monotonic() + 60
+        while not mark.exists():
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+        stat = Path(f'/proc/{mark.read_text()}/stat')
+        while stat.exists() and ') Z ' not in stat.read_text():
+            assert time.monotonic() < end
+            time.sleep(0.01)
+    finally:
+        parent.kill()
+        parent.wait()

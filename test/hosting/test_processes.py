@@ -1,0 +1,289 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Real `mddag run`s of several processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+from mddag_executor.clocks import boot
+from mddag_executor.core.tally import counts
+from mddag_executor.hosting import processes
+from mddag_executor.replay import replay
+from mddag_executor.trace import read_events
+from msg_graph import loads
+import pytest
+
+GUESTS = Path(__file__).resolve().parent / 'guests'
+CHAIN = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /sensor
+    callbacks: [{name: tick, timer: 20ms, publishes: [/raw], dag: chain, execution_time: 1ms,
+                 release_from: header_stamp}]
+  - node: /first
+    callbacks: [{name: relay, subscription: /raw, publishes: [/half], execution_time: 1ms}]
+  - node: /second
+    callbacks: [{name: relay, subscription: /half, publishes: [/whole], execution_time: 1ms}]
+  - node: /last
+    callbacks: [{name: sink, subscription: /whole, deadline: 60s, execution_time: 1ms}]
+"""
+PROCESSES = 'processes: {up: [/first], down: [/second, /last]}\n'
+NODES = [argument for name in ('sensor', 'first', 'second', 'last')
+         for argument in ('--node', f'relay:{name}')]
+
+Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+
+
+@pytest.fixture
+def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
+        [str(GUESTS), *filter(None, [os.environ.get('PYTHONPATH')])]))
+    monkeypatch.setenv('RELAY_MARK', str(tmp_path / 'enough'))
+    (tmp_path / 'chain.yaml').write_text(CHAIN)
+    (tmp_path / 'graph.yaml').write_text(CHAIN + PROCESSES)
+    return tmp_path
+
+
+class Running:
+    """A run that goes on; its processes by name."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.process = process
+
+    def pids(self) -> dict[str, int]:
+        """Return the processes of the run that there are now."""
+        found = {}
+        children = Path(f'/proc/{self.process.pid}/task/{self.process.pid}/children')
+        for pid in children.read_text().split():
+            words = Path(f'/proc/{pid}/cmdline').read_bytes().decode().split('\0')
+            if '--process' in words:
+                found[words[words.index('--process') + 1]] = int(pid)
+        return found
+
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        end = time.monotonic() + 60
+        while not condition():
+            assert self.process.poll() is None, self.process.communicate()
+            assert time.monotonic() < end
+            time.sleep(0.01)
+
+    def end(self) -> tuple[dict[str, Any], str, str]:
+        """Wait for its end; return the result, and what it printed."""
+        out, err = self.process.communicate(timeout=60)
+        assert Path('result.json').exists(), err
+        return json.loads(Path('result.json').read_text()), out, err
+
+
+@contextmanager
+def running(*arguments: str) -> Iterator[Running]:
+    with subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'run', *arguments, '--json', 'result.json'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:
+        try:
+            yield Running(process)
+        finally:
+            process.kill()  # its processes end with it
+
+
+def test_synthetic_nodes_in_two_processes_are_measured_as_one_run(
+        world: Path, mddag: Mddag) -> None:
+    (world / 'chain.yaml').write_text(CHAIN.replace('60s', '500ms'))
+    run = mddag('run', 'chain.yaml', '--synthetic', 'sleep', '--processes', '2',
+                '--duration', '1s', '--trace', 'out.mcap', '--json', 'result.json')
+    assert run.returncode == 0, run.stderr
+    result = json.loads(Path('result.json').read_text())
+    assert [p['name'] for p in result['processes']] == ['p1', 'p2']
+    assert sorted(n for p in result['processes'] for n in p['nodes']) == [
+        '/first', '/last', '/second', '/sensor']
+    sink = result['dags']['chain']['sinks']['/last:sink']
+    measured = result['measured']
+    assert counts(sink).due >= sink['completed'] > 0
+    assert 0 < measured['on_time'] <= measured['sink_jobs_due']
+    # what waited 0.1 s for its announcement, as on a busy machine, is of no job
+    assert measured['attribution']['wrong'] == 0
+    assert measured['attribution']['none'] < measured['sink_jobs_due'] / 2
+    assert result['undeclared'] == sum(
+        each['unattributed'] for each in result['callbacks'].values())
+    assert result['never_ran'] == result['drift'] == []
+    for name in ('p1', 'p2'):
+        assert f'trace: {world / f"out.{name}.mcap"}' in run.stdout
+        said = next(e for e in read_events(f'out.{name}.mcap')
+                    if e['_name'] == 'mddag:task_set')
+        assert len(loads(said['yaml']).processes) == 2
+        assert said['file'] == 'chain.yaml'
+    assert 'measured by the nodes, ' in run.stdout and '1 declared callback' not in run.stdout
+
+
+class Beside:
+    """A session in which, at each wait, the next thing happens in the other process."""
+
+    def __init__(self, *happens: Callable[[], None]) -> None:
+        self.happens = list(happens)
+        self.waited = 0.0
+
+    def wait(self, seconds: float) -> bool:
+        if self.happens:
+            self.happens.pop(0)()
+        else:
+            self.waited = seconds
+        return False
+
+    def wait_until_matched(self, unmatched: Callable[[], list[str]], patience_s: float) -> None:
+        while unmatched():
+            self.wait(0.02)
+
+
+def test_processes_start_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However late another process is: it is waited for until its nodes are made, and ready."""
+    processes.Part.make(str(tmp_path), CHAIN)
+    monkeypatch.setattr(processes.time, 'monotonic_ns', lambda: 5 * 10 ** 9)
+    unmatched = ['/half']
+    seen = []
+
+    def note(step: str, at: int) -> Callable[[], None]:
+        def write() -> None:
+            seen.append([path.name for path in tmp_path.glob('first.*')])
+            (tmp_path / f'second.{step}').write_text(str(at))
+        return write
+
+    session: Any = Beside(note('made', 6 * 10 ** 9), unmatched.clear, note('ready', 7 * 10 ** 9))
+    processes.Part.read(str(tmp_path)).start_together(
+        'first', ['first', 'second'], session, lambda: unmatched)
+    assert sorted(seen[0]) == ['first.made'] and 'first.ready' in seen[1]
+    assert session.waited == 2 + processes.LEAD_NS / 1e9
+
+
+def test_who_has_ended_is_not_waited_for(tmp_path: Path) -> None:
+    processes.Part.make(str(tmp_path), CHAIN)
+    for step in ('made', 'ready'):
+        (tmp_path / f'second.{step}').write_text('1')
+    session: Any = Beside(lambda: processes.Part.ended(str(tmp_path), 'second'))
+    part = processes.Part.read(str(tmp_path))
+    part.start_together('first', ['first', 'second', 'third'], session, lambda: ['/half'])
+    assert not session.happens and session.waited <= processes.LEAD_NS / 1e9
+
+
+def test_what_is_lost_until_processes_have_met_is_of_no_job(world: Path) -> None:
+    (world / 'slow.py').write_text(
+        'import time\ntime.sleep(1)\nfrom relay import last, second\n')
+    (world / 'graph.yaml').write_text(PROCESSES + CHAIN.replace('60s', '1s').replace(
+        ',\n                 release_from: header_stamp', ''))
+    nodes = ['--node', 'up=relay:sensor', *NODES[2:4], '--node', 'down=slow:second', '--node',
+             'down=slow:last']
+    with running('graph.yaml', *nodes, '--trace', '.', '--duration', '2s') as run:
+        result, _, errors = run.end()
+    assert run.process.returncode == 0, errors
+    live, replayed = (counts(dags['chain']['sinks']['/last:sink']) for dags in (
+        result['dags'], replay(['up.mcap', 'down.mcap']).result()['dags']))
+    # beside what waited 0.1 s for its announcement, as on a busy machine
+    assert 0 <= replayed.due - live.due <= result['undeclared']
+    assert live.due > 0
+
+
+def test_programs_run_in_the_process_of_their_nodes(world: Path) -> None:
+    with running('graph.yaml', *NODES, '--trace', '.') as run:
+        run.wait_for((world / 'enough').exists)
+        run.process.send_signal(signal.SIGINT)
+        result, _, errors = run.end()
+    assert run.process.returncode == 0, errors
+    assert {p['name']: p['nodes'] for p in result['processes']} == {
+        'up': ['/sensor', '/first'], 'down': ['/second', '/last']}
+    assert result['dags']['chain']['sinks']['/last:sink']['completed'] > 0
+    assert result['callbacks']['/sensor:tick']['ran'] >= 60
+    assert result['never_ran'] == [] and not any(p['died'] for p in result['processes'])
+    ran = {name: {e['dag'] for e in read_events(f'{name}.mcap') if e['_name'] == 'mddag:complete'}
+           for name in ('up', 'down')}
+    assert ran == {'up': {0}, 'down': {0}}
+
+
+def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world: Path) -> None:
+    with running('graph.yaml', *NODES, '--on-exit', 'continue', '--trace', 'out.mcap') as run:
+        run.wait_for((world / 'enough').exists)
+        os.kill(run.pids()['up'], signal.SIGKILL)
+        run.wait_for(lambda: 'up' not in run.pids())
+        run.process.send_signal(signal.SIGTERM)
+        result, out, errors = run.end()
+    assert run.process.returncode == 70
+    assert 'process up was ended by SIGKILL' in errors
+    up, down = result['processes']
+    assert (up['died'], up['how'], down['died']) == (True, 'was ended by SIGKILL', False)
+    assert result['dags']['chain']['sinks']['/last:sink']['completed'] > 0
+    assert sum(e['_name'] == 'mddag:complete' for e in read_events('out.down.mcap')) >= 60
+    assert f'trace: {world / "out.up.mcap"}' in out
+    assert [e['boot'] for name in ('up', 'down') for e in read_events(
+        f'out.{name}.mcap', {'mddag:host'})] == [boot()] * 2
+    replayed = replay(['out.up.mcap', 'out.down.mcap']).result()
+    assert any(warning.startswith('out.up.mcap: its end is not recorded (the process was killed')
+               and 'with it' in warning or warning.endswith('no job was open in it')
+               for warning in replayed['warnings']), replayed['warnings']
+    sink = replayed['dags']['chain']['sinks']['/last:sink']
+    assert sink['completed'] > 0 and set(replayed['callbacks']) >= {'/first:relay', '/last:sink'}
+
+
+def test_an_exception_in_one_ends_the_run_with_its_status(world: Path) -> None:
+    (world / 'bad.py').write_text(
+        'from relay import sensor as good\n'
+        'def sensor():\n'
+        '    node = good()\n'
+        '    def fail(): raise ValueError("boom")\n'
+        '    node.create_timer(0.05, fail)\n'
+        '    return node\n')
+    nodes = ['--node', 'up=bad:sensor', *NODES[2:]]
+    with running('graph.yaml', *nodes) as run:
+        result, _, errors = run.end()
+    assert run.process.returncode == 70
+    assert 'warning: process up ended with status 70: ValueError: boom' in errors
+    assert '[up] Traceback' in errors
+    assert [p['died'] for p in result['processes']] == [True, False]
+
+
+def test_one_process_by_itself(world: Path, mddag: Mddag) -> None:
+    run = mddag('run', 'graph.yaml', '--node', 'relay:sensor', '--node', 'relay:first',
+                '--process', 'up', '--duration', '0.5s', '--json', 'result.json')
+    assert run.returncode == 0, run.stderr
+    result = json.loads(Path('result.json').read_text())
+    assert result['dags']['chain']['sinks'] == {}
+    assert not {'/second:relay', '/last:sink'} & set(result['never_ran'])
+    assert not {'/second:relay', '/last:sink'} & {d['callback'] for d in result['drift']}
+
+
+def test_a_declared_run_of_one_process_is_asked_for_with_1(world: Path, mddag: Mddag) -> None:
+    run = mddag('run', 'graph.yaml', '--synthetic', 'sleep', '--duration', '0.2s',
+                '--processes', '1', '--json', '-')
+    assert run.returncode == 0, run.stderr
+    result = json.loads(run.stdout)
+    assert 'processes' not in result and result['never_ran'] == []
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['graph.yaml', *NODES, '--processes', '0'], '--processes 0: give 1 or more'),
+    (['graph.yaml', *NODES, '--processes', '5'], 'there are only 4 nodes to place'),
+    (['graph.yaml', *NODES, '--processes', 'none.yaml'], 'none.yaml: '),
+    (['graph.yaml', *NODES[:2]], "process 'down': no --node brings one of its nodes"),
+    (['graph.yaml', *NODES, '--node', 'pair:main'], "it brings /first, which is to run in 'up'"
+     .replace("in 'up'", "in process 'up'")),
+    (['graph.yaml', *NODES, '--node', 'relay:nobody'], "has no 'nobody'"),
+    (['graph.yaml', *NODES, '--process', 'left'], "process 'left'"),
+    (['chain.yaml', *NODES, '--processes', '2', '--process', 'p1'], 'name a file'),
+    (['graph.yaml', *NODES, '--trace', 'no/where.mcap'], 'no directory no'),
+])
+def test_bad_input_is_one_line(
+        world: Path, mddag: Mddag, arguments: list[str], message: str) -> None:
+    (world / 'pair.py').write_text(
+        'from relay import first, second\ndef main():\n    return [first(), second()]\n')
+    run = mddag('run', *arguments)
+    assert (run.returncode, run.stdout) == (2, '')
+    assert message in run.stderr and run.stderr.count('\n') == 1, run.stderr

@@ -1,0 +1,173 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Processes of a run that end in all the ways there are; here they are small programs."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+from mddag_executor.hosting import processes as module
+from mddag_executor.hosting.processes import ProcessError, Run, Supervisor
+import pytest
+
+WAITS = """
+import signal, sys, threading
+end = threading.Event()
+signal.signal(signal.SIGTERM, lambda *_: end.set())
+print('waits')
+end.wait(60)
+print('ends')
+"""
+
+
+class Case:
+    """A supervisor of programs by name."""
+
+    def __init__(self, goes_on: bool = False, **programs: str) -> None:
+        self.out, self.err = io.StringIO(), io.StringIO()
+        self.died: list[Run] = []
+        self.programs = programs
+        self.supervisor = Supervisor(self.command, goes_on, self.out, self.err, self.ended)
+
+    def ended(self, run: Run) -> None:
+        if run.died:
+            self.died.append(run)
+
+    def command(self, name: str) -> list[str]:
+        return [sys.executable, '-c', self.programs[name]]
+
+    def run(self, seconds: float | None = None) -> list[tuple[str, int | None]]:
+        self.supervisor.run(list(self.programs), seconds)
+        return [(run.name, run.status) for run in self.supervisor.runs]
+
+    def stop_when(self, wanted: str) -> None:
+        """Ask for the end as soon as something has been printed."""
+        def wait() -> None:
+            end = time.monotonic() + 60
+            while wanted not in self.out.getvalue() and time.monotonic() < end:
+                time.sleep(0.01)
+            self.supervisor.stop()
+
+        threading.Thread(target=wait, daemon=True).start()
+
+
+def test_output_has_the_name_of_the_process_before_each_line() -> None:
+    case = Case(True, a='print("one"); print("two", end="")',
+                b='import sys; print("three", file=sys.stderr)')
+    assert case.run() == [('a', 0), ('b', 0)]
+    assert case.out.getvalue() == '[a] one\n[a] two\n'
+    assert case.err.getvalue() == '[b] three\n'
+    assert not case.died
+
+
+def test_the_end_of_one_ends_all(tmp_path: Path) -> None:
+    mark = tmp_path / 'waits'
+    waits = WAITS.replace("print('waits')", f'open({str(mark)!r}, "w").close()')
+    ends = f'import os, time\nwhile not os.path.exists({str(mark)!r}): time.sleep(0.01)'
+    case = Case(a=waits, b=ends)
+    assert case.run() == [('a', 0), ('b', 0)]
+    assert case.out.getvalue() == '[a] ends\n' and not case.died
+
+
+def test_one_that_dies_is_named_with_what_it_said() -> None:
+    case = Case(True, a='raise ValueError("boom")',
+                b='import os, signal; os.kill(os.getpid(), signal.SIGKILL)', c='pass')
+    assert dict(case.run()) == {'a': 1, 'b': -signal.SIGKILL, 'c': 0}
+    by_name = {run.name: run for run in case.died}
+    assert set(by_name) == {'a', 'b'}
+    assert by_name['a'].said == 'ValueError: boom' and by_name['a'].how == 'ended with status 1'
+    assert by_name['b'].how == 'was ended by SIGKILL'
+
+
+def test_bad_input_of_one_is_the_error_of_all() -> None:
+    error = 'import sys; print("error: x.yaml:1: wrong: mend it", file=sys.stderr); sys.exit(2)'
+    case = Case(True, a=WAITS, b=error)
+    with pytest.raises(ProcessError, match='^process b: x.yaml:1: wrong: mend it$'):
+        case.run()
+    assert all(run.status is not None for run in case.supervisor.runs)
+    assert case.err.getvalue() == ''
+
+
+def test_an_error_line_of_one_that_ends_otherwise_is_printed() -> None:
+    case = Case(True, a='import sys; print("error: no", file=sys.stderr)')
+    case.run()
+    assert case.err.getvalue() == '[a] error: no\n'
+
+
+def test_all_end_when_asked_and_who_does_not_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, 'END_TIMEOUT_S', 0.1)
+    deaf = WAITS.replace('lambda *_: end.set()', 'signal.SIG_IGN')
+    case = Case(a=deaf)
+    case.stop_when('[a] waits')
+    assert case.run() == [('a', -signal.SIGKILL)]
+    assert [run.how for run in case.died] == ['was ended by SIGKILL']
+    assert case.err.getvalue() == (
+        'warning: process a has not ended within 0.1 s: it is killed\n')
+
+
+@pytest.mark.parametrize('is_deaf', [False, True])
+def test_who_does_not_end_when_the_run_is_over_is_asked_then_killed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_deaf: bool
+) -> None:
+    monkeypatch.setattr(module, 'END_TIMEOUT_S', 0.1)
+    mark = tmp_path / 'goes on'
+    how = 'signal.SIG_IGN' if is_deaf else 'signal.SIG_DFL'
+    goes_on = (f'import signal, time\nsignal.signal(signal.SIGTERM, {how})\n'
+               f'open({str(mark)!r}, "w").close()\nwhile True: time.sleep(60)')
+    ends = f'import os, time\nwhile not os.path.exists({str(mark)!r}): time.sleep(0.01)'
+    case = Case(a=goes_on, b=ends)
+    assert case.run(seconds=0.0) == [('a', -signal.SIGKILL if is_deaf else -signal.SIGTERM),
+                                     ('b', 0)]
+    assert [run.name for run in case.died] == ['a'] * is_deaf
+    said = case.err.getvalue().splitlines()
+    assert said[0] == 'warning: process a has not ended with the others: it is asked to'
+    assert said[1:] == ['warning: process a has not ended within 0.1 s: it is killed'] * is_deaf
+
+
+def test_one_that_ends_when_the_run_is_over_takes_no_other_along(tmp_path: Path) -> None:
+    mark = tmp_path / 'ended'
+    a = f'open({str(mark)!r}, "w").close()'
+    b = (f'import os, time\nwhile not os.path.exists({str(mark)!r}): time.sleep(0.01)\n'
+         'time.sleep(0.2); print("on its own")')
+    case = Case(a=a, b=b)
+    assert case.run(seconds=0.0) == [('a', 0), ('b', 0)]
+    assert case.out.getvalue() == '[b] on its own\n'
+
+
+def test_it_ends_with_who_started_it(tmp_path: Path) -> None:
+    mark = tmp_path / 'pid'
+    child = ('import os, sys; from mddag_executor.hosting.processes import belong_to_parent; '
+             'belong_to_parent(int(sys.argv[1])); from pathlib import Path; '
+             f'Path({str(mark)!r} + "x").write_text(str(os.getpid())); '
+             f'os.rename({str(mark)!r} + "x", {str(mark)!r}); import time; time.sleep(60)')
+    parent = subprocess.Popen([sys.executable, '-c', (
+        'import os, subprocess, sys; '
+        f'subprocess.run([sys.executable, "-c", {child!r}, str(os.getpid())])')])
+    try:
+        end = time.monotonic() + 60
+        while not mark.exists():
+            assert time.monotonic() < end
+            time.sleep(0.01)
+    finally:
+        parent.kill()
+        parent.wait()
+    pid = int(mark.read_text())
+    while is_alive(pid):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def is_alive(pid: int) -> bool:
+    """Tell whether a process runs; nobody may be there to take note of its end."""
+    try:
+        os.kill(pid, 0)
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except (ProcessLookupError, FileNotFoundError):
+        return False

@@ -1,0 +1,367 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+import threading
+import time
+from typing import Any
+
+from mddag_executor.executor import current_job
+from mddag_executor.executor.executor import MultiDeadlineExecutor
+from mddag_executor.hosting.measure import BODIES, ExecutionPlan, Ledger, measure, PlanError
+from mddag_executor.hosting.session import Session
+from mddag_executor.hosting.synthetic import (
+    Grid,
+    JOIN_LIMIT,
+    native,
+    Role,
+    sleeper,
+    spinner,
+    SyntheticWorkload,
+)
+from mddag_executor.simulate import draw_execution_times
+from msg_graph import load, loads, TaskSet
+import pytest
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+
+TOP = Path(__file__).resolve().parents[2]
+MS = 1_000_000
+
+# AND (join), OR (/sink belongs to fast and slow), a source that is a subscription and one that is
+# a service, a group, a queue edge.
+GRAPH = """
+mddag: 1
+nodes:
+  - node: /sensor/a
+    callbacks:
+      - {name: tick, timer: 40ms, dag: fast, publishes: [/left, /right], execution_time: 2ms}
+  - node: /sensor/b
+    callbacks:
+      - {name: tick, timer: 50ms, dag: slow, publishes: [/joined], execution_time: 1ms}
+  - node: /filter/left
+    callbacks:
+      - {name: cb, subscription: /left, publishes: [/left_out, /debug], execution_time: 3ms,
+         group: one}
+      - {name: again, subscription: /left, publishes: [/debug], deadline: 400ms,
+         execution_time: 1ms, group: one}
+  - node: /filter/right
+    callbacks:
+      - {name: cb, subscription: /right, publishes: [/right_out], reads: [/seen]}
+  - node: /join
+    callbacks:
+      - {name: cb, sync: [/left_out, /right_out], publishes: [/joined], execution_time: 2ms}
+  - node: /sink
+    callbacks:
+      - {name: cb, subscription: /joined, deadline: 400ms, execution_time: 1ms}
+  - node: /camera
+    callbacks:
+      - {name: cb, subscription: /image, period: 50ms, dag: camera, publishes: [/seen]}
+  - node: /tracker
+    callbacks:
+      - {name: cb, subscription: /seen, deadline: 400ms, execution_time: 1ms}
+  - node: /gate
+    callbacks:
+      - {name: cb, service: /gate/reset, period: 80ms, dag: gate, deadline: 400ms}
+"""
+
+
+@pytest.fixture
+def task_set() -> TaskSet:
+    return loads(GRAPH, 'graph.yaml')
+
+
+@pytest.fixture(scope='module')
+def autoware() -> TaskSet:
+    return load(TOP / 'config' / 'autoware.yaml')
+
+
+# --- the plan ------------------------------------------------------------------------------------
+
+def drawn(task_set: TaskSet, plan: ExecutionPlan) -> list[list[int]]:
+    return [[plan.execution_ns(d.index, v.index) for v in d.vertices] for d in task_set.dags]
+
+
+def test_a_seed_gives_the_draw_that_the_simulator_gives(autoware: TaskSet) -> None:
+    assert drawn(autoware, ExecutionPlan(autoware, 5)) == draw_execution_times(autoware, 5)
+    assert drawn(autoware, ExecutionPlan(autoware, 6)) != draw_execution_times(autoware, 5)
+
+
+def test_a_draw_stays_within_the_quantiles(autoware: TaskSet) -> None:
+    plan = ExecutionPlan(autoware, 3)
+    for vertex in autoware.vertices:
+        declared = vertex.callback.execution_time
+        assert declared is not None
+        time_ns = plan.execution_ns(vertex.dag, vertex.index)
+        assert declared.quantiles_ns[0] <= time_ns <= declared.quantiles_ns[-1]
+
+
+@pytest.mark.parametrize('workers', [1, 7])
+def test_scaling_gives_the_utilisation_asked_for(autoware: TaskSet, workers: int) -> None:
+    plan = ExecutionPlan(autoware, 1, 0.6, workers)
+    total = sum(plan.execution_ns(v.dag, v.index) / autoware.dags[v.dag].period_ns
+                for v in autoware.vertices)
+    assert total / workers == pytest.approx(0.6, abs=1e-6)
+    assert plan.utilisation == pytest.approx(0.6, abs=1e-6)
+    before = ExecutionPlan(autoware, 1, None, workers)
+    ratios = [a / b for x, y in zip(drawn(autoware, plan), drawn(autoware, before))
+              for a, b in zip(x, y) if b > 100_000]
+    assert max(ratios) == pytest.approx(min(ratios), rel=1e-4)  # one factor for all
+
+
+def test_the_critical_path_tells_what_is_infeasible() -> None:
+    text = """
+mddag: 1
+nodes:
+  - node: /a
+    callbacks: [{name: a, timer: 100ms, publishes: [/x], execution_time: 10ms}]
+  - node: /b
+    callbacks: [{name: b, subscription: /x, publishes: [/y], execution_time: 20ms}]
+  - node: /c
+    callbacks: [{name: c, subscription: /x, deadline: 30ms, execution_time: 20ms}]
+  - node: /d
+    callbacks: [{name: d, sync: [/x, /y], deadline: 30ms, execution_time: 1ms}]
+"""
+    plan = ExecutionPlan(loads(text), 0)
+    found, = plan.infeasible()  # /c takes exactly 30 ms, which is in time
+    assert (found.vertex, found.critical_path_ns, found.deadline_ns) == ('/d:d', 31 * MS, 30 * MS)
+
+
+def test_the_demo_draw_is_feasible(autoware: TaskSet) -> None:
+    from mddag_executor.cli.demo import DEFAULT_SEED, WORKERS
+    assert ExecutionPlan(autoware, DEFAULT_SEED, 0.6, WORKERS).infeasible() == []
+
+
+@pytest.mark.parametrize('utilisation', [0.0, -1.0, math.nan, math.inf])
+def test_an_absurd_utilisation_is_refused(autoware: TaskSet, utilisation: float) -> None:
+    with pytest.raises(PlanError, match='no number above zero'):
+        ExecutionPlan(autoware, 0, utilisation)
+
+
+def test_nothing_to_scale_is_refused() -> None:
+    text = ('mddag: 1\nnodes:\n  - node: /a\n    callbacks: '
+            '[{name: a, timer: 100ms, deadline: 1ms}]\n')
+    assert ExecutionPlan(loads(text)).utilisation == 0
+    with pytest.raises(PlanError, match='declare execution_time'):
+        ExecutionPlan(loads(text), 0, 0.6)
+
+
+# --- emulation -----------------------------------------------------------------------------------
+
+def test_a_sleep_is_asked_for_less_than_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+    monkeypatch.setattr(time, 'sleep', asked.append)
+    emulate = sleeper(oversleep_ns=70_000)
+    emulate(2 * MS)
+    assert asked == [pytest.approx(1.93e-3)]
+    # What is shorter than that is waited out.
+    start = time.monotonic_ns()
+    emulate(30_000)
+    assert time.monotonic_ns() - start >= 30_000
+    emulate(0)
+    assert len(asked) == 1
+
+
+def test_spinning_takes_cpu_of_its_own_thread_only() -> None:
+    emulate = spinner()
+    taken = []
+
+    def spin() -> None:
+        start = time.thread_time_ns()
+        emulate(30 * MS)
+        taken.append(time.thread_time_ns() - start)
+
+    threads = [threading.Thread(target=spin) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(taken) == 3 and min(taken) >= 30 * MS
+
+
+def test_what_bodies_do(autoware: TaskSet) -> None:
+    """Mixed ones are drawn: the same for the same seed, whatever else there is."""
+    drawn = [[ExecutionPlan(autoware, seed, mode='mixed').body(v) for v in autoware.vertices]
+             for seed in (1, 1, 2)]
+    assert set(drawn[0]) == set(BODIES) and drawn[0] == drawn[1] != drawn[2]
+    assert {ExecutionPlan(autoware, mode='native').body(v) for v in autoware.vertices} == {
+        'native'}
+
+
+def test_native_bodies_take_cpu_time() -> None:
+    emulate = native()
+    start = time.thread_time_ns()
+    emulate(0)
+    short = time.thread_time_ns() - start
+    start = time.thread_time_ns()
+    emulate(20 * MS)
+    assert time.thread_time_ns() - start > 2 * MS + short
+
+
+# --- joins and releases --------------------------------------------------------------------------
+
+def role(task_set: TaskSet, ledger: Ledger, senders: str) -> Role:
+    return Role(task_set.vertex('/join:cb'), list(senders), '', 0, [], lambda ns: None, ledger)
+
+
+def test_only_the_last_leg_of_a_job_completes_a_join(task_set: TaskSet) -> None:
+    join = role(task_set, Ledger(task_set), 'abc')
+    assert [join.is_whole(1, s) for s in 'ab'] == [False, False]
+    assert not join.is_whole(2, 'c')
+    assert not join.is_whole(1, 'b')  # twice the same is no third
+    assert join.is_whole(1, 'c')
+    assert list(join.waiting) == [2]
+
+
+def test_incomplete_joins_are_bounded_and_counted(task_set: TaskSet) -> None:
+    ledger = Ledger(task_set)
+    join = role(task_set, ledger, 'ab')
+    for release in range(JOIN_LIMIT + 3):
+        join.is_whole(release, 'a')
+    assert (len(join.waiting), len(ledger.dropped_joins)) == (JOIN_LIMIT, 3)
+    assert not join.is_whole(0, 'b')  # its first leg is gone
+    assert join.is_whole(JOIN_LIMIT + 2, 'b')
+
+
+def test_a_late_timer_call_does_not_move_the_release(ros_context: Any) -> None:
+    period = 400 * MS  # a busy machine may stop for less than that
+    node = Node('grid', context=ros_context)
+    timer = node.create_timer(
+        period / 1e9, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME),
+        autostart=False)
+    before = time.monotonic_ns()
+    timer.reset()
+    after = time.monotonic_ns()
+    grid = Grid(timer, 0)
+    first = grid.first_release
+    assert before + period - 50_000 <= first <= after + period + 50_000
+
+    def call() -> int:
+        timer.handle.call_timer()
+        return grid.release()
+
+    time.sleep(max(0, first - time.monotonic_ns() + 5 * MS) / 1e9)
+    assert call() == first
+    # The next two become due; the late call stands for the first of them, the other is lost.
+    time.sleep(max(0, first + 2 * period - time.monotonic_ns() + 5 * MS) / 1e9)
+    assert call() == first + period
+    time.sleep(max(0, first + 3 * period - time.monotonic_ns() + 5 * MS) / 1e9)
+    late = call()
+    assert late >= first + 3 * period
+    assert (late - first) % period == 0
+    node.destroy_node()
+
+
+# --- nodes ---------------------------------------------------------------------------------------
+
+def test_nodes_have_exactly_what_is_declared(task_set: TaskSet, ros_context: Any) -> None:
+    workload = SyntheticWorkload(task_set, ExecutionPlan(task_set), context=ros_context)
+    nodes = {node.get_fully_qualified_name(): node for node in workload.nodes}
+    assert set(nodes) == {c.node for c in task_set.callbacks}
+    found = {}
+    for name, node in nodes.items():
+        found[name] = (
+            sorted(t.timer_period_ns for t in node.timers),
+            sorted(s.topic_name for s in node.subscriptions),
+            [s.srv_name for s in node.services],
+            sorted(p.topic_name for p in node.publishers if p.topic_name != '/parameter_events'))
+    assert found == {
+        '/sensor/a': ([40 * MS], [], [], ['/left', '/right']),
+        '/sensor/b': ([50 * MS], [], [], ['/joined']),
+        '/filter/left': ([], ['/left', '/left'], [], ['/debug', '/left_out']),
+        '/filter/right': ([], ['/right'], [], ['/right_out']),
+        '/join': ([], ['/left_out', '/right_out'], [], ['/joined']),
+        '/sink': ([], ['/joined'], [], []),
+        '/camera': ([], ['/image'], [], ['/seen']),
+        '/tracker': ([], ['/seen'], [], []),
+        '/gate': ([], [], ['/gate/reset'], []),
+    }
+    assert all(t.is_canceled() for node in nodes.values() for t in node.timers)
+    first, second = nodes['/filter/left'].subscriptions
+    assert isinstance(first.callback_group, MutuallyExclusiveCallbackGroup)
+    assert first.callback_group is second.callback_group
+    assert isinstance(next(iter(nodes['/sink'].subscriptions)).callback_group,
+                      ReentrantCallbackGroup)
+    workload.destroy()
+
+
+def test_every_release_reaches_every_sink(task_set: TaskSet, ros_context: Any) -> None:
+    executor = MultiDeadlineExecutor(task_set, context=ros_context)
+    workload = SyntheticWorkload(
+        task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
+    for node in workload.nodes:
+        executor.add_node(node)
+    with Session(executor) as session:
+        assert workload.run(session, 1.0, warm_up_s=0.5)
+    assert session.error is None
+    assert session.clean
+    result = measure(workload.ledger, workload.plan)
+    names = {n for dag in result['dags'].values() for n in dag['sinks']}
+    assert names == {
+        '/filter/left:again', '/sink:cb@fast', '/sink:cb@slow', '/tracker:cb', '/gate:cb'}
+    for dag in task_set.dags:
+        for name, sink in result['dags'][dag.name]['sinks'].items():
+            assert abs(sink['due'] - result['window_ns'] / dag.period_ns) <= 1, name
+            assert sink['response_ns']['min'] >= 0
+    # Each sink knows the release of its job exactly: the completions are on the nominal grid.
+    for dag in task_set.dags:
+        first = workload.ledger.first_release[dag.index]
+        assert first is not None
+        ran = len(workload.ledger.durations[dag.index][dag.source])
+        for index in dag.sinks:
+            # A busy machine may skip releases and make jobs late, but what began is not lost;
+            # some are open at the end.
+            assert ran - 2 <= len(workload.ledger.completions[dag.index][index]) <= ran
+            for release, _ in workload.ledger.completions[dag.index][index]:
+                late = (release - first + MS) % dag.period_ns - MS
+                if dag.vertices[dag.source].callback.kind == 'timer':
+                    assert abs(late) < MS / 2
+    assert result['attribution'] == {'wrong': 0, 'none': 0}
+    assert result['incomplete_joins_dropped'] == 0
+    workload.destroy()
+
+
+def test_groups_keep_their_callbacks_apart(task_set: TaskSet, ros_context: Any) -> None:
+    executor = MultiDeadlineExecutor(task_set, context=ros_context)
+    workload = SyntheticWorkload(
+        task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
+    running: list[int] = []
+    most = []
+    for subscription in next(
+            n for n in workload.nodes if n.get_name() == 'left').subscriptions:
+        inner = subscription.callback
+
+        def watched(message: Any, inner: Any = inner) -> None:
+            running.append(1)
+            most.append(len(running))
+            inner(message)
+            running.pop()
+
+        subscription.callback = watched
+    for node in workload.nodes:
+        executor.add_node(node)
+    with Session(executor) as session:
+        workload.run(session, 0.5, warm_up_s=0.1)
+    assert len(most) > 10
+    assert max(most) == 1
+    workload.destroy()
+
+
+def test_a_session_gives_out_what_a_callback_raised(ros_context: Any) -> None:
+    node = Node('raiser', context=ros_context)
+
+    def boom() -> None:
+        raise ValueError('on purpose')
+
+    node.create_timer(0.01, boom)
+    executor = MultiDeadlineExecutor(context=ros_context)
+    executor.add_node(node)
+    with Session(executor) as session:
+        assert session.wait(5.0)
+    assert isinstance(session.error, ValueError)
+    node.destroy_node()

@@ -1,0 +1,91 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""The verdicts of a recording by the scheduler core itself, fed event by event."""
+
+from __future__ import annotations
+
+from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core.jobs import is_judged, judge_from
+from mddag_executor.core.rules import record
+from mddag_executor.core.state import Decision, IDLE, JOB_END, OPEN, SKIP
+from mddag_executor.core.tables import CONTINUE
+from mddag_executor.recording.tables import ABORTED, ALL_LEGS, EXPIRED, FAILED, Recording
+from mddag_executor.replay.tolerances import MissTally
+
+_KINDS = ('released', 'completed', 'ended', 'judge_from', 'hosted', 'finished')
+
+
+class Oracle:
+    """Feeds a core what a recording says, in order; its bounds are lifted."""
+
+    def __init__(self, recording: Recording, skip: int = 0) -> None:
+        task_set = recording.task_set
+        tables = Tables.build(task_set, legs=True, groups=False)
+        n = tables.n_dags + 1
+        self.tables = tables._replace(
+            max_active_jobs=[NEVER] * n, expire_after=[NEVER] * n, on_miss=[CONTINUE] * n)
+        self.tally = MissTally(task_set, self.tables)
+        self.decisions: list[Decision] = []
+        self.scheduler = Scheduler(self.tables, 1, propagate=False)
+        self.scheduler.state.scalars[SKIP] = skip
+        self.slots: dict[tuple[int, int], int] = {}
+        events = [(order, 0, (dag, job, release, noticed)) for _, dag, job, release, noticed, order
+                  in recording.releases.tolist()]
+        columns = ('order', 'dag', 'vertex', 'job', 'leg', 'end')
+        done = recording.executions[
+            (recording.executions['completes'] > 0) & (recording.executions['vertex'] >= 0)]
+        events += [(order, 1, row) for order, *row in done[list(columns)].tolist()]
+        events += [(order, 2, (dag, job, time, reason)) for _, dag, _, job, time, reason, order
+                   in recording.job_ends.tolist()]
+        events += [(order, 3, (release,)) for order, release in recording.judge_from]
+        events += [(order, 4, (dag, here)) for order, dag, here in recording.hosted]
+        if recording.judged:
+            events.append((recording.judged_order, 5, (recording.judged_until,)))
+        for _, kind, what in sorted(events, key=lambda event: event[0]):
+            getattr(self, _KINDS[kind])(*what)
+            decided = self.scheduler.decisions()
+            for each in decided:
+                if each[0] == JOB_END:
+                    self.slots.pop((each[1], each[3]), None)
+            self.decisions += decided
+        self.tally.add(self.decisions)
+
+    def released(self, dag: int, job: int, release: int, now: int) -> None:
+        slot = self.slots[dag, job] = self.scheduler.release(dag, job, release, now)
+        if is_judged(self.scheduler.state, slot):
+            self.tally.released(dag)
+
+    def completed(self, dag: int, vertex: int, job: int, leg: int, end: int) -> None:
+        state, tables = self.scheduler.state, self.tables
+        legs = range(tables.n_legs[vertex]) if leg == ALL_LEGS else [leg]
+        for each in legs:
+            slot = self.slots.get((dag, job))
+            if slot is None or state.job_state[slot] != OPEN:
+                return
+            x = self.scheduler.execution(slot, vertex, each)
+            if state.x_state[x] == IDLE:
+                record(tables, state, self.scheduler.policy.key, x, end)
+
+    def ended(self, dag: int, job: int, time: int, reason: int) -> None:
+        slot = self.slots.get((dag, job))
+        if slot is None:
+            return
+        if reason == EXPIRED:
+            self.scheduler.expire(slot, time)
+        elif reason == ABORTED:
+            self.scheduler.abort(slot, time)
+        elif reason == FAILED:
+            self.scheduler.fail_open(slot, time)
+        else:
+            self.scheduler.withdraw(slot)
+            del self.slots[dag, job]
+
+    def judge_from(self, release: int) -> None:
+        judge_from(self.scheduler.state, release)
+
+    def hosted(self, dag: int, here: frozenset[int]) -> None:
+        first, last = self.tables.first_vertex[dag:dag + 2]
+        self.scheduler.expect(dag, [int(v in here) for v in range(first, last)])
+
+    def finished(self, now: int) -> None:
+        self.scheduler.finish(now)
