@@ -22,10 +22,11 @@ from msg_graph.model import (
     QueueEdge,
     TaskSet,
     Vertex,
+    WeaklyHard,
 )
 
 __all__ = [
     'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'GraphErrors', 'NO_GRAPH',
-    'Path', 'Process', 'QueueEdge', 'TaskSet', 'Vertex', 'format_duration', 'load', 'loads',
-    'parse_duration',
+    'Path', 'Process', 'QueueEdge', 'TaskSet', 'Vertex', 'WeaklyHard', 'format_duration', 'load',
+    'loads', 'parse_duration',
 ]

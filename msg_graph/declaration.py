@@ -223,8 +223,8 @@ def _callback(entry: Entry, node: str, top: str) -> Callback:
         period_ns=_period(entry, timer_period),
         deadline_ns=entry.get('deadline'),
         **{same: entry.get(same) for same in (
-            'publishes', 'reads', 'release_from', 'group', 'dag', 'execution_time', 'on_miss',
-            'max_active_jobs', 'holds_interpreter')},
+            'publishes', 'reads', 'release_from', 'group', 'dag', 'execution_time', 'on_late',
+            'max_active_jobs', 'holds_interpreter', 'keep', 'importance', 'tolerate')},
         line=entry.line,
         file=None if entry.file == top else entry.file)
 

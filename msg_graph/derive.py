@@ -213,7 +213,7 @@ class Links:
                     "remove 'period:', or take the topic out of that callback's 'publishes:'")
 
     def _check_started(self, callback: Callback) -> None:
-        for key in ('dag', 'max_active_jobs', 'on_miss'):
+        for key in ('dag', 'max_active_jobs', 'on_late'):
             if self.entries[callback.key].has(key):
                 raise self._only_source(callback, key)
         if callback.release_from != 'arrival':
@@ -307,6 +307,20 @@ class Links:
                 f'{shown(topic)}',
                 'move the deadline to the sinks after it, or read that topic by a queue edge '
                 "('reads:')")
+        if topic is not None:
+            self._check_no_sink(callback)
+
+    def _check_no_sink(self, callback: Callback) -> None:
+        entry = self.entries[callback.key]
+        for key in ('importance', 'tolerate'):
+            if entry.has(key):
+                raise entry.error(
+                    key, f"'{key}:' is for a sink, and this callback starts another one",
+                    'move it to the sinks after it')
+        if entry.has('keep') and not self.is_source(callback):
+            raise entry.error(
+                'keep', "'keep:' is for a source or a sink, and this callback is neither",
+                "move it, or give the topic's QoS a depth of 1")
 
     def queue_edges(self) -> tuple[QueueEdge, ...]:
         """Return the queue edges, each with its writers (rule 1)."""
@@ -496,6 +510,6 @@ def _dag(
         sinks=tuple(v.index for v in vertices if not v.successors),
         edges=tuple((i, after) for i, each in enumerate(successors) for after in sorted(each)),
         release_from=first.release_from,
-        on_miss=first.on_miss,
+        on_late=first.on_late,
         max_active_jobs=first.max_active_jobs,
     )

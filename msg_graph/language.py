@@ -29,7 +29,7 @@ from typing import Any
 
 from msg_graph.duration import DAY, DurationError, MICROSECOND, parse_duration, UNITS
 from msg_graph.errors import did_you_mean, GraphError, listed, shown
-from msg_graph.model import ExecutionTime, MOST_WORKERS
+from msg_graph.model import ExecutionTime, MOST_WORKERS, WeaklyHard
 from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
 Schema = dict[str, Any]
@@ -39,6 +39,7 @@ ARGUMENT_USE = rf'\$\({ARGUMENT.pattern}\)'
 """How an argument of the file stands in a value; the JSON Schema allows it in any."""
 
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
+_OF = re.compile(r'[ \t]*([0-9]{1,6})[ \t]+of[ \t]+([0-9]{1,6})[ \t]*')
 _INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
 _USE: Schema = {'type': 'string', 'pattern': ARGUMENT_USE}
 _ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
@@ -134,6 +135,10 @@ class Key:
     needed: bool = False
 
 
+RENAMED = {'on_miss': 'on_late'}
+"""Keys of earlier versions, and what they are called now."""
+
+
 class Entry:
     """
     One mapping of the declaration.
@@ -153,6 +158,9 @@ class Entry:
         self._tree = tree
         for key in tree.entries:
             if key not in keys:
+                if RENAMED.get(key) in keys:
+                    raise self.error(
+                        key, f'unknown key {shown(key)}', f"write '{RENAMED[key]}:' instead")
                 raise self.error(
                     key, f'unknown key {shown(key)}',
                     did_you_mean(key, keys, f'use {", ".join(keys)}'))
@@ -233,15 +241,16 @@ def name(what: Name) -> Kind:
         'pattern': f'^(?:{what.pattern.pattern})$|{ARGUMENT_USE}', 'maxLength': what.longest})
 
 
-def choice(*words: str) -> Kind:
-    """Return the kind of some words; where the key is missing it is the first."""
+def choice(*words: str, missing: str | None = '') -> Kind:
+    """Return the kind of some words; a missing key has the first, unless ``missing`` is given."""
     def check(word: str) -> tuple[str, str] | None:
         if word in words:
             return None
         return (f'{shown(word)} is not known',
                 did_you_mean(word, words, f'use {", ".join(words)}'))
 
-    return text(check, {'anyOf': [{'enum': list(words)}, _USE]}, words[0])
+    return text(
+        check, {'anyOf': [{'enum': list(words)}, _USE]}, words[0] if missing == '' else missing)
 
 
 def items(form: Schema) -> Kind:
@@ -380,6 +389,24 @@ def _check_file(path: str) -> tuple[str, str] | None:
     return None
 
 
+def weakly_hard() -> Kind:
+    """Return the kind of 'N of M': at most N misses in any M results in a row."""
+    def read(entry: Entry, key: str, value: Tree) -> WeaklyHard:
+        found = _OF.fullmatch(value.text) if isinstance(value, Scalar) else None
+        if found is None:
+            raise entry.value_error(
+                key, value, f'is {_described(value)}', "write how many of how many, as '1 of 100'")
+        misses, of = int(found[1]), int(found[2])
+        if not 0 < misses < of:
+            raise entry.value_error(
+                key, value, f'{misses} of {of} makes no sense',
+                'tolerate at least 1 miss, and fewer than all')
+        return WeaklyHard(misses, of)
+
+    return Kind(read, {'type': 'string', 'pattern': f'^(?:{_OF.pattern})$|{ARGUMENT_USE}',
+                       'examples': ['1 of 100']})
+
+
 def _read_execution_time(entry: Entry, key: str, value: Tree) -> ExecutionTime:
     if isinstance(value, Scalar):
         return ExecutionTime((time(least_ns=1).read(entry, key, value),), (50.0,))
@@ -503,8 +530,13 @@ CALLBACK_KEYS = {
                              'computes with the lock of the interpreter released (false).'),
     'group': Key(name(GROUP), 'Its mutually exclusive callback group in the node.'),
     'dag': Key(name(DAG), 'Name of the DAG that it is the source of.'),
-    'on_miss': Key(choice('continue', 'abort'),
+    'on_late': Key(choice('continue', 'demote', 'abort', missing=None),
                    'What is done with a late job of its DAG, if it is a source.'),
+    'keep': Key(choice('all', 'newest'),
+                'Of a source or sink: newest drops what has not started when the next is ready.'),
+    'importance': Key(choice('high', 'normal', 'low', missing='normal'),
+                      'Of a sink: in an overload the more important keep their deadlines.'),
+    'tolerate': Key(weakly_hard(), "Of a sink: how many misses are tolerated, as '1 of 100'."),
     'max_active_jobs': Key(whole(1, 1_000_000),
                            'Bound on the open jobs of its DAG, if it is a source.'),
 }

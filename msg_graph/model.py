@@ -16,7 +16,9 @@ from typing import Any, Literal
 
 Kind = Literal['timer', 'subscription', 'sync', 'service']
 ReleaseFrom = Literal['arrival', 'source_timestamp', 'header_stamp']
-OnMiss = Literal['continue', 'abort']
+OnLate = Literal['continue', 'demote', 'abort']
+Keep = Literal['all', 'newest']
+Importance = Literal['high', 'normal', 'low']
 
 MOST_WORKERS = 4096
 """Of one executor, declared or asked for."""
@@ -66,6 +68,23 @@ class ExecutionTime:
 
 
 @dataclass(frozen=True, slots=True)
+class WeaklyHard:
+    """
+    How many results of a sink may miss their deadlines: ``misses`` of any ``of`` in a row.
+
+    Source: G. Bernat, A. Burns and A. Llamosi, "Weakly hard real-time systems", IEEE Transactions
+    on Computers 50(4), 2001.
+    """
+
+    misses: int
+    of: int
+
+    def __str__(self) -> str:
+        """Return it as in a declaration."""
+        return f'{self.misses} of {self.of}'
+
+
+@dataclass(frozen=True, slots=True)
 class Callback:
     """
     A declared callback: the unit that an executor runs.
@@ -86,10 +105,15 @@ class Callback:
     :ivar dag: declared name of the DAG that it is the source of, or None.
     :ivar execution_time: its execution time, or None where it is not declared.
     :ivar line: line of its declaration, counted from 1.
-    :ivar on_miss: what is done with a late job of the DAG that it is the source of.
+    :ivar on_late: what is done with a late job of the DAG that it is the source of; None: what
+        the run does by default.
     :ivar max_active_jobs: bound on the open jobs of the DAG that it is the source of, or None.
     :ivar holds_interpreter: whether it computes in Python (True), or waits, or computes with the
         interpreter's lock released (False); None where nobody says.
+    :ivar keep: of a source or sink: ``newest`` if an execution that has not started is dropped
+        when the next job's is ready.
+    :ivar importance: of a sink, in an overload.
+    :ivar tolerate: of a sink: how many deadline misses are tolerated, or None.
     :ivar file: name of the file that declares it; None: that of the task set.
     """
 
@@ -109,9 +133,12 @@ class Callback:
     dag: str | None
     execution_time: ExecutionTime | None
     line: int
-    on_miss: OnMiss = 'continue'
+    on_late: OnLate | None = None
     max_active_jobs: int | None = None
     holds_interpreter: bool | None = None
+    keep: Keep = 'all'
+    importance: Importance = 'normal'
+    tolerate: WeaklyHard | None = None
     file: str | None = None
 
 
@@ -152,7 +179,7 @@ class Dag:
     :ivar edges: trigger edges as pairs of indices, ascending.
     :ivar release_from: where a job's release time comes from; of a timer's it is when that was
         due, and ``header_stamp`` says where other processes of the DAG have it from.
-    :ivar on_miss: whether a late job goes on or is aborted.
+    :ivar on_late: what is done with a late job, or None where the declaration says nothing.
     :ivar max_active_jobs: bound on the open jobs, or None where the declaration has none.
     """
 
@@ -164,7 +191,7 @@ class Dag:
     sinks: tuple[int, ...]
     edges: tuple[tuple[int, int], ...]
     release_from: ReleaseFrom
-    on_miss: OnMiss
+    on_late: OnLate | None
     max_active_jobs: int | None
 
 

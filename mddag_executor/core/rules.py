@@ -231,7 +231,7 @@ def peek(t: Tables, s: State, now: int) -> int:
                 queue = next_queue(t, s, False)
                 continue
             slot = s.x_slot[x]
-            if (t.on_miss[s.job_dag[slot]] == ABORT and s.job_state[slot] == OPEN
+            if (t.on_late[s.job_dag[slot]] == ABORT and s.job_state[slot] == OPEN
                     and overdue(t, s, slot, now)):
                 abort_job(t, s, slot, now)
             if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
@@ -441,7 +441,7 @@ def _complete_vertex(
             s.job_late[slot] += 1
         if s.job_sinks_left[slot] == 0:
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
-        elif late and t.on_miss[dag] == ABORT:
+        elif late and t.on_late[dag] == ABORT:
             abort_job(t, s, slot, now)
     elif s.expected[vertex] == LEADS_OUT:
         s.job_sinks_left[slot] -= 1

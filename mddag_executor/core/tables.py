@@ -79,7 +79,7 @@ class Tables(NamedTuple):
     n_vertices: int
     period: list[int]
     dag_deadline: list[int]
-    on_miss: list[int]
+    on_late: list[int]
     max_active_jobs: list[int]
     expire_after: list[int]
     first_vertex: list[int]
@@ -197,7 +197,7 @@ class _Columns:
             region += len(topics)
         lists['period'].append(dag.period_ns)
         lists['dag_deadline'].append(max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks))
-        lists['on_miss'].append(ABORT if dag.on_miss == 'abort' else CONTINUE)
+        lists['on_late'].append(ABORT if dag.on_late == 'abort' else CONTINUE)
         lists['max_active_jobs'].append(dag.max_active_jobs or self._max_active_jobs)
         lists['expire_after'].append(self._expire_after)
         lists['first_vertex'].append(first)
@@ -223,7 +223,7 @@ class _Columns:
             'n_legs': 1, 'first_leg': len(lists['leg_topic']), 'leg_topic': 0,
             'n_predecessors': 0, 'first_successor': len(lists['successors']),
             'group': -1, 'process': 1,
-            'period': default_deadline, 'dag_deadline': default_deadline, 'on_miss': CONTINUE,
+            'period': default_deadline, 'dag_deadline': default_deadline, 'on_late': CONTINUE,
             'max_active_jobs': NEVER, 'expire_after': NEVER, 'first_vertex': n_vertices,
             'n_region': 1, 'source': n_vertices, 'first_sink': len(lists['sinks']),
         }

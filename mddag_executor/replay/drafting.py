@@ -364,7 +364,10 @@ def _is_shown(entity: Callback) -> bool:
 def _from_declared(declared: Declared) -> DraftCallback:
     starts = [declared.service] if declared.service else list(declared.topics)
     also = {key: str(value).lower() for key, value, usual in (
-        ('on_miss', declared.on_miss, 'continue'),
+        ('on_late', declared.on_late, None),
+        ('keep', declared.keep, 'all'),
+        ('importance', declared.importance, 'normal'),
+        ('tolerate', declared.tolerate, None),
         ('max_active_jobs', declared.max_active_jobs, None),
         ('holds_interpreter', declared.holds_interpreter, None)) if value != usual}
     return DraftCallback(

@@ -187,7 +187,7 @@ def feasible(
                 lengths[index] += lengths[list(vertex.predecessors)].max(axis=0)
             if vertex.deadline_ns is not None and vertex.deadline_ns <= duration_ns:
                 late = lengths[index] > vertex.deadline_ns
-                if not horizon and dag.on_miss != 'abort':
+                if not horizon and dag.on_late != 'abort':
                     late &= lengths[index] + overheads + latest < duration_ns
                 possible &= ~late
             jobs = max(0, (duration_ns - offsets[index]) // dag.period_ns + 1)

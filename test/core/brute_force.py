@@ -280,7 +280,7 @@ class BruteForce:
             self._miss(job, sink, self.now)
         if not self._open_sinks(job):
             job.outcome = 'late' if job.late else 'completed'
-        elif late and job.dag.on_miss == 'abort':
+        elif late and job.dag.on_late == 'abort':
             self._give_up(job, 'aborted')
 
     # --- workers ---------------------------------------------------------------------------------
@@ -306,7 +306,7 @@ class BruteForce:
         if best is None:
             return False
         job = best.job
-        if job.outcome is None and job.dag.on_miss == 'abort' and any(
+        if job.outcome is None and job.dag.on_late == 'abort' and any(
                 self._deadline(job, sink) < self.now for sink in self._open_sinks(job)):
             self._give_up(job, 'aborted')
             return True

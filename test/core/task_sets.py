@@ -151,7 +151,7 @@ def task_sets(
                 callback['timer'] = _ticks(draw, 3, 15)
                 callback['dag'] = f'dag{dag}'
                 if bounds:
-                    callback['on_miss'] = draw(st.sampled_from(['continue', 'abort']))
+                    callback['on_late'] = draw(st.sampled_from(['continue', 'abort']))
                     if draw(st.booleans()):
                         callback['max_active_jobs'] = draw(st.integers(1, 3))
             mine.append(callback)

@@ -332,7 +332,7 @@ def test_lateness_stops_the_run_only_when_asked() -> None:
     assert result['deadline_missed'] is True
 
 
-@pytest.mark.parametrize('bound', [{'on_miss': 'abort'}, {'max_active_jobs': 1}])
+@pytest.mark.parametrize('bound', [{'on_late': 'abort'}, {'max_active_jobs': 1}])
 def test_any_kind_of_miss_stops_the_run(bound: dict[str, Any]) -> None:
     # b.0 waits behind a. At 10, when b.1 is released, it expires, or is seen to be late.
     callbacks = [single('a', 100), single('b', 10, 9, **bound)]
@@ -351,7 +351,7 @@ def test_a_late_job_goes_on_or_is_aborted() -> None:
     going_on = case(TWO_SINKS, ticks).run(50).result()['dags']['s']
     assert going_on['ends'] == {'completed': 0, 'late': 1, 'aborted': 0, 'expired': 0, 'failed': 0}
     assert [s['completed'] for s in going_on['sinks'].values()] == [1, 1]
-    aborting = [{**TWO_SINKS[0], 'on_miss': 'abort'}, *TWO_SINKS[1:]]
+    aborting = [{**TWO_SINKS[0], 'on_late': 'abort'}, *TWO_SINKS[1:]]
     of = case(aborting, ticks)
     assert starts(of, 50) == ['s.0', 'x.0']
     dag = of.run(50).result()['dags']['s']
@@ -361,7 +361,7 @@ def test_a_late_job_goes_on_or_is_aborted() -> None:
 
 
 def test_an_abort_lets_finish_what_has_started() -> None:
-    aborting = [{**TWO_SINKS[0], 'on_miss': 'abort'}, *TWO_SINKS[1:]]
+    aborting = [{**TWO_SINKS[0], 'on_late': 'abort'}, *TWO_SINKS[1:]]
     of = case(aborting, {'s': 1, 'x': 2, 'y': 9}, workers=2)
     assert log(of, 50)[-2:] == [(3, 'end', 0, 'x.0'), (10, 'end', 1, 'y.0')]
     dag = of.run(50).result()['dags']['s']
@@ -370,14 +370,14 @@ def test_an_abort_lets_finish_what_has_started() -> None:
 
 
 def test_what_would_start_too_late_is_aborted_at_its_turn() -> None:
-    callbacks = [single('a', 100, 100), single('b', 10, 5, on_miss='abort')]
+    callbacks = [single('a', 100, 100), single('b', 10, 5, on_late='abort')]
     # fifo: a runs 0-7; at 7 b.0 is past its deadline at 5; at 10 b.1 starts.
     of = case(callbacks, {'a': 7, 'b': 1}, policy='fifo')
     assert starts(of, 20) == ['a.0', 'b.1']
     dag = of.run(20).result()['dags']['b']
     assert dag['ends'] == {'completed': 1, 'late': 0, 'aborted': 1, 'expired': 0, 'failed': 0}
     # At the very deadline nothing is lost yet.
-    callbacks = [single('a', 100, 100), single('b', 10, 7, on_miss='abort')]
+    callbacks = [single('a', 100, 100), single('b', 10, 7, on_late='abort')]
     assert starts(case(callbacks, {'a': 7, 'b': 1}, policy='fifo'), 10) == ['a.0', 'b.0']
 
 

@@ -162,7 +162,7 @@ def test_a_job_that_is_told_to_end_ends() -> None:
 def aborting() -> TaskSet:
     return declaration([
         {'node': '/n', 'name': 's', 'timer': '100us', 'publishes': ['/s'], 'dag': 'd',
-         'on_miss': 'abort'},
+         'on_late': 'abort'},
         {'node': '/n', 'name': 'x', 'subscription': '/s', 'deadline': '5us'},
         {'node': '/n', 'name': 'y', 'subscription': '/s', 'deadline': '50us'},
         {'node': '/n', 'name': 'z', 'subscription': '/s', 'deadline': '60us'}])

@@ -117,7 +117,7 @@ def test_what_was_aborted_takes_no_place_in_a_round() -> None:
     """Two runs of b wait for the poll at 9; that of DAG s, the first, was aborted just then."""
     callbacks = [
         {'node': '/n', 'name': 's', 'timer': '99us', 'publishes': ['/mid', '/early'], 'dag': 's',
-         'on_miss': 'abort'},
+         'on_late': 'abort'},
         {'node': '/n', 'name': 'z', 'timer': '99us', 'publishes': ['/way'], 'dag': 'z'},
         {'node': '/n', 'name': 'mid', 'subscription': '/mid', 'publishes': ['/b']},
         {'node': '/n', 'name': 'way', 'subscription': '/way', 'publishes': ['/b', '/c']},

@@ -16,7 +16,7 @@ US = 1_000
 def two_dags() -> TaskSet:
     return declaration([
         {'node': '/a', 'name': 's', 'timer': '10us', 'publishes': ['/s', '/all'], 'dag': 'first',
-         'max_active_jobs': 4, 'on_miss': 'abort', 'group': 'g'},
+         'max_active_jobs': 4, 'on_late': 'abort', 'group': 'g'},
         {'node': '/a', 'name': 'late', 'subscription': '/s', 'deadline': '30us', 'group': 'g'},
         {'node': '/b', 'name': 't', 'timer': '20us', 'publishes': ['/t', '/all'],
          'dag': 'second', 'group': 'g'},
@@ -42,7 +42,7 @@ def test_columns_of_two_dags() -> None:
     assert tables.sink_deadline == [-1, 30 * US, -1, 25 * US, 40 * US, -1, 40 * US, -1]
     assert tables.sinks == [1, 3, 4, 6]
     assert tables.first_sink == [0, 3, 4, 4]
-    assert tables.on_miss == [1, 0, 0]
+    assert tables.on_late == [1, 0, 0]
     assert tables.max_active_jobs == [4, 9, NEVER]
     assert tables.expire_after == [7, 7, NEVER]
     assert tables.n_predecessors == [0, 1, 1, 2, 1, 0, 1, 0]

@@ -388,7 +388,7 @@ def with_source(more: str) -> TaskSet:
 
 def test_abort_drops_what_is_left_of_a_late_job(make_executor, make_node):
     chain = Chain(make_node, {'relay': lambda: time.sleep(0.06)})
-    executor = make_executor(with_source('on_miss: abort'), num_workers=2)
+    executor = make_executor(with_source('on_late: abort'), num_workers=2)
 
     def all_ended() -> bool:
         dag = executor.statistics()['dags']['chain']
@@ -414,7 +414,7 @@ def test_whatever_became_ready_ran_was_dropped_or_waits(make_executor, make_node
     dawdle = {name: lambda: time.sleep(generator.choice((0, 0.012, 0.03, 0.06)))
               for name in ('relay', 'early', 'last')}
     chain = Chain(make_node, dawdle)
-    executor = make_executor(with_source('on_miss: abort'), num_workers=2)
+    executor = make_executor(with_source('on_late: abort'), num_workers=2)
     with Spinning(executor):
         chain.start(executor)
         assert wait_for(lambda: len(chain.jobs['tick']) >= 40, 20)

@@ -60,7 +60,10 @@ def callbacks(draw: st.DrawFn, name: str) -> dict[str, object]:
         ('execution_time', st.sampled_from(
             ['0ns', '1us', '1ms', '86400s', {'quantiles_us': [1, 2, 3]},
              {'quantiles_us': [0, 10**10]}])),
-        ('on_miss', st.sampled_from(['abort', 'continue'])),
+        ('on_late', st.sampled_from(['abort', 'demote', 'continue'])),
+        ('keep', st.sampled_from(['newest', 'all'])),
+        ('importance', st.sampled_from(['high', 'low'])),
+        ('tolerate', st.sampled_from(['1 of 100', '0 of 1', '5'])),
         ('max_active_jobs', st.sampled_from([1, 2, 10**6, 2**31, 10**30, 0])),
         ('release_from', st.sampled_from(['arrival', 'header_stamp', 'source_timestamp'])),
         ('group', st.sampled_from(['g', 'h', 'reentrant'])), ('dag', st.sampled_from(NAMES)),

@@ -53,7 +53,7 @@ nodes:
   - node: /m
     callbacks:
       - {name: both, sync: [/c, /b], deadline: 10ms, execution_time: 1ms}
-      - {name: other, timer: 7ms, deadline: 7ms, execution_time: 3ms, on_miss: abort, dag: e}
+      - {name: other, timer: 7ms, deadline: 7ms, execution_time: 3ms, on_late: abort, dag: e}
 paths:
   - {name: whole, callbacks: ['/n:tick', '/n:left', '/m:both']}
 """

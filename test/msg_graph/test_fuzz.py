@@ -103,7 +103,7 @@ VALUES = st.recursive(
 @given(
     st.sampled_from(['workers', 'nodes', 'paths', 'mddag']), VALUES,
     st.sampled_from(['name', 'timer', 'deadline', 'publishes', 'reads', 'execution_time', 'group',
-                     'release_from', 'on_miss', 'max_active_jobs', 'dag']), VALUES)
+                     'release_from', 'on_late', 'max_active_jobs', 'dag']), VALUES)
 def test_any_value_at_any_key(top: str, value: object, key: str, inner: object) -> None:
     callback = {'name': 't', 'timer': '1ms', 'deadline': '1ms', key: inner}
     data: dict[str, object] = {

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from msg_graph import loads
+from msg_graph import loads, WeaklyHard
 import pytest
 
 from .helpers import error, graph, MARK, nodes_error
@@ -20,7 +20,7 @@ nodes:
         period: 50ms
         release_from: header_stamp
         dag: camera
-        on_miss: abort
+        on_late: abort
         max_active_jobs: 3
         publishes: [/image, /info]
         execution_time: 3ms
@@ -62,7 +62,7 @@ def test_every_key() -> None:
         '/camera/driver', 'frame', '/camera/driver:frame')
     assert (frame.kind, frame.topics, frame.period_ns, frame.timer_period_ns) == (
         'subscription', ('/camera/raw',), 50_000_000, None)
-    assert (frame.release_from, frame.dag, frame.on_miss, frame.max_active_jobs) == (
+    assert (frame.release_from, frame.dag, frame.on_late, frame.max_active_jobs) == (
         'header_stamp', 'camera', 'abort', 3)
     assert (frame.publishes, frame.group, frame.line) == (('/image', '/info'), 'io', 6)
     assert frame.execution_time is not None
@@ -74,7 +74,7 @@ def test_every_key() -> None:
     assert call.execution_time.quantiles_ns == (1_000, 2_500, 1_000_000)
     assert call.execution_time.percent == (0.0, 50.0, 100.0)
     assert (call.period_ns, call.deadline_ns, call.group, call.dag) == (None, None, None, None)
-    assert (call.release_from, call.on_miss, call.max_active_jobs) == ('arrival', 'continue', None)
+    assert (call.release_from, call.on_late, call.max_active_jobs) == ('arrival', None, None)
     assert (settings.kind, settings.service, settings.topics, settings.period_ns) == (
         'service', '/detector/set', (), 1_000_000_000)
     assert (tick.kind, tick.timer_period_ns, tick.period_ns, tick.deadline_ns, tick.line) == (
@@ -82,9 +82,9 @@ def test_every_key() -> None:
     assert show.execution_time is not None
     assert show.execution_time.quantiles_ns == (0, 5_000)
     assert show.execution_time.percent == (10.0, 99.9)
-    assert [(d.name, d.release_from, d.on_miss, d.max_active_jobs) for d in tasks.dags] == [
-        ('camera', 'header_stamp', 'abort', 3), ('/detector', 'arrival', 'continue', None),
-        ('tick', 'arrival', 'continue', None)]
+    assert [(d.name, d.release_from, d.on_late, d.max_active_jobs) for d in tasks.dags] == [
+        ('camera', 'header_stamp', 'abort', 3), ('/detector', 'arrival', None, None),
+        ('tick', 'arrival', None, None)]
     assert [(e.reader, e.topic, e.writers) for e in tasks.queue_edges] == [
         ('/detector:call-1.x', '/set', ('/detector:settings',)),
         ('/detector:call-1.x', None, ('/detector:settings',))]
@@ -268,7 +268,15 @@ def test_node_without_callbacks() -> None:
     (['name: t', 'timer: 1ms', f'release_from: arival {MARK}'], ["did you mean 'arrival'?"]),
     (['name: t', 'timer: 1ms', f'release_from: 7 {MARK}'],
      ["'7' is not known: use arrival, source_timestamp, header_stamp"]),
-    (['name: t', 'timer: 1ms', f'on_miss: stop {MARK}'], ['use continue, abort']),
+    (['name: t', 'timer: 1ms', f'on_late: stop {MARK}'], ['use continue, demote, abort']),
+    (['name: t', 'timer: 1ms', f'on_miss: abort {MARK}'],
+     ["unknown key 'on_miss': write 'on_late:' instead"]),
+    (['name: t', 'timer: 1ms', f'keep: last {MARK}'], ['use all, newest']),
+    (['name: t', 'timer: 1ms', f'importance: hgh {MARK}'], ["did you mean 'high'?"]),
+    (['name: t', 'timer: 1ms', f'tolerate: 5% {MARK}'],
+     ["'tolerate': is '5%'", "write how many of how many, as '1 of 100'"]),
+    (['name: t', 'timer: 1ms', f'tolerate: 3 of 3 {MARK}'], ['and fewer than all']),
+    (['name: t', 'timer: 1ms', f'tolerate: 0 of 3 {MARK}'], ['at least 1 miss']),
     (['name: t', 'timer: 1ms', f'max_active_jobs: 0 {MARK}'], ['from 1 to 1000000']),
     (['name: t', 'timer: 1ms', f'group: a/b {MARK}'], ['no name for a callback group']),
     (['name: t', 'timer: 1ms', f'dag: a@b {MARK}'], ['no name for a DAG']),
@@ -277,6 +285,22 @@ def test_node_without_callbacks() -> None:
 def test_callback_entries(entries: list[str], says: list[str]) -> None:
     lines = '\n'.join(f'    {entry}' for entry in entries)
     nodes_error(f'- node: /a\n  callbacks:\n  - {lines[4:]}\n', *says)
+
+
+def test_overload_keys() -> None:
+    tasks = loads("""
+        mddag: 1
+        nodes:
+          - node: /n
+            callbacks:
+              - {name: t, timer: 10ms, publishes: [/a], keep: newest, on_late: demote}
+              - {name: s, subscription: /a, deadline: 10ms, keep: newest, importance: high,
+                 tolerate: 2 of 50}
+    """)
+    source, sink = tasks.callbacks
+    assert (source.keep, source.importance, source.tolerate) == ('newest', 'normal', None)
+    assert (sink.keep, sink.importance, sink.tolerate) == ('newest', 'high', WeaklyHard(2, 50))
+    assert (str(sink.tolerate), tasks.dags[0].on_late) == ('2 of 50', 'demote')
 
 
 def test_duplicate_callback_names() -> None:

@@ -40,7 +40,7 @@ def test_topic_nobody_publishes() -> None:
 
 def test_what_only_a_source_may_have() -> None:
     for key, value in (
-        ('dag', 'd'), ('on_miss', 'continue'), ('max_active_jobs', '3'),
+        ('dag', 'd'), ('on_late', 'continue'), ('max_active_jobs', '3'),
         ('release_from', 'header_stamp'),
     ):
         nodes_error(f"""
@@ -52,6 +52,24 @@ def test_what_only_a_source_may_have() -> None:
                   {key}: {value} {MARK}
                   deadline: 10ms
         """, f"callback '/n:s': '{key}:' is for the source of a DAG", 'move it to the source')
+    nodes_error(f"""
+        - node: /n
+          callbacks:
+            - {{name: t, timer: 10ms, publishes: [/a]}}
+            - {{name: m, subscription: /a, publishes: [/b],
+               keep: newest}} {MARK}
+            - {{name: s, subscription: /b, deadline: 10ms}}
+    """, "'keep:' is for a source or a sink")
+    for key, value in ('importance', 'high'), ('tolerate', '1 of 10'):
+        nodes_error(f"""
+            - node: /n
+              callbacks:
+                - name: t
+                  timer: 10ms
+                  publishes: [/a]
+                  {key}: {value} {MARK}
+                - {{name: s, subscription: /a, deadline: 10ms}}
+        """, f"'{key}:' is for a sink", 'move it to the sinks after it')
     nodes_error(f"""
         - node: /n
           callbacks:

@@ -20,15 +20,15 @@ workers: 3
 nodes:
   - node: /n
     callbacks:
-      - {name: t, timer: 10ms, publishes: [/a], dag: one, on_miss: abort, max_active_jobs: 3,
-         execution_time: 2 ms}
+      - {name: t, timer: 10ms, publishes: [/a], dag: one, on_late: abort, max_active_jobs: 3,
+         keep: newest, execution_time: 2 ms}
       - {name: x, subscription: /a, deadline: 1.5s, group: g, holds_interpreter: true,
          execution_time: {quantiles_us: [1, 2.5], percent: [0, 100]}}
       - {name: y, subscription: /o, period: 1min, reads: [x, /a], publishes: [/b],
          release_from: header_stamp}
       - {name: w, subscription: /b, publishes: [/c]}
       - {name: v, subscription: /b, publishes: [/d]}
-      - {name: 7, sync: [/c, /d], deadline: 50ms}
+      - {name: 7, sync: [/c, /d], deadline: 50ms, importance: high, tolerate: 1 of 100}
       - {name: s, service: /s, period: 1s, deadline: 1s, dag: service}
 paths:
   - {name: p, callbacks: ['/n:t', '/n:x']}
@@ -69,7 +69,7 @@ include:
 workers: $(workers)
 nodes:
   - node: /$(period)
-    callbacks: [{name: $(period)_x, timer: $(period), deadline: 1ms, on_miss: $(period)}]
+    callbacks: [{name: $(period)_x, timer: $(period), deadline: 1ms, on_late: $(period)}]
 """
     assert errors(text) == []
     assert errors(text.replace('namespace', 'name_space')) != []
@@ -93,7 +93,10 @@ nodes:
     ('sync: [/c, /d]', 'sync: [/c]'),
     ('sync: [/c, /d]', 'sync: /c'),
     ('publishes: [/b]', 'publishes: [/b, /b]'),
-    ('on_miss: abort', 'on_miss: stop'),
+    ('on_late: abort', 'on_late: stop'),
+    ('keep: newest', 'keep: old'),
+    ('importance: high', 'importance: vital'),
+    ('1 of 100', '1 in 100'),
     ('max_active_jobs: 3', 'max_active_jobs: many'),
     ('release_from: header_stamp', 'release_from: stamp'),
     ('quantiles_us: [1, 2.5]', 'quantiles_us: []'),

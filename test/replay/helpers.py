@@ -90,7 +90,7 @@ def declarations(draw: st.DrawFn) -> str:
             about = []
             if i == 0:
                 about += ['timer: 10ms', f'dag: dag{d}']
-                about += ['on_miss: abort'] if draw(st.booleans()) else []
+                about += ['on_late: abort'] if draw(st.booleans()) else []
                 about += ['max_active_jobs: 2'] if draw(st.booleans()) else []
             elif len(before[i - 1]) == 1:
                 about.append(f'subscription: /d{d}t{before[i - 1][0]}')

@@ -23,7 +23,7 @@ class Oracle:
         tables = Tables.build(task_set, legs=True, groups=False)
         n = tables.n_dags + 1
         self.tables = tables._replace(
-            max_active_jobs=[NEVER] * n, expire_after=[NEVER] * n, on_miss=[CONTINUE] * n)
+            max_active_jobs=[NEVER] * n, expire_after=[NEVER] * n, on_late=[CONTINUE] * n)
         self.tally = MissTally(task_set, self.tables)
         self.decisions: list[Decision] = []
         self.scheduler = Scheduler(self.tables, 1, propagate=False)

@@ -61,7 +61,7 @@ def test_replay_counts_what_the_driver_counted(
 
 def test_every_kind_of_verdict_occurs(tmp_path: Path) -> None:
     """The differential test would be worth little if nothing ever went wrong in its runs."""
-    text = SMALL.replace('timer: 20ms,', 'timer: 20ms, on_miss: abort,')
+    text = SMALL.replace('timer: 20ms,', 'timer: 20ms, on_late: abort,')
     seen = dict.fromkeys(('completed', 'late', 'expired', 'failed', 'aborted', 'overdue'), 0)
     for seed in range(8):
         path = tmp_path / f'{seed}.mcap'

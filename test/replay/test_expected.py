@@ -37,7 +37,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Path('demo.mcap').symlink_to(BAGS / 'demo_short.mcap')
     Path('four.yaml').write_text(IMPORTED)
     four_jobs(Path('four.mcap'))
-    abort = SMALL.replace('timer: 20ms,', 'timer: 20ms, on_miss: abort,') + PATHS
+    abort = SMALL.replace('timer: 20ms,', 'timer: 20ms, on_late: abort,') + PATHS
     for seed, workers, policy in ((1, 2, 'fifo'), (7, 4, 'fifo')):
         VirtualRun(Path(f'v{seed}.mcap'), loads(abort, 'g.yaml'), seed, workers=workers,
                    policy=policy, duration=(400 + 100 * seed) * MS, longest=(3 + 2 * seed) * MS,

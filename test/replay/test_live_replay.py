@@ -37,7 +37,7 @@ nodes:
       - {name: join, sync: [/boxes, /flat], deadline: 12ms}
   - node: /imu
     callbacks:
-      - {name: tick, timer: 10ms, publishes: [/twist], on_miss: abort}
+      - {name: tick, timer: 10ms, publishes: [/twist], on_late: abort}
   - node: /filter
     callbacks:
       - {name: use, subscription: /twist, publishes: [/odometry]}

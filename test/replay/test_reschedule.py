@@ -93,7 +93,7 @@ def test_the_same_settings_give_the_same_schedule(
     text: str, seed: int, workers: int, policy: str, longest: int, undeclared: int
 ) -> None:
     """A schedule of the core, recorded and rescheduled, is the same: starts, ends, verdicts."""
-    text = text.replace('on_miss: abort, ', '').replace('max_active_jobs: 2, ', '')
+    text = text.replace('on_late: abort, ', '').replace('max_active_jobs: 2, ', '')
     task_set = loads(text, 'g.yaml')
     load = random_load(task_set, seed, longest * MS, undeclared)
     end = START_TIME + 10_000 * MS

@@ -182,7 +182,7 @@ def test_times_of_a_day() -> None:
     """Keys and times do not overflow: a day at the nanosecond, and what never expires."""
     task_set = loads(
         'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, timer: 3600s, deadline: 86400s, '
-        'on_miss: abort}]}]', 'day.yaml')
+        'on_late: abort}]}]', 'day.yaml')
     case = Case(task_set, ((7_200_000_000,),), 1, 'rad', True)
     assert compare(case, 86_400_000_000) > 10
 

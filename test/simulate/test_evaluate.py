@@ -147,7 +147,7 @@ def test_a_late_completion_that_no_scheduler_avoids_bounds_completions() -> None
 
 @pytest.mark.parametrize('judge', ['completions', 'horizon'])
 @pytest.mark.parametrize('change', [
-    {}, {'group': 'g'}, {'holds_interpreter': True}, {'on_miss': 'abort'}])
+    {}, {'group': 'g'}, {'holds_interpreter': True}, {'on_late': 'abort'}])
 def test_no_policy_exceeds_the_bound(judge: str, change: dict[str, object]) -> None:
     count = {True: 0, False: 0}
     for seed in range(12):
@@ -157,7 +157,7 @@ def test_no_policy_exceeds_the_bound(judge: str, change: dict[str, object]) -> N
         declared = yaml.safe_load(generate(options))
         for node in declared['nodes']:
             for callback in node['callbacks']:
-                if 'on_miss' not in change or 'timer' in callback:
+                if 'on_late' not in change or 'timer' in callback:
                     callback.update(change)
         for overhead in (0, 50_000):
             outcome = evaluate(Experiment(

@@ -38,7 +38,7 @@ mddag: 1
 nodes:
   - node: /n
     callbacks:
-      - {name: s, timer: 3us, dag: d, on_miss: abort, publishes: [/t]}
+      - {name: s, timer: 3us, dag: d, on_late: abort, publishes: [/t]}
       - {name: a, subscription: /t, deadline: 1us}
       - {name: b, subscription: /t, deadline: 1us}
 """), ((1, 1, 1),), 2, 'rad', False, 0, 0)
