@@ -89,7 +89,7 @@ def test_yaml_that_is_refused(text: str, says: str) -> None:
 
 @pytest.mark.parametrize('opening', ['[', '{a: ', '- ', '- - ? '])
 def test_nesting_is_bounded(opening: str) -> None:
-    with pytest.raises(GraphError, match='levels of nesting|a key is'):
+    with pytest.raises(GraphError, match='nesting|a key is'):
         loads('mddag: 1\nnodes:\n  ' + opening * 100_000)
 
 
