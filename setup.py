@@ -4,6 +4,7 @@
 
 from pathlib import Path
 import re
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -29,6 +30,9 @@ def ros(distribution: str, *packages: str) -> list[str]:
 
 ROS = ['common-interfaces', 'rclpy[fastrtps]', 'rmw-fastrtps-cpp']
 HERE = Path(__file__).resolve().parent
+# Maintainer and addresses are given there, once for all.
+PACKAGE = ElementTree.parse(HERE / 'package.xml').getroot()
+URLS = {url.get('type'): url.text for url in PACKAGE.iter('url')}
 
 
 def version() -> str:
@@ -53,8 +57,10 @@ setup(
     long_description=(HERE / 'README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     license='Apache-2.0',
-    maintainer='The mddag_executor developers',
-    maintainer_email='mddag-executor@example.com',
+    maintainer=PACKAGE.findtext('maintainer'),
+    maintainer_email=PACKAGE.find('maintainer').get('email'),
+    url=URLS['repository'],
+    project_urls={'Source': URLS['repository'], 'Tracker': URLS['bugtracker']},
     keywords=['ROS 2', 'rclpy', 'executor', 'real time', 'scheduling', 'deadline'],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'msg_graph', 'msg_graph.*']),
@@ -63,6 +69,8 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
+        # for `ros2 run` and the launch action Node
+        (f'lib/{NAME}', ['resource/mddag']),
         (f'share/{NAME}/launch', files('launch', '*.launch.py')),
         (f'share/{NAME}/config', files('config', '*.yaml', '*.md')),
         (f'share/{NAME}/examples/robot', files('examples/robot', '*.yaml', '*.py')),
@@ -130,5 +138,8 @@ setup(
         # make test-kilted
         'test-kilted': [*TEST_LIVE, *ros('kilted', 'test-msgs')],
     },
-    entry_points={'console_scripts': ['mddag = mddag_executor.cli.main:main']},
+    entry_points={
+        'console_scripts': ['mddag = mddag_executor.cli.main:main'],
+        'ros2cli.command': ['mddag = mddag_executor.cli.ros2:MddagCommand'],
+    },
 )

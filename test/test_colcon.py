@@ -67,6 +67,8 @@ def test_what_was_built_is_what_runs(workspace: Path):
     program = installed / 'lib' / NAME / 'mddag'  # where `ros2 run` looks
     done = in_workspace(workspace, f'"{program}" --version')
     assert (done.returncode, done.stdout[:6]) == (0, 'mddag '), done.stderr
+    done = in_workspace(workspace, 'mddag --version && command -v mddag')
+    assert done.stdout.splitlines()[1:] == [str(installed / 'bin' / 'mddag')], done.stderr
     done = in_workspace(
         workspace, f'"{sys.executable}" -c "import {NAME}; print({NAME}.__file__)"')
     assert done.stdout.startswith(str(installed))
@@ -92,6 +94,8 @@ def test_ros2_finds_and_runs_it(workspace: Path, tmp_path: Path):
     assert said(f'ros2 pkg executables {NAME}') == f'{NAME} mddag\n'
     assert said(f'ros2 pkg prefix --share {NAME}').startswith(str(workspace / 'install'))
     assert said(f'ros2 run {NAME} mddag --version').startswith('mddag ')
+    assert said('ros2 mddag --version').startswith('mddag ')
+    assert NAME not in said('ros2 --help') and ' mddag ' in said('ros2 --help')
     launch = f'ros2 launch {NAME} autoware_demo.launch.py'
     assert "'utilisation':" in said(f'{launch} --show-args')
     text = said(f'{launch} duration:=1s utilisation:=0.2 trace:=out.mcap')

@@ -245,7 +245,8 @@ def test_the_wheel_holds_what_runs_and_nothing_else(built: Path) -> None:
                                         ('bags', '*.mcap'), ('bags', '*.md'),
                                         ('examples/robot', '*.yaml'), ('examples/robot', '*.py'))
                 for path in (TOP / folder).glob(pattern)}
-    expected |= {f'{SHARE}/package.xml', f'share/ament_index/resource_index/packages/{NAME}'}
+    expected |= {f'{SHARE}/package.xml', f'share/ament_index/resource_index/packages/{NAME}',
+                 f'lib/{NAME}/mddag'}
     assert len(expected) > 5
     assert share == expected
 

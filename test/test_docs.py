@@ -92,10 +92,9 @@ def command_lines() -> list[tuple[str, str]]:
                           for part in re.split(r'&&|\|\|?|;', line.partition(' #')[0])]
         text = re.sub(r'^ *```.*?^ *```$', '', text, flags=re.MULTILINE | re.DOTALL)
         found += [(page, line.replace('\n', ' ')) for line in re.findall(r'`([^`]+)`', text)]
-    lines = [(page, re.sub(r'^.*?(\bros2 run mddag_executor )?\bmddag ', '', line))
+    lines = [(page, re.sub(r'^.*?\bmddag ', '', line))
              for page, line in found
-             if re.match(r'(\S+=\S+ |chrt \S+ \S+ |ros2 run mddag_executor )*'
-                         r'(\.venv/bin/)?mddag ', line)]
+             if re.match(r'(\S+=\S+ |chrt \S+ \S+ |ros2 )*(\.venv/bin/)?mddag ', line)]
     return sorted(set(lines))
 
 

@@ -56,8 +56,8 @@ NOT_IN_CORE = {
     'time', 'yaml',
 }
 # Offline parts work on a machine without ROS.
-ROS = {'rclpy', 'rcl_interfaces', 'std_msgs', 'diagnostic_msgs', 'builtin_interfaces', 'launch',
-       'launch_ros', 'ament_index_python', 'rosidl_parser'}
+ROS = {'rclpy', 'ros2cli', 'rcl_interfaces', 'std_msgs', 'diagnostic_msgs', 'builtin_interfaces',
+       'launch', 'launch_ros', 'ament_index_python', 'rosidl_parser'}
 MAY_USE_ROS = {'mddag_executor.executor', 'mddag_executor.hosting', 'mddag_executor.rerun',
                'mddag_executor.cli'}
 
