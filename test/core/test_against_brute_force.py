@@ -32,31 +32,15 @@ def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False
 
 
 @pytest.mark.parametrize('policy', POLICIES)
-@examples(150)
-@given(st.data(), st.integers(5, 50))
-def test_plain(policy: str, data: st.DataObject, horizon: int) -> None:
-    """Without groups, bounds and overheads, as in the paper."""
-    compare(data.draw(cases((policy,), groups=False, bounds=False)), horizon)
-
-
-@pytest.mark.parametrize('policy', POLICIES)
-@examples(150)
-@given(st.data(), st.integers(5, 50))
-def test_groups(policy: str, data: st.DataObject, horizon: int) -> None:
-    compare(data.draw(cases((policy,), bounds=False)), horizon)
-
-
-@examples(300)
-@given(cases(groups=False), st.integers(5, 50))
-def test_abort_and_bounded_jobs(case: Case, horizon: int) -> None:
-    compare(case, horizon)
-
-
-@examples(300)
-@given(cases(overheads=True), st.integers(5, 50), st.sampled_from(['horizon', 'completions']),
-       st.booleans())
-def test_everything_at_once(case: Case, horizon: int, judge: str, stop: bool) -> None:
-    compare(case, horizon, judge, stop)
+@examples(100)
+@given(st.data(), st.integers(5, 50), st.sampled_from(['horizon', 'completions']), st.booleans())
+def test_everything_at_once(
+    policy: str, data: st.DataObject, horizon: int, judge: str, stop: bool
+) -> None:
+    """Groups, bounds, aborts and overheads, or none of them, as in the paper."""
+    with_groups, with_bounds, overheads = (data.draw(st.booleans()) for _ in range(3))
+    compare(data.draw(cases((policy,), groups=with_groups, bounds=with_bounds,
+                            overheads=overheads)), horizon, judge, stop)
 
 
 @examples(150)

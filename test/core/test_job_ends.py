@@ -4,20 +4,16 @@
 
 from __future__ import annotations
 
-from mddag_executor.core import NEVER, rules
+from mddag_executor.core import rules
 from mddag_executor.core.state import (
-    ABORTED,
     DROP,
     EXPIRED,
     FAILED,
     FREE,
-    IDLE,
     JOB_END,
     OPEN,
     SINK_ABORTED,
-    SINK_EXPIRED,
     SINK_FAILED,
-    SINK_LATE,
     SINK_MISSED,
     WAITING,
 )
@@ -25,43 +21,6 @@ from msg_graph import TaskSet
 
 from .live_helpers import J, live, start_job, undeclared, US, X
 from .task_sets import declaration
-
-
-def test_at_most_so_many_jobs_are_open() -> None:
-    scheduler = live(max_active_jobs=2)
-    slots = [start_job(scheduler, job) for job in range(2)]
-    waiting = scheduler.execution(slots[0], X)
-    scheduler.ready(waiting, 5)
-    assert scheduler.decisions() == []
-    third = scheduler.release(0, 2, 10, 10)
-    assert third not in slots, 'something of job 0 still waits in its slot'
-    assert scheduler.state.n_open[0] == 2
-    assert scheduler.decisions() == [
-        (SINK_EXPIRED, 0, J, 0, 50 * US, -1), (JOB_END, 0, -1, 0, EXPIRED, 10)]
-    # The message of the expired job still gets its callback, which counts for nothing.
-    assert scheduler.take(0, 11) == waiting
-    assert scheduler.complete(waiting, 12)
-    assert scheduler.decisions() == []
-    assert scheduler.state.job_state[slots[0]] == FREE
-    assert start_job(scheduler, 3, 20) in slots, 'slots are used again'
-
-
-def test_what_still_runs_of_an_expired_job_does_not_touch_its_successor() -> None:
-    scheduler = live(max_active_jobs=1)
-    slot = start_job(scheduler)
-    leg = scheduler.execution(slot, J, 0)
-    scheduler.ready(leg, 1)
-    assert scheduler.take(0, 1) == leg
-    second = start_job(scheduler, 1, 2)
-    assert second != slot
-    assert scheduler.complete(leg, 3) is False
-    pending = scheduler.state.x_pending[scheduler.execution(second, J)]
-    assert pending == 2, 'the join of job 1 still lacks both'
-    scheduler.ready(scheduler.execution(second, X), 4)
-    third = scheduler.release(0, 2, 4, 4)
-    assert third == slot
-    assert scheduler.state.x_pending[scheduler.execution(third, J)] == 2
-    assert scheduler.state.x_state[leg] == IDLE
 
 
 def test_a_job_fails_with_what_fails_of_it() -> None:
@@ -102,28 +61,6 @@ def test_an_undeclared_callback_that_fails_is_judged_by_nobody() -> None:
     assert scheduler.decisions() == [] and scheduler.state.job_state[0] == FREE
 
 
-def test_only_idle_jobs_expire_and_only_after_their_time() -> None:
-    scheduler = live(expire_after=10 * US)
-    slot = start_job(scheduler)
-    x = scheduler.execution(slot, X)
-    scheduler.ready(x, 1)
-    scheduler.expire_idle(NEVER)
-    assert scheduler.decisions() == [], 'something of it waits'
-    assert scheduler.take(0, 2) == x
-    scheduler.suspend(x)
-    scheduler.expire_idle(NEVER)
-    assert scheduler.decisions() == [], 'something of it is suspended'
-    scheduler.resume(x)
-    scheduler.take(0, 3)
-    scheduler.complete(x, 4)
-    scheduler.expire_idle(60 * US)
-    assert scheduler.decisions() == []
-    scheduler.release(0, 1, 60 * US + 1, 60 * US + 1)
-    assert scheduler.decisions() == [
-        (SINK_EXPIRED, 0, J, 0, 50 * US, -1), (JOB_END, 0, -1, 0, EXPIRED, 60 * US + 1)]
-    assert scheduler.state.n_open[0] == 1
-
-
 def test_a_stuck_job_does_not_keep_younger_ones_from_expiring() -> None:
     scheduler = live(expire_after=10 * US)
     stuck = scheduler.release(0, 0, 0, 0)
@@ -148,17 +85,6 @@ def test_releases_may_come_out_of_order() -> None:
     assert [decision[3] for decision in scheduler.decisions() if decision[0] == JOB_END] == [1]
 
 
-def test_a_job_that_is_told_to_end_ends() -> None:
-    scheduler = live()
-    slots = [start_job(scheduler, job) for job in range(2)]
-    scheduler.expire(slots[0], 7)
-    scheduler.abort(slots[1], 8)
-    assert scheduler.decisions() == [
-        (SINK_EXPIRED, 0, J, 0, 50 * US, -1), (JOB_END, 0, -1, 0, EXPIRED, 7),
-        (SINK_ABORTED, 0, J, 1, 50 * US, -1), (JOB_END, 0, -1, 1, ABORTED, 8)]
-    assert scheduler.state.n_open[0] == 0
-
-
 def aborting() -> TaskSet:
     return declaration([
         {'node': '/n', 'name': 's', 'timer': '100us', 'publishes': ['/s'], 'dag': 'd',
@@ -166,48 +92,6 @@ def aborting() -> TaskSet:
         {'node': '/n', 'name': 'x', 'subscription': '/s', 'deadline': '5us'},
         {'node': '/n', 'name': 'y', 'subscription': '/s', 'deadline': '50us'},
         {'node': '/n', 'name': 'z', 'subscription': '/s', 'deadline': '60us'}])
-
-
-def test_an_abort_drops_what_waits_and_spares_what_has_started() -> None:
-    scheduler = live(aborting(), workers=3)
-    slot = start_job(scheduler)
-    x, y, z = (scheduler.execution(slot, vertex) for vertex in (1, 2, 3))
-    group = scheduler.new_group()
-    scheduler.state.x_group[y] = scheduler.state.x_group[z] = group
-    for each in (x, y, z):
-        scheduler.ready(each, 1)
-    assert [scheduler.take(worker, 1) for worker in range(3)] == [x, y, -1]
-    scheduler.suspend(y)
-    scheduler.complete(x, 6 * US)            # late by 1 us
-    assert scheduler.decisions() == [
-        (SINK_LATE, 0, 1, 0, 5 * US, 6 * US), (SINK_ABORTED, 0, 2, 0, 50 * US, -1),
-        (SINK_ABORTED, 0, 3, 0, 60 * US, -1), (JOB_END, 0, -1, 0, ABORTED, 6 * US)]
-    scheduler.resume(y)
-    assert scheduler.take(0, 7 * US) == y, 'it has started, so it runs on'
-    assert scheduler.complete(y, 8 * US)
-    assert scheduler.decisions() == []
-    assert scheduler.take(0, 9 * US) == -1
-    assert scheduler.decisions() == [(DROP, 0, 3, 0, z, 9 * US)]
-    assert scheduler.state.job_state[slot] == FREE
-    assert scheduler.queue_length == 0
-    assert scheduler.state.group_owner[group] == -1
-
-
-def test_an_abort_drops_what_was_refused_when_it_is_asked_about_again() -> None:
-    scheduler = live(aborting(), workers=1)
-    slot = start_job(scheduler)
-    y, group = scheduler.execution(slot, 2), scheduler.new_group()
-    scheduler.state.x_group[y] = group
-    scheduler.ready(y, 1)
-    assert scheduler.take(0, 1) == y
-    scheduler.refuse(y)
-    scheduler.abort(slot, 2)
-    scheduler.decisions()
-    scheduler.resume(y)
-    assert scheduler.take(0, 3) == -1
-    assert scheduler.decisions() == [(DROP, 0, 2, 0, y, 3)]
-    assert scheduler.state.job_state[slot] == FREE
-    assert scheduler.state.group_owner[group] == -1
 
 
 def test_what_comes_too_late_aborts_its_job_at_its_turn() -> None:

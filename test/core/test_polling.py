@@ -6,15 +6,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from hypothesis import given
-from hypothesis import strategies as st
 from mddag_executor.core import PolicyError, Scheduler, Tables
 from mddag_executor.core.queues import SWEEP_AT
 from mddag_executor.simulate import Settings, simulate, SimulationError
 import pytest
 
 from .live_helpers import undeclared
-from .task_sets import Case, cases, declaration, examples
+from .task_sets import Case, declaration
 from .test_by_hand import after, case, log, single, source, starts
 
 
@@ -24,6 +22,7 @@ def ros2(callbacks: list[dict[str, Any]], ticks: dict[str, int], **more: Any) ->
 
 # --- order ---------------------------------------------------------------------------------------
 
+
 def test_timers_then_subscriptions_then_services() -> None:
     callbacks = [
         {'node': f'/{name}', 'name': name, 'period': '50us', 'deadline': '50us', kind: f'/{name}'}
@@ -32,15 +31,6 @@ def test_timers_then_subscriptions_then_services() -> None:
     callbacks.append(single('timer', 50))
     ticks = dict.fromkeys(('serve', 'sub', 'sub2', 'timer'), 1)
     assert starts(ros2(callbacks, ticks), 40) == ['timer.0', 'sub.0', 'sub2.0', 'serve.0']
-
-
-def test_a_sync_is_a_subscription() -> None:
-    """Both get ready at 1, when s ends; the sync stands first in the declaration."""
-    callbacks = [
-        {'node': '/n', 'name': 's', 'timer': '50us', 'publishes': ['/a', '/b'], 'dag': 's'},
-        {'node': '/n', 'name': 'sync', 'sync': ['/a', '/b'], 'deadline': '50us'},
-        {'node': '/n', 'name': 'sub', 'subscription': '/a', 'deadline': '50us'}]
-    assert starts(ros2(callbacks, {'s': 1, 'sync': 1, 'sub': 1}), 40) == ['s.0', 'sync.0', 'sub.0']
 
 
 def test_what_becomes_ready_during_a_round_waits_for_the_next() -> None:
@@ -62,17 +52,6 @@ def test_a_callback_runs_once_in_a_round() -> None:
     assert starts(of, 10) == ['u.0', 's.0', 'u.1', 'b.0', 'u.2', 'u.3']
 
 
-def test_a_chain_takes_a_round_for_each_link() -> None:
-    """Each link waits for a whole round of the others: the chain ends late, whatever its rank."""
-    callbacks = [source('c0', 100), after('c0', 'c1'), after('c1', 'c2', 9),
-                 *(single(f'o{i}', 7) for i in range(3))]
-    of = ros2(callbacks, dict.fromkeys(('c0', 'c1', 'c2', 'o0', 'o1', 'o2'), 2))
-    assert starts(of, 22) == [
-        'c0.0', 'o0.0', 'o1.0', 'o2.0',    # polled at 0
-        'o0.1', 'o1.1', 'o2.1', 'c1.0',    # at 8
-        'o0.2', 'o1.2', 'o2.2']            # at 16: c1 ends then, and c2 waits behind them
-
-
 def test_workers_share_a_round() -> None:
     """Two workers take what one of them polled; the round goes on until it is empty."""
     callbacks = [single('x', 10), *(single(f'r{i}', 50) for i in range(3))]
@@ -83,17 +62,8 @@ def test_workers_share_a_round() -> None:
         (7, 'start', 0, 'r2.0'), (12, 'start', 1, 'x.1')]
 
 
-def test_nobody_polls_while_all_workers_are_busy() -> None:
-    """What is ready at 4 and at 6 is in one round, in order of places, when the worker polls."""
-    callbacks = [
-        {'node': '/n', 'name': 'late', 'timer': '6us', 'deadline': '99us', 'dag': 'late'},
-        {'node': '/n', 'name': 'soon', 'timer': '4us', 'deadline': '99us', 'dag': 'soon'},
-        single('long', 100)]
-    of = ros2(callbacks, {'late': 1, 'soon': 1, 'long': 5})
-    assert starts(of, 9) == ['late.0', 'soon.0', 'long.0', 'late.1', 'soon.1']
-
-
 # --- callback groups -----------------------------------------------------------------------------
+
 
 def test_what_is_blocked_is_left_out_of_the_round() -> None:
     """At 0 b is passed over: a holds the group. At 1 c ends, and a poll finds b blocked again."""
@@ -107,67 +77,8 @@ def test_what_is_blocked_is_left_out_of_the_round() -> None:
         (3, 'start', 0, 'e.0'), (4, 'start', 1, 'b.0'), (5, 'start', 1, 'e.1')]
 
 
-def test_a_blocked_one_runs_as_soon_as_its_group_is_free() -> None:
-    callbacks = [single('a', 100, group='g'), single('b', 100, group='g')]
-    of = ros2(callbacks, {'a': 3, 'b': 1}, workers=2)
-    assert log(of, 10)[-2:] == [(3, 'start', 0, 'b.0'), (4, 'end', 0, 'b.0')]
-
-
-def test_what_was_aborted_takes_no_place_in_a_round() -> None:
-    """Two runs of b wait for the poll at 9; that of DAG s, the first, was aborted just then."""
-    callbacks = [
-        {'node': '/n', 'name': 's', 'timer': '99us', 'publishes': ['/mid', '/early'], 'dag': 's',
-         'on_late': 'abort'},
-        {'node': '/n', 'name': 'z', 'timer': '99us', 'publishes': ['/way'], 'dag': 'z'},
-        {'node': '/n', 'name': 'mid', 'subscription': '/mid', 'publishes': ['/b']},
-        {'node': '/n', 'name': 'way', 'subscription': '/way', 'publishes': ['/b', '/c']},
-        {'node': '/n', 'name': 'early', 'subscription': '/early', 'deadline': '6us'},
-        {'node': '/n', 'name': 'b', 'subscription': '/b', 'deadline': '90us'},
-        {'node': '/n', 'name': 'c', 'subscription': '/c', 'deadline': '90us'}]
-    of = ros2(callbacks, {**dict.fromkeys(('s', 'z', 'mid', 'way', 'b', 'c'), 1), 'early': 5})
-    assert log(of, 80)[-6:] == [
-        (4, 'start', 0, 'early.0'), (9, 'end', 0, 'early.0'), (9, 'start', 0, 'b.0'),
-        (10, 'end', 0, 'b.0'), (10, 'start', 0, 'c.0'), (11, 'end', 0, 'c.0')]
-
-
-# --- properties ----------------------------------------------------------------------------------
-
-@examples(200)
-@given(cases(('ros2',), groups=False, bounds=False), st.integers(20, 80))
-def test_nothing_starves(of: Case, horizon: int) -> None:
-    """Nobody starts three times while another waits: the third is two polls after the first."""
-    dags = of.task_set.dags
-    ready: dict[tuple[int, int, int], int] = {
-        (dag.index, dag.source, job): job * dag.period_ns // 1000
-        for dag in dags for job in range(-(-horizon * 1000 // dag.period_ns))}
-    events = of.events(of.run(horizon))
-    ended: dict[tuple[int, int, int], int] = {}
-    started: dict[tuple[int, int, int], int] = {}
-    for place, (now, kind, _, dag, vertex, job) in enumerate(events):
-        if kind == 'start':
-            started[dag, vertex, job] = place
-        else:
-            ended[dag, vertex, job] = now
-            for successor in dags[dag].vertices[vertex].successors:
-                before = dags[dag].vertices[successor].predecessors
-                if all((dag, each, job) in ended for each in before):
-                    ready[dag, successor, job] = now
-    runs: dict[str, list[int]] = {}
-    for (dag, vertex, _), place in started.items():
-        runs.setdefault(dags[dag].vertices[vertex].callback.key, []).append(place)
-    for (dag, vertex, job), since in ready.items():
-        key = dags[dag].vertices[vertex].callback.key
-        earlier = [each for each in ready if each != (dag, vertex, job)
-                   and dags[each[0]].vertices[each[1]].callback.key == key
-                   and ready[each] <= since]
-        end = started.get((dag, vertex, job), len(events))
-        for other, places in runs.items():
-            if other != key:
-                waited = [p for p in places if events[p][0] > since and p < end]
-                assert len(waited) <= 2 * (1 + len(earlier))
-
-
 # --- the core by itself --------------------------------------------------------------------------
+
 
 def scheduler(workers: int = 1) -> Scheduler:
     tables = Tables.build(declaration([
@@ -177,13 +88,6 @@ def scheduler(workers: int = 1) -> Scheduler:
         {'node': '/n', 'name': 'tick', 'timer': '10us', 'deadline': '10us', 'dag': 't'}]),
         legs=True)
     return Scheduler(tables, workers, 'ros2', propagate=False)
-
-
-def test_places_in_the_wait_set() -> None:
-    """The timer, the subscription, two legs of the sync, and behind them what nobody declares."""
-    tables = scheduler().tables
-    assert tables.entity == [1, 2, 0, 4]
-    assert tables.n_entities == 4
 
 
 def test_legs_are_entities_of_their_own() -> None:

@@ -8,13 +8,8 @@ from mddag_executor.core import NEVER, PolicyError, Scheduler, Tables
 from mddag_executor.core.queues import SWEEP_AT
 from mddag_executor.core.state import (
     COMPLETED,
-    DROP,
-    EXPIRED,
     FREE,
     JOB_END,
-    LATE,
-    OPEN,
-    SINK_EXPIRED,
     SINK_IN_TIME,
 )
 import pytest
@@ -28,6 +23,7 @@ def test_an_unknown_policy_is_refused_with_the_list() -> None:
 
 
 # --- legs of a sync ------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize('order', [(0, 1), (1, 0)])
 def test_a_sync_completes_with_the_leg_that_makes_it_whole(order: tuple[int, int]) -> None:
@@ -45,43 +41,7 @@ def test_a_sync_completes_with_the_leg_that_makes_it_whole(order: tuple[int, int
     assert scheduler.state.job_state[slot] == FREE
 
 
-def test_legs_of_one_sync_may_run_at_once_and_count_at_their_ends() -> None:
-    scheduler = live()
-    slot = start_job(scheduler)
-    legs = [scheduler.execution(slot, J, leg) for leg in (0, 1)]
-    for leg in legs:
-        scheduler.ready(leg, 10)
-    assert [scheduler.take(worker, 10) for worker in (0, 1)] == legs
-    assert scheduler.complete(legs[1], 20) is False
-    assert scheduler.complete(legs[0], 60 * US) is True
-    assert scheduler.decisions()[-1] == (JOB_END, 0, -1, 0, LATE, 60 * US)
-
-
-def test_completions_make_no_edge_true() -> None:
-    scheduler = live()
-    slot = start_job(scheduler)
-    assert scheduler.queue_length == 0
-    assert scheduler.take(0, 1) == -1
-    assert scheduler.state.job_state[slot] == OPEN
-
-
 # --- workers -------------------------------------------------------------------------------------
-
-def test_the_worker_that_asks_gets_the_work() -> None:
-    scheduler = live(workers=3)
-    x = undeclared(scheduler, 0, -1, 0)
-    assert scheduler.take(2, 0) == x
-    assert scheduler.state.worker_x == [-1, -1, x]
-    assert scheduler.idle_workers == 2
-    y = undeclared(scheduler, 1, -1, 0)
-    assert scheduler.schedule(0) == y
-    assert scheduler.state.worker_x == [y, -1, x]
-    assert scheduler.schedule(0) == -1
-    undeclared(scheduler, 2, -1, 0)
-    undeclared(scheduler, 3, -1, 0)
-    assert scheduler.schedule(0) >= 0
-    assert scheduler.schedule(0) == -1, 'no worker is idle, and nobody preempts'
-    assert scheduler.queue_length == 1
 
 
 def test_undeclared_callbacks_have_the_default_deadline() -> None:
@@ -107,71 +67,6 @@ def test_without_declaration_everything_is_undeclared() -> None:
     assert scheduler.decisions() == []
 
 
-def test_lending_frees_the_worker_but_not_the_group() -> None:
-    scheduler = live(workers=1)
-    group = scheduler.new_group()
-    x = undeclared(scheduler, 0, group, 0)
-    assert scheduler.take(0, 0) == x
-    blocked = undeclared(scheduler, 1, group, 0)
-    other = undeclared(scheduler, 2, -1, 0)
-    assert scheduler.idle_workers == 0
-    scheduler.lend(x)
-    assert scheduler.idle_workers == 1
-    assert scheduler.take(0, 1) == other
-    scheduler.complete(x, 2)     # ends on a thread without a place
-    assert scheduler.idle_workers == 0
-    scheduler.complete(other, 3)
-    assert scheduler.take(0, 3) == blocked
-
-
-def test_a_suspended_callback_keeps_its_group_and_its_key() -> None:
-    scheduler = live(workers=1)
-    group = scheduler.new_group()
-    x = undeclared(scheduler, 0, group, 0)
-    scheduler.take(0, 0)
-    scheduler.suspend(x)
-    assert scheduler.idle_workers == 1
-    blocked = undeclared(scheduler, 1, group, 1)
-    assert scheduler.take(0, 2) == -1
-    later = undeclared(scheduler, 2, -1, 3)
-    scheduler.resume(x)
-    assert scheduler.queue_length == 3
-    assert scheduler.take(0, 4) == x, 'its deadline is still the first'
-    scheduler.suspend(x)
-    assert scheduler.take(0, 5) == later
-    scheduler.complete(later, 6)
-    scheduler.resume(x)
-    assert scheduler.take(0, 7) == x
-    assert scheduler.complete(x, 8)
-    assert scheduler.take(0, 8) == blocked
-
-
-def test_what_is_refused_keeps_its_place_and_what_may_run_lets_the_next_be_asked() -> None:
-    scheduler = live(workers=2)
-    group = scheduler.new_group()
-    first, second, other = (
-        undeclared(scheduler, i, place, i) for i, place in enumerate((group, group, -1)))
-    assert scheduler.take(0, 3) == first
-    scheduler.refuse(first)
-    assert scheduler.take(0, 4) == other
-    assert scheduler.take(1, 5) == -1        # the second of the group does not pass the first
-    assert scheduler.queue_length == 2
-    scheduler.resume(first)
-    assert scheduler.take(1, 6) == first
-    scheduler.complete(other, 7)
-    assert scheduler.take(0, 8) == -1
-    scheduler.leave_group(first)
-    assert scheduler.take(0, 9) == second
-    scheduler.suspend(first)
-    scheduler.resume(first)                  # it has no group to wait for any more
-    scheduler.refuse(second)
-    assert scheduler.take(0, 10) == first
-    scheduler.drop(second, 11)
-    assert scheduler.queue_length == 0
-    third = undeclared(scheduler, 3, group, 12)
-    assert scheduler.take(1, 12) == third
-
-
 def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits() -> None:
     scheduler = live(workers=1)
     first, second = scheduler.new_group(), scheduler.new_group()
@@ -192,87 +87,7 @@ def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits() -> Non
     assert len(scheduler.state.group_owner) == len(scheduler.state.group_heap) == n_groups
 
 
-def test_what_waits_for_a_group_comes_in_order_of_its_key() -> None:
-    scheduler = live(workers=2)
-    group = scheduler.new_group()
-    busy = undeclared(scheduler, 0, group, 0)
-    assert scheduler.take(0, 0) == busy
-    waiting = [undeclared(scheduler, i, group, i) for i in (1, 2, 3)]
-    assert scheduler.take(1, 4) == -1
-    assert scheduler.queue_length == 3
-    slot = scheduler.release(0, 0, 4, 4)
-    source = scheduler.source(slot)
-    scheduler.state.x_group[source] = group     # its RAD, 50 us, is before all of them
-    scheduler.ready(source, 4)
-    done = busy
-    for expected in (source, *waiting):
-        scheduler.complete(done, 5)
-        assert scheduler.take(0, 5) == expected
-        assert scheduler.take(1, 5) == -1
-        done = expected
-
-
 # --- drop ----------------------------------------------------------------------------------------
-
-def test_what_is_dropped_never_runs_and_frees_its_place() -> None:
-    scheduler = live()
-    x = undeclared(scheduler, 7, -1, 0)
-    scheduler.drop(x, 1)
-    assert scheduler.decisions() == [(DROP, 1, 4, 7, x, 1)]
-    assert scheduler.queue_length == 0
-    assert scheduler.state.n_open == [0, 0]
-    assert undeclared(scheduler, 8, -1, 2) == x, 'its slot is free'
-    assert scheduler.queue_length == 1
-    assert scheduler.take(0, 2) == x
-    assert scheduler.take(1, 2) == -1
-
-
-def test_a_job_with_a_dropped_message_expires_when_its_time_is_over() -> None:
-    scheduler = live(expire_after=10 * US)
-    slot = start_job(scheduler)
-    x = scheduler.execution(slot, X)
-    scheduler.ready(x, 0)
-    scheduler.drop(x, 0)
-    scheduler.expire_idle(60 * US)
-    assert scheduler.state.job_state[slot] == OPEN
-    scheduler.expire_idle(60 * US + 1)
-    assert scheduler.state.job_state[slot] == FREE
-    assert scheduler.decisions()[1:] == [
-        (SINK_EXPIRED, 0, J, 0, 50 * US, -1), (JOB_END, 0, -1, 0, EXPIRED, 60 * US + 1)]
-
-
-@pytest.mark.parametrize('dropped', [0, 1, 2])
-def test_a_group_goes_on_when_one_that_waits_for_it_is_dropped(dropped: int) -> None:
-    scheduler = live(workers=1)
-    group = scheduler.new_group()
-    busy = undeclared(scheduler, 0, group, 0)
-    scheduler.take(0, 0)
-    waiting = [undeclared(scheduler, i, group, i) for i in (1, 2, 3)]
-    scheduler.lend(busy)
-    assert scheduler.take(0, 4) == -1        # all three wait for the group now
-    scheduler.complete(busy, 5)              # the first of them is back in the ready queue
-    scheduler.drop(waiting.pop(dropped), 6)
-    for expected in waiting:
-        assert scheduler.take(0, 7) == expected
-        scheduler.complete(expected, 8)
-    assert scheduler.take(0, 9) == -1
-    assert scheduler.queue_length == 0
-
-
-def test_the_entry_of_a_dropped_execution_is_not_taken_for_its_successor() -> None:
-    # rm: the undeclared come last; the stale entry stands in the queue while x is in use again.
-    scheduler = live(workers=1, policy_name='rm')
-    first = undeclared(scheduler, 0, -1, 0)
-    keep = undeclared(scheduler, 1, -1, 0)
-    scheduler.drop(first, 1)
-    assert undeclared(scheduler, 2, -1, 2) == first
-    assert scheduler.queue_length == 2
-    assert scheduler.take(0, 3) == keep
-    scheduler.complete(keep, 4)
-    assert scheduler.take(0, 5) == first
-    scheduler.complete(first, 6)
-    assert scheduler.take(0, 7) == -1
-    assert scheduler.state.ready == []
 
 
 @pytest.mark.parametrize('grouped', [False, True])

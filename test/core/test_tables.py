@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from mddag_executor.core import NEVER, POLICIES, policy, PolicyError, rad_offsets, Tables
+from mddag_executor.core import NEVER, policy, PolicyError, rad_offsets, Tables
 from msg_graph import TaskSet
 import pytest
 
@@ -77,11 +77,6 @@ def test_a_sync_has_a_leg_for_each_publisher_of_a_topic() -> None:
     assert tables.leg_topic[tables.first_leg[2]:tables.first_leg[3]] == [0, 0, 1]
 
 
-def test_no_declaration_is_the_undeclared_dag_alone() -> None:
-    tables = Tables.build(None, default_deadline=5)
-    assert (tables.n_dags, tables.n_vertices, tables.rad_offset) == (0, 0, [5])
-
-
 def test_rad_of_a_long_chain_is_found_without_recursion() -> None:
     n = 3_000
     chain = [{'node': '/n', 'name': 'c0', 'timer': '1ms', 'publishes': ['/t0'], 'dag': 'd'}]
@@ -106,11 +101,6 @@ def test_latest_start_by_hand() -> None:
     assert policy('llf').key(tables, 2, 1_000, 6, 9) == (1_000 + 25 * US, 2, 0, 9)
 
 
-def test_without_execution_times_the_latest_start_is_rad() -> None:
-    tables = Tables.build(two_dags())
-    assert tables.latest_start == tables.rad_offset
-
-
 @pytest.mark.parametrize(('name', 'key'), [
     ('rad', (1_000 + 25 * US, 3, 0, 9)),
     ('gedf', (1_000 + 40 * US, 3, 0, 9)),
@@ -125,20 +115,6 @@ def test_keys(name: str, key: tuple[int, ...]) -> None:
     """Vertex 3 of the first DAG, job 6, released at 1000, order 9."""
     tables = Tables.build(two_dags())
     assert policy(name).key(tables, 3, 1_000, 6, 9) == key
-
-
-def test_every_policy_has_its_row() -> None:
-    assert set(POLICIES) == {
-        'rad', 'rm', 'wc', 'fifo', 'gedf', 'dm', 'llf', 'ros2', 'picas'}
-    assert {name for name, row in POLICIES.items() if not row.preemptive} == {
-        'wc', 'fifo', 'ros2', 'picas'}
-    assert [name for name, row in POLICIES.items() if row.polling] == ['ros2']
-    for name, row in POLICIES.items():
-        assert policy(name) is row
-        assert row.name == name
-        assert row.meaning
-    with pytest.raises(PolicyError, match="policy 'x': there is no such policy: choose one of"):
-        policy('x')
 
 
 def test_modes() -> None:

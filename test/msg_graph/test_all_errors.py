@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-import difflib
-from pathlib import Path
 import pickle
 import subprocess
 
@@ -101,30 +99,11 @@ def test_one_error_stays_one() -> None:
     assert caught.value.errors == (caught.value,)
 
 
-def test_a_file_full_of_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The word that was meant is looked for only where somebody reads it: that takes its time."""
-    looked_for: list[str] = []
-    close_matches = difflib.get_close_matches
-
-    def look_for(word: str, known: list[str], n: int) -> list[str]:
-        looked_for.append(word)
-        return close_matches(word, known, n)
-
-    monkeypatch.setattr(difflib, 'get_close_matches', look_for)
-    lines = [f'      - {{name: c{i}, subscription: /topic_{i}, publishes: [/t{i}]}}'
-             for i in range(10_000)]
+def test_a_file_full_of_errors() -> None:
+    lines = [f'      - {{nme: c{i}, subscription: /topic_{i}, publishes: [/t{i}]}}'
+             for i in range(1_000)]
     text = '\n'.join(['mddag: 1', 'nodes:', '  - node: /n', '    callbacks:', *lines])
-    assert len(found(text).errors) == MOST_ERRORS
-    assert len(found(text.replace('name', 'nme')).errors) == MOST_ERRORS
-    assert MOST_ERRORS <= len(looked_for) <= 2 * MOST_ERRORS
-
-
-def test_the_program_shows_all(call: Mddag, tmp_path: Path) -> None:
-    (tmp_path / 'g.yaml').write_text(LINKS)
-    done = call('graph', 'check', 'g.yaml', cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, '')
-    lines = done.stderr.splitlines()
-    assert lines == [f'error: {error}' for error in found(LINKS).errors]
+    assert len(found(text).errors) == len(found(text.replace('nme', 'name')).errors) == MOST_ERRORS
 
 
 def test_the_program_says_where_it_stops(call: Mddag) -> None:

@@ -41,16 +41,6 @@ def test_alike_ones_are_handed_out_in_order() -> None:
     assert key(binder.bind(Entity('/b', 'subscription', '/x'))) == '/b:s'
 
 
-def test_what_is_not_declared_is_none() -> None:
-    binder = Binder(TASKS)
-    assert binder.bind(Entity('/a', 'timer', '', 15_000_000)) is None
-    assert binder.bind(Entity('/c', 'timer', '', 10_000_000)) is None
-    assert binder.bind(Entity('/a', 'subscription', '/z')) is None
-    assert binder.bind(Entity('/b', 'subscription', '/y')) is None
-    assert binder.bind(Entity('/b', 'service', '/ask')) is None
-    assert binder.bind(Entity('/a', 'service', '/x')) is None
-
-
 def test_a_sync_is_bound_by_each_leg() -> None:
     binder = Binder(TASKS)
     assert key(binder.bind(Entity('/a', 'subscription', '/y'))) == '/a:j0'
@@ -114,19 +104,6 @@ def test_release_gives_back_in_declaration_order() -> None:
     assert timer is not None
     binder.release(timer)
     assert binder.bind(Entity('/a', 'timer', '', 20_000_000)) is timer
-
-
-def test_release_of_what_is_not_bound() -> None:
-    binder = Binder(TASKS)
-    first = binder.bind(Entity('/a', 'subscription', '/x'))
-    assert first is not None
-    with pytest.raises(KeyError):
-        binder.release(first, '/y')
-    binder.release(first)
-    with pytest.raises(KeyError):
-        binder.release(first)
-    with pytest.raises(KeyError):
-        binder.release(TASKS.callback('/a:t0'))
 
 
 @pytest.mark.parametrize(('callback', 'seen', 'question'), [

@@ -12,7 +12,6 @@ import re
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from msg_graph import GraphError, load, loads, TaskSet
-from msg_graph.declaration import MOST_DEPTH
 from msg_graph.layout import format_text, without_lines
 import pytest
 
@@ -211,12 +210,6 @@ def test_cycles(tmp_path: Path) -> None:
         load(top)
 
 
-def test_too_deep(tmp_path: Path) -> None:
-    files = {f'f{i}': f'mddag: 1\ninclude: [f{i + 1}.yaml]\n' for i in range(MOST_DEPTH + 2)}
-    with pytest.raises(GraphError, match='are included'):
-        load(write(tmp_path, top='mddag: 1\ninclude: [f0.yaml]\n', **files))
-
-
 def test_too_many(tmp_path: Path) -> None:
     files = {f'f{i}': f'mddag: 1\ninclude: [{", ".join([f"f{i + 1}.yaml"] * 8)}]\n'
              for i in range(6)}
@@ -230,21 +223,6 @@ def test_values_do_not_explode(tmp_path: Path) -> None:
                       'set: {a: $(a)$(a)$(a)}}]\n' for i in range(14)}
     with pytest.raises(GraphError, match='this value is too long'):
         load(write(tmp_path, top='mddag: 1\ninclude: [{file: f0.yaml, set: {a: abc}}]\n', **files))
-
-
-def test_text_without_a_file_includes_nothing() -> None:
-    with pytest.raises(GraphError, match='not read from a file includes nothing'):
-        loads('mddag: 1\ninclude: [a.yaml]\n')
-    with pytest.raises(GraphError, match="'nodes' is missing"):
-        loads('mddag: 1\narguments: {}\n')
-
-
-def test_arguments_of_a_single_file() -> None:
-    text = ('mddag: 1\narguments: {t: 10ms, name: x}\nworkers: 2\nnodes: [{node: /n, callbacks: '
-            '[{name: c_$(name), timer: $(t), deadline: $(t)}]}]\n')
-    assert loads(text).callbacks[0].key == '/n:c_x'
-    with pytest.raises(GraphError, match='<string>:4: .*stands for no argument'):
-        loads(text.replace('name: x', 'nam: x'))
 
 
 def test_format() -> None:

@@ -44,12 +44,6 @@ def test_is_flat_beyond_the_outer_quantiles() -> None:
     assert time.mean_ns == 150
 
 
-def test_one_value_is_a_constant() -> None:
-    time = distribution([7], [50.0])
-    assert {time.draw(u / 10) for u in range(11)} == {7}
-    assert time.mean_ns == 7
-
-
 @pytest.mark.parametrize('u', [-0.1, 1.1, float('nan'), float('inf')])
 def test_draws_only_from_shares(u: float) -> None:
     with pytest.raises(ValueError):
@@ -62,7 +56,7 @@ def test_draws_only_from_shares(u: float) -> None:
 def test_mean_is_that_of_the_draws(pairs: list[tuple[int, float]]) -> None:
     percent = sorted(share for _, share in pairs)
     time = distribution(sorted(ns for ns, _ in pairs), percent)
-    steps = 20_000
+    steps = 2_000
     drawn = [time.draw((i + 0.5) / steps) for i in range(steps)]
     assert drawn == sorted(drawn)
     assert all(time.quantiles_ns[0] <= ns <= time.quantiles_ns[-1] for ns in drawn)
@@ -111,7 +105,3 @@ def test_error_survives_pickling() -> None:
     other = pickle.loads(pickle.dumps(error))
     assert str(other) == 'f.yaml:3: what: do'
     assert (other.file, other.line, other.problem, other.remedy) == ('f.yaml', 3, 'what', 'do')
-
-
-def test_error_is_one_line_whatever_the_name() -> None:
-    assert str(GraphError('a\nb\x1b', None, 'p', 'r')) == 'a\\nb\\x1b: p: r'

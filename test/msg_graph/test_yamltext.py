@@ -27,15 +27,12 @@ def loader(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(yamltext, '_LOADER', getattr(yaml, request.param))
 
 
-@pytest.mark.parametrize('text', ['', '\n\n', '# nothing\n', '~\n', '---\n', '\ufeff'])
-def test_empty(text: str) -> None:
-    assert 'empty' in str(error(text))
-
-
-@pytest.mark.parametrize('text', [
-    f'hello {MARK}', f'- a {MARK}\n- b', f'[] {MARK}', f"'' {MARK}"])
-def test_no_declaration(text: str) -> None:
-    assert 'not a declaration' in str(error(text))
+@pytest.mark.parametrize(('text', 'says'), [
+    ('', 'empty'), ('# nothing\n', 'empty'), ('---\n', 'empty'), ('\ufeff', 'empty'),
+    (f'hello {MARK}', 'not a declaration'), (f'- a {MARK}\n- b', 'not a declaration'),
+    (f"'' {MARK}", 'not a declaration')])
+def test_no_declaration(text: str, says: str) -> None:
+    assert says in str(error(text))
 
 
 @pytest.mark.parametrize('text', [
@@ -66,10 +63,6 @@ def test_bytes() -> None:
         loads(b'mddag: 1\n\xff', 'g')
     with pytest.raises(GraphError, match='not UTF-8'):
         loads(SMALL.encode('utf-16'))
-
-
-def test_windows_line_ends() -> None:
-    assert loads(SMALL.replace('\n', '\r\n')).callbacks[0].line == 5
 
 
 @pytest.mark.parametrize('text, says', [
@@ -137,16 +130,6 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         assert caught.value.line is None
     with pytest.raises(GraphError, match='cannot be read'):
         load('nul\x00byte')
-
-
-def test_load_is_loads_of_the_file(tmp_path: Path) -> None:
-    path = tmp_path / 'g.yaml'
-    path.write_text(SMALL)
-    tasks = load(path)
-    assert tasks == loads(SMALL, str(path))
-    assert tasks.file == str(path)
-    assert tasks.text == SMALL
-    assert load(str(path)) == tasks
 
 
 def test_scalars_are_what_stands_there() -> None:
