@@ -18,18 +18,17 @@ mddag graph draw config/autoware.yaml -o autoware.svg
 mddag graph draw config/autoware.yaml -o autoware.mmd
 """
 DESCRIPTION = """\
-Draw the DAGs of a declaration. Each DAG is a frame, and in it each node. Timers are ellipses,
-subscriptions rounded boxes, sync callbacks hexagons, services parallelograms; sinks have a double
-border and their deadline. Solid arrows are trigger edges. Dotted arrows are queue edges, and begin
-at the name of what is read and of its writer. The colour is the RAD offset: the time from the
-release of a job to the earliest deadline that a callback leads to; red is the most urgent. DAGs
-stand in the order of the file.
+Draw the DAGs of a declaration, each in a frame. Timers are ellipses, subscriptions rounded boxes,
+sync callbacks hexagons, services parallelograms. Sinks have a double border and their deadline.
+Solid arrows are trigger edges with their topics (tool tips in graphs of more than 30 callbacks).
+Dotted arrows are queue edges; they begin at the name of what is read and of its writer. The colour
+is the RAD offset: the time from the release of a job to the earliest deadline that a callback leads
+to; red is the most urgent. DAGs are in the order of the file, many of them in a grid.
 
-The ending of OUT says what it becomes: .svg, .png and .pdf need Graphviz (Debian, Ubuntu:
+The ending of OUT selects the format: .svg, .png and .pdf need Graphviz (Debian, Ubuntu:
 'sudo apt install graphviz'); .dot (Graphviz's language) and .mmd (Mermaid) need nothing.
-Viewers of Mermaid limit its size: raise maxEdges and maxTextSize there for large graphs.
-Graphs of more than 1000 vertices are laid out more plainly, and quickly: DAGs stand in rows, lines
-are straight, and PNG has at most 16000 dots in a row."""
+Mermaid viewers limit the size: raise maxEdges and maxTextSize there for large graphs.
+Graphs of more than 1000 vertices get straight lines, and a PNG at most 16000 dots in a row."""
 
 _BY_GRAPHVIZ = ('.svg', '.png', '.pdf')
 _ENDINGS = (*_BY_GRAPHVIZ, '.dot', '.mmd')

@@ -3,35 +3,38 @@
 r"""
 A picture in DOT, Graphviz's language.
 
-Every name stands in a quoted string. In those Graphviz gives a meaning to the quotation mark and
-to the backslash (`\n`, `\N`, `\G`, …), to nothing else, and an HTML-like label only begins with
-`<` outside of quotes; control characters are written as escapes, so that no name can break a line.
-
-A queue edge begins at a text that says what is read and from whom, beside the reader: a line from
-the writer would cross the pictures of other DAGs.  So no line joins the DAGs.  Graphviz then puts
-them above one another, the first lowest, or fills rows from the lowest one up: they are written
-in that order.
-
-``dot`` takes minutes for thousands of boxes, as it weighs each against all others.  So in a
-picture of more than ``_MANY`` it lays out each DAG by itself, spends less on it, draws straight
-lines and puts the DAGs into rows.  (Without ``newrank``: with it, version 2.43 fails.)
+Theory of operation
+-------------------
+1. Every name is in a quoted string. There Graphviz gives a meaning to the quotation mark and to the
+   backslash (`\n`, `\N`, `\G`, …) only; control characters are written as escapes. Only the title
+   with the legend is an HTML-like label, whose texts are escaped for HTML.
+2. A box has the name of its node above that of its callback. Graphviz leads arrows around boxes,
+   but not around the titles of frames.
+3. A queue edge begins at a text next to the reader, which says what is read and from whom. So no
+   line joins two DAGs.
+4. In a small graph the topics are on the trigger edges, and the DAGs are in one column. In a larger
+   one the topics are tool tips. Graphviz lays out each DAG by itself and packs them into a grid, in
+   the order of the file, with as many columns as give about the proportions of a screen. (Version
+   2.43 leaves out the labels of edges when it packs.)
+5. ``dot`` takes minutes for thousands of boxes. For more than ``_MANY`` it spends less time on the
+   order of boxes, and lines are straight.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import zip_longest
+from html import escape
 import math
 import re
 
-from mddag_executor.report.picture import Box, DagFrame, Picture
+from mddag_executor.report.picture import Arrow, Box, DagFrame, MOST_LABELLED, Picture
 from mddag_executor.report.text import printable
 
 _SHAPES = {
-    'timer': 'shape=ellipse, style="filled"',
-    'subscription': 'shape=box, style="filled,rounded"',
-    'sync': 'shape=hexagon, style="filled"',
-    'service': 'shape=parallelogram, style="filled"',
+    'timer': ('shape=ellipse, style="filled", margin="0,0"', 'ellipse: timer'),
+    'subscription': ('shape=box, style="filled,rounded"', 'rounded box: subscription'),
+    'sync': ('shape=hexagon, style="filled", margin="0,0"', 'hexagon: sync (joins topics)'),
+    'service': ('shape=parallelogram, style="filled"', 'parallelogram: service'),
 }
 _CENTRED = '\\n'
 _LEFT = '\\l'
@@ -41,9 +44,11 @@ _QUEUE = 'style=dotted, color="#2244bb", penwidth=1.6, arrowhead=open'
 _STUB = 'shape=plaintext, fontsize=9, fontcolor="#2244bb", margin="0.02,0.02"'
 _PIECES = re.compile(r'[^/_]*[/_]?')
 _MANY = 1_000
-_IN_ROWS = ('pack=true, splines=line, nslimit=0.1, nslimit1=0.1, mclimit=0.1, size="166,166", '
-            'packmode=array_c')
+_QUICK = 'splines=line, nslimit=0.1, nslimit1=0.1, mclimit=0.1, size="166,166",'
 """166 inches are 16,000 dots: viewers take no wider PNG."""
+_BOX_WIDTH, _BOX_HEIGHT = 150, 70
+"""About the size of a box with the gap to the next one, points."""
+_PROPORTION = 1.5
 
 
 def to_dot(picture: Picture) -> str:
@@ -57,7 +62,7 @@ def quoted(text: str) -> str:
 
 
 def _label(lines: Iterable[str], end: str = _CENTRED) -> str:
-    r"""Return lines as one label, centred (``\n`` ends each) or from the left on (``\l``)."""
+    r"""Return lines as one label, centred (``\n`` ends each) or left-aligned (``\l``)."""
     return '"' + ''.join(quoted(line)[1:-1] + end for line in lines) + '"'
 
 
@@ -72,41 +77,48 @@ def _wrapped(name: str, width: int = _WIDTH) -> list[str]:
 
 
 def _lines(picture: Picture) -> Iterator[str]:
+    labelled = len(picture.boxes) <= MOST_LABELLED
     yield 'digraph mddag {'
     yield '  graph [rankdir=LR, compound=true, ranksep=0.35, nodesep=0.1,'
-    yield '    fontname="Helvetica", labelloc=t, labeljust=l, fontsize=20,'
-    columns = 1
-    if sum(len(node.boxes) for dag in picture.dags for node in dag.nodes) > _MANY:
-        columns = math.isqrt(len(picture.dags) // 2) + 1
-        yield f'    {_IN_ROWS}{columns},'
-    else:
-        yield '    newrank=false,'
-    yield f'    label={quoted(picture.title)}]'
-    yield '  node [fontname="Helvetica", fontsize=12, margin="0.08,0.04", height=0.3]'
-    yield '  edge [arrowsize=0.7]'
+    columns = 1 if labelled else _columns(picture)
+    if not labelled:
+        yield f'    pack=36, packmode="array_cutr{columns}",'
+    if len(picture.boxes) > _MANY:
+        yield f'    {_QUICK}'
+    yield '    fontname="Helvetica", labelloc=t, labeljust=l, fontsize=12,'
+    yield f'    label={_legend(picture)}]'
+    yield '  node [fontname="Helvetica", fontsize=11, margin="0.08,0.04", height=0.3]'
+    yield '  edge [arrowsize=0.7, fontname="Helvetica", fontsize=9]'
     stubs = _stubs(picture)
-    yield from _legend(picture)
     for dag in _upwards(picture.dags, columns):
         yield from _dag(dag, stubs)
     for arrow in picture.arrows:
         if not arrow.queue:
-            yield (f'  {quoted(arrow.start)} -> {quoted(arrow.end)} '
-                   f'[tooltip={quoted(arrow.note)}]')
+            yield f'  {_edge(arrow, labelled)}'
     yield '}'
 
 
+def _columns(picture: Picture) -> int:
+    """Return how many columns of DAGs give the proportions of a screen, about."""
+    width = max(dag.depth for dag in picture.dags) * _BOX_WIDTH
+    height = sum(_BOX_HEIGHT * (1 + len(dag.boxes) / dag.depth) for dag in picture.dags)
+    return max(1, min(len(picture.dags), round(math.sqrt(_PROPORTION * height / width))))
+
+
 def _upwards(dags: Sequence[DagFrame], columns: int) -> Iterator[DagFrame]:
-    """Yield DAGs row by row, the lowest row, in which the legend comes first, at first."""
-    end, room = len(dags), max(1, columns - 1)
-    while end > 0:
-        yield from dags[max(0, end - room):end]
-        end, room = end - room, columns
+    """Yield the DAGs row by row from the lowest row up: so Graphviz fills the picture."""
+    for end in range(len(dags), 0, -columns):
+        yield from dags[max(0, end - columns):end]
+
+
+def _edge(arrow: Arrow, labelled: bool) -> str:
+    label = f', label={_label(arrow.note.split(", "))}' if labelled else ''
+    return f'{quoted(arrow.start)} -> {quoted(arrow.end)} [tooltip={quoted(arrow.note)}{label}]'
 
 
 def _stubs(picture: Picture) -> dict[str, list[list[str]]]:
     """Return by reader the texts at which its queue edges begin."""
-    names = {box.mark: f'{node.title.rpartition("/")[2]}:{box.lines[0]}'
-             for dag in picture.dags for node in dag.nodes for box in node.boxes}
+    names = {box.mark: f'{box.node.rpartition("/")[2]}:{box.lines[0]}' for box in picture.boxes}
     writers: dict[tuple[str, str], dict[str, None]] = {}
     for arrow in picture.arrows:
         if arrow.queue:
@@ -125,54 +137,35 @@ def _dag(dag: DagFrame, stubs: dict[str, list[list[str]]]) -> Iterator[str]:
     yield f'  subgraph {quoted("cluster_" + dag.mark)} {{'
     yield (f'    label={quoted(dag.title)} labeljust=l fontsize=16 style="rounded,bold" '
            'color="#444444"')
-    for node in dag.nodes:
-        yield f'    subgraph {quoted("cluster_" + node.mark)} {{'
-        yield (f'      label={_label(_wrapped(node.title), _LEFT)} labeljust=l fontsize=10 '
-               'style="filled" color="#bbbbbb" fillcolor="#f6f6f6" penwidth=1')
-        for box in node.boxes:
-            yield f'      {_box(box)}'
-        yield '    }'
-    for node in dag.nodes:
-        for box in node.boxes:
-            for number, text in enumerate(stubs.get(box.mark, ())):
-                mark = quoted(f'{box.mark}q{number}')
-                yield f'    {mark} [label={_label(text)}, {_STUB}]'
-                yield f'    {mark} -> {quoted(box.mark)} [{_QUEUE}]'
+    for box in dag.boxes:
+        yield f'    {_box(box)}'
+        for number, text in enumerate(stubs.get(box.mark, ())):
+            mark = quoted(f'{box.mark}q{number}')
+            yield f'    {mark} [label={_label(text)}, {_STUB}]'
+            yield f'    {mark} -> {quoted(box.mark)} [{_QUEUE}]'
     yield '  }'
 
 
 def _box(box: Box) -> str:
     sink = ', peripheries=2' if box.sink else ''
-    return (f'{quoted(box.mark)} [label={_label(box.lines)}, {_SHAPES[box.kind]}, '
+    label = _label((*_wrapped(box.node), *box.lines))
+    return (f'{quoted(box.mark)} [label={label}, {_SHAPES[box.kind][0]}, '
             f'fillcolor={quoted(box.colour)}{sink}, tooltip={quoted(box.note)}]')
 
 
-_LEGEND = (
-    'Colour: the RAD offset of a callback, which is',
-    'the time from the release of its job to the',
-    'earliest deadline that the callback leads to.')
-
-
-def _legend(picture: Picture) -> Iterator[str]:
-    """Yield the legend, a row for each pair of its texts."""
-    yield '  subgraph "cluster_legend" {'
-    yield (f'    label={_label(_LEGEND, _LEFT)} labeljust=l fontsize=12 style="dashed" '
-           'color="#888888"')
-    colours = [f'label={quoted(text)}, shape=box, style="filled", color={quoted(colour)}, '
-               f'fillcolor={quoted(colour)}' for colour, text in picture.legend]
-    shapes = [f'label={quoted(text)}, {_SHAPES[kind]}, fillcolor=white{double}'
-              for kind, text, double in (
-                  ('timer', 'timer', ''), ('subscription', 'subscription', ''),
-                  ('sync', 'sync (joins topics)', ''), ('service', 'service', ''),
-                  ('subscription', 'sink, with deadline', ', peripheries=2'))]
-    rows = [(*pair, 'style=invis') for pair in zip_longest(
-        colours, shapes, fillvalue='style=invis')]
-    rows += [('label="publishes", shape=plaintext', 'label="is started by it", shape=plaintext',
-              ''),
-             (f'label="topic and writer", {_STUB}',
-              'label="reads it later (queue edge)", shape=plaintext', _QUEUE)]
-    for number, (left, right, edge) in enumerate(rows):
-        yield f'    "k{number}" [{left}]'
-        yield f'    "s{number}" [{right}]'
-        yield f'    "k{number}" -> "s{number}" [{edge}]'
-    yield '  }'
+def _legend(picture: Picture) -> str:
+    """Return title and legend as an HTML-like label; the legend has what is in the picture."""
+    kinds = {box.kind for box in picture.boxes}
+    shapes = [text for kind, (_, text) in _SHAPES.items() if kind in kinds]
+    colours = ''.join(f'<td bgcolor="{colour}">{escape(text)}</td>'
+                      for colour, text in picture.legend)
+    lines = [', '.join((*shapes, 'double border: sink')), 'solid arrow: starts the next callback']
+    if any(arrow.queue for arrow in picture.arrows):
+        lines[1] += '; dotted: is read later (queue edge)'
+    lines.append('colour: RAD offset, from the release to the earliest deadline ahead')
+    rows = ''.join(f'<tr><td align="left"><font point-size="10">{line}</font></td></tr>'
+                   for line in lines)
+    return (f'<<table border="0" cellspacing="0" cellpadding="2"><tr><td align="left">'
+            f'<font point-size="20">{escape(printable(picture.title)) or " "}</font></td></tr>'
+            f'{rows}<tr><td align="left"><table border="0" cellspacing="3" cellpadding="3">'
+            f'<tr>{colours}</tr></table></td></tr></table>>')

@@ -3,9 +3,9 @@
 """
 A picture in Mermaid, which many web pages and editors show as a drawing.
 
-Names stand in quoted labels. Mermaid reads those as HTML, so everything in them but plain letters,
-digits and a few harmless signs is written by its number (`#35;`), and nothing in a name can end
-the label, open a tag or start a comment. Identifiers are numbers of our own.
+Names are in quoted labels, which Mermaid reads as HTML. So everything in them except plain letters,
+digits and a few harmless signs is written as its number (`#35;`): no name can end the label, open a
+tag or start a comment. Identifiers are generated.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 import re
 
-from mddag_executor.report.picture import Box, Picture
+from mddag_executor.report.picture import Box, MOST_LABELLED, Picture
 from mddag_executor.report.text import printable
 
 _BRACKETS = {
@@ -42,18 +42,17 @@ def _lines(picture: Picture) -> Iterator[str]:
     sinks = []
     for dag in picture.dags:
         yield f'  subgraph {dag.mark}[{quoted(dag.title)}]'
-        for node in dag.nodes:
-            yield f'    subgraph {node.mark}[{quoted(node.title)}]'
-            for box in node.boxes:
-                yield f'      {_box(box)}'
-                name = classes.setdefault(box.colour, f'c{len(classes)}')
-                members.setdefault(name, []).append(box.mark)
-                if box.sink:
-                    sinks.append(box.mark)
-            yield '    end'
+        for box in dag.boxes:
+            yield f'    {_box(box)}'
+            name = classes.setdefault(box.colour, f'c{len(classes)}')
+            members.setdefault(name, []).append(box.mark)
+            if box.sink:
+                sinks.append(box.mark)
         yield '  end'
+    labelled = len(picture.boxes) <= MOST_LABELLED
     for arrow in picture.arrows:
-        yield f'  {arrow.start} {"-.->" if arrow.queue else "-->"} {arrow.end}'
+        topic = f'|{quoted(arrow.note)}|' if labelled and not arrow.queue else ''
+        yield f'  {arrow.start} {"-.->" if arrow.queue else "-->"}{topic} {arrow.end}'
     for colour, name in classes.items():
         yield f'  classDef {name} fill:{colour},stroke:#444444,color:#000000'
         yield f'  class {",".join(members[name])} {name}'
@@ -63,5 +62,5 @@ def _lines(picture: Picture) -> Iterator[str]:
 
 def _box(box: Box) -> str:
     opening, closing = _BRACKETS[box.kind]
-    label = '<br>'.join(quoted(line)[1:-1] for line in box.lines)
+    label = '<br>'.join(quoted(line)[1:-1] for line in (box.node, *box.lines))
     return f'{box.mark}{opening}"{label}"{closing}'

@@ -5,14 +5,13 @@ A task set as a picture: what is drawn, in words of boxes, frames and arrows.
 
 Theory of operation
 -------------------
-1. A DAG is a frame; in it each node that has vertices of the DAG is a frame; in that each vertex
-   is a box. Trigger edges are solid arrows.
-2. Queue edges are dotted arrows from the vertices that write to the vertices that read. Where
-   reader and writer have vertices in the same DAG, those are joined. A reader without a writer in
-   its own DAG gets one arrow from the writer's first vertex, as more would say nothing new.
-3. The colour of a box is its RAD offset (reference absolute deadline minus release): red what is
-   most urgent, blue what has most time, on a logarithmic scale over the whole task set.
-4. Names are kept as they are; each language of pictures escapes them in its own way.
+1. A DAG is a frame, a vertex is a box in it. Trigger edges are solid arrows.
+2. Queue edges are dotted arrows from the vertices that write to the vertices that read. If reader
+   and writer have vertices in the same DAG, those are joined. A reader without a writer in its own
+   DAG gets one arrow, from the writer's first vertex.
+3. The colour of a box is its RAD offset (reference absolute deadline minus release): the most
+   urgent is red, the least urgent is blue, on a logarithmic scale over the whole task set.
+4. Names are kept as they are. Each picture language escapes them in its own way.
 """
 
 from __future__ import annotations
@@ -20,11 +19,15 @@ from __future__ import annotations
 from colorsys import hls_to_rgb
 from dataclasses import dataclass
 import math
+from pathlib import PurePath
 
 from mddag_executor.core import Tables
 from mddag_executor.report.text import format_ns
-from msg_graph import Dag, TaskSet, Vertex
+from msg_graph import TaskSet, Vertex
+from msg_graph.model import path_lengths
 
+MOST_LABELLED = 30
+"""The topics are on the arrows of a picture with at most this many boxes."""
 _RED, _BLUE = 0.0, 0.62
 _MOST_IN_LEGEND = 12
 
@@ -32,14 +35,16 @@ _MOST_IN_LEGEND = 12
 @dataclass(frozen=True, slots=True)
 class Box:
     """
-    A vertex; ``mark`` is what arrows call it.
+    A vertex; arrows refer to its ``mark``.
 
-    :ivar lines: its text: name, what starts it if that is not a topic, a sink's deadline.
+    :ivar node: the name of its node.
+    :ivar lines: callback, what starts it if that is not a topic, a sink's deadline.
     :ivar kind: ``timer``, ``subscription``, ``sync`` or ``service``.
-    :ivar note: all about it, for a tool tip.
+    :ivar note: everything about it, for a tool tip.
     """
 
     mark: str
+    node: str
     lines: tuple[str, ...]
     kind: str
     colour: str
@@ -48,26 +53,18 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
-class NodeFrame:
-    """The vertices that a node has in a DAG."""
+class DagFrame:
+    """A DAG: its title with name and period, and how many boxes its longest path has."""
 
     mark: str
     title: str
     boxes: tuple[Box, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class DagFrame:
-    """A DAG; ``title`` has its name and period."""
-
-    mark: str
-    title: str
-    nodes: tuple[NodeFrame, ...]
+    depth: int
 
 
 @dataclass(frozen=True, slots=True)
 class Arrow:
-    """An edge; ``queue`` for a queue edge, else a trigger edge. ``note`` names the topic."""
+    """A trigger edge, or a queue edge if ``queue`` is set; ``note`` names what is sent."""
 
     start: str
     end: str
@@ -77,12 +74,17 @@ class Arrow:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """All that is drawn; ``legend`` has colours and what they mean, the most urgent first."""
+    """All that is drawn; ``legend`` has the colours and their RAD offsets, most urgent first."""
 
     title: str
     dags: tuple[DagFrame, ...]
     arrows: tuple[Arrow, ...]
     legend: tuple[tuple[str, str], ...]
+
+    @property
+    def boxes(self) -> tuple[Box, ...]:
+        """Return the boxes of all DAGs."""
+        return tuple(box for dag in self.dags for box in dag.boxes)
 
 
 def picture(task_set: TaskSet) -> Picture:
@@ -93,25 +95,18 @@ def picture(task_set: TaskSet) -> Picture:
     dags = []
     for dag in task_set.dags:
         first = tables.first_vertex[dag.index]
-        dags.append(_dag_frame(dag, offsets[first:first + len(dag.vertices)], colours))
+        boxes = tuple(_box(vertex, offset, colours[offset]) for vertex, offset in zip(
+            dag.vertices, offsets[first:first + len(dag.vertices)]))
+        dags.append(DagFrame(
+            f'd{dag.index}', f'{dag.name}, every {format_ns(dag.period_ns)}', boxes,
+            max(path_lengths(dag, [1] * len(boxes)))))
     return Picture(
-        title=task_set.file, dags=tuple(dags),
-        arrows=(*_trigger_arrows(task_set), *_queue_arrows(task_set)),
-        legend=_legend(colours))
+        PurePath(task_set.file).name, tuple(dags),
+        (*_trigger_arrows(task_set), *_queue_arrows(task_set)), _legend(colours))
 
 
-def _id(vertex: Vertex) -> str:
+def _mark(vertex: Vertex) -> str:
     return f'd{vertex.dag}v{vertex.index}'
-
-
-def _dag_frame(dag: Dag, offsets: list[int], colours: dict[int, str]) -> DagFrame:
-    by_node: dict[str, list[Box]] = {}
-    for vertex, offset in zip(dag.vertices, offsets):
-        by_node.setdefault(vertex.callback.node, []).append(_box(vertex, offset, colours[offset]))
-    nodes = tuple(
-        NodeFrame(f'd{dag.index}n{place}', node, tuple(boxes))
-        for place, (node, boxes) in enumerate(by_node.items()))
-    return DagFrame(f'd{dag.index}', f'{dag.name}, every {format_ns(dag.period_ns)}', nodes)
 
 
 def _box(vertex: Vertex, offset: int, colour: str) -> Box:
@@ -133,7 +128,7 @@ def _box(vertex: Vertex, offset: int, colour: str) -> Box:
         note.append('started by ' + ', '.join(callback.topics))
     if callback.group is not None:
         note.append(f'group {callback.group}')
-    return Box(_id(vertex), tuple(lines), callback.kind, colour,
+    return Box(_mark(vertex), callback.node, tuple(lines), callback.kind, colour,
                vertex.deadline_ns is not None, ', '.join(note))
 
 
@@ -164,7 +159,7 @@ def _trigger_arrows(task_set: TaskSet) -> list[Arrow]:
             before, after = dag.vertices[start], dag.vertices[end]
             topics = [topic for topic in after.callback.topics
                       if topic in before.callback.publishes]
-            arrows.append(Arrow(_id(before), _id(after), False, ', '.join(topics)))
+            arrows.append(Arrow(_mark(before), _mark(after), False, ', '.join(topics)))
     return arrows
 
 
@@ -180,5 +175,6 @@ def _queue_arrows(task_set: TaskSet) -> list[Arrow]:
             first = next(iter(written.values()))[0]
             for dag, readers in vertices[edge.reader].items():
                 start = written[dag][0] if dag in written else first
-                arrows.extend(Arrow(_id(start), _id(reader), True, note) for reader in readers)
+                arrows.extend(
+                    Arrow(_mark(start), _mark(reader), True, note) for reader in readers)
     return arrows

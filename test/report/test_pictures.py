@@ -20,7 +20,7 @@ from mddag_executor.report.text import printable
 import msg_graph
 import pytest
 
-CONFIG = Path(__file__).resolve().parents[2] / 'config'
+ROOT = Path(__file__).resolve().parents[2]
 GRAPH = """\
 mddag: 1
 nodes:
@@ -46,9 +46,9 @@ def drawn(text: str = GRAPH) -> Picture:
 def test_frames_boxes_and_arrows() -> None:
     result = drawn()
     assert [dag.title for dag in result.dags] == ['one, every 10 ms', 'two, every 1 s']
-    assert [node.title for node in result.dags[0].nodes] == ['/n', '/m']
-    boxes = [box for dag in result.dags for node in dag.nodes for box in node.boxes]
-    assert [(box.lines, box.kind, box.sink) for box in boxes] == [
+    assert [dag.depth for dag in result.dags] == [3, 1]
+    assert [box.node for box in result.boxes] == ['/n', '/n', '/n', '/m', '/m', '/m']
+    assert [(box.lines, box.kind, box.sink) for box in result.boxes] == [
         (('t', 'timer 10 ms'), 'timer', False), (('x',), 'subscription', False),
         (('y',), 'subscription', False), (('z', 'sync of 2', 'deadline 50 ms'), 'sync', True),
         (('q', 'deadline 5 ms'), 'subscription', True),
@@ -62,8 +62,7 @@ def test_frames_boxes_and_arrows() -> None:
 
 def test_colours_follow_the_rad_offset() -> None:
     result = drawn()
-    colours = {box.mark: box.colour for dag in result.dags for node in dag.nodes
-               for box in node.boxes}
+    colours = {box.mark: box.colour for box in result.boxes}
     assert colours['d0v0'] == colours['d0v4'] == result.legend[0][0]  # 5 ms: the most urgent
     assert colours['d0v1'] == colours['d0v2'] == colours['d0v3'] == result.legend[1][0]
     assert colours['d1v0'] == result.legend[2][0]
@@ -81,64 +80,65 @@ def test_a_long_legend_keeps_its_ends() -> None:
 
 def test_dot() -> None:
     text = to_dot(drawn())
-    assert text.count('subgraph "cluster_d0n') == 2
-    assert re.search(r'"d0v0" \[label="t\\ntimer 10 ms\\n", shape=ellipse', text)
-    assert re.search(r'"d0v3" \[label="z\\nsync of 2\\ndeadline 50 ms\\n", shape=hexagon', text)
+    assert re.search(r'"d0v0" \[label="/n\\nt\\ntimer 10 ms\\n", shape=ellipse', text)
+    assert re.search(
+        r'"d0v3" \[label="/m\\nz\\nsync of 2\\ndeadline 50 ms\\n", shape=hexagon', text)
     assert re.search(r'"d0v3" .*peripheries=2', text)
     assert not re.search(r'"d0v1" .*peripheries', text)
-    dotted = [line.split(' [')[0].strip() for line in text.splitlines() if 'dotted' in line]
-    assert dotted[0].startswith('"k')     # in the legend
-    assert dotted[1:] == ['"d1v0q0" -> "d1v0"', '"d0v2q0" -> "d0v2"']
+    assert '"d0v1" -> "d0v3" [tooltip="/b", label="/b\\n"]' in text
+    dotted = [line.split(' [')[0].strip() for line in text.splitlines() if 'dotted,' in line]
+    assert dotted == ['"d1v0q0" -> "d1v0"', '"d0v2q0" -> "d0v2"']
     assert '"d1v0q0" [label="/c\\nfrom n:y\\n"' in text
     assert '"d0v2q0" [label="member variable\\nfrom n:x\\n"' in text
 
 
-@pytest.mark.needs('graphviz')
-@pytest.mark.parametrize('name', ['autoware.yaml', 'autoware_multi.yaml'])
-def test_dags_stand_in_the_order_of_the_file_and_the_legend_below(name: str) -> None:
-    result = picture(msg_graph.load(CONFIG / name))
-    done = subprocess.run(['dot', '-Tjson'], input=to_dot(result), text=True, check=True,
+def laid_out(text: str) -> dict[str, list[float]]:
+    """Return where Graphviz puts each DAG: left, low, right and high."""
+    done = subprocess.run(['dot', '-Tjson0'], input=text, text=True, check=True,
                           stdout=subprocess.PIPE, timeout=60)
-    objects = json.loads(done.stdout)['objects']
-    frames = {item['name']: [float(number) for number in item['bb'].split(',')]
-              for item in objects if item['name'].startswith('cluster_')}
-    order = [f'cluster_{dag.mark}' for dag in result.dags] + ['cluster_legend']
-    tops = [frames[mark][3] for mark in order]
-    assert tops == sorted(tops, reverse=True)
+    return {item['name']: [float(number) for number in item['bb'].split(',')]
+            for item in json.loads(done.stdout)['objects']
+            if item['name'].startswith('cluster_')}
 
 
 @pytest.mark.needs('graphviz')
-def test_dags_of_a_large_picture_stand_in_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = 'mddag: 1\nnodes:\n' + '\n'.join(
+@pytest.mark.parametrize('name', ['config/autoware.yaml', 'examples/robot/graph.yaml'])
+def test_dags_are_in_the_order_of_the_file(name: str) -> None:
+    result = picture(msg_graph.load(ROOT / name))
+    assert result.title == Path(name).name
+    frames = laid_out(to_dot(result))
+    tops = [frames[f'cluster_{dag.mark}'][3] for dag in result.dags]
+    assert tops == sorted(tops, reverse=True) and len(set(tops)) == len(tops)
+
+
+@pytest.mark.needs('graphviz')
+def test_many_small_dags_are_in_a_grid() -> None:
+    count = 32
+    text = to_dot(drawn('mddag: 1\nnodes:\n' + '\n'.join(
         f'- {{node: /n{i}, callbacks: [{{name: t, timer: 10ms, dag: d{i}, publishes: [/t{i}]}}, '
         f'{{name: s, subscription: /t{i}, deadline: 9ms, reads: [/t{(i + 1) % 9}]}}]}}'
-        for i in range(9))
-    small = to_dot(drawn(text))
-    monkeypatch.setattr(dot, '_MANY', 10)
-    large = to_dot(drawn(text))
-    assert 'pack=' not in small and 'packmode=array_c3' in large
-    laid = json.loads(subprocess.run(
-        ['dot', '-Tjson0'], input=large.encode(), capture_output=True, check=True).stdout)
-    boxes = {each['label'].partition(',')[0]: each['bb'].split(',') for each in laid['objects']
-             if each['name'].startswith('cluster_d') and 'every' in each['label']}
-    left, low = ([float(boxes[f'd{i}'][k]) for i in range(9)] for k in (0, 1))
-    rows = [[0], [1, 2, 3], [4, 5, 6], [7, 8]]
+        for i in range(count))))
+    assert '[tooltip="/t0"]' in text
+    frames = [laid_out(text)[f'cluster_d{i}'] for i in range(count)]
+    columns = len({round(frame[0]) for frame in frames})
+    assert 3 <= columns <= 8
+    first = count % columns or columns
+    rows = [frames[:first], *(frames[i:i + columns] for i in range(first, count, columns))]
     for row in rows:
-        assert [left[i] for i in row] == sorted(left[i] for i in row)
+        assert row == sorted(row)
     for above, below in zip(rows, rows[1:]):
-        assert min(low[i] for i in above) > max(low[i] for i in below)
-    assert len(laid['edges']) == large.count(' -> ')
+        assert min(frame[1] for frame in above) > max(frame[3] for frame in below)
 
 
 def test_mermaid() -> None:
     lines = [line.strip() for line in to_mermaid(drawn()).splitlines()]
     assert lines[0] == 'flowchart LR'
-    assert 'd0v0(["t<br>timer 10 ms"])' in lines
-    assert 'd0v3{{"z<br>sync of 2<br>deadline 50 ms"}}' in lines
-    assert 'd1v0[/"s<br>service /serve<br>deadline 1 s"/]' in lines
-    assert 'd0v1 --> d0v3' in lines and 'd0v2 -.-> d1v0' in lines
+    assert 'd0v0(["/n<br>t<br>timer 10 ms"])' in lines
+    assert 'd0v3{{"/m<br>z<br>sync of 2<br>deadline 50 ms"}}' in lines
+    assert 'd1v0[/"/m<br>s<br>service /serve<br>deadline 1 s"/]' in lines
+    assert 'd0v1 -->|"/b"| d0v3' in lines and 'd0v2 -.-> d1v0' in lines
     assert 'class d0v3,d0v4,d1v0 sink' in lines
-    assert lines.count('end') == sum(line.startswith('subgraph') for line in lines) == 5
+    assert lines.count('end') == sum(line.startswith('subgraph') for line in lines) == 2
 
 
 @given(st.one_of(st.sampled_from(HOSTILE), st.text()))
@@ -156,25 +156,22 @@ def test_labels_hold_any_text(text: str) -> None:
 def test_graphviz_reads_hostile_names_as_they_are() -> None:
     result = drawn()
     first = result.dags[0]
-    node = first.nodes[0]
-    boxes = tuple(replace(node.boxes[0], mark=f'd0v{place}', lines=(name,), note=name)
+    boxes = tuple(replace(first.boxes[0], mark=f'd0v{place}', node=name, lines=(name,), note=name)
                   for place, name in enumerate(HOSTILE))
-    titles = tuple(replace(node, mark=f'd0n{place}', title=name, boxes=(boxes[place],))
-                   for place, name in enumerate(HOSTILE))
-    hostile = replace(result, title='\\N"', arrows=(),
-                      dags=(replace(first, title='"<\\', nodes=titles),))
+    hostile = replace(result, title='\\N"<b>&', arrows=(),
+                      dags=(replace(first, title='"<\\', boxes=boxes),))
     done = subprocess.run(['dot', '-Tdot_json'], input=to_dot(hostile), text=True, check=True,
                           stdout=subprocess.PIPE, timeout=60)
     objects = {item['name']: item for item in json.loads(done.stdout)['objects']}
     for place, name in enumerate(HOSTILE):
         # Graphviz gives its strings back with the escapes for labels still in them.
-        label = objects[f'd0v{place}']['label'].removesuffix('\\n')
-        assert label.replace('\\\\', '\\') == printable(name)
+        label = objects[f'd0v{place}']['label'].replace('\\\\', '\\')
+        assert label.endswith(f'\\n{printable(name)}\\n')
 
 
 def test_the_workload() -> None:
-    result = picture(msg_graph.load(CONFIG / 'autoware_multi.yaml'))
-    boxes = [box for dag in result.dags for node in dag.nodes for box in node.boxes]
+    result = picture(msg_graph.load(ROOT / 'config' / 'autoware_multi.yaml'))
+    boxes = result.boxes
     assert (len(result.dags), len(boxes), len({box.mark for box in boxes})) == (11, 86, 86)
     assert {arrow.start for arrow in result.arrows} <= {box.mark for box in boxes}
     assert sum(arrow.queue for arrow in result.arrows) >= 32
