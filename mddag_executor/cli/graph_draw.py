@@ -22,8 +22,8 @@ Draw the DAGs of a declaration, each in a frame. Timers are ellipses, subscripti
 sync callbacks hexagons, services parallelograms. Sinks have a double border and their deadline.
 Solid arrows are trigger edges with their topics (tool tips in graphs of more than 30 callbacks).
 Dotted arrows are queue edges; they begin at the name of what is read and of its writer. The colour
-is the RAD offset: the time from the release of a job to the earliest deadline that a callback leads
-to; red is the most urgent. DAGs are in the order of the file, many of them in a grid.
+is the RAD offset: the time from the release of a job to the earliest deadline that a callback
+leads to; red is the most urgent. DAGs are in the order of the file, many of them in a grid.
 
 The ending of OUT selects the format: .svg, .png and .pdf need Graphviz (Debian, Ubuntu:
 'sudo apt install graphviz'); .dot (Graphviz's language) and .mmd (Mermaid) need nothing.

@@ -5,17 +5,17 @@ A picture in DOT, Graphviz's language.
 
 Theory of operation
 -------------------
-1. Every name is in a quoted string. There Graphviz gives a meaning to the quotation mark and to the
-   backslash (`\n`, `\N`, `\G`, …) only; control characters are written as escapes. Only the title
-   with the legend is an HTML-like label, whose texts are escaped for HTML.
+1. Every name is in a quoted string. There Graphviz gives a meaning only to the quotation mark and
+   to the backslash (`\n`, `\N`, `\G`, …); control characters are written as escapes. Only the
+   title with the legend is an HTML-like label, whose texts are escaped for HTML.
 2. A box has the name of its node above that of its callback. Graphviz leads arrows around boxes,
    but not around the titles of frames.
 3. A queue edge begins at a text next to the reader, which says what is read and from whom. So no
    line joins two DAGs.
-4. In a small graph the topics are on the trigger edges, and the DAGs are in one column. In a larger
-   one the topics are tool tips. Graphviz lays out each DAG by itself and packs them into a grid, in
-   the order of the file, with as many columns as give about the proportions of a screen. (Version
-   2.43 leaves out the labels of edges when it packs.)
+4. In a small graph the topics are on the trigger edges, and the DAGs are in one column. In a
+   larger one the topics are tool tips. Graphviz lays out each DAG by itself and packs them into a
+   grid, in the order of the file, with as many columns as give about the proportions of a screen.
+   (Version 2.43 leaves out the labels of edges when it packs.)
 5. ``dot`` takes minutes for thousands of boxes. For more than ``_MANY`` it spends less time on the
    order of boxes, and lines are straight.
 """

@@ -3,9 +3,9 @@
 """
 A picture in Mermaid, which many web pages and editors show as a drawing.
 
-Names are in quoted labels, which Mermaid reads as HTML. So everything in them except plain letters,
-digits and a few harmless signs is written as its number (`#35;`): no name can end the label, open a
-tag or start a comment. Identifiers are generated.
+Names are in quoted labels, which Mermaid reads as HTML. So everything in them except plain
+letters, digits and a few harmless signs is written as its number (`#35;`): no name can end the
+label, open a tag or start a comment. Identifiers are generated.
 """
 
 from __future__ import annotations
