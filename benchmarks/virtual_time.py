@@ -28,12 +28,12 @@ from typing import Any
 from mddag_executor import defaults
 from mddag_executor.core import Scheduler, Tables
 from mddag_executor.core.state import IDLE
-from mddag_executor.generate import generate, Options
-from mddag_executor.simulate.compiled import ACCEPT_RUNS, compiled_judge, prepare
-from mddag_executor.simulate.draws import Draws
+from mddag_executor.laboratory.draws import Draws
+from mddag_executor.laboratory.evaluate import evaluate
+from mddag_executor.laboratory.experiment import Experiment, judge_of
+from mddag_executor.laboratory.generate import generate
+from mddag_executor.laboratory.generate_options import Options
 from mddag_executor.simulate.engine import END
-from mddag_executor.simulate.evaluate import evaluate
-from mddag_executor.simulate.experiment import Experiment, plain_judge
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.schedule import schedule, Settings
 from mddag_executor.simulate.workload import draw_execution_times, periodic_load
@@ -55,10 +55,12 @@ def time_runs(
     :param repeat: how often to do it, each time with its own draws; the medians are taken.
     :return: for machines; ``ms`` is wall-clock time for each run and policy.
     """
-    evaluate(experiment, jobs, jobs=jobs, core=core)  # compiled or loaded, memory in place
+    evaluate(experiment, jobs, jobs=jobs,
+                           compiled=core == 'compiled')  # compiled or loaded, memory in place
     taken = []
     for number in range(repeat):
-        outcome = evaluate(replace(experiment, seed=number), runs, jobs=jobs, core=core)
+        outcome = evaluate(replace(experiment, seed=number), runs, jobs=jobs,
+                           compiled=core == 'compiled')
         taken.append(outcome.elapsed_s)
     each = median(taken) / runs / len(experiment.policies)
     return {
@@ -93,10 +95,7 @@ def time_vertex_jobs(
     task_set = random_task_set(n_vertices)
     rate = sum(len(dag.vertices) / dag.period_ns for dag in task_set.dags)
     duration_ns = max(max(_PERIODS_NS), round(vertex_jobs / rate))
-    judge = plain_judge(task_set, duration_ns)
-    if core == 'compiled':
-        prepare(ACCEPT_RUNS)
-        judge = compiled_judge(task_set, duration_ns)
+    judge = judge_of(task_set, duration_ns, core == 'compiled')
     settings = Settings('rad', WORKERS, duration_ns, True, 'completions', True)
     done = sum(-(-duration_ns // dag.period_ns) * len(dag.vertices) for dag in task_set.dags)
     times = Draws(task_set, 0).times(0, 1)

@@ -25,7 +25,6 @@ from msg_graph.derive import loads
 from msg_graph.duration import exact_duration, SECOND
 from msg_graph.errors import GraphError
 from msg_graph.language import Entry, FILE
-from msg_graph.layout import refused, without_lines
 from msg_graph.model import Process, TaskSet
 from msg_graph.yamltext import Mapping, parse_yaml
 import yaml
@@ -40,8 +39,19 @@ def checked(text: str, wanted: TaskSet) -> str:
     except GraphError:
         same = False
     if not same:
-        raise refused(wanted.file)
+        raise _refused(wanted.file)
     return text
+
+
+def without_lines(task_set: TaskSet) -> TaskSet:
+    """Return the task set without the places in the text."""
+    nowhere = {callback.key: {'line': 0, 'file': None} for callback in task_set.callbacks}
+    return replace(task_set.with_callbacks(nowhere), text='')
+
+
+def _refused(name: str) -> GraphError:
+    return GraphError(name, None, 'it cannot be changed without a change of its meaning',
+                      'write anchors, quotes and multi-line texts more plainly')
 
 
 def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, list[str]]:
@@ -65,7 +75,7 @@ def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Table[str, int]) 
     try:
         result = _with_deadlines(text, deadlines)
     except KeyError:  # of a declaration of several files
-        raise refused(task_set.file) from None
+        raise _refused(task_set.file) from None
     return checked(result, with_deadlines(task_set, deadlines))
 
 

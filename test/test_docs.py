@@ -125,7 +125,7 @@ def test_every_verb_is_on_the_page_of_commands() -> None:
         program.run(['graph', '--help'])
     verbs |= {f'graph {name}' for name in re.findall(r'^    ([a-z-]+)\b', out.getvalue(),
                                                      re.MULTILINE)}
-    assert {'graph fmt', 'graph assign-deadlines'} <= verbs
+    assert {'graph assign-deadlines'} <= verbs
     assert not [verb for verb in verbs if not re.search(rf'`mddag {verb}[ `]', text)]
 
 

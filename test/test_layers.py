@@ -3,8 +3,8 @@
 """
 The parts of the program know one another in one direction only.
 
-    cli -> rerun -> report, hosting -> (executor | replay | assign | simulate | analysis)
-        -> trace, core, generate -> msg_graph
+    cli -> rerun -> report, hosting -> (executor | replay | laboratory) -> simulate
+        -> trace, core -> msg_graph
 
 Imports are read from the sources, those inside functions and for type checkers included. So are
 the names of rclpy that only the modules in ``COMPAT`` may use.
@@ -32,11 +32,9 @@ LEVELS = {
     'mddag_executor': 3,  # its __init__.py, to those who want the version
     'mddag_executor.core': 4,
     'mddag_executor.trace': 4,
-    'mddag_executor.generate': 4,
     'mddag_executor.recording': 5,
-    'mddag_executor.analysis': 5,
     'mddag_executor.simulate': 5,  # below replay, which reschedules with its engine
-    'mddag_executor.assign': 6,
+    'mddag_executor.laboratory': 6,
     'mddag_executor.executor': 6,
     'mddag_executor.replay': 6,
     'mddag_executor.report': 7,

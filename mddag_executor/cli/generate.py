@@ -19,7 +19,7 @@ from typing import Any, TYPE_CHECKING, TypeVar
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
 from mddag_executor.errors import InputError, UsageError
-from mddag_executor.generate.options import option_of, Options
+from mddag_executor.laboratory.generate_options import option_of, Options
 from msg_graph.duration import exact_duration
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ _KINDS: dict[str, Callable[[str], Any]] = {
 
 def main(args: argparse.Namespace) -> int:
     """Make task sets."""
-    from mddag_executor.generate import generate
+    from mddag_executor.laboratory.generate import generate
     every = list(_every(args))
     for each in (every[0], every[-1]):
         each.check()

@@ -15,7 +15,7 @@ from mddag_executor.errors import InputError, UsageError
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
-    from mddag_executor.assign import Found, Measured
+    from mddag_executor.laboratory.assign_deadlines import Found, Measured
     from msg_graph import TaskSet
 
 HELP = 'give the sinks relative deadlines, by critical path or by search'
@@ -54,8 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--budget', choices=defaults.BUDGETS, default='p99',
         help='what of each execution time makes the critical path (default: %(default)s)')
     options.add_policy(parser, 'to simulate, ')
-    add('--non-preemptive', action='store_true',
-        help="simulate as an executor of callbacks runs them, not in the policy's own mode")
+    options.add(parser, '--preemptive', otherwise="as in the paper's experiment")
     add('--runs', type=options.positive_int, default=1000, metavar='N',
         help='runs that measure the acceptance of each scale (default: %(default)s)')
     options.add_seed(parser, 'seed of the drawn execution times')
@@ -85,12 +84,12 @@ def main(args: argparse.Namespace) -> int:
 def _assign(
     args: argparse.Namespace, task_set: TaskSet
 ) -> tuple[dict[str, int], Measured, Found | None]:
-    from mddag_executor.assign import measure, proportional, Search
-    from mddag_executor.simulate.evaluate import Experiment
+    from mddag_executor.laboratory.assign_deadlines import measure, proportional, Search
+    from mddag_executor.laboratory.experiment import Experiment
     experiment = Experiment(
         task_set, (args.policy,), workers=defaults.workers(args.workers, task_set),
         duration_ns=args.duration, seed=args.seed, overhead_ns=args.overhead,
-        preemptive=False if args.non_preemptive else None)
+        preemptive=args.preemptive)
     jobs = args.jobs or defaults.processors()
     if args.by == 'path':
         deadlines = proportional(

@@ -16,8 +16,8 @@ from mddag_executor.errors import UsageError
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
-    from mddag_executor.assign.placed import Predictor
-    from mddag_executor.assign.placement import Placing
+    from mddag_executor.laboratory.placement import Placing
+    from mddag_executor.laboratory.prediction import Predictor
     from msg_graph import Process, TaskSet
 
 HELP = 'say which node is to run in which process, so that the deadlines hold'
@@ -60,8 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Place nodes."""
-    from mddag_executor.assign.placed import cost_of, improve, Predictor, PUBLISH_NS
-    from mddag_executor.assign.placement import Placing
+    from mddag_executor.laboratory.placement import Placing
+    from mddag_executor.laboratory.prediction import cost_of, improve, Predictor, PUBLISH_NS
     from msg_graph import Process
     from msg_graph.edit import with_processes
     if args.trace and args.utilisation is not None:

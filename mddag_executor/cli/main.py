@@ -67,7 +67,7 @@ VERBS = {
     'evaluate': Verb('evaluate', 'measure acceptance ratios over many simulated runs'),
     'generate': Verb('generate', 'make random multi-deadline, multi-rate DAG sets'),
     'graph': Verb('graph', 'check, draw, derive and analyse declarations', (
-        'check', 'draw', 'schema', 'fmt', 'from-caret', 'from-trace', 'from-ros', 'analyse',
+        'check', 'draw', 'schema', 'from-caret', 'from-trace', 'from-ros', 'analyse',
         'assign-deadlines', 'place')),
     'import': Verb('import', 'turn a CARET or ros2_tracing recording into a trace', ('ctf',)),
     'export': Verb('export', 'turn a recording into files for Perfetto or for data frames'),

@@ -198,7 +198,7 @@ def _processes(
     if given is None:
         return None
     if given.isdecimal():
-        from mddag_executor.assign.placement import packed
+        from mddag_executor.laboratory.placement import packed
         return lambda task_set, times: packed(task_set, int(given), times)
     name, text = common.read_text(given)
     return lambda task_set, times: load_processes(text, name, task_set)

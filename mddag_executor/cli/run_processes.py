@@ -152,7 +152,7 @@ def _place(
     together: Sequence[Sequence[str]],
 ) -> TaskSet:
     """Place the nodes in N processes; what one program brings stays together."""
-    from mddag_executor.assign.placement import packed
+    from mddag_executor.laboratory.placement import packed
     from mddag_executor.simulate.workload import draw_execution_times
     times = draw_execution_times(task_set, args.seed, undeclared=0) if plan is None else [
         [plan.execution_ns(v.dag, v.index) for v in dag.vertices] for dag in task_set.dags]

@@ -1,38 +1,31 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Runs in the compiled core: what ``kernel`` does (see ``compiling``), over memory that it is lent.
+Runs in the compiled core: calls of the entry points of ``kernel`` with memory that they use.
 
-A structure has three words for each field, those of a vector (address, length, capacity; see
+A structure has three words for each field: those of a vector (address, length, capacity; see
 ``vectors``), or an integer in the first of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 import ctypes
-from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple, TYPE_CHECKING
 
+from mddag_executor import progress
 from mddag_executor.core.policies import POLICIES
 from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.core.state import Decision, State
 from mddag_executor.core.tables import Tables
-from mddag_executor.simulate.compiling import (
-    available,
-    cached_entries,
-    compile_elsewhere,
-    entries_of,
-    keeps_entries,
-)
+from mddag_executor.simulate.compiling import available, entry_points
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.draws import Bools, Times
 from mddag_executor.simulate.engine import LogEntry, Orders
-from mddag_executor.simulate.experiment import Judge, load_without_costs
+from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.machine import Machine
-from msg_graph import TaskSet
 import numpy as np
 import numpy.typing as npt
 
@@ -40,76 +33,79 @@ if TYPE_CHECKING:
     from mddag_executor.simulate.schedule import Settings
 
 ACCEPT_RUNS, RUN_ONCE = 'accept_runs', 'run_once'
-"""What is compiled: for ``evaluate``, and for all else."""
+"""The entry points: of ``evaluate``, and of everything else."""
 _WORD = 8
+_COMPILE_S = {ACCEPT_RUNS: 15.0, RUN_ONCE: 40.0}    # about how long compiling takes
 
-# Roughly, to choose what is sooner done: how long compiling takes.
-_COMPILE_S = {ACCEPT_RUNS: 15.0, RUN_ONCE: 40.0}
 
-_ready: set[str] = set()    # what this process has loaded
+def check_available() -> None:
+    """Check that there is a compiler."""
+    if not available():
+        raise SimulationError("numba, which compiles the core, is not installed: install "
+                              "'mddag_executor[batch]' with pip")
 
 
 def pays(name: str, plain_s: float) -> bool:
-    """Return whether to compile, or load what was, for work that takes plain Python that long."""
-    return name in _ready or (
-        available() and (plain_s > _COMPILE_S[name] or cached_entries(name)))
+    """Return whether compiled code is sooner done with work that takes plain Python this long."""
+    return available() and (plain_s > _COMPILE_S[name] or _is_compiled(name))
+
+
+def _is_compiled(name: str) -> bool:
+    entry: Any = entry_points()[name]
+    folder = entry.stats.cache_path
+    return bool(entry.signatures) or (
+        folder is not None and any(Path(folder).glob(f'*{name}*.nbi')))
 
 
 def prepare(name: str) -> None:
-    """Compile, or load what was compiled before."""
-    if name in _ready:
-        return
-    if keeps_entries() and not cached_entries(name):
-        compile_elsewhere(f'{__name__}.compile_here({name!r})')
-    compile_here(name)
-    _ready.add(name)
-
-
-@cache
-def _entries() -> dict[str, Callable[..., Any]]:
-    from mddag_executor.simulate import kernel
-    return entries_of(kernel, (ACCEPT_RUNS, RUN_ONCE, 'free_run'))
-
-
-def compile_here(name: str) -> None:
-    """Compile, or load, by running nothing."""
+    """Compile an entry point, or load what was compiled before, by a call that runs nothing."""
+    if not _is_compiled(name):
+        progress.report(f'compiling the core, once: about {_COMPILE_S[name]:.0f} s')
     if name == RUN_ONCE:
         run_once(Tables.build(None), Load([], [], [], [], [], []), 'rad',
                  Orders(*[0] * len(Orders._fields)))
         return
     nothing = EmptyMemory(max(len(Tables._fields) + 1, len(State._fields)))
-    _entries()[ACCEPT_RUNS](
+    entry_points()[ACCEPT_RUNS](
         nothing.address, nothing.address, nothing.address, 0, 0, 1, 0, 0, 0, 0, 1, False,
         np.zeros(0, dtype=np.bool_))
 
 
-def compiled_judge(task_set: TaskSet, duration_ns: int) -> Judge:
-    """Return what simulates runs in compiled code; several threads may call it."""
-    built = Tables.build(task_set)
-    tables = [LentTuple(built, number) for number in range(len(POLICIES))]
-    without_costs = LentTuple(load_without_costs(task_set, duration_ns))
+class AcceptRuns:
+    """
+    Simulates runs up to their first miss, in compiled code; several threads may call it.
 
-    def judge(settings: Settings, times: Times) -> Bools:
-        load = without_costs.copy()  # whose costs become each run's
+    :param load: that of all runs, except for its costs.
+    """
+
+    def __init__(self, tables: Tables, load: Load) -> None:
+        prepare(ACCEPT_RUNS)
+        self._tables = [LentTuple(tables, number) for number in range(len(POLICIES))]
+        self._load = LentTuple(load)
+        self._row = tables.n_vertices * _WORD
+
+    def __call__(
+        self, settings: Settings, times: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.bool_]:
+        """Return which runs, with the execution times of their rows, have no miss."""
+        load = self._load.copy()  # its costs become those of each run
         working = EmptyMemory(len(State._fields))
         times = np.ascontiguousarray(times, dtype=np.int64)
         accepted = np.zeros(len(times), dtype=np.bool_)
-        _entries()[ACCEPT_RUNS](
-            tables[list(POLICIES).index(settings.policy)].address, load.address,
-            working.address, times.ctypes.data, built.n_vertices * _WORD, settings.workers,
+        entry_points()[ACCEPT_RUNS](
+            self._tables[list(POLICIES).index(settings.policy)].address, load.address,
+            working.address, times.ctypes.data, self._row, settings.workers,
             int(settings.preempts), int(find_policy(settings.policy).polling),
-            settings.dispatch_overhead_ns, settings.switch_overhead_ns, duration_ns,
+            settings.dispatch_overhead_ns, settings.switch_overhead_ns, settings.duration_ns,
             settings.judge == 'horizon', accepted)
         return accepted
-
-    return judge
 
 
 def run_once(
     tables: Tables, load: Load, policy: str, orders: Orders
 ) -> tuple[int, Sequence[LogEntry], Sequence[Decision], list[int]]:
     """
-    Do what ``engine.run_load`` does.
+    Run a load as ``engine.run_load`` does.
 
     :return: the end, the log of every worker, the decisions, how long each worker was busy.
     """
@@ -118,17 +114,17 @@ def run_once(
         EmptyMemory(len(fields)) for fields in (
             State._fields, Deliveries._fields, Machine._fields, ('busy',), ('log',))]
     addresses = [each.address for each in working]
-    ended = _entries()[RUN_ONCE](*(each.address for each in lent), *addresses)
+    ended = entry_points()[RUN_ONCE](*(each.address for each in lent), *addresses)
     try:
         place = State._fields.index('decisions')
         return (int(ended), log.rows(0, 6), state.rows(place, 6),  # type: ignore[return-value]
                 busy.words(0, 1)[:, 0].tolist())
     finally:
-        _entries()['free_run'](*addresses)
+        entry_points()['free_run'](*addresses)
 
 
 class LentTuple:
-    """A named tuple of integers and lists, as a structure in numpy's memory."""
+    """A named tuple of integers and lists as a structure in numpy's memory."""
 
     def __init__(self, row: NamedTuple, *more: int) -> None:
         self._columns: list[npt.NDArray[np.int64]] = []  # keeps the memory
@@ -148,14 +144,14 @@ class LentTuple:
         return int(self._words.ctypes.data)
 
     def copy(self) -> LentTuple:
-        """Return a structure of its own over the same columns."""
+        """Return another structure with the same columns."""
         copied = copy(self)
         copied._words = self._words.copy()
         return copied
 
 
 class EmptyMemory:
-    """Memory for a structure or a vector that is all empty."""
+    """Memory for an empty structure or vector."""
 
     def __init__(self, fields: int = 1) -> None:
         self._words = np.zeros(3 * fields, dtype=np.int64)
@@ -179,7 +175,7 @@ class EmptyMemory:
 
 
 class Rows(Sequence[tuple[int, ...]]):
-    """Tuples of integers that are made when they are asked for: as numbers they take a sixth."""
+    """Rows of integers as tuples, made on access: the array takes a sixth of their memory."""
 
     _SOME = 8192
 

@@ -1,11 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The verb `evaluate`: table, JSON, CSV, figure, Ctrl-C, and bad input in one line."""
+"""The verb `evaluate`: table, JSON, figure, Ctrl-C, and bad input in one line."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from pathlib import Path
@@ -14,7 +12,6 @@ import subprocess
 import sys
 import time
 
-from msg_graph import load
 import numpy as np
 import pytest
 
@@ -40,7 +37,7 @@ BATCH = pytest.importorskip('matplotlib', reason='the extra batch is not there')
 
 def test_table(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = call(
-        capsys, graph, '--runs', 40, '--policies', 'rad,fifo', '--non-preemptive')
+        capsys, graph, '--runs', 40, '--policies', 'rad,fifo', '--no-preemptive')
     assert (status, err) == (0, '')
     lines = [line.split() for line in out.splitlines()]
     assert lines[0] == ['utilisation', 'runs', 'rad', 'fifo', 'bound']
@@ -68,16 +65,6 @@ def test_json(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
         capsys, graph, '--runs', 20, '--seed', 4, '--json', '-', '--duration', '1s',
         '--overhead', '10us', '--jobs', 2)[1])
     assert {**again, 'elapsed_s': 0, 'jobs': 0} == {**result, 'elapsed_s': 0, 'jobs': 0}
-
-
-def test_csv(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = call(capsys, graph, '--runs', 20, '--policies', 'rad', '--csv', '-')
-    assert status == 0
-    rows = list(csv.DictReader(io.StringIO(out)))
-    assert [row['utilisation'] for row in rows][:3] == ['0.5', '0.55', '0.6']
-    assert list(rows[0]) == ['utilisation', 'runs', 'rad', 'rad_low', 'rad_high', 'bound']
-    assert rows[0]['rad'] == '' and rows[0]['runs'] == '0'
-    assert float(rows[5]['rad_low']) < float(rows[5]['rad']) == float(rows[5]['rad_high']) == 1.0
 
 
 @pytest.mark.parametrize(('ending', 'start'), [
@@ -119,11 +106,7 @@ def test_samples(graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     (['--seed', '-1'], "mddag evaluate: argument --seed: '-1' is no whole number from 0"),
     (['--duration', '3'], 'mddag evaluate: argument --duration: '),
     (['--overhead', 'x'], 'mddag evaluate: argument --overhead: '),
-    (['--dask', 'nonsense'], '--dask nonsense: this is no usable address (ValueError: '),
-    (['--dask', 'tcp://127.0.0.1:1'], '--dask tcp://127.0.0.1:1: no Dask scheduler answers there'),
-    (['--resume', '-'], '--resume -: it is not written to standard output: name a file'),
-    (['--resume', 'few.npz'], 'few.npz: it is damaged, or no file of kept runs: remove it, or '),
-    (['--resume', 'nowhere/k'], 'nowhere/k: there is no directory nowhere: make it first'),
+    (['--dask', 'nonsense'], '--dask nonsense: '),
     (['empty'], 'empty: there is no *.yaml in this folder: name a declaration, or make some'),
     (['-', '-'], '-: standard input can be only one of graph and graph: name a file '),
     (['none.yaml'], 'none.yaml: '),
@@ -135,8 +118,6 @@ def test_samples(graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     (['--plot', 'picture'], 'picture: the ending names no kind of picture: '),
     (['--plot', 'nowhere/a.png'], 'nowhere/a.png: there is no directory nowhere: make it first'),
     (['--json', 'nowhere/a.json'], 'nowhere/a.json: there is no directory nowhere: '),
-    (['--csv', '.'], '.: this is a directory: name a file'),
-    (['--csv', '-', '--json', '-'], '-: standard output can be only one of csv and json: '),
 ])
 def test_bad_input(
     graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str],
@@ -155,31 +136,12 @@ def test_bad_input(
 def test_without_matplotlib(
     graph: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mddag_executor.simulate import plot
+    from mddag_executor.laboratory import plot
     monkeypatch.setattr(plot, 'find_spec', lambda name: None)
     status, _, err = call(capsys, graph, '--runs', 5, '--plot', 'a.png')
     assert status == 2
     assert err == ('error: a.png: matplotlib, which draws it, is not there: '
                    "install 'mddag_executor[batch]' with pip\n")
-
-
-def test_interrupted_while_the_core_is_compiled(graph: Path, tmp_path: Path) -> None:
-    """Nobody waits until it is."""
-    pytest.importorskip('numba')
-    with subprocess.Popen(
-        [sys.executable, '-m', 'mddag_executor', 'evaluate', str(graph), '--runs', '5000000',
-         '--core', 'compiled'], stderr=subprocess.PIPE, text=True, cwd=tmp_path,
-        env={**os.environ, 'XDG_CACHE_HOME': str(tmp_path)},
-    ) as process:
-        threads = Path(f'/proc/{process.pid}/task')
-        while not any(each.read_text() for each in threads.glob('*/children')):
-            assert process.poll() is None
-            time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=120)
-    assert (process.returncode, err) == (
-        130, 'warning: interrupted: 0 of 5000000 runs are done\n')
-    assert not list(tmp_path.glob('**/*.nbc'))
 
 
 def group_seconds(group: int) -> float:
@@ -217,43 +179,13 @@ def interrupted_after(folder: Path, seconds: float, *arguments: str) -> tuple[st
 def test_interrupted(graph: Path, tmp_path: Path) -> None:
     """Ctrl-C: the exit status is 130, and what is done is written as a whole."""
     out, err = interrupted_after(
-        tmp_path, 2, str(graph), '--runs', '5000000', '--core', 'plain', '--jobs', '1', '--json',
+        tmp_path, 2, str(graph), '--runs', '5000000', '--jobs', '1', '--json',
         'out.json', '--plot', 'out.png')
     result = json.loads((tmp_path / 'out.json').read_text())
     assert err == f"warning: interrupted: {result['runs']} of 5000000 runs are done\n"
     assert 0 < result['runs'] < 5000000 and result['interrupted'] is True
     assert (tmp_path / 'out.png').stat().st_size > 5000
     assert f"{result['runs']} runs in" in out
-
-
-@pytest.mark.parametrize(('how', 'seconds'), [
-    ([], 4), pytest.param(['--dask', 'local'], 7, marks=pytest.mark.slow)])
-def test_resumed(graph: Path, tmp_path: Path, how: list[str], seconds: float) -> None:
-    """What two interrupted evaluations keep is what an uninterrupted one finds."""
-    if how:
-        pytest.importorskip('distributed', reason='the extra dask is not there')
-    from mddag_executor.simulate.checkpoint import Checkpoint
-    from mddag_executor.simulate.evaluate import evaluate, Evaluation, Experiment
-    counts = []
-    for name in ('first.json', 'second.json'):
-        _, err = interrupted_after(
-            tmp_path, seconds, 'graph.yaml', '--runs', '1000000', '--duration', '200ms',
-            '--core', 'plain', '--jobs', '2', '--policies', 'rad,fifo', '--resume', 'kept.npz',
-            '--json', name, *how)
-        result = json.loads((tmp_path / name).read_text())
-        counts.append(result['runs'])
-        assert err == (f'warning: interrupted: {counts[-1]} of 1000000 runs are done, '
-                       'and kept in kept.npz\n')
-        assert result['resumed'] == sum(counts[:-1])
-    assert 0 < counts[0] < counts[1]
-    experiment = Experiment(load(graph), ('rad', 'fifo'), workers=1, duration_ns=200_000_000)
-    kept = Evaluation((experiment,), 1000000)
-    Checkpoint(str(tmp_path / 'kept.npz'), NotImplemented).restore(kept)
-    done = kept.done.nonzero()[0][:100]
-    whole = evaluate(experiment, int(done[-1]) + 1, core='plain')
-    assert kept.runs == counts[1]
-    assert (kept.accepted[:, done] == whole.accepted[:, done]).all()
-    assert (kept.utilisation[done] == whole.utilisation[done]).all()
 
 
 def test_several_graphs(
@@ -266,7 +198,7 @@ def test_several_graphs(
     (tmp_path / 'sets' / 'a.yaml').write_text(GRAPH.replace('workers: 1', 'workers: 2'))
     (tmp_path / 'sets' / 'notes.txt').write_text('no declaration')
     status, out, err = call(
-        capsys, graph, 'sets', '--runs', 20, '--policies', 'rad', '--non-preemptive', '--json',
+        capsys, graph, 'sets', '--runs', 20, '--policies', 'rad', '--no-preemptive', '--json',
         'out.json', '--plot', 'out.svg')
     assert (status, err) == (0, '')
     assert '60 runs of 3 task sets in' in out

@@ -9,6 +9,7 @@ import json
 from pathlib import Path
 import subprocess
 
+import msg_graph
 import pytest
 
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
@@ -64,7 +65,7 @@ def test_table(call: Mddag, tmp_path: Path) -> None:
 
 def test_standard_input_and_output(call: Mddag, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)
-    text = (CONFIG / 'autoware_multi.yaml').read_text()
+    text = msg_graph.load(CONFIG / 'autoware_multi.yaml').text
     done = call('graph', 'check', '-', '--json', '-', stdin=text)
     assert (done.returncode, done.stderr) == (0, '')
     result = json.loads(done.stdout)

@@ -8,7 +8,6 @@ from collections.abc import Callable
 import json
 from pathlib import Path
 import subprocess
-import sys
 
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -59,28 +58,6 @@ def test_json(call: Mddag) -> None:
         'says nothing'}
     assert all(test['reason'] and test['source'] and test['assumption']
                for test in result['tests'])
-
-
-def test_schedule_abstraction(call: Mddag, tmp_path: Path) -> None:
-    stand_in = Path(__file__).resolve().parents[1] / 'analysis' / 'stand_in_nptest.py'
-    program = tmp_path / 'nptest'
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} {stand_in} "$@"\n')
-    program.chmod(0o755)
-    done = call('graph', 'analyse', '-', '--budget', 'mean', '--sag', 'jobs', '--sag-binary',
-                './nptest', stdin=GRAPH, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, '')
-    line = next(line for line in done.stdout.splitlines() if line.startswith('schedule abs'))
-    assert 'holds' in line and '1 job, 2 states' in line
-    assert sorted(path.name for path in (tmp_path / 'jobs').iterdir()) == [
-        'edges.csv', 'jobs.csv', 'tasks.csv']
-    done = call('graph', 'analyse', '-', '--sag-binary', './nptest', '--json', '-', stdin=GRAPH,
-                cwd=tmp_path)
-    assert json.loads(done.stdout)['tests'][-1]['verdict'] == 'says nothing'
-    done = call('graph', 'analyse', '-', '--sag-binary', './none', stdin=GRAPH, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith('error: ./none: it cannot be run (No such file or directory): ')
-    done = call('graph', 'analyse', '-', '--horizon', '1s', stdin=GRAPH)
-    assert done.returncode == 2
 
 
 def test_bad_input(call: Mddag) -> None:

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 
+import msg_graph
 import pytest
 
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
@@ -30,7 +31,7 @@ def test_text(call: Mddag, tmp_path: Path, ending: str, begin: str) -> None:
 @pytest.mark.parametrize(('ending', 'begin'), [
     ('svg', b'<?xml'), ('png', b'\x89PNG'), ('pdf', b'%PDF')])
 def test_graphviz(call: Mddag, tmp_path: Path, ending: str, begin: bytes) -> None:
-    text = (CONFIG / 'autoware_multi.yaml').read_text()
+    text = msg_graph.load(CONFIG / 'autoware_multi.yaml').text
     done = call('graph', 'draw', '-', '-o', f'o.{ending}', cwd=tmp_path, stdin=text)
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
     assert (tmp_path / f'o.{ending}').read_bytes().startswith(begin)

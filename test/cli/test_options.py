@@ -16,7 +16,6 @@ from mddag_executor.cli import options
 from mddag_executor.core import POLICIES, PolicyError
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.simulate import JUDGES, Settings
-from mddag_executor.simulate.evaluate import CORES
 from mddag_executor.simulate.run import check
 from msg_graph import GraphError, loads
 import pytest
@@ -74,7 +73,6 @@ def test_the_number_of_workers() -> None:
 
 @pytest.mark.parametrize(('verb', 'option', 'known'), [
     ('simulate', '--judge', JUDGES), ('evaluate', '--judge', JUDGES),
-    ('evaluate', '--core', CORES),
 ])
 def test_choices_are_those_of_the_program(verb: str, option: str, known: tuple[str, ...]) -> None:
     """Verbs name them again, as to import them would make every help slow."""

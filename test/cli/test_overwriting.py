@@ -58,7 +58,6 @@ def run(graph: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     'run graph.yaml --synthetic sleep --json graph.yaml',
     'rerun run.mcap graph.yaml --node a:b -o run.mcap --overwrite',
     'rerun run.mcap graph.yaml --node a:b --expect out.mcap -o out.mcap',
-    'evaluate graph.yaml --csv graph.yaml',
 ])
 def test_an_output_is_never_an_input_or_another_output(
     run: Path, capsys: pytest.CaptureFixture[str], command: str
@@ -94,7 +93,7 @@ def test_a_recording_replaces_no_file(
 
 @pytest.mark.parametrize('command', [
     'graph check graph.yaml --json run.mcap',
-    'evaluate graph.yaml --runs 2 --csv other.dat',
+    'evaluate graph.yaml --runs 2 --json other.dat',
     'generate -o other.dat',
     'simulate graph.yaml --report damaged.mcap.html --json damaged.mcap',
 ])

@@ -53,8 +53,8 @@ HARMFUL = {
     'escapes': HEAD + 'nodes: [{node: "/\\e[2J", "\\e]0;x\\a": 1}]\n',
 }
 
-# `fmt` only lays a file with arguments out, and an architecture has no `workers`.
-HARMLESS = {('fmt', 'long arguments'), ('fmt', 'open brackets'), ('from-caret', 'digits')}
+# An architecture has no `workers`.
+HARMLESS = {('from-caret', 'digits')}
 
 
 def refused(done: subprocess.CompletedProcess[str], folder: Path) -> None:
@@ -67,7 +67,7 @@ def refused(done: subprocess.CompletedProcess[str], folder: Path) -> None:
 
 
 @pytest.mark.parametrize(('verb', 'name'), [
-    (verb, name) for verb in ('check', 'fmt', 'from-caret') for name in HARMFUL
+    (verb, name) for verb in ('check', 'from-caret') for name in HARMFUL
     if (verb, name) not in HARMLESS])
 def test_harmful_yaml_is_refused(call: Mddag, tmp_path: Path, verb: str, name: str) -> None:
     (tmp_path / 'graph.yaml').write_text(HARMFUL[name])
@@ -76,7 +76,7 @@ def test_harmful_yaml_is_refused(call: Mddag, tmp_path: Path, verb: str, name: s
 
 
 @pytest.mark.parametrize('arguments', [
-    ('graph', 'check', '/dev/zero'), ('graph', 'fmt', '/dev/zero'),
+    ('graph', 'check', '/dev/zero'),
     ('graph', 'from-caret', '/dev/zero', '-o', 'out.yaml'),
     ('simulate', AUTOWARE, '--execution-times', '/dev/zero'),
     ('replay', '/dev/zero'), ('replay', '/dev/urandom'),
@@ -138,8 +138,8 @@ def test_samples_are_no_pickles(call: Mddag, tmp_path: Path, key: str) -> None:
     (tmp_path / 'graph.yaml').write_text(
         HEAD + 'nodes: [{node: /n, callbacks: [{name: t, timer: 1ms, deadline: 1ms}]}]\n')
     np.savez(tmp_path / 'samples.npz', **{key: np.array([Owner()], dtype=object)})
-    done = call('evaluate', 'graph.yaml', '--runs', '2', '--samples', 'samples.npz', '--core',
-                'plain', cwd=tmp_path)
+    done = call('evaluate', 'graph.yaml', '--runs', '2', '--samples', 'samples.npz',
+                cwd=tmp_path)
     refused(done, tmp_path)
     (tmp_path / 'samples.npz').write_bytes(b'\x80\x04cos\nsystem\n(S"touch owned"\ntR.')
     refused(call('evaluate', 'graph.yaml', '--runs', '2', '--samples', 'samples.npz',

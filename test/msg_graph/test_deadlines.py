@@ -5,8 +5,12 @@
 from __future__ import annotations
 
 from msg_graph import GraphError, loads
-from msg_graph.edit import deadlines_in_text, load_with_or_without_deadlines, with_deadlines
-from msg_graph.layout import without_lines
+from msg_graph.edit import (
+    deadlines_in_text,
+    load_with_or_without_deadlines,
+    with_deadlines,
+    without_lines,
+)
 import pytest
 
 TEXT = """\

@@ -12,7 +12,7 @@ import re
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from msg_graph import GraphError, load, loads, TaskSet
-from msg_graph.layout import format_text, without_lines
+from msg_graph.edit import without_lines
 import pytest
 
 SENSOR = """\
@@ -223,15 +223,6 @@ def test_values_do_not_explode(tmp_path: Path) -> None:
                       'set: {a: $(a)$(a)$(a)}}]\n' for i in range(14)}
     with pytest.raises(GraphError, match='this value is too long'):
         load(write(tmp_path, top='mddag: 1\ninclude: [{file: f0.yaml, set: {a: abc}}]\n', **files))
-
-
-def test_format() -> None:
-    ragged = SENSOR.replace('  period', '     period').replace('  late', '     late')
-    assert format_text(ragged) == format_text(SENSOR)
-    assert '$(period)' in format_text(SENSOR)
-    assert format_text(TOP) == format_text(format_text(TOP))
-    with pytest.raises(GraphError, match="unknown key 'nods'"):
-        format_text(SENSOR.replace('nodes:', 'nods:'))
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])

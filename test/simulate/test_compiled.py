@@ -18,11 +18,10 @@ import sys
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor import progress
 from mddag_executor.core import POLICIES, Tables
-from mddag_executor.simulate import compiled, compiling, Load, schedule, Settings, simulate
-from mddag_executor.simulate.draws import Draws
-from mddag_executor.simulate.experiment import plain_judge
+from mddag_executor.laboratory.draws import Draws
+from mddag_executor.laboratory.experiment import judge_of
+from mddag_executor.simulate import compiling, Load, schedule, Settings, simulate
 from mddag_executor.simulate.load import as_arrays, FAILS, RUNS, SKIPPED
 from msg_graph import load, loads
 import numpy as np
@@ -159,9 +158,9 @@ def test_runs_do_not_disturb_one_another(
     times = np.array(data.draw(st.lists(
         st.lists(st.integers(1, 9), min_size=columns, max_size=columns), min_size=1,
         max_size=6)), dtype=np.int64) * TICK
-    found = compiled.compiled_judge(case.task_set, settings.duration_ns)(settings, times)
-    assert found.tolist() == plain_judge(
-        case.task_set, settings.duration_ns)(settings, times).tolist()
+    found, plain = (judge_of(case.task_set, settings.duration_ns, compiled)(settings, times)
+                    for compiled in (True, False))
+    assert found.tolist() == plain.tolist()
 
 
 @pytest.mark.parametrize('name', ['autoware.yaml', 'autoware_multi.yaml'])
@@ -190,7 +189,7 @@ def test_times_of_a_day() -> None:
 def test_memory_is_given_back() -> None:
     """Thousands of runs need no more memory than some."""
     task_set = load(CONFIG / 'autoware.yaml')
-    judge = compiled.compiled_judge(task_set, 300_000_000)
+    judge = judge_of(task_set, 300_000_000, True)
     times = Draws(task_set, 1).times(0, 50)
     settings = Settings(workers=3, preemptive=True, judge='completions')
 
@@ -215,79 +214,22 @@ def python(*lines: str, **environment: str) -> str:
 def test_nothing_is_compiled_at_import() -> None:
     assert python(
         'import sys',
-        'import mddag_executor.simulate.compiled, mddag_executor.simulate.evaluate',
+        'import mddag_executor.simulate.compiled, mddag_executor.laboratory.evaluate',
         'print([m for m in ("numba", "matplotlib") if m in sys.modules])') == '[]'
 
 
-WARM_UP = (
-    'from mddag_executor.simulate import compiled',
-    'compiled.prepare(compiled.ACCEPT_RUNS)',
-    'statistics = compiled._entries()["accept_runs"].stats',
-    'print(sum(statistics.cache_hits.values()), sum(statistics.cache_misses.values()))')
-
-
 @pytest.mark.slow
-def test_a_second_process_does_not_compile(tmp_path: Path) -> None:
-    """The code is kept under the hash of its sources; old ones are forgotten."""
-    old = tmp_path / 'mddag_executor' / 'old'
-    old.mkdir(parents=True)
-    (old / 'kernel.py').touch()
-    os.utime(old / 'kernel.py', (0, 0))
-    peaks = []
-    for _ in range(2):  # a process of its own compiles: this one loads, even the first time
-        counts, peak = python(
-            *WARM_UP, 'status = open("/proc/self/status").read()',
-            'print(status.split("VmHWM:")[1].split()[0])',  # its own peak, not its parent's, kB
-            XDG_CACHE_HOME=str(tmp_path)).splitlines()
-        assert counts == '1 0'
-        peaks.append(int(peak))
-    assert max(peaks) < 200_000
-    assert python(
-        'from mddag_executor.simulate.compiling import cached_entries',
-        'print(cached_entries("accept_runs"))',
-        XDG_CACHE_HOME=str(tmp_path)) == 'True'
-    assert [path.name for path in (tmp_path / 'mddag_executor').iterdir()] == [
-        compiling._fingerprint()]
+def test_compiled_code_is_kept_until_a_source_changes(tmp_path: Path) -> None:
+    """The hash of the sources decides, not only the file that numba checks."""
+    def hits_and_misses(*change: str) -> str:
+        return python(
+            'from mddag_executor.simulate import compiled, compiling', *change,
+            'entry = compiling.entry_points()["free_run"]',
+            'memory = [compiled.EmptyMemory(99) for _ in range(5)]',
+            'entry(*(each.address for each in memory))',
+            'print(sum(entry.stats.cache_hits.values()), sum(entry.stats.cache_misses.values()))',
+            NUMBA_CACHE_DIR=str(tmp_path))
 
-
-@pytest.mark.slow
-def test_where_no_process_can_be_started(tmp_path: Path) -> None:
-    """Then the process itself compiles."""
-    assert python(
-        'import sys', 'sys.executable = "/nowhere/python"', *WARM_UP,
-        XDG_CACHE_HOME=str(tmp_path)) == '0 1'
-
-
-def test_an_interrupted_compilation_is_not_begun_anew(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    interrupted = tmp_path / 'python'
-    interrupted.write_text(  # by a signal that may be ignored here
-        f'#!{sys.executable}\nimport os, signal\nsignal.signal(signal.SIGINT, signal.SIG_DFL)\n'
-        'os.kill(os.getpid(), signal.SIGINT)\n')
-    interrupted.chmod(0o755)
-    monkeypatch.setattr(sys, 'executable', str(interrupted))
-    monkeypatch.setattr(compiled, '_ready', set())
-    with pytest.raises(KeyboardInterrupt):
-        compiled.prepare(compiled.ACCEPT_RUNS)
-
-
-def test_whoever_shows_progress_is_told_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[str] = []
-    monkeypatch.setattr(progress, 'LISTENERS', [told.append])
-    compiling.compile_elsewhere('time.sleep(0)')
-    assert set(told) == {'the core is being compiled, once'}
-
-
-def test_without_a_place_for_the_cache(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    for place in ('relative', '/proc/nowhere'):
-        monkeypatch.setenv('XDG_CACHE_HOME', place)
-        assert compiling._stamp() is None
-        assert not compiling.cached_entries('accept_runs')
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    stamp = compiling._stamp()
-    assert stamp is not None and stamp.is_file()
-    assert stamp.parent.stat().st_mode & 0o077 == 0
+    assert [hits_and_misses() for _ in range(2)] == ['0 1', '1 0']
+    changed = 'compiling._hash_of = lambda *modules: "another"'
+    assert [hits_and_misses(changed) for _ in range(2)] == ['0 1', '1 0']

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core import queues, Tables
 from mddag_executor.core.state import divide, new_state
+from mddag_executor.laboratory.experiment import Evaluator, Experiment
 from mddag_executor.simulate import (
     END,
     Load,
@@ -24,7 +25,6 @@ from mddag_executor.simulate import (
     START,
 )
 from mddag_executor.simulate.engine import run
-from mddag_executor.simulate.experiment import Evaluator, Experiment
 from mddag_executor.simulate.machine import new_machine
 from msg_graph import loads
 import pytest
@@ -205,7 +205,7 @@ def test_declared_holders_in_an_evaluation() -> None:
     for holds in ('false', 'true'):
         experiment = Experiment(
             loads(text.replace('H', holds), 'g.yaml'), ('rad',), 2, 40 * MS)
-        accepted.append(Evaluator([experiment], 1, compiled=True)(0, 1).accepted.tolist())
+        accepted.append(Evaluator([experiment], 1, 0, True)(0, 1).accepted.tolist())
     assert accepted == [[[True]], [[False]]]
 
 

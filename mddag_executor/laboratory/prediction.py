@@ -1,0 +1,154 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A placement in virtual time: what the scheduler's rules make of it.
+
+Theory of operation
+-------------------
+1. Each process has its workers and its interpreter, all in one state of the core (its rules 11 and
+   12): of those that compute in Python the most urgent goes first, and one at a time computes.
+2. All processes share the CPUs (``simulate.machine``).
+3. What the executor and the middleware take is added to execution times: ``CALLBACK_NS`` for each
+   callback, ``PUBLISH_NS`` for each callback that it sends a message to.  DAGs are released
+   ``APART_NS`` after one another: timers that start together are never due at the very same time,
+   so there are no ties.
+4. What timers and messages of other processes take to be noticed: see ``simulate.intakes``.
+5. One placement is better than another where fewer deadlines are missed, then where the response
+   that uses most of its deadline uses less of it.  Placements that differ in one block of nodes or
+   two are tried, those of the least load first, until none is better or ``MOST_TRIES`` were tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from itertools import accumulate, islice
+
+from mddag_executor.core import NEVER, Tables, Tally
+from mddag_executor.core import policy as find_policy
+from mddag_executor.core.tally import total
+from mddag_executor.laboratory.placement import Placing
+from mddag_executor.simulate.intakes import Costs, Intakes
+from mddag_executor.simulate.load import edge_numbers, edges_of, Load
+from mddag_executor.simulate.schedule import prepare, Settings
+from mddag_executor.simulate.workload import periodic_load
+from msg_graph import Process, TaskSet
+
+CALLBACK_NS = 20_000
+PUBLISH_NS = 75_000
+APART_NS = 20_000
+MOST_TRIES = 150
+_AHEAD = 40
+
+Cost = tuple[int, float]
+
+
+class Predictor:
+    """
+    Simulates placements.
+
+    :param workers: of each process.
+    :param cpus: that all processes share; None: enough for all.
+    :param duration_ns: virtual time of a run.
+    :param publish_ns: what publishing takes beside execution times, for each callback that it is
+        to; recorded ones have it in them.
+    """
+
+    def __init__(
+        self, task_set: TaskSet, workers: int, cpus: int | None, policy: str, duration_ns: int,
+        publish_ns: int = PUBLISH_NS,
+    ) -> None:
+        self._task_set = task_set
+        self._workers = workers
+        self._cpus = cpus
+        self._policy = find_policy(policy)
+        self._duration, self._publish = duration_ns, publish_ns
+        self._compiled: bool | None = None  # not known yet
+
+    def predict(
+        self, processes: Sequence[Process], execution_ns: Sequence[Sequence[int]]
+    ) -> Tally:
+        """Return the verdicts about a placement, with these execution times in each job."""
+        task_set = replace(self._task_set, processes=tuple(processes))
+        tables = Tables.build(task_set, max_active_jobs=NEVER)
+        costs = Costs()
+        crosses = {(a, b): tables.process[a] != tables.process[b]
+                   for a, b in edge_numbers(tables)}
+        sends = {a for (a, _), leaves in crosses.items() if leaves}
+        times = [[ns + CALLBACK_NS + self._publish * len(vertex.successors)
+                  + costs.send_ns * (first + vertex.index in sends)
+                  for ns, vertex in zip(row, dag.vertices)]
+                 for row, dag, first in zip(execution_ns, task_set.dags, tables.first_vertex)]
+        bases = list(accumulate(edges_of(tables), initial=0))[:-1]
+        load = _apart(periodic_load(task_set, times, self._duration)._replace(
+            holds=[0 if vertex.callback.holds_interpreter is False else process
+                   for vertex, process in zip(task_set.vertices, tables.process)],
+            delays=[costs.delay_ns * leaves for leaves in crosses.values()], delay_base=bases,
+            delay_stride=[0] * len(bases)))
+        settings = Settings(
+            self._policy.name, self._workers, self._duration, cpus=self._cpus,
+            processes=max(1, len(processes)))
+        if self._compiled is None:
+            self._compiled = prepare(tables, load, settings, MOST_TRIES)
+        decisions = Intakes(task_set, tables, costs).schedule(
+            load, settings, compiled=self._compiled).decisions
+        tally = Tally(task_set, tables)
+        for time, dag in zip(load.times, load.dags):
+            if time < self._duration:
+                tally.released(dag)
+        tally.add(decisions)
+        return tally
+
+
+def _apart(load: Load) -> Load:
+    """Release each DAG a little after the one before it (rule 3)."""
+    releases = sorted((time + dag * APART_NS, dag, job) for time, dag, job in zip(
+        load.times, load.dags, load.jobs))
+    times, dags, jobs = (list(column) for column in zip(*releases))
+    return load._replace(times=times, dags=dags, jobs=jobs)
+
+
+def cost_of(tally: Tally) -> Cost:
+    """Return what is compared of two placements (rule 5)."""
+    dags = tally.result()['dags']
+    worst = max((sink['response_ns']['max'] / sink['relative_deadline_ns']
+                 for dag in dags.values() for sink in dag['sinks'].values()
+                 if sink['response_ns'] is not None), default=0.0)
+    return total(dags).missed, round(worst, 2)
+
+
+def improve(
+    placing: Placing, place: dict[int, int], cost: Callable[[tuple[Process, ...]], Cost],
+    report: Callable[[int], None] = lambda tried: None, most: int = MOST_TRIES,
+) -> tuple[dict[int, int], int]:
+    """
+    Return a placement at least as good, and how many were simulated.
+
+    :param cost: simulates one.
+    :param report: called now and then with how many have been tried.
+    """
+    best, tried = cost(placing.processes(place)), 1
+    seen = {tuple(sorted(place.items()))}
+    while tried < most:
+        for other in _next(placing, place, seen):
+            seen.add(tuple(sorted(other.items())))
+            tried += 1
+            report(tried)
+            found = cost(placing.processes(other))
+            if found < best:
+                place, best = other, found
+                break
+            if tried >= most:
+                break
+        else:
+            break
+    return place, tried
+
+
+def _next(
+    placing: Placing, place: dict[int, int], seen: set[tuple[tuple[int, int], ...]]
+) -> Iterable[dict[int, int]]:
+    """Return the placements to try next, those of the least load first."""
+    candidates = [each for each in placing.neighbours(place)
+                  if tuple(sorted(each.items())) not in seen]
+    return islice(sorted(candidates, key=lambda each: max(placing.loads(each))), _AHEAD)

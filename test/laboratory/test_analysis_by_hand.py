@@ -1,0 +1,233 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""The tests of the analysis, on figures worked out by hand."""
+
+from __future__ import annotations
+
+from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS, NOTHING, Verdict
+from mddag_executor.laboratory.necessary import largest_demand
+from mddag_executor.laboratory.sufficient import (
+    graham,
+    own_jobs,
+    own_urgent,
+    rad,
+    urgent,
+    workload,
+)
+from mddag_executor.laboratory.tasks import AnalysisError, tasks_of
+from msg_graph import loads
+import pytest
+
+from .test_analysis_against_simulation import missed
+
+MS = 1_000_000
+FORK = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 100ms, publishes: [/a], execution_time: 1ms}
+      - {name: x, subscription: /a, deadline: 3ms, execution_time: 2ms}
+      - {name: y, subscription: /a, deadline: 50ms, execution_time: 40ms}
+"""
+
+WIDE = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 10ms, publishes: [/a], execution_time: 1ms}
+      - {name: x, subscription: /a, deadline: 10ms, execution_time: 3ms}
+      - {name: y, subscription: /a, deadline: 10ms, execution_time: 5ms}
+"""
+
+
+def timers(*callbacks: str) -> str:
+    """Return a declaration of timers, each as `PERIOD DEADLINE COST`."""
+    lines = ['mddag: 1', 'nodes:']
+    for place, each in enumerate(callbacks):
+        period, deadline, cost = each.split()
+        lines.append(f'  - {{node: /n{place}, callbacks: [{{name: t, timer: {period}, '
+                     f'deadline: {deadline}, execution_time: {cost}}}]}}')
+    return '\n'.join(lines)
+
+
+def verdicts(text: str, workers: int, budget: str = 'max') -> dict[str, Verdict]:
+    found = analyse(loads(text, 'g.yaml'), workers, budget).verdicts
+    assert len({verdict.name for verdict in found}) == len(found)
+    return {verdict.name: verdict for verdict in found}
+
+
+def test_tasks() -> None:
+    task, = tasks_of(loads(FORK))
+    assert (task.volume, task.length, task.deadline) == (43 * MS, 41 * MS, 50 * MS)
+    assert task.rad == (3 * MS, 3 * MS, 50 * MS)
+    assert task.latest == (1 * MS, 3 * MS, 50 * MS)
+    assert task.sinks == ((1, 3 * MS, 3 * MS), (2, 50 * MS, 41 * MS))
+
+
+@pytest.mark.parametrize(('budget', 'cost'), [('max', 100), ('p99', 99), ('mean', 50)])
+def test_budgets(budget: str, cost: int) -> None:
+    text = timers('1ms 1ms 1us').replace('1us', '{quantiles_us: [0, 100]}')
+    task, = tasks_of(loads(text), budget)
+    assert task.costs == (cost * 1000,)
+
+
+def test_what_is_not_declared() -> None:
+    text = FORK.replace(', execution_time: 2ms', '')
+    with pytest.raises(AnalysisError, match='g.yaml:6: /n:x declares no execution_time: add one'):
+        verdicts(text, 2)
+    with pytest.raises(AnalysisError, match='workers: 0 is too few'):
+        verdicts(FORK, 0)
+    with pytest.raises(AnalysisError, match="budget 'min': there is no such"):
+        verdicts(FORK, 1, 'min')
+
+
+def test_a_path_that_is_too_long() -> None:
+    found = verdicts(FORK.replace('deadline: 3ms', 'deadline: 2.9ms'), 8)
+    assert found['longest path'].verdict == FAILS
+    assert found['longest path'].figure == '3ms of 2.9ms at /n: /n:x'
+    assert found['longest path'].reason == 'too long for 1 of 2 sinks'
+    assert all(v.verdict == NOTHING for v in found.values() if v.kind == 'sufficient')
+
+
+def test_too_much_work() -> None:
+    found = verdicts(timers('10ms 20ms 9ms', '10ms 20ms 2ms'), 1)
+    assert found['longest path'].verdict == HOLDS
+    assert found['utilisation'].verdict == FAILS
+    assert found['utilisation'].figure == '1.100 of 1 worker'
+
+
+def test_demand() -> None:
+    found = verdicts(timers('10ms 1ms 1ms', '10ms 1ms 1ms'), 1)
+    assert found['utilisation'].verdict == HOLDS
+    assert found['demand bound'].verdict == FAILS
+    assert found['demand bound'].figure == '2ms due within 1ms, of 1ms'
+    # Refined for each sink: 1 ms by 1 ms, 3 ms by 3 ms, and 43 ms by 50 ms.
+    demand = largest_demand(tasks_of(loads(FORK)), 2)
+    assert (demand.time, demand.work, demand.complete) == (1 * MS, 1 * MS, True)
+    assert verdicts(FORK, 1)['demand bound'].verdict == HOLDS
+
+
+def test_graham() -> None:
+    task, = tasks_of(loads(FORK))
+    assert [bound.response for bound in graham(task, 2)] == [None, 42 * MS]  # 3 + 40 / 2 > 3
+    slower, = tasks_of(loads(FORK.replace('deadline: 3ms', 'deadline: 23ms')))
+    assert [bound.response for bound in graham(slower, 2)] == [23 * MS, 42 * MS]
+    often, = tasks_of(loads(FORK.replace('deadline: 3ms', 'deadline: 23ms').replace(
+        '100ms', '41ms')))
+    assert [bound.response for bound in graham(often, 2)] == [None, None]  # jobs overlap
+    assert verdicts(timers('10ms 10ms 1ms'), 1)["Graham's bound"].verdict == HOLDS
+    two = verdicts(timers('10ms 10ms 1ms', '10ms 10ms 1ms'), 1)["Graham's bound"]
+    assert (two.verdict, two.figure) == (NOTHING, '2 of 2 DAGs in time, each alone')
+
+
+def test_workload() -> None:
+    task, = tasks_of(loads(timers('10ms 10ms 4ms')))
+    # One job ends as late as it may and one follows: y = 6 + 10 - 4 / 2 = 14, so 4 + min(4, 8).
+    assert workload(task, 6 * MS, 2) == 8 * MS
+    assert workload(task, 1 * MS, 1) == 1 * MS
+
+
+def test_only_rad_puts_the_urgent_first() -> None:
+    found = verdicts(timers('100ms 14ms 2ms', '100ms 100ms 4ms', '100ms 100ms 3ms'), 1)
+    assert found['response time, any policy'].verdict == NOTHING
+    bound = found['response time, RAD without preemption']
+    assert bound.verdict == HOLDS
+    # 2 of its own, a job of each other one that may be urgent, and the longest that had begun.
+    assert bound.details['/n0: /n0:t'] == {'deadline_ns': 14 * MS, 'response_bound_ns': 13 * MS}
+
+
+def test_response_times_with_others() -> None:
+    found = verdicts(timers('10ms 10ms 2ms', '20ms 20ms 3ms'), 1)
+    bounds = found['response time, any policy'].details
+    # One job of the other may end late and the next follow at once: 2 + 2 * 3, and 3 + 2 * 2.
+    assert bounds['/n0: /n0:t']['response_bound_ns'] == 8 * MS
+    assert bounds['/n1: /n1:t']['response_bound_ns'] == 7 * MS
+
+
+@pytest.mark.parametrize(('right', 'wrong', 'reason'), [
+    ('name: x,', 'name: x, group: g,', '/n:x is in a callback group'),
+    ('name: x,', 'name: x, holds_interpreter: true,', '/n:x computes in Python'),
+    ('name: x,', 'name: x, holds_interpreter: false,', None),
+    ('name: t, timer: 100ms,', 'name: t, subscription: /o, period: 100ms, '
+     'release_from: header_stamp,', 'released from header_stamp'),
+    ('deadline: 50ms', 'deadline: 99ms', None),
+    ('name: t,', 'name: t, max_active_jobs: 1,', None),
+])
+def test_assumptions(right: str, wrong: str, reason: str | None) -> None:
+    text = FORK.replace('deadline: 3ms', 'deadline: 45ms')
+    found = verdicts(text.replace(right, wrong), 2)
+    for verdict in found.values():
+        if reason is not None and verdict.kind == 'sufficient':
+            assert verdict.verdict == NOTHING
+            assert reason in verdict.reason
+    if reason is None:
+        assert found['response time, any policy'].verdict == HOLDS
+
+
+def test_a_bound_on_open_jobs_that_could_end_one() -> None:
+    text = FORK.replace('deadline: 3ms', 'deadline: 240ms').replace(
+        'deadline: 50ms', 'deadline: 250ms').replace('name: t,', 'name: t, max_active_jobs: 2,')
+    assert 'max_active_jobs of DAG /n' in verdicts(text, 2)['response time, any policy'].reason
+    text = text.replace('max_active_jobs: 2', 'max_active_jobs: 3')
+    assert verdicts(text, 2)['response time, any policy'].verdict == HOLDS
+
+
+def test_deadlines_of_very_many_periods_take_no_time() -> None:
+    found = verdicts(timers('1ms 1000s 0.2ms', '1s 1000s 1ms'), 2)
+    assert found['utilisation'].verdict == HOLDS
+
+
+def test_a_long_callback_that_has_begun_is_part_of_the_bound() -> None:
+    # 2 ms of its own, 4 ms of a job of the other with an earlier RAD, 4 ms of one with a later.
+    tasks = tasks_of(loads(timers('100ms 50ms 2ms', '1s 1s 4ms')))
+    assert [bound.response for bound in rad(tasks, 1)] == [10 * MS, 6 * MS]
+    # On two workers both of these go on beside each other, and each callback of a chain waits.
+    wide = tasks_of(loads(WIDE.replace('10ms, publishes', '100ms, publishes').replace(
+        'deadline: 10ms', 'deadline: 50ms')
+        + timers('1s 1s 4ms', '1s 1s 2ms').partition('nodes:\n')[2].replace('/n', '/m')))
+    first = rad(wide, 2)[0]
+    # To x: 4 + (5 + urgent 4 + 2 + the lesser of 2 * (4 + 2) and what there is, 6 more) / 2.
+    assert first.response == (4 + (5 + 6 + 6) / 2) * MS
+
+
+def test_without_preemption_less_is_proven() -> None:
+    text = timers('100ms 5.999ms 2ms', '100ms 100ms 4ms')
+    times, late = [[2 * MS], [4 * MS]], [100, 0]  # ns after the blocking one
+    assert missed(loads(text), times, 'rad', False, 1, late)
+    assert verdicts(text, 1)['response time, RAD without preemption'].verdict == NOTHING
+    assert not missed(loads(text), times, 'rad', True, 1, late)
+
+
+def test_jobs_before_and_after() -> None:
+    task, = tasks_of(loads(timers('10ms 25ms 4ms')))
+    # Earlier: 15 and 5 ms into the window, later: 2 ms of it are left, for 2 workers.
+    assert own_jobs(task, 12 * MS, 2) == (4 + 4 + 4) * MS
+    assert own_jobs(task, 11 * MS, 2) == (4 + 4 + 2) * MS
+    assert own_jobs(task, 10 * MS, 2) == (4 + 4) * MS
+
+
+def test_urgent_work() -> None:
+    task, = tasks_of(loads(timers('10ms 25ms 4ms')))
+    assert urgent(task, 25 * MS) == 12 * MS
+    assert urgent(task, 22 * MS) == (4 + 4 + 2) * MS
+    assert urgent(task, 3 * MS) == 3 * MS
+    # RADs 25, 15, 5 ms of this job and of those before; 35 ms of the next one.
+    assert own_urgent(task, 25 * MS) == 12 * MS
+    assert own_urgent(task, 35 * MS) == 16 * MS
+    assert own_urgent(task, 24 * MS) == 8 * MS
+
+
+@pytest.mark.parametrize('budget', ['max', 'mean'])
+def test_all_that_is_missing_is_counted(budget: str) -> None:
+    text = WIDE.replace(', execution_time: 3ms', '').replace(', execution_time: 5ms', '')
+    with pytest.raises(AnalysisError, match=r'g:6: /n:x \(and 1 more callback\) declares no'):
+        analyse(loads(text, 'g'), 2, budget)
+
+
+def test_words_and_assumptions() -> None:
+    for verdict in analyse(loads(WIDE), 2).verdicts:
+        assert verdict.verdict in (HOLDS, FAILS, NOTHING)
+        assert verdict.kind == 'necessary' or verdict.verdict != FAILS
+        assert verdict.name and verdict.assumption and verdict.figure and verdict.reason

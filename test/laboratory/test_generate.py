@@ -1,0 +1,162 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Random task sets are declarations, and are what was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hypothesis import given, settings
+import hypothesis.strategies as st
+from mddag_executor.laboratory.generate import generate
+from mddag_executor.laboratory.generate_options import BASES, GenerateError, METHODS, Options
+from mddag_executor.laboratory.shapes import draw_shape, MOST_COPIES
+from mddag_executor.laboratory.shares import Dice
+from msg_graph import loads, TaskSet
+from msg_graph.model import load_of, mean_execution_times, path_lengths
+import pytest
+
+
+def pairs(low: int, high: int) -> st.SearchStrategy[tuple[int, int]]:
+    return st.tuples(st.integers(low, high), st.integers(low, high)).map(
+        lambda pair: (min(pair), max(pair)))
+
+
+@st.composite
+def any_options(draw: st.DrawFn) -> Options:
+    dags, workers = draw(pairs(1, 5)), draw(st.integers(1, 8))
+    vertices = draw(pairs(1, 12))
+    most_per_dag = draw(st.floats(0.2, 3.0))
+    most = dags[0] * most_per_dag / workers
+    sinks = draw(pairs(1, max(1, vertices[0] - 1)))
+    return Options(
+        dags=dags, vertices=vertices, sinks=(sinks[0], draw(st.integers(sinks[1], 12))),
+        edge_probability=draw(st.floats(0.0, 1.0)),
+        or_share=draw(st.sampled_from([0.0, 0.5, 1.0])),
+        utilisation=most * draw(st.floats(0.1, 1.0)), workers=workers,
+        method=draw(st.sampled_from(METHODS)), most_per_dag=most_per_dag,
+        periods_ns=tuple(draw(st.lists(
+            st.integers(2_000, 200_000).map(lambda us: us * 1000), min_size=1, max_size=4))),
+        tightness=tuple(sorted(draw(st.tuples(st.floats(0.1, 3.0), st.floats(0.1, 3.0))))),
+        deadline_of=draw(st.sampled_from(BASES)), spread=draw(st.sampled_from([0.0, 0.3, 0.99])),
+        seed=draw(st.integers(0, 2 ** 70)))
+
+
+def made(options: Options) -> tuple[str, TaskSet] | None:
+    """Return a task set; None where UUniFast does not find one, as it says."""
+    try:
+        text = generate(options, 3)
+    except GenerateError as error:
+        assert options.method == 'uunifast' or 'less than 1 us' in str(error)
+        return None
+    return text, loads(text, 'random.yaml')
+
+
+@settings(max_examples=150)
+@given(options=any_options())
+def test_every_task_set_is_what_was_asked_for(options: Options) -> None:
+    found = made(options)
+    if found is None:
+        return
+    text, task_set = found
+    assert generate(options, 3) == text
+    assert task_set.workers == options.workers
+    assert options.dags[0] <= len(task_set.dags) <= options.dags[1]
+    each = [load_of(dag) or 0.0 for dag in task_set.dags]
+    rounding = sum(1 / dag.period_ns for dag in task_set.dags)  # a DAG's time is in whole ns
+    assert sum(each) == pytest.approx(options.utilisation * options.workers, abs=rounding)
+    assert max(each) <= options.most_per_dag + rounding
+    for dag in task_set.dags:
+        assert dag.period_ns in options.periods_ns
+        callbacks = {vertex.callback.key for vertex in dag.vertices}
+        sinks = {dag.vertices[sink].callback.key for sink in dag.sinks}
+        assert options.vertices[0] <= len(callbacks) <= options.vertices[1]
+        assert options.sinks[0] <= len(sinks) <= max(1, min(options.sinks[1], len(callbacks) - 1))
+        if options.or_share == 0.0:
+            assert len(callbacks) == len(dag.vertices)
+        lengths = path_lengths(dag, mean_execution_times(dag) or [])
+        for sink in dag.sinks:
+            key = dag.vertices[sink].callback.key
+            longest = max(lengths[i] for i in dag.sinks if dag.vertices[i].callback.key == key)
+            base = dag.period_ns if options.deadline_of == 'period' else longest
+            low, high = (base * factor for factor in options.tightness)
+            deadline = dag.vertices[sink].deadline_ns or 0
+            off = 1000 + high * 1e-6 + len(dag.vertices)
+            assert low - off <= deadline <= high + off or deadline == 1000
+
+
+@settings(max_examples=60)
+@given(count=st.integers(1, 40), part=st.floats(0, 1), edges=st.floats(0, 1), ors=st.floats(0, 1),
+       seed=st.integers(0, 10 ** 6))
+def test_shapes(count: int, part: float, edges: float, ors: float, seed: int) -> None:
+    sinks = 1 + round(part * max(0, count - 2))
+    shape = draw_shape(Dice(str(seed)), count, sinks, edges, ors)
+    leads_on = {before for each in shape.predecessors for before in each}
+    assert [place for place in range(count) if place not in leads_on] == list(
+        range(count - sinks, count))
+    assert [place for place in range(count) if not shape.predecessors[place]] == [0]
+    assert all(before < place for place in range(count) for before in shape.predecessors[place])
+    assert max(shape.copies) <= MOST_COPIES
+
+
+def test_edge_probability() -> None:
+    """Without edges the graph is a tree, with all of them it is complete."""
+    tree = loads(generate(Options(edge_probability=0.0, vertices=(10, 10), sinks=(3, 3))))
+    assert all(len(dag.edges) <= 9 + 6 for dag in tree.dags)
+    full = loads(generate(Options(edge_probability=1.0, vertices=(10, 10), sinks=(3, 3))))
+    assert all(len(dag.edges) == 7 * 6 / 2 + 7 * 3 for dag in full.dags)
+
+
+def test_joins() -> None:
+    base = Options(edge_probability=0.5, vertices=(8, 8), dags=(6, 6))
+    joined = loads(generate(base))
+    assert {callback.kind for callback in joined.callbacks} == {'timer', 'subscription', 'sync'}
+    apart = loads(generate(replace(base, or_share=1.0)))
+    assert sum(len(dag.vertices) for dag in apart.dags) > len(apart.callbacks)
+
+
+def test_several_deadlines_of_a_dag() -> None:
+    task_set = loads(generate(Options(sinks=(4, 4), vertices=(10, 15), tightness=(0.2, 1.0))))
+    assert all(len({dag.vertices[sink].deadline_ns for sink in dag.sinks}) > 1
+               for dag in task_set.dags)
+
+
+def test_spread() -> None:
+    task_set = loads(generate(Options(spread=0.5)))
+    for callback in task_set.callbacks:
+        time = callback.execution_time
+        assert time is not None
+        low, high = time.quantiles_ns
+        assert (high - low) / 2 == pytest.approx(0.5 * time.mean_ns, abs=2)
+
+
+def test_seed_and_number_count() -> None:
+    texts = {generate(Options(seed=seed), number) for seed in range(4) for number in range(4)}
+    assert len(texts) == 16
+
+
+@pytest.mark.parametrize(('change', 'problem'), [
+    ({'sinks': (9, 9), 'vertices': (9, 9)}, '--sinks 9: a DAG of 9 vertices has at most 8: '),
+    ({'sinks': (2, 2), 'vertices': (1, 9)}, '--sinks 2: a DAG of 1 vertex has at most 1: '),
+    ({'dags': (0, 3)}, '--dags 0: it is out of range: give from 1 to 1000'),
+    ({'dags': (5, 3)}, '--dags 5:3: the first is larger: write the smaller one first'),
+    ({'vertices': (1, 10 ** 9)}, '--vertices 1e+09: it is out of range: '),
+    ({'tightness': (0.0, 1.0)}, '--tightness 0: it is out of range: give above 0 to 1000'),
+    ({'tightness': (1.0, float('nan'))}, '--tightness nan: it is out of range: '),
+    ({'edge_probability': 1.5}, '--edge-probability 1.5: it is out of range: give from 0 to 1'),
+    ({'or_share': -0.1}, '--or-share -0.1: it is out of range: '),
+    ({'spread': 1.0}, '--spread 1: it is out of range: give from 0 to 0.99'),
+    ({'utilisation': 0.0}, '--utilisation 0: it is out of range: give above 0 to 100'),
+    ({'utilisation': 0.9, 'dags': (3, 3)},
+     '--utilisation 0.9: a load of 3.6 does not fit into 3 DAGs of at most 1 '),
+    ({'utilisation': 1e-6}, '--utilisation 1e-06: it leaves a callback less than 1 us: give more'),
+    ({'method': 'fair'}, "--method 'fair': choose one of dirichlet, uunifast"),
+    ({'deadline_of': 'x'}, "--deadline-of 'x': choose one of period, path"),
+    ({'periods_ns': ()}, '--periods: there is none: give some, as 10ms,20ms'),
+    ({'periods_ns': (5,)}, '--periods 5: it is out of range: '),
+    ({'workers': 0}, '--workers 0: it is out of range: '),
+])
+def test_impossible(change: dict[str, object], problem: str) -> None:
+    with pytest.raises(GenerateError) as caught:
+        generate(replace(Options(), **change))  # type: ignore[arg-type]
+    assert str(caught.value).startswith(problem)
