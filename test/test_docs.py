@@ -93,7 +93,7 @@ def known_options(words: list[str]) -> tuple[str, set[str]]:
             with contextlib.redirect_stdout(out):
                 program.run([*verbs[:count], '--help'])
         except SystemExit:
-            if count == 1 and len(verbs) == 2 and 'VERB ...' in out.getvalue():
+            if count == 1 and len(verbs) == 2 and 'VERB …' in out.getvalue():
                 break
             return out.getvalue(), set(re.findall(r'(?<![\w-])--?[a-z][\w-]*', out.getvalue()))
         except UsageError:
@@ -117,16 +117,7 @@ def test_commands_and_options_exist(page: str, line: str) -> None:
 
 def test_every_verb_is_on_the_page_of_commands() -> None:
     text = (TOP / 'docs' / 'commands.md').read_text(encoding='utf-8')
-    verbs = set(program.VERBS) - {'graph', 'import'}
-    help_of_graph, _ = known_options(['graph', 'check'])
-    assert 'mddag graph check' in help_of_graph
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out), pytest.raises(SystemExit):
-        program.run(['graph', '--help'])
-    verbs |= {f'graph {name}' for name in re.findall(r'^    ([a-z-]+)\b', out.getvalue(),
-                                                     re.MULTILINE)}
-    assert {'graph assign-deadlines'} <= verbs
-    assert not [verb for verb in verbs if not re.search(rf'`mddag {verb}[ `]', text)]
+    assert not [verb for verb in program.VERBS if not re.search(rf'`mddag {verb}[ `]', text)]
 
 
 # --- the site ------------------------------------------------------------------------------------

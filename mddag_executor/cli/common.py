@@ -12,7 +12,7 @@ starts, so a mistyped path costs nothing.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import json
 import os
@@ -23,7 +23,9 @@ import sys
 import tempfile
 from typing import Any, BinaryIO, cast, TYPE_CHECKING, TypeVar
 
+from mddag_executor import __version__
 from mddag_executor.cli.options import Input, NamedFile, Output, Report
+from mddag_executor.cli.text import is_quiet, Progress
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.output_rules import check_distinct, check_replaced
 from mddag_executor.resources import find
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
     from msg_graph import TaskSet
 
 R = TypeVar('R', bound='str | Traces')
+FORMAT = 2
+"""Version of the results for machines; a change of the meaning of a key raises it."""
 STDIN = '<stdin>'
 _MCAP = b'\x89MCAP'
 MOST_BYTES = 64 << 20
@@ -328,7 +332,6 @@ def write_report(path: str, data: Callable[[], ReportData]) -> None:
 
     :param data: makes what it is about, when it is needed
     """
-    from mddag_executor.cli.text import Progress
     from mddag_executor.report.html import write
     with Progress('making the report') as line:
         line.update(0)
@@ -336,14 +339,18 @@ def write_report(path: str, data: Callable[[], ReportData]) -> None:
             write(file, data())
 
 
-def write_result(args: argparse.Namespace, result: Any) -> bool:
-    """Write a result where `--json` says; return whether tables are to be shown as well."""
+def write_result(args: argparse.Namespace, result: Mapping[str, Any]) -> bool:
+    """
+    Write a result where `--json` says; return whether tables are to be shown as well.
+
+    :param result: gets the version of the program and of the results' format
+    """
     if args.json is not None:
-        write_json(args.json, result)
+        write_json(args.json, {'mddag': __version__, 'format': FORMAT, **result})
     return wants_tables(args)
 
 
-def show(args: argparse.Namespace, result: Any, lines: Iterable[str]) -> None:
+def show(args: argparse.Namespace, result: Mapping[str, Any], lines: Iterable[str]) -> None:
     """Write a result where `--json` says, and print its lines for people if those are wanted."""
     if write_result(args, result):
         for line in lines:
@@ -352,4 +359,5 @@ def show(args: argparse.Namespace, result: Any, lines: Iterable[str]) -> None:
 
 def wants_tables(args: argparse.Namespace) -> bool:
     """Return whether standard output is for people, and not taken by a result."""
-    return not any(isinstance(each, Output) and each == '-' for _, each in _files(args))
+    return not is_quiet() and not any(
+        isinstance(each, Output) and each == '-' for _, each in _files(args))

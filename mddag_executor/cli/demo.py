@@ -3,11 +3,10 @@
 """
 The verb `demo`: the whole Autoware workload, run, recorded, replayed and compared.
 
-Theory of operation: each step is a process of its own, one after the other, so that none has
-another's threads, caches or nodes beside it: `mddag run --synthetic sleep`, which records; two
-times `mddag replay`; and rclpy's own MultiThreadedExecutor with the same nodes, seed and number of
-threads.  Both executors are measured by the nodes themselves, in the same way
-(`mddag_executor.hosting.measure`), so the figures side by side mean the same.
+Each step runs in a process of its own, without the threads, caches or nodes of another step:
+`mddag run --synthetic sleep`, which records; two times `mddag replay`; and rclpy's own
+MultiThreadedExecutor with the same nodes, seed and number of threads.  The nodes measure both
+executors in the same way (`mddag_executor.hosting.measure`).
 
 With `--processes N` callbacks compute in Python, in N processes.  The steps are `graph place`;
 `run --synthetic spin` of what that wrote, which records; `replay` of all traces; and rclpy's
@@ -44,14 +43,14 @@ from mddag_executor.resources import find
 from mddag_executor.text import counted
 
 EXAMPLE = """\
-mddag demo --seconds 20 --utilisation 0.6
+mddag demo --duration 20s
 mddag demo --processes 2"""
 
 WORKERS = defaults.WORKERS
 UTILISATION = 0.6
 UTILISATION_EACH = 0.1
 """Of seven workers, with `--processes`: 0.7 of a core for each."""
-DEFAULT_SEED = 0
+SEED = 0
 """The first seed; at utilisation 0.6 its draw is feasible (`ExecutionPlan.infeasible`)."""
 
 
@@ -62,18 +61,13 @@ class DemoError(MddagError):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('--seconds', type=options.positive_float, default=20.0, metavar='S',
-        help='how long to measure this executor (default: 20)')
-    add('--baseline-seconds', type=options.positive_float, default=10.0, metavar='S',
-        help="how long to measure rclpy's MultiThreadedExecutor (default: 10)")
-    add('--utilisation', type=options.positive_float, metavar='U',
-        help='normalised utilisation that the execution times are scaled to (default: 0.6, with '
-        '--processes 0.1 for each)')
+    add('--duration', type=options.duration, default=20 * 10 ** 9, metavar='TIME',
+        help="how long to measure this executor (default: 20s), and half of it rclpy's")
+    options.add(parser, '--utilisation', otherwise='0.6, with --processes 0.1 for each')
     add('--processes', type=options.positive_int, metavar='N',
-        help='let callbacks compute in Python, place the nodes in N processes, run them, and '
-        'replay their recordings as one run')
-    options.add_seed(parser, 'seed of the drawn execution times', int, DEFAULT_SEED)
-    add('--output', default='build/demo', metavar='DIR',
+        help='callbacks compute in Python: place the nodes in N processes, run them, and replay '
+        'their recordings as one run')
+    add('-o', '--output', default='build/demo', metavar='DIR',
         help='where trace and results are written (default: build/demo)')
     options.add(parser, '--json')
 
@@ -109,7 +103,7 @@ def _in_one_process(
     for line in causes_line(recorded['misses']):
         say(f'{line} (mddag explain {output / "demo.mcap"})')
     say(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), "
-        f'{args.baseline_seconds:g} s ==')
+        f'{_half(args):g} s ==')
     baseline = _peer(args, graph, 'multi', args.utilisation)
     say(side_by_side(live['measured'], baseline))
     return {'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': baseline,
@@ -121,7 +115,7 @@ def _in_several(
 ) -> dict[str, Any]:
     """Run the steps of `--processes`, say what each found, and return all of it."""
     utilisation = args.utilisation or UTILISATION_EACH * args.processes
-    load = ['--utilisation', str(utilisation), '--seed', str(args.seed),
+    load = ['--utilisation', str(utilisation), '--seed', str(SEED),
             '--workers', str(WORKERS)]
     placed = output / 'placed.yaml'
     say(f'{graph}: callbacks compute in Python, {utilisation * WORKERS:.2f} cores in all')
@@ -133,11 +127,12 @@ def _in_several(
         say(f'{process["name"]}: {counted(len(process["nodes"]), "node")}, {share:.2f} of a core')
     say(f'predicted: {verdicts_line(placement["predicted"])}')
     say(f'predicted of one process: {verdicts_line(placement["one_process"])}')
-    say(f'\n== Under MultiDeadlineExecutor({WORKERS}) each, recording, {args.seconds:g} s ==')
+    say(f'\n== Under MultiDeadlineExecutor({WORKERS}) each, recording, '
+        f'{args.duration / 1e9:g} s ==')
     live = json_of(mddag(
-        'run', str(placed), '--synthetic', 'spin', *load, '--duration', f'{args.seconds:.3f}s',
+        'run', str(placed), '--synthetic', 'spin', *load, '--duration', f'{args.duration}ns',
         '--trace', str(output / 'demo.mcap'), '--overwrite', '--json', '-'), 'running',
-        args.seconds + 3)
+        args.duration / 1e9 + 3)
     say(sink_table(live['dags']))
     for line in summary(live):
         say(line)
@@ -147,13 +142,13 @@ def _in_several(
     say(beside(('median', 'p99'), predicted=placement['predicted'], live=live['dags'],
                replayed=recorded['dags']))
     say(f'mddag replay {" ".join(traces)} --report {output / "demo.html"}')
-    say(f'\n== Side by side, {args.baseline_seconds:g} s each ==')
+    say(f'\n== Side by side, {_half(args):g} s each ==')
     runs = []
     for what, path in ((f'{args.processes} processes', placed), ('one process', graph)):
         ours = json_of(mddag(
             'run', str(path), '--synthetic', 'spin', *load, '--duration',
-            f'{args.baseline_seconds:.3f}s', '--diagnostics', 'off', '--json', '-'),
-            'measuring', args.baseline_seconds + 3, quiet=True)
+            f'{_half(args):.3f}s', '--diagnostics', 'off', '--json', '-'),
+            'measuring', _half(args) + 3, quiet=True)
         runs += [(what, 'rad', measured(ours)),
                  (what, 'events', _peer(args, path, 'events', utilisation))]
     say(table(['', 'executor', 'due', 'in time', 'share'], [
@@ -165,14 +160,20 @@ def _in_several(
                          for what, executor, run in runs]}
 
 
+def _half(args: argparse.Namespace) -> float:
+    """Return how long a baseline is measured, s."""
+    seconds: float = args.duration / 2e9
+    return seconds
+
+
 def _peer(
     args: argparse.Namespace, graph: Path, executor: str, utilisation: float
 ) -> dict[str, Any]:
     """Run the same nodes on an executor of rclpy; return what they measured."""
     from mddag_executor.hosting.peers import measure_peer
-    with Progress('measuring', args.baseline_seconds + 3) as progress:
+    with Progress('measuring', _half(args) + 3) as progress:
         return measure_peer(
-            executor, str(graph), WORKERS, seconds=args.baseline_seconds, seed=args.seed,
+            executor, str(graph), WORKERS, seconds=_half(args), seed=SEED,
             utilisation=utilisation, mode='sleep' if args.processes is None else 'spin',
             tick=progress.update)
 
@@ -181,12 +182,12 @@ def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
     from mddag_executor.hosting.measure import ExecutionPlan
     from msg_graph import load
     task_set = load(graph)
-    plan = ExecutionPlan(task_set, args.seed, args.utilisation, WORKERS)
+    plan = ExecutionPlan(task_set, SEED, args.utilisation, WORKERS)
     nodes = {callback.node for callback in task_set.callbacks}
     yield (f'{printable(task_set.file)}: {counted(len(task_set.dags), "DAG")}, '
            f'{counted(len(task_set.vertices), "vertex", "vertices")}, '
            f'{counted(len(nodes), "node")}')
-    yield (f'Execution times: one draw from the measured distributions (seed {args.seed}), scaled '
+    yield (f'Execution times: one draw from the measured distributions (seed {SEED}), scaled '
            f'by {plan.factor:.2f} to utilisation {plan.utilisation:.2f} of {WORKERS} workers. '
            'Another seed gives another draw.')
     infeasible = plan.infeasible()
@@ -196,17 +197,16 @@ def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
     else:
         yield 'No critical path is longer than its deadline.'
     yield (f'\n== rclpy nodes under MultiDeadlineExecutor({WORKERS}), policy rad, recording, '
-           f'{args.seconds:g} s ==')
+           f'{args.duration / 1e9:g} s ==')
 
 
 def run_live(args: argparse.Namespace, graph: Path, output: Path) -> dict[str, Any]:
     """Run the workload under the executor, recording; return the result of `mddag run`."""
-    seconds = args.seconds
     command = [
         'run', str(graph), '--synthetic', 'sleep', '--utilisation', str(args.utilisation),
-        '--seed', str(args.seed), '--workers', str(WORKERS), '--duration', f'{seconds:.3f}s',
+        '--seed', str(SEED), '--workers', str(WORKERS), '--duration', f'{args.duration}ns',
         '--trace', str(output / 'demo.mcap'), '--overwrite', '--json', '-']
-    result = json_of(mddag(*command), 'running', seconds + 3)
+    result = json_of(mddag(*command), 'running', args.duration / 1e9 + 3)
     measured(result)
     return result
 
@@ -280,7 +280,7 @@ def beside(which: Sequence[str], **several: dict[str, Any]) -> str:
 
 
 def agreement(live: dict[str, Any], recorded: dict[str, Any]) -> str:
-    """Say for how many sinks the replayer counts what the executor counted."""
+    """Return for how many sinks the replay counts what the executor counted."""
     wrong = []
     n = 0
     for dag, _, name, _, ours in each_sink(live['dags']):

@@ -18,7 +18,7 @@ import os
 from pathlib import Path, PurePath
 
 from mddag_executor.cli import common, options, recorded
-from mddag_executor.cli.text import printable, warn
+from mddag_executor.cli.text import printable, say, warn
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.output_rules import check_results, remove_results
 
@@ -80,7 +80,7 @@ def main(args: argparse.Namespace) -> int:
                 write(form, file, replay, args.rows or 'executions')
     warn(*outcome.warnings)
     if args.output != '-':
-        print(f'exported: {printable(args.output)}')
+        say(f'exported: {printable(args.output)}')
     return 0
 
 

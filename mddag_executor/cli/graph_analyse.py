@@ -15,7 +15,6 @@ from mddag_executor.text import counted
 if TYPE_CHECKING:
     from mddag_executor.laboratory.analyse import Analysis
 
-HELP = 'test whether the deadlines can hold, before the first run'
 EXAMPLE = """\
 mddag graph analyse config/autoware.yaml --budget p99
 mddag graph analyse config/autoware.yaml --workers 4 --json -

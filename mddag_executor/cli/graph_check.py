@@ -21,7 +21,6 @@ from mddag_executor.text import counted, listed
 if TYPE_CHECKING:
     from msg_graph import Dag, TaskSet
 
-HELP = 'validate a declaration and show its DAGs'
 EXAMPLE = """\
 mddag graph check config/autoware.yaml
 mddag graph check config/autoware.yaml --json -

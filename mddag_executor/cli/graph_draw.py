@@ -12,7 +12,6 @@ from mddag_executor.cli import common, options
 from mddag_executor.cli.text import one_line, run_program
 from mddag_executor.errors import InputError, UsageError
 
-HELP = 'draw the DAGs of a declaration (SVG, PNG, PDF, DOT, Mermaid)'
 EXAMPLE = """\
 mddag graph draw config/autoware.yaml -o autoware.svg
 mddag graph draw config/autoware.yaml -o autoware.mmd

@@ -13,7 +13,6 @@ from mddag_executor.cli.text import warn
 if TYPE_CHECKING:
     from msg_graph.draft import Draft
 
-HELP = 'make a declaration to fill in from a CARET architecture file'
 EXAMPLE = """\
 mddag graph from-caret architecture.yaml -o graph.yaml
 mddag graph from-caret architecture.yaml --trace ~/.ros/tracing/session-20261121 -o graph.yaml

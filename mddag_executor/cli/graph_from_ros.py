@@ -10,10 +10,9 @@ from mddag_executor.cli import options
 from mddag_executor.cli.text import Progress, warn
 from mddag_executor.errors import InputError
 
-HELP = 'make a declaration to fill in from the nodes that run now'
 EXAMPLE = """\
 mddag graph from-ros -o graph.yaml
-mddag graph from-ros --timeout 10 -o graph.yaml
+mddag graph from-ros --timeout 10s -o graph.yaml
 """
 DESCRIPTION = """\
 Make a declaration from the nodes that run now in this ROS domain: their subscriptions, services
@@ -28,9 +27,14 @@ out."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument(
-        '--timeout', type=options.positive_float, default=5.0, metavar='SECONDS',
-        help='how long to look and to measure rates (default: 5)')
+        '--timeout', type=_seconds, default=5.0, metavar='TIME',
+        help='how long to listen and to measure rates, for instance 10s (default: 5s)')
     options.add(parser, '--output')
+
+
+def _seconds(text: str) -> float:
+    """Return the seconds of a time; a plain number is seconds, too."""
+    return options.duration(text if text[-1:].isalpha() else f'{text}s') / 1e9
 
 
 def main(args: argparse.Namespace) -> int:

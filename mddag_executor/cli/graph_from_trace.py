@@ -9,7 +9,6 @@ import argparse
 from mddag_executor.cli import options
 from mddag_executor.errors import InputError
 
-HELP = 'make a declaration to fill in from a recorded run'
 EXAMPLE = """\
 mddag graph from-trace run.mcap -o graph.yaml
 mddag graph from-trace run.mcap --accept -o graph.yaml

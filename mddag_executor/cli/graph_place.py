@@ -11,7 +11,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import Cell, one_line, printable, Progress, table
+from mddag_executor.cli.text import Cell, is_quiet, one_line, Progress, table
 from mddag_executor.errors import UsageError
 from mddag_executor.text import counted
 
@@ -20,19 +20,15 @@ if TYPE_CHECKING:
     from mddag_executor.laboratory.prediction import Predictor
     from msg_graph import Process, TaskSet
 
-HELP = 'say which node is to run in which process, so that the deadlines hold'
 EXAMPLE = """\
 mddag graph place config/autoware.yaml --processes 2 --cpus 2 --utilisation 0.2 -o placed.yaml
 mddag graph place graph.yaml --processes 3 --trace run.mcap --apart /lidar,/camera -o placed.yaml
 mddag run placed.yaml --node my_robot/lidar --node my_robot/camera --node my_robot/control"""
 DESCRIPTION = """\
-Pack the nodes of a declaration into processes by the time that they need the interpreter of
+Pack the nodes of a declaration into processes by the time for which they need the interpreter of
 Python, and improve that by simulation with the rules of the scheduler: each process computes in
-one callback at a time, and all share the CPUs. The result is the declaration with `processes:`,
-which `mddag run` goes by."""
-
-_DRAWS = 10
-_MOST_FACTOR = 4.0
+one callback at a time, and all share the CPUs. The result is the declaration with `processes:`, as
+`mddag run` reads it."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -86,12 +82,10 @@ def main(args: argparse.Namespace) -> int:
             'policy': args.policy, 'tried': tried,
             **{name: _predicted(args, task_set, cpus, predictor, where, times)
                for name, where in (('predicted', processes),
-                                   ('one_process', (Process('all', tuple(placing.nodes)),)))},
-            'factor': _factor(predictor, processes, times),
-            'draws': _draws(args, task_set, workers, predictor, processes)}
+                                   ('one_process', (Process('all', tuple(placing.nodes)),)))}}
     common.write_text(args.output, with_processes(task_set, processes).text)
     common.write_result(args, result)
-    if args.json != '-':
+    if args.json != '-' and not is_quiet():
         stream = sys.stderr if args.output == '-' else sys.stdout
         for text in _lines(result):
             print(text, file=stream)
@@ -158,41 +152,9 @@ def _loads(placing: Placing, place: dict[int, int], processes: Sequence[Process]
     return [loads[place[placing.block_of(process.nodes[0])]] for process in processes]
 
 
-def _factor(
-    predictor: Predictor, processes: Sequence[Process], times: list[list[int]]
-) -> float | None:
-    """Return by how much all execution times may grow; None: deadlines are missed already."""
-    def holds(factor: float) -> bool:
-        return not predictor.predict(
-            processes, [[round(ns * factor) for ns in row] for row in times]).missed
-
-    low, high = 1.0, _MOST_FACTOR
-    if not holds(low):
-        return None
-    if holds(high):
-        return high
-    while high - low > 0.02:
-        middle = (low + high) / 2
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return round(low, 2)
-
-
-def _draws(
-    args: argparse.Namespace, task_set: TaskSet, workers: int, predictor: Predictor,
-    processes: Sequence[Process],
-) -> list[float]:
-    """Return the share in time of other draws of execution times; none of a recorded run."""
-    from mddag_executor.core.tally import total
-    found = []
-    for seed in range(args.seed + 1, args.seed + 1 + _DRAWS) if not args.trace else ():
-        times = _drawn(args, task_set, workers, seed)
-        verdicts = total(predictor.predict(processes, times).result()['dags'])
-        found.append(verdicts.in_time / verdicts.due if verdicts.due else 1.0)
-    return found
-
-
 def _lines(result: dict[str, Any]) -> Iterator[str]:
     """Yield the lines about a placement."""
+    from mddag_executor.core.tally import total
     from mddag_executor.report.tables import sink_table, verdicts_line
     rows: list[list[Cell]] = [
         [process['name'], len(process['nodes']), f'{load:.2f}',
@@ -204,18 +166,8 @@ def _lines(result: dict[str, Any]) -> Iterator[str]:
     yield (f'predicted with {counted(result["cpus"], "CPU")}: '
            f'{verdicts_line(result["predicted"])}')
     yield f'in one process: {verdicts_line(result["one_process"])}'
-    factor = result['factor']
-    if factor is None:
+    if total(result['predicted']).missed:
         yield ('The deadlines do not hold: '
                f'{counted(result["tried"], "placement")} were simulated, and this is the best.')
-    else:
-        more = 'at least ' if factor >= _MOST_FACTOR else ''
-        yield f'They hold until all execution times are {more}{factor:g} times as long.'
-    draws = result['draws']
-    if draws:
-        yield printable(
-            f'With {len(draws)} other draws of the execution times '
-            f'{100 * min(draws):.1f} to {100 * max(draws):.1f} % are in time, and in '
-            f'{sum(share == 1.0 for share in draws)} of them all.')
-    yield ('This counts what callbacks and messages take, not other programs on the CPUs, nor '
+    yield ('The prediction has what callbacks and messages cost, no other load of the CPUs and no '
            'waiting of nodes for each other.')

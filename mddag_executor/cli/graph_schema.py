@@ -8,7 +8,6 @@ import argparse
 
 from mddag_executor.cli import common, options
 
-HELP = 'print the JSON Schema of declarations, for editors'
 EXAMPLE = """\
 mddag graph schema -o mddag.schema.json
 """

@@ -7,10 +7,9 @@ from __future__ import annotations
 import argparse
 
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import printable, Progress, warn
+from mddag_executor.cli.text import printable, Progress, say, warn
 from mddag_executor.text import counted
 
-HELP = 'import a session that LTTng recorded'
 DESCRIPTION = """\
 Turn a session that LTTng recorded (CARET, ros2_tracing), all its processes and events, into a
 trace. It is read with the Python bindings of babeltrace2 (apt install python3-bt2), in whichever
@@ -37,10 +36,10 @@ def main(args: argparse.Namespace) -> int:
         imported = import_ctf(
             args.session, path, progress=lambda events: line.update(events, 'events'))
     warn(*imported.warnings)
-    print(f'{counted(imported.events, "event")} of {counted(imported.kinds, "kind")} from '
+    say(f'{counted(imported.events, "event")} of {counted(imported.kinds, "kind")} from '
           f'{counted(len(imported.processes), "process", "processes")}: {printable(args.output)}')
     if imported.unread:
         named = ', '.join(f'{printable(provider)} ({count})'
                           for provider, count in imported.unread.most_common())
-        print(f'replay does not use the events of these providers: {named}')
+        say(f'replay does not use the events of these providers: {named}')
     return 0

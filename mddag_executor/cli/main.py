@@ -4,11 +4,10 @@
 Entry point of `mddag`: find the verb, run it, turn errors into one line and an exit status.
 
 Theory of operation: the table of verbs below holds the one-line helps, so that `mddag --help`
-imports nothing but argparse; the module of a verb is imported when that verb is named first on the
-command line, and only then. Options and files follow the verb, in any order (`parsing.py`).
-Whatever the user can cause comes up as an exception of a known tree and leaves as one line
-`error: PLACE: what is wrong: what to do`, several errors of a declaration as one line each. The
-exit status is
+imports no verb; the module of a verb is imported when that verb is named, and only then. Options
+and files follow the verb, in any order (`parsing.py`). Whatever the user can cause is an exception
+of a known tree and becomes one line `error: PLACE: what is wrong: what to do`; several errors of a
+declaration are one line each. The exit status is
 
 | status | meaning |
 | --- | --- |
@@ -24,18 +23,18 @@ exit status is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 import errno
 from importlib import import_module
 import io
 import os
 import sys
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 from mddag_executor import __version__
-from mddag_executor.cli.parsing import group_parser, Parser, verb_parser
-from mddag_executor.cli.text import one_line
+from mddag_executor.cli.parsing import Parser, unknown, verb_parser
+from mddag_executor.cli.text import label, one_line, set_quiet
 from mddag_executor.errors import MddagError, UsageError, UserCodeError
 
 EXIT_BAD_INPUT = 2
@@ -44,48 +43,58 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 
 
-class Verb(NamedTuple):
-    """
-    A row of the table of verbs: its module in `mddag_executor.cli` and its one-line help.
-
-    What has verbs itself has these instead: `graph check` is the module `graph_check`.
-    """
-
-    module: str
-    summary: str
-    verbs: tuple[str, ...] = ()
-
-
-VERBS = {
-    'demo': Verb('demo', 'run the whole Autoware workload, record it and replay the recording'),
-    'run': Verb('run', 'run rclpy nodes, or nodes made from the declaration, and record them'),
-    'rerun': Verb('rerun', 'run real nodes again from a recording, in virtual time'),
-    'replay': Verb('replay', 'check a recorded run against its deadlines, or reschedule it'),
-    'explain': Verb('explain', 'say why each deadline of a recorded run was missed'),
-    'slack': Verb('slack', 'find how much longer callbacks may take before a deadline is missed'),
-    'simulate': Verb('simulate', 'run a declaration in virtual time'),
-    'evaluate': Verb('evaluate', 'measure acceptance ratios over many simulated runs'),
-    'generate': Verb('generate', 'make random multi-deadline, multi-rate DAG sets'),
-    'graph': Verb('graph', 'check, draw, derive and analyse declarations', (
-        'check', 'draw', 'schema', 'from-caret', 'from-trace', 'from-ros', 'analyse',
-        'assign-deadlines', 'place')),
-    'import': Verb('import', 'turn a CARET or ros2_tracing recording into a trace', ('ctf',)),
-    'export': Verb('export', 'turn a recording into files for Perfetto or for data frames'),
-    'diff': Verb('diff', 'compare two recorded runs sink by sink'),
-    'top': Verb('top', 'show the deadlines and workers of running executors, live'),
+# Each verb and its one-line help, by task. `graph check` is the module `graph_check`.
+TASKS = {
+    'Run': {
+        'run': 'run rclpy nodes, or nodes made from the declaration, and record them',
+        'rerun': 'run real nodes again from a recording, in virtual time',
+        'top': 'show the deadlines and workers of running executors, live',
+        'demo': 'run the whole Autoware workload, record it and replay the recording'},
+    'Judge': {
+        'replay': 'check a recorded run against its deadlines, or reschedule it',
+        'explain': 'say why each deadline of a recorded run was missed',
+        'slack': 'find how much longer callbacks may take before a deadline is missed',
+        'diff': 'compare two recorded runs sink by sink',
+        'export': 'turn a recording into files for Perfetto or for data frames',
+        'import ctf': 'turn a CARET or ros2_tracing recording (LTTng) into a trace'},
+    'Plan': {
+        'graph check': 'validate a declaration and show its DAGs',
+        'graph draw': 'draw the DAGs of a declaration (SVG, PNG, PDF, DOT, Mermaid)',
+        'graph from-trace': 'make a declaration to fill in from a recorded run',
+        'graph from-caret': 'make a declaration to fill in from a CARET architecture file',
+        'graph from-ros': 'make a declaration to fill in from the nodes that run now',
+        'graph place': 'choose the process of each node, so that the deadlines hold'},
+    'Laboratory': {
+        'simulate': 'run a declaration in virtual time',
+        'evaluate': 'measure acceptance ratios over many simulated runs',
+        'generate': 'make random multi-deadline, multi-rate DAG sets',
+        'graph analyse': 'test whether the deadlines can hold, before the first run',
+        'graph assign-deadlines': 'give the sinks deadlines, by critical path or by search'},
+    'Develop': {
+        'graph schema': 'print the JSON Schema of declarations, for editors'},
 }
+VERBS = {verb: summary for verbs in TASKS.values() for verb, summary in verbs.items()}
+_FAMILIES = {verb.split()[0] for verb in VERBS if ' ' in verb}
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
 
 
-def load(verb: Verb) -> ModuleType:
+def load(verb: str) -> ModuleType:
     """Import the module of a verb."""
-    return import_module(f'mddag_executor.cli.{verb.module}')
+    return import_module(f'mddag_executor.cli.{verb.replace(" ", "_").replace("-", "_")}')
 
 
-def load_inner(verb: Verb, name: str) -> ModuleType:
-    """Import the module of a verb of a verb."""
-    return import_module(f'mddag_executor.cli.{verb.module}_{name.replace("-", "_")}')
+def overview(family: str = '') -> str:
+    """Return the help that lists the verbs; of a family (`graph`) only its own."""
+    lines = [f'usage: mddag {family and family + " "}VERB …', '',
+             'Run ROS 2 callbacks by their deadlines, and check recorded runs offline.']
+    for task, verbs in TASKS.items():
+        shown = {verb: text for verb, text in verbs.items()
+                 if not family or verb.startswith(f'{family} ')}
+        if shown:
+            lines += ['', f'{task}:', *(f'  {verb:<23} {text}' for verb, text in shown.items())]
+    return '\n'.join((*lines, '', "'mddag VERB --help' explains a verb and shows an example. "
+                      "'mddag --version' shows the version."))
 
 
 def find_verb(argv: Sequence[str]) -> tuple[Parser, Sequence[str]]:
@@ -95,41 +104,26 @@ def find_verb(argv: Sequence[str]) -> tuple[Parser, Sequence[str]]:
     :returns: its parser and its arguments
     :raises mddag_executor.errors.UsageError: when there is no such verb
     """
-    name, rest = _first_word(program_parser, 'mddag', VERBS, argv)
-    verb = VERBS[name]
-    sentence = f'{verb.summary[:1].upper()}{verb.summary[1:]}.'
-    if not verb.verbs:
-        return verb_parser(f'mddag {name}', load(verb), sentence), rest
-    modules = dict.fromkeys(verb.verbs)
-    inner, rest = _first_word(
-        lambda: group_parser(f'mddag {name}', {each: load_inner(verb, each) for each in modules},
-                             sentence), f'mddag {name}', modules, rest)
-    module = load_inner(verb, inner)
-    return verb_parser(f'mddag {name} {inner}', module, module.DESCRIPTION), rest
-
-
-def _first_word(
-    parser: Callable[[], Parser], prog: str, verbs: Collection[str], argv: Sequence[str]
-) -> tuple[str, Sequence[str]]:
-    """Return the verb that comes first, and what follows; do what an option there says."""
-    if not argv or argv[0].startswith('-'):
-        parser().parse(argv[:1])   # shows help or version, or fails
-    if argv[0] not in verbs:
-        from msg_graph.errors import did_you_mean, shown
-        remedy = did_you_mean(argv[0], verbs, f"see '{prog} --help'")
-        raise UsageError(f'{prog}: there is no verb {shown(argv[0])}: {remedy}')
-    return argv[0], argv[1:]
-
-
-def program_parser() -> Parser:
-    """Return the parser of what stands before the verb."""
-    parser = Parser(
-        prog='mddag', allow_abbrev=False,
-        description='Run ROS 2 callbacks by their deadlines, and check recorded runs offline.',
-        epilog="'mddag VERB --help' explains a verb and shows an example.")
-    parser.add_argument('--version', action='version', version=f'mddag {__version__}')
-    parser.add_verbs({name: verb.summary for name, verb in VERBS.items()})
-    return parser
+    family = argv[0] if argv and argv[0] in _FAMILIES else ''
+    prog = f'mddag {family}'.rstrip()
+    count = 2 if family else 1
+    if len(argv) < count:
+        raise UsageError(f"{prog}: a verb is missing: see '{prog} --help'")
+    word, verb = argv[count - 1], ' '.join(argv[:count])
+    if word in ('-h', '--help'):
+        print(overview(family))
+        raise SystemExit(0)
+    if word == '--version' and not family:
+        print(f'mddag {__version__}')
+        raise SystemExit(0)
+    if word.startswith('-'):
+        raise UsageError(f'{prog}: {one_line(word)}: options of a verb follow it: '
+                         f"see '{prog} --help'")
+    if verb not in VERBS:
+        known = (each.removeprefix(f'{family} ') for each in VERBS)
+        raise unknown(prog, 'verb', word, [each for each in known if ' ' not in each]
+                      + ([] if family else sorted(_FAMILIES)))
+    return verb_parser(f'mddag {verb}', load(verb), VERBS[verb]), argv[count:]
 
 
 def run(argv: Sequence[str]) -> int:
@@ -140,6 +134,7 @@ def run(argv: Sequence[str]) -> int:
     """
     parser, rest = find_verb(argv)
     args = parser.parse(rest)
+    set_quiet(args.quiet)
     from mddag_executor.cli.common import check_files
     check_files(args)
     status = int(args.main(args))
@@ -158,6 +153,9 @@ def main(
     :param run: does what they say
     :returns: the exit status
     """
+    if '_ARGCOMPLETE' in os.environ:
+        from mddag_executor.cli.completion import complete
+        complete()
     try:
         # A name that the terminal's encoding lacks is escaped; it must not end the program.
         if isinstance(sys.stdout, io.TextIOWrapper):
@@ -179,7 +177,7 @@ def main(
         if line is None:
             return EXIT_DEFECT
         for each in filter(None, _user_lines(error, line)):
-            print(f'error: {each}', file=sys.stderr)
+            print(f'{label("error", sys.stderr)}: {each}', file=sys.stderr)
         return EXIT_BAD_INPUT if raised is error else EXIT_DEFECT
 
 
@@ -223,10 +221,10 @@ _REMEDIES: dict[type[BaseException], str] = {
 
 def known_errors() -> tuple[type[BaseException], ...]:
     """
-    Return the base classes of the errors that are the user's to mend.
+    Return the base classes of the errors that the user can correct.
 
-    That of ``msg_graph``, which stands below this package, derives from none of its own. It is
-    looked up in sys.modules: a module that was not imported cannot have raised.
+    That of ``msg_graph``, which is below this package, is found in sys.modules: a module that was
+    not imported cannot have raised.
     """
     msg_graph = sys.modules.get('msg_graph')
     return (MddagError,) if msg_graph is None else (MddagError, msg_graph.GraphError)

@@ -1,17 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""
-The parser of a verb's arguments: made from the verb's module, for options and files in any order.
-
-argparse fills every positional argument from the first group of words without an option, so that
-`replay run.mcap --reschedule graph.yaml` has no place for the last word. `Parser.parse` therefore
-parses the options first and the words between them after that, for all verbs.
-"""
+"""The parser of a verb's arguments: options and files in any order, errors as one line."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import takewhile
 from types import ModuleType
 from typing import NoReturn
@@ -25,65 +19,50 @@ _REST = ('--', '--ros-args')
 class Parser(argparse.ArgumentParser):
     """An argument parser that reports a wrong command line as a `UsageError`."""
 
-    _given: Sequence[str] = ()
-    _has_verbs = False
+    _words: Sequence[str] = ()
 
-    def parse(self, args: Sequence[str]) -> argparse.Namespace:
+    def parse(self, words: Sequence[str]) -> argparse.Namespace:
         """Parse options and other arguments, in any order up to `--`."""
-        self._given = args
-        if self._has_verbs or '--' in args:     # argparse would forget about `--`
-            return self.parse_args(args)
-        return self.parse_intermixed_args(args)
-
-    def add_verbs(self, summaries: Mapping[str, str]) -> None:
-        """Show verbs in the help; one of them has to come before any other argument."""
-        self._has_verbs = True
-        verbs = self.add_subparsers(dest='verb', metavar='VERB', required=True, title='verbs')
-        for name, summary in summaries.items():
-            verbs.add_parser(name, help=summary, add_help=False)
+        self._words = words
+        if '--' in words:     # argparse would lose it
+            return self.parse_args(words)
+        return self.parse_intermixed_args(words)
 
     def error(self, message: str) -> NoReturn:
-        """Raise instead of printing the usage over several lines and exiting."""
-        remedy = f"see '{self.prog} --help'"
-        for word in takewhile(lambda each: each not in _REST, self._given):
+        """Raise instead of printing the usage and exiting."""
+        for word in takewhile(lambda each: each not in _REST, self._words):
             name = word.partition('=')[0] if word.startswith('--') else word[:2]
             if _is_option(name) and name not in self._option_string_actions:
-                from msg_graph.errors import did_you_mean
-                message = f"there is no option '{name}'"
-                if self._has_verbs:
-                    remedy = f'options of a verb follow it, {remedy}'
-                remedy = did_you_mean(name, self._option_string_actions, remedy)
-                break
-        raise UsageError(f'{self.prog}: {message}: {remedy}')
+                raise unknown(self.prog, 'option', name, self._option_string_actions)
+        raise UsageError(f"{self.prog}: {message}: see '{self.prog} --help'")
+
+
+def unknown(prog: str, kind: str, word: str, known: Iterable[str]) -> UsageError:
+    """Return the error about a verb or option that does not exist."""
+    from msg_graph.errors import did_you_mean, shown
+    remedy = did_you_mean(word, known, f"see '{prog} --help'")
+    return UsageError(f'{prog}: there is no {kind} {shown(word)}: {remedy}')
 
 
 def _is_option(word: str) -> bool:
     return len(word) > 2 if word.startswith('--') else word[:1] == '-' and word[1:].isalpha()
 
 
-def verb_parser(prog: str, module: ModuleType, description: str) -> Parser:
+def verb_parser(prog: str, module: ModuleType, summary: str) -> Parser:
     """
     Return the parser of a verb.
 
     :param prog: the command up to the verb
-    :param module: has `EXAMPLE`, `add_arguments`, and `main`, which becomes `args.main`
+    :param module: has `EXAMPLE`, `add_arguments`, perhaps `DESCRIPTION`, and `main`, which becomes
+        `args.main`
     """
-    parser = _parser(prog, description, module.EXAMPLE.strip().splitlines())
+    parser = Parser(
+        prog=prog, allow_abbrev=False,
+        description=getattr(module, 'DESCRIPTION', f'{summary[:1].upper()}{summary[1:]}.'),
+        epilog='\n  '.join(('example:', *module.EXAMPLE.strip().splitlines())),
+        formatter_class=argparse.RawDescriptionHelpFormatter)
     module.add_arguments(parser)
+    parser.add_argument('-q', '--quiet', action='store_true',
+                        help='no tables, warnings and progress: only errors and written files')
     parser.set_defaults(main=module.main)
     return parser
-
-
-def group_parser(prog: str, modules: Mapping[str, ModuleType], description: str) -> Parser:
-    """Return the parser of a verb that has verbs."""
-    parser = _parser(
-        prog, description, [module.EXAMPLE.split('\n')[0] for module in modules.values()])
-    parser.add_verbs({name: module.HELP for name, module in modules.items()})
-    return parser
-
-
-def _parser(prog: str, description: str, examples: Sequence[str]) -> Parser:
-    return Parser(
-        prog=prog, allow_abbrev=False, description=description,
-        epilog='\n  '.join(('example:', *examples)),
-        formatter_class=argparse.RawDescriptionHelpFormatter)

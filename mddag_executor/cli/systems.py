@@ -9,7 +9,7 @@ import tempfile
 from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common
-from mddag_executor.cli.text import Progress, warn
+from mddag_executor.cli.text import Progress, say, warn
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
@@ -52,8 +52,8 @@ def write_declaration(output: str, text: str) -> None:
     lines = text.splitlines()
     count = sum(MARK in line for line in lines[2:])
     if count:
-        print(f"{counted(count, 'blank')} to fill in, marked '{MARK}'")
+        say(f"{counted(count, 'blank')} to fill in, marked '{MARK}'")
     else:
-        print('no blanks to fill in')
+        say('no blanks to fill in')
     if count := sum(line.startswith(LEFT_OUT) for line in lines):
-        print(f"{counted(count, 'callback')} left out: see '{LEFT_OUT}' in it")
+        say(f"{counted(count, 'callback')} left out: see '{LEFT_OUT}' in it")

@@ -11,13 +11,14 @@ from types import TracebackType
 from typing import TextIO, TYPE_CHECKING
 
 from mddag_executor import progress
-from mddag_executor.report.text import Cell, format_ns, printable, table
+from mddag_executor.report.text import Cell, format_ns, is_coloured, printable, table
 
 if TYPE_CHECKING:
     import subprocess
 
 __all__ = [
-    'Cell', 'Progress', 'format_ns', 'one_line', 'printable', 'run_program', 'table', 'warn']
+    'Cell', 'Progress', 'format_ns', 'is_quiet', 'label', 'one_line', 'printable', 'run_program',
+    'say', 'set_quiet', 'table', 'warn']
 
 
 def one_line(text: str) -> str:
@@ -25,10 +26,35 @@ def one_line(text: str) -> str:
     return printable(' '.join(text.split()))
 
 
+_quiet = False
+
+
+def set_quiet(quiet: bool) -> None:
+    """Say whether tables, warnings and progress are left out from now on (`-q`)."""
+    global _quiet
+    _quiet = quiet
+
+
+def is_quiet() -> bool:
+    """Return whether only errors and results in files are wanted."""
+    return _quiet
+
+
+def label(word: str, stream: TextIO) -> str:
+    """Return the word that begins a message, in bold on a terminal that shows colours."""
+    return f'\x1b[1m{word}\x1b[0m' if is_coloured(stream) else word
+
+
+def say(text: str) -> None:
+    """Print a line for people."""
+    if not _quiet:
+        print(text)
+
+
 def warn(*texts: str) -> None:
     """Print warnings on standard error, each as a single harmless line."""
-    for text in texts:
-        print(f'warning: {one_line(text)}', file=sys.stderr)
+    for text in () if _quiet else texts:
+        print(f'{label("warning", sys.stderr)}: {one_line(text)}', file=sys.stderr)
 
 
 class Progress:
@@ -57,7 +83,8 @@ class Progress:
         self._total = total
         self._stream = sys.stderr if stream is None else stream
         self._clock = clock
-        self._next = clock() + self.PATIENCE_S if self._stream.isatty() else float('inf')
+        self._next = clock() + self.PATIENCE_S if self._stream.isatty() and not _quiet else (
+            float('inf'))
         self._shown = 0
 
     def __enter__(self) -> Progress:

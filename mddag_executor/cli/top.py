@@ -18,7 +18,6 @@ import sys
 import time
 
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import printable
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.report.board import Board, KEYS, picture, plain
 
@@ -26,6 +25,7 @@ EXAMPLE = """\
 mddag top
 mddag top --once --json - | jq '.statuses[] | select(.level != "OK")'"""
 
+TOPIC = '/diagnostics'
 INTERVAL_S = 1.0
 PATIENCE_NS = 10_000_000_000
 
@@ -37,7 +37,6 @@ class NothingHeard(MddagError):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add('--topic', default='/diagnostics', help='where to listen (default: /diagnostics)')
     add('--once', action='store_true', help='print the state once, as soon as it has arrived')
     add('--duration', type=options.duration, metavar='TIME',
         help='end after this time, for instance 20s (default: run until Ctrl-C)')
@@ -53,7 +52,7 @@ def main(args: argparse.Namespace) -> int:
         _check_rich()
     board = Board()
     seconds = None if args.duration is None else args.duration / 1e9
-    with _listening(args.topic, board) as spin:
+    with _listening(board) as spin:
         try:
             if args.once:
                 _wait(spin, board, args.timeout / 1e9)
@@ -67,7 +66,7 @@ def main(args: argparse.Namespace) -> int:
             pass  # how one leaves it
     if (args.once or args.duration is not None) and not board.statuses():
         raise NothingHeard(
-            f'{printable(args.topic)}: no executor has published its state here: start one with '
+            f'{TOPIC}: no executor has published its state here: start one with '
             'mddag run, or with diagnostics_period, and check ROS_DOMAIN_ID')
     if common.write_result(args, board.result()) and args.once:
         print(plain(board.statuses()), end='')
@@ -157,7 +156,7 @@ def _ticks(
 
 
 @contextmanager
-def _listening(topic: str, board: Board) -> Iterator[Callable[[float], None]]:
+def _listening(board: Board) -> Iterator[Callable[[float], None]]:
     """Subscribe; give a function that collects what comes within a time."""
     from diagnostic_msgs.msg import DiagnosticArray
     import rclpy
@@ -172,12 +171,7 @@ def _listening(topic: str, board: Board) -> Iterator[Callable[[float], None]]:
         node = Node(
             'mddag_top', context=context, enable_rosout=False, start_parameter_services=False,
             parameter_overrides=[Parameter('start_type_description_service', value=False)])
-        try:
-            node.create_subscription(DiagnosticArray, topic, board.take, 10)
-        except Exception as error:
-            raise UsageError(
-                f'--topic {printable(topic)}: {str(error).splitlines()[0]}: give the name of a '
-                'topic') from None
+        node.create_subscription(DiagnosticArray, TOPIC, board.take, 10)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
         yield lambda seconds: executor.spin_once(seconds)

@@ -15,9 +15,9 @@ or maximum) of the execution times.  Deadlines are rounded up to whole us.  The 
    is halved (on a logarithmic scale) down to ``PRECISION``.
 3. Acceptance grows with the scale, but for anomalies.  The result is a scale that was tried and
    is good; nothing is concluded about those that were not tried.
-4. The draws that chose the scale favour it.  So the acceptance that is reported comes from as
-   many draws that took no part in the search, of the next seed.
-5. What is open at the end is judged too, and no deadline is longer than half of a run: else an
+4. The draws that chose the scale favour it.  So the reported acceptance comes from as many other
+   draws, of the next seed.
+5. Open jobs at the end are judged too, and no deadline is longer than half of a run: else an
    overload would look good because nothing was judged.
 """
 
@@ -89,26 +89,21 @@ class Found:
     check: Measured
 
 
-def proportional(
-    task_set: TaskSet, budget: str, factor: float = 1.0, base: str = 'period'
-) -> dict[str, int]:
+def proportional(task_set: TaskSet, budget: str) -> dict[str, int]:
     """
     Return a deadline (ns) for each sink by its callback's key.
 
-    The sink of a DAG with the longest critical path gets the base times the factor, the others
-    less in proportion to theirs.  A callback that is several sinks gets the shortest of theirs.
+    The sink of a DAG with the longest critical path gets the period, the others less in proportion
+    to theirs.  A callback that is several sinks gets the shortest of theirs.
 
-    :param base: ``period``, or ``deadline``: the longest that the DAG has so far.
     :raises mddag_executor.laboratory.tasks.AnalysisError: an execution time is not declared.
     """
     deadlines: dict[str, int] = {}
     for task in tasks_of(task_set, budget):
         longest = max(length for _, _, length in task.sinks)
-        whole = task.period if base == 'period' else task.deadline
         for index, _, length in task.sinks:
-            share = length / longest if longest else 1.0
             key = task.dag.vertices[index].callback.key
-            deadline = whole_us(whole * factor * share)
+            deadline = whole_us(task.period * (length / longest if longest else 1.0))
             deadlines[key] = min(deadline, deadlines.get(key, deadline))
     return deadlines
 

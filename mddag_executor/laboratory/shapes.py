@@ -17,7 +17,6 @@ job joins instead.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mddag_executor.laboratory.shares import Dice
@@ -45,13 +44,6 @@ class Shape:
     def count(self) -> int:
         """Count the callbacks."""
         return len(self.predecessors)
-
-    def path_lengths(self, costs: Sequence[int]) -> list[int]:
-        """Return the length of the longest path that ends with each callback."""
-        lengths: list[int] = []
-        for before, cost in zip(self.predecessors, costs):
-            lengths.append(cost + max((lengths[p] for p in before), default=0))
-        return lengths
 
 
 def draw_shape(

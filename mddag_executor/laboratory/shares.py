@@ -1,20 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Draws: a seeded source of randomness, and how a whole is dealt out at random.
+Draws: a seeded source of randomness, and the random distribution of a total.
 
 Theory of operation
 -------------------
-Only ``Random.random`` is used, whose numbers are the same in every version of Python, and plain
-arithmetic on them; so a seed gives the same file everywhere.
+Only ``Random.random``, whose numbers are the same in every version of Python, and plain arithmetic
+are used; so a seed gives the same file everywhere.
 
-- *UUniFast* (Bini and Buttazzo, "Measuring the performance of schedulability tests", 2005) draws
-  uniformly from all shares with a given sum.  Where shares have bounds, what breaks one is thrown
-  away and drawn anew (UUniFast-Discard, Davis and Burns 2009), which can take for ever.
-- *Dirichlet-rescale* (Griffin, Bate and Davis, "Generating utilization vectors for the systematic
-  evaluation of schedulability tests", RTSS 2020) keeps every draw: the part of the simplex that
-  breaks some bounds is a smaller simplex, and is stretched back over the whole, until no bound
-  is broken.  Where more than half of the room is asked for, what stays free is dealt out instead.
+*Dirichlet-rescale* (Griffin, Bate and Davis, "Generating utilization vectors for the systematic
+evaluation of schedulability tests", RTSS 2020) draws uniformly from all shares with a given sum
+and upper bounds, and rejects no draw: the part of the simplex that exceeds some bounds is a
+smaller simplex, and is stretched back over the whole, until no bound is exceeded.  If more than
+half of the room is asked for, the free room is distributed instead.
 """
 
 from __future__ import annotations
@@ -57,36 +55,17 @@ class Dice:
         return choices[self.whole(0, len(choices) - 1)]
 
 
-def uunifast(dice: Dice, count: int, total: float) -> list[float]:
-    """Return shares that sum up to a total, uniformly drawn from all such."""
-    shares = []
-    left = total
-    for i in range(1, count):
-        rest = left * dice.number() ** (1.0 / (count - i))
-        shares.append(left - rest)
-        left = rest
-    return [*shares, left]
-
-
-def deal(dice: Dice, method: str, total: float, most: Sequence[float]) -> list[float]:
+def deal(dice: Dice, total: float, most: Sequence[float]) -> list[float]:
     """
     Return shares that sum up to a total, each with its upper bound.
 
-    :param method: ``dirichlet`` or ``uunifast``.
+    :raises GenerateError: the bounds are too low.
     """
     if total > sum(most) * (1 + 1e-9):
         raise GenerateError(
             f'--utilisation: a load of {total:g} does not fit into DAGs of {sum(most):g} in all: '
             'give more --dags, or a larger --max-dag-load')
-    if method == 'dirichlet':
-        return dirichlet_rescale(dice, total, most)
-    for _ in range(_MOST_TRIES):
-        shares = uunifast(dice, len(most), total)
-        if all(share <= limit for share, limit in zip(shares, most)):
-            return shares
-    raise GenerateError(
-        f'--method uunifast: {_MOST_TRIES} draws had a DAG with too large a load: use '
-        "'dirichlet', more --dags, or a larger --max-dag-load")
+    return dirichlet_rescale(dice, total, most)
 
 
 def dirichlet_rescale(dice: Dice, total: float, most: Sequence[float]) -> list[float]:
@@ -122,5 +101,5 @@ def _stretched(dice: Dice, total: float, most: Sequence[float]) -> list[float]:
             lower = [limit if is_over else 0.0 for limit, is_over in zip(most, over)]
             shares = [(share - less) * total / rest for share, less in zip(shares, lower)]
     raise GenerateError(
-        f'--method dirichlet: {_MOST_TRIES} draws did not fit: give more --dags, or a larger '
+        f'--utilisation: {_MOST_TRIES} draws did not fit: give more --dags, or a larger '
         '--max-dag-load')

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 import os
 import re
 import sys
+from typing import TextIO
 
 from mddag_executor.text import listed as listed_plainly
 
@@ -61,9 +62,9 @@ def format_ns(nanoseconds: int, digits: int = 4) -> str:
     return f'{sign}{text} {unit}'
 
 
-def is_coloured() -> bool:
-    """Return whether standard output is a terminal that shows colours (see no-color.org)."""
-    return sys.stdout.isatty() and not os.environ.get('NO_COLOR') and os.environ.get(
+def is_coloured(stream: TextIO | None = None) -> bool:
+    """Return whether a stream (standard output) shows colours (see no-color.org)."""
+    return (stream or sys.stdout).isatty() and not os.environ.get('NO_COLOR') and os.environ.get(
         'TERM') != 'dumb'
 
 

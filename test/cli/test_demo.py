@@ -56,7 +56,7 @@ def test_the_main_job_end_to_end(
     tmp_path: Path, mddag: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:
     process = mddag(
-        'demo', '--seconds', '3', '--baseline-seconds', '1', '--utilisation', '0.3',
+        'demo', '--duration', '3s', '--utilisation', '0.3',
         '--output', tmp_path / 'made', '--json', tmp_path / 'result.json', timeout=150.0)
     assert process.returncode == 0, process.stderr
     # A busy machine skips periods, and that is said.
@@ -87,7 +87,7 @@ def test_a_step_that_fails_is_one_line(
     tmp_path: Path, mddag: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:
     (tmp_path / 'demo.mcap').mkdir()  # the trace cannot be written
-    process = mddag('demo', '--seconds', '1', '--output', tmp_path)
+    process = mddag('demo', '--duration', '1s', '--output', tmp_path)
     assert process.returncode == 2
     assert process.stderr == (
         f'error: mddag run: {tmp_path}/demo.mcap: this is a directory: name a file\n')
@@ -98,8 +98,8 @@ def test_the_main_job_in_two_processes(
     tmp_path: Path, mddag: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:
     process = mddag(
-        'demo', '--processes', '2', '--seconds', '1', '--baseline-seconds', '0.5', '--utilisation',
-        '0.05', '--output', tmp_path / 'made', '--json', tmp_path / 'result.json', timeout=180.0)
+        'demo', '--processes', '2', '--duration', '1s', '--utilisation', '0.05',
+        '--output', tmp_path / 'made', '--json', tmp_path / 'result.json', timeout=180.0)
     assert process.returncode == 0, process.stderr
     result = json.loads((tmp_path / 'result.json').read_text())
     assert [p['name'] for p in result['live']['processes']] == ['p1', 'p2']

@@ -8,6 +8,7 @@ import argparse
 from collections.abc import Callable
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 from types import ModuleType
@@ -31,8 +32,7 @@ def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[argparse.Namesp
         module = ModuleType('probe')
         module.__dict__.update(EXAMPLE='mddag probe graph.yaml', add_arguments=add_arguments,
                                main=action)
-        row = program.Verb('probe', 'try things')
-        monkeypatch.setattr(program, 'VERBS', {'probe': row})
+        monkeypatch.setattr(program, 'VERBS', {'probe': 'try things'})
         monkeypatch.setattr(program, 'load', lambda _: module)
     return install
 
@@ -117,12 +117,12 @@ def test_an_interrupt_is_quiet(verb, capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.parametrize(('argv', 'says'), [
-    ([], 'required: VERB'),
+    ([], 'a verb is missing'),
     (['nonsense'], "'nonsense'"),
     (['probe', '--number', 'x'], "argument --number: invalid int value: 'x'"),
     (['probe', '-x'], "there is no option '-x'"),
     (['probe', '--\x1b[2J\n'], "there is no option '--\\x1b[2J"),
-    (['--nonsense'], "there is no option '--nonsense'"),
+    (['--nonsense'], '--nonsense: options of a verb follow it'),
 ])
 def test_wrong_usage_is_one_line(verb, capsys: pytest.CaptureFixture[str],
                                  argv: list[str], says: str) -> None:
@@ -139,15 +139,15 @@ def test_wrong_usage_is_one_line(verb, capsys: pytest.CaptureFixture[str],
     (['replay', 't', '--reshedule'], "'--reshedule': did you mean '--reschedule'?"),
     (['replay', '--reshedule'], "'--reshedule': did you mean '--reschedule'?"),
     (['graph', 'check', 'g', '--jsn=-'], "'--jsn': did you mean '--json'?"),
-    (['--versio'], "'--versio': did you mean '--version'?"),
     (['rplay', 'run.mcap', '--json', '-'],
      "mddag: there is no verb 'rplay': did you mean 'replay'?"),
     (['graph', 'chek', 'g', '--json', '-'],
      "mddag graph: there is no verb 'chek': did you mean 'check'?"),
-    (['-q', 'replay', 'run.mcap'], "mddag: there is no option '-q': options of a verb follow it"),
-    (['graph', '--json', '-', 'check', 'g'],
-     "mddag graph: there is no option '--json': options of a verb follow it"),
-    (['replay', '-q', 'run.mcap'], "mddag replay: there is no option '-q'"),
+    (['grph', 'check', 'g'], "mddag: there is no verb 'grph': did you mean 'graph'?"),
+    (['-q', 'replay', 'run.mcap'], 'mddag: -q: options of a verb follow it'),
+    (['graph', '--json', '-', 'check', 'g'], 'mddag graph: --json: options of a verb follow it'),
+    (['graph'], 'mddag graph: a verb is missing'),
+    (['replay', '-z', 'run.mcap'], "mddag replay: there is no option '-z'"),
 ])
 def test_the_wrong_word_is_blamed_and_the_right_one_suggested(
         capsys: pytest.CaptureFixture[str], argv: list[str], says: str) -> None:
@@ -189,30 +189,42 @@ def test_help_has_an_example(verb, capsys: pytest.CaptureFixture[str]) -> None:
     assert 'example:\n  mddag probe graph.yaml' in out
 
 
-def test_only_the_chosen_verb_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
-    loaded = []
-
-    def load(verb: program.Verb) -> ModuleType:
-        loaded.append(verb.module)
-        module = ModuleType(verb.module)
-        module.__dict__.update(EXAMPLE='x', add_arguments=lambda parser: None,
-                               main=lambda args: 0)
-        return module
-
-    monkeypatch.setattr(program, 'load', load)
-    assert program.main(['replay']) == 0
-    assert loaded == ['replay']
-
-
-@pytest.mark.parametrize('name', sorted(program.VERBS))
-def test_the_help_of_each_verb(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    row = program.VERBS[name]
+@pytest.mark.parametrize('verb', sorted(program.VERBS))
+def test_the_help_of_each_verb(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        program.main([name, '--help'])
+        program.main([*verb.split(), '--help'])
     assert stop.value.code == 0
-    out = capsys.readouterr().out
-    assert row.summary[1:] in ' '.join(out.split())
-    assert f'example:\n  mddag {name}' in out
+    assert f'example:\n  mddag {verb}' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('words', 'verbs'), [
+    ((), set(program.VERBS)), (('graph',), {v for v in program.VERBS if v.startswith('graph')})])
+def test_the_list_of_verbs(
+        words: tuple[str, ...], verbs: set[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        program.main([*words, '--help'])
+    assert stop.value.code == 0
+    found = re.findall(r'^  ([a-z-]+(?: [a-z-]+)?)  ', capsys.readouterr().out, re.MULTILINE)
+    assert set(found) == verbs
+
+
+def test_completion(tmp_path: Path) -> None:
+    """As a shell asks for it; see register-python-argcomplete."""
+    pytest.importorskip('argcomplete')
+
+    def completed(line: str) -> set[str]:
+        out = tmp_path / 'out'
+        out.touch()
+        subprocess.run(
+            [sys.executable, '-m', 'mddag_executor'], check=True, env={
+                **os.environ, '_ARGCOMPLETE': '1', '_ARGCOMPLETE_IFS': ' ', 'COMP_LINE': line,
+                'COMP_POINT': str(len(line)), '_ARGCOMPLETE_STDOUT_FILENAME': str(out)})
+        return set(out.read_text().split())
+
+    assert {'graph', 'replay', 'run'} <= completed('mddag ')
+    assert completed('mddag expl') == {'explain'}
+    assert {'from-trace', 'from-ros'} <= completed('mddag graph from-')
+    assert completed('mddag graph place g.yaml --pro') == {'--processes'}
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -228,7 +240,7 @@ def test_help_imports_nothing_heavy() -> None:
     result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                             check=False)
     assert result.returncode == 0, result.stderr
-    assert 'verbs:' in result.stdout
+    assert 'Laboratory:' in result.stdout
 
 
 def test_module_and_program_are_the_same(mddag: Mddag) -> None:
@@ -251,7 +263,7 @@ def test_a_reader_that_goes_away_is_no_error(length: int) -> None:
              'from mddag_executor.cli import main as program\n'
              "module = types.SimpleNamespace(EXAMPLE='x', add_arguments=id,\n"
              f'                               main=lambda args: print("x" * {length}) or 0)\n'
-             "program.VERBS = {'probe': program.Verb('probe', 'x')}\n"
+             "program.VERBS = {'probe': 'x'}\n"
              'program.load = lambda verb: module\n'
              "sys.exit(program.main(['probe']))"],
             stdout=gone, stderr=subprocess.PIPE, text=True, check=False,

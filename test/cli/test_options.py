@@ -83,24 +83,6 @@ def test_choices_are_those_of_the_program(verb: str, option: str, known: tuple[s
     assert sorted(action.choices) == sorted(known)
 
 
-@pytest.mark.parametrize('verb', [
-    (verb, name) for verb, row in program.VERBS.items() for name in row.verbs])
-def test_the_help_of_verbs_of_verbs(
-    verb: tuple[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    module = importlib.import_module(
-        f'mddag_executor.cli.{verb[0]}_{verb[1].replace("-", "_")}')
-    for words, says in ((verb, module.DESCRIPTION), (verb[:1], module.HELP)):
-        with pytest.raises(SystemExit) as stop:
-            program.main([*words, '--help'])
-        assert stop.value.code == 0
-        out = ' '.join(capsys.readouterr().out.split())
-        assert ' '.join(says.replace('%%', '%').split()) in out
-        assert 'example: mddag ' in out
-    assert all(line.startswith((f'mddag {verb[0]} ', 'mddag run', 'mddag replay'))
-               for line in module.EXAMPLE.strip().splitlines())
-
-
 def test_the_limit_of_workers_is_the_same_everywhere(tmp_path: Path) -> None:
     from mddag_executor.executor.settings import resolve
     graph = tmp_path / 'g.yaml'

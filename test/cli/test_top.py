@@ -191,10 +191,10 @@ def test_live_in_a_terminal_until_the_user_ends_it(running: Any, how: str):
 
 
 def test_nobody_to_hear(call: Mddag):
-    done = call('top', '--once', '--topic', '/nobody', '--timeout', '300ms')
+    done = call('top', '--once', '--timeout', '300ms')
     assert done.returncode == 2 and done.stdout == ''
     assert done.stderr.startswith('error: /nobody: no executor has published its state here: ')
-    done = call('top', '--duration', '300ms', '--topic', '/nobody')
+    done = call('top', '--duration', '300ms')
     assert done.returncode == 2
     spent: list[float] = []
     board = Board()
@@ -203,7 +203,6 @@ def test_nobody_to_hear(call: Mddag):
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
-    (['--topic', 'a b'], '--topic a b: '),
     (['--duration', '3'], 'has no unit'),
     (['--once', '--json', 'no/such/dir/x.json'], 'no directory'),
 ])
