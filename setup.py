@@ -79,6 +79,7 @@ setup(
     # The ROS packages are not among these: with an installed ROS they come from rosdep, and the
     # extra `ros` brings them from the package index for those who have none.
     install_requires=[
+        'argcomplete>=1.10',
         'PyYAML>=5.4',
         'lz4>=3.1',
         'mcap>=1.0',

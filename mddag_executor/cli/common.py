@@ -339,18 +339,19 @@ def write_report(path: str, data: Callable[[], ReportData]) -> None:
             write(file, data())
 
 
-def write_result(args: argparse.Namespace, result: Mapping[str, Any]) -> bool:
+def write_result(args: argparse.Namespace, result: Any) -> bool:
     """
     Write a result where `--json` says; return whether tables are to be shown as well.
 
     :param result: gets the version of the program and of the results' format
     """
     if args.json is not None:
-        write_json(args.json, {'mddag': __version__, 'format': FORMAT, **result})
+        head = {'mddag': __version__, 'format': FORMAT}
+        write_json(args.json, {**head, **result} if isinstance(result, Mapping) else result)
     return wants_tables(args)
 
 
-def show(args: argparse.Namespace, result: Mapping[str, Any], lines: Iterable[str]) -> None:
+def show(args: argparse.Namespace, result: Any, lines: Iterable[str]) -> None:
     """Write a result where `--json` says, and print its lines for people if those are wanted."""
     if write_result(args, result):
         for line in lines:

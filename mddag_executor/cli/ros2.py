@@ -8,7 +8,7 @@ import argparse
 from typing import Any
 
 from mddag_executor import __version__
-from mddag_executor.cli.main import main, program_parser
+from mddag_executor.cli.main import main, overview
 from ros2cli.command import CommandExtension
 
 
@@ -19,7 +19,7 @@ class MddagCommand(CommandExtension):  # type: ignore[misc]
         """Declare that all that follows is for this program, whose help is shown."""
         parser.add_argument('--version', action='version', version=f'mddag {__version__}')
         parser.add_argument('arguments', nargs=argparse.REMAINDER)
-        parser.format_help = program_parser().format_help  # type: ignore[method-assign]
+        parser.format_help = overview  # type: ignore[method-assign]
 
     def main(self, *, parser: Any, args: argparse.Namespace) -> int:
         """Do what the arguments say; return the exit status."""

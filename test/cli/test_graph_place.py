@@ -32,13 +32,11 @@ def test_a_placement_is_written_and_predicted(graph: Path, call: Mddag) -> None:
     placed = load('placed.yaml')
     assert Path('placed.yaml').read_text().startswith(GRAPH)
     assert len(placed.processes) == 2 and placed.process_of('/a') != placed.process_of('/b')
-    for text in ('predicted with 2 CPUs: 90 sink jobs due, 90 in time', 'in one process: 90 sink',
-                 'They hold until all execution times are 1.', 'other draws'):
+    for text in ('predicted with 2 CPUs: 90 sink jobs due, 90 in time', 'in one process: 90 sink'):
         assert text in run.stdout, run.stdout
     result = json.loads(Path('out.json').read_text())
     assert [p['name'] for p in result['processes']] == ['p1', 'p2']
     assert sorted(result['loads'], reverse=True)[0] == pytest.approx(0.4, abs=0.02)
-    assert 1.2 < result['factor'] < 1.34 and result['draws'] == [1.0] * 10
     again = call('graph', 'place', 'placed.yaml', '--processes', '1', '-o', '-')
     assert again.stdout == GRAPH + 'processes:\n  p1: [/a, /b, /c]\n'
     assert 'The deadlines do not hold' in again.stderr
@@ -63,7 +61,6 @@ def test_times_of_a_recorded_run(graph: Path, call: Mddag) -> None:
     assert run.returncode == 0, run.stderr
     result = json.loads(Path('out.json').read_text())
     assert sorted(result['loads']) == pytest.approx([0.45, 0.45], abs=0.01)
-    assert result['draws'] == [] and 'other draws' not in run.stdout
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [

@@ -193,7 +193,7 @@ def test_live_in_a_terminal_until_the_user_ends_it(running: Any, how: str):
 def test_nobody_to_hear(call: Mddag):
     done = call('top', '--once', '--timeout', '300ms')
     assert done.returncode == 2 and done.stdout == ''
-    assert done.stderr.startswith('error: /nobody: no executor has published its state here: ')
+    assert done.stderr.startswith('error: /diagnostics: no executor has published its state')
     done = call('top', '--duration', '300ms')
     assert done.returncode == 2
     spent: list[float] = []

@@ -46,8 +46,6 @@ def test_proportional() -> None:
     # To x it is 2 ms, to y 1 ms + 9 ms.
     assert proportional(task_set, 'max') == {
         '/n:x': 4_000_000, '/n:y': 20_000_000, '/n:z': 10_000_000}
-    assert proportional(task_set, 'max', 0.5, 'deadline') == {
-        '/n:x': 5_000_000, '/n:y': 25_000_000, '/n:z': 5_000_000}
     assert proportional(task_set, 'mean')['/n:x'] == 8_000_000
     with pytest.raises(Exception, match='no such budget'):
         proportional(task_set, 'median')

@@ -28,9 +28,10 @@ EXPERIMENT = Experiment(
 @pytest.fixture(scope='module')
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Give a cluster of two worker processes."""
-    with distributed.LocalCluster(
+    import dask
+    folder = str(tmp_path_factory.mktemp('dask'))
+    with dask.config.set({'temporary-directory': folder}), distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, processes=True, dashboard_address='127.0.0.1:0',
-            local_directory=str(tmp_path_factory.mktemp('dask')),
             silence_logs=logging.CRITICAL) as cluster:
         yield cluster
 

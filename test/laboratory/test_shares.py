@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
-from hypothesis import assume, example, given, settings
+from hypothesis import example, given
 import hypothesis.strategies as st
 from mddag_executor.laboratory.generate_options import GenerateError
-from mddag_executor.laboratory.shares import deal, Dice, dirichlet_rescale, uunifast
+from mddag_executor.laboratory.shares import deal, Dice, dirichlet_rescale
 import pytest
 
 LIMITS = st.lists(st.floats(0.01, 2.0), min_size=1, max_size=30)
@@ -25,35 +25,17 @@ def test_dirichlet_rescale_keeps_sum_and_bounds(
         assert 0.0 <= share <= limit * (1 + 1e-9)
 
 
-@given(count=st.integers(1, 50), total=st.floats(0.0, 100.0), seed=st.integers(0, 10 ** 6))
-def test_uunifast_keeps_the_sum(count: int, total: float, seed: int) -> None:
-    shares = uunifast(Dice(str(seed)), count, total)
-    assert len(shares) == count and min(shares) >= 0.0
-    assert sum(shares) == pytest.approx(total)
-
-
-@settings(max_examples=25)
-@given(limits=LIMITS, part=st.floats(0.0, 0.3), seed=st.integers(0, 10 ** 6))
-def test_uunifast_with_bounds(limits: list[float], part: float, seed: int) -> None:
-    total = sum(limits) * part
-    try:
-        shares = deal(Dice(str(seed)), 'uunifast', total, limits)
-    except GenerateError as error:
-        assume('10000 draws' not in str(error))
-        raise
-    assert sum(shares) == pytest.approx(total, abs=1e-9)
-    assert all(share <= limit for share, limit in zip(shares, limits))
-
-
 @pytest.mark.parametrize('total', [0.7, 1.2, 1.5, 1.9, 2.6])
 def test_dirichlet_rescale_is_as_uniform_as_throwing_away(total: float) -> None:
-    """Quantiles of the largest of three shares are those of draws that break no bound."""
+    """Quantiles of the largest of three shares are those of UUniFast-Discard."""
     dice = Dice('uniform')
     count, limits = 4000, [1.0, 1.0, 1.0]
     stretched = sorted(max(dirichlet_rescale(dice, total, limits)) for _ in range(count))
     discarded: list[float] = []
     while len(discarded) < count:
-        shares = uunifast(dice, 3, total)
+        first = total * (1 - dice.number() ** 0.5)      # UUniFast
+        second = (total - first) * dice.number()
+        shares = (first, second, total - first - second)
         if max(shares) <= 1.0:
             discarded.append(max(shares))
     discarded.sort()
@@ -79,9 +61,7 @@ def test_shares_are_the_same_for_all_places() -> None:
 
 def test_no_room() -> None:
     with pytest.raises(GenerateError, match='a load of 3 does not fit into DAGs of 2 in all'):
-        deal(Dice(''), 'dirichlet', 3.0, [1.0, 1.0])
-    with pytest.raises(GenerateError, match='--method uunifast: 10000 draws had a DAG with'):
-        deal(Dice(''), 'uunifast', 9.999, [1.0] * 10)
+        deal(Dice(''), 3.0, [1.0, 1.0])
 
 
 def test_dice_are_the_same_everywhere() -> None:
