@@ -55,7 +55,8 @@ def test_the_result_for_machines(capsys: pytest.CaptureFixture[str], graph: Path
     # tick 0-2, near on worker 0 2-3, far on worker 1 2-10: all in time.
     result = result_of(capsys, graph, '--policy', 'rad', '--duration', '30ms')
     assert result == {
-        'mddag': __version__, 'format': 2, 'policy': 'rad', 'workers': 2, 'preemptive': False, 'duration_ns': 30_000_000,
+        'mddag': __version__, 'format': 2, 'policy': 'rad', 'workers': 2, 'preemptive': False,
+        'duration_ns': 30_000_000,
         'utilisation': 0.55, 'deadline_missed': False, 'first_miss': None, 'never_due': [],
         'dags': {'lidar': {
             'jobs': 3,
