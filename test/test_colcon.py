@@ -8,12 +8,16 @@ Without an installation of ROS, the rclpy that colcon's packages find is that of
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.util import find_spec
 import os
 from pathlib import Path
+import re
 import shutil
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -64,7 +68,8 @@ def test_what_was_built_is_what_runs(workspace: Path):
     installed = workspace / 'install' / NAME
     share = installed / 'share'
     assert (share / 'ament_index/resource_index/packages' / NAME).is_file()
-    assert (share / NAME / 'package.xml').is_file()
+    for name in ('package.xml', 'launch/run.launch.py'):
+        assert (share / NAME / name).is_file()
     program = installed / 'lib' / NAME / 'mddag'  # where `ros2 run` looks
     done = in_workspace(
         workspace, f'"{sys.executable}" -c "import {NAME}; print({NAME}.__file__)" && '
@@ -77,17 +82,86 @@ def test_what_was_built_is_what_runs(workspace: Path):
 
 @needs_ros2
 def test_ros2_finds_and_runs_it(workspace: Path, tmp_path: Path):
-    launch = f'ros2 launch {NAME} autoware_demo.launch.py'
-    # To all processes, as a terminal does; reading from none, `ros2 launch` sends one more.
     done = in_workspace(
-        workspace, f'ros2 run {NAME} mddag --version && ros2 mddag --version && '
-        f'{launch} --show-args && '
-        f'timeout --kill-after=20 -s INT 5 {launch} utilisation:=0.2 trace:=out.mcap; '
-        f'ros2 run {NAME} mddag replay out.mcap', tmp_path)
+        workspace, f'ros2 run {NAME} mddag --version && ros2 mddag --version && ros2 --help && '
+        f'ros2 launch {NAME} run.launch.py --show-args', tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    for text in ('mddag ', "'utilisation':", 'sink jobs due', 'process has finished cleanly'):
-        assert text in done.stdout
-    assert 'Traceback' not in done.stdout + done.stderr
+    assert done.stdout.count('mddag 1.') == 2 and '\n  mddag ' in done.stdout
+    assert "'ros_args':" in done.stdout
+
+
+GRAPH = """
+mddag: 1
+nodes:
+  - node: /n
+    callbacks: [{name: tick, timer: 20ms, deadline: DEADLINE, execution_time: 5ms}]
+"""
+
+
+@needs_ros2
+@pytest.mark.parametrize(('deadline', 'status'), [
+    ('20s, tolerate: 999 of 1000', 0), ('1ms', 1)])
+def test_ros2_launch_ends_with_the_verdict(
+    workspace: Path, tmp_path: Path, deadline: str, status: int
+):
+    (tmp_path / 'graph.yaml').write_text(GRAPH.replace('DEADLINE', deadline))
+    done = in_workspace(
+        workspace, f'ros2 launch {NAME} run.launch.py graph:=graph.yaml synthetic:=sleep '
+        'duration:=500ms trace:=out.mcap fail_on_miss:=true', tmp_path)
+    said = done.stdout + done.stderr
+    assert done.returncode == status and 'sink jobs due' in said, said
+    assert ('process has finished cleanly' in said) == (status == 0)
+    assert ('mddag run ended with status 1' in said) == (status == 1)
+    replayed = in_workspace(workspace, 'ros2 mddag replay out.mcap --fail-on-miss', tmp_path)
+    assert (replayed.returncode, replayed.stderr) == (status, '')
+
+
+@needs_ros2
+def test_bad_input_ends_ros2_launch(workspace: Path, tmp_path: Path):
+    for arguments, says in (('graph:=none.yaml nodes:=a/b', 'error: none.yaml: '),
+                            ('nodes:="\'a/b"', 'No closing quotation'),
+                            ('graph:=x.yaml', 'required')):
+        done = in_workspace(workspace, f'ros2 launch {NAME} run.launch.py {arguments}', tmp_path)
+        assert done.returncode == 1 and says in done.stdout + done.stderr
+
+
+@needs_ros2
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('to_all', [True, False])
+def test_a_signal_ends_ros2_launch_and_the_run(
+    workspace: Path, tmp_path: Path, number: signal.Signals, to_all: bool
+):
+    """As a terminal or systemd sends it, or to `ros2 launch` only."""
+    (tmp_path / 'graph.yaml').write_text(GRAPH.replace('DEADLINE', '20s'))
+    command = (f'. "{workspace}/install/setup.bash" && exec ros2 launch {NAME} run.launch.py '
+               'graph:=graph.yaml synthetic:=sleep trace:=out.mcap')
+    with subprocess.Popen(
+            ['bash', '-c', command], cwd=tmp_path, text=True, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True,
+            env={**os.environ, 'COLCON_TRACE': '', 'PYTHONUNBUFFERED': '1'}) as process:
+        assert process.stdout is not None
+        pid = int(re.search(r'process started with pid \[(\d+)\]', next(
+            line for line in process.stdout if 'process started' in line))[1])
+        trace = tmp_path / 'out.mcap'
+        wait_until(lambda: trace.exists() and trace.stat().st_size > 1000)
+        if to_all:
+            os.killpg(process.pid, number)
+        else:
+            process.send_signal(number)
+        said = process.stdout.read()    # to its end: the run has it, too
+    wait_until(lambda: not Path(f'/proc/{pid}').exists())
+    if number == signal.SIGINT:
+        assert 'sink jobs due' in said and 'process has finished cleanly' in said
+    assert 'Traceback' not in said.replace('see debug for traceback', '')
+    replayed = in_workspace(workspace, 'ros2 mddag replay out.mcap', tmp_path)
+    assert (replayed.returncode, replayed.stderr) == (0, ''), replayed.stdout
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 def test_colcon_test_runs_the_tests(workspace: Path):

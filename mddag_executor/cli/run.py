@@ -30,7 +30,7 @@ from types import FrameType
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
-from mddag_executor.cli import common, options
+from mddag_executor.cli import common, options, verdicts
 from mddag_executor.cli.stuck import dump_when_stuck
 from mddag_executor.cli.text import Progress, warn
 from mddag_executor.errors import MddagError, UsageError, UserCodeError
@@ -98,6 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--on-exit', choices=('end', 'continue'), default='end',
         help='if one of several processes ends by itself: end the run, or continue without it '
         '(default: end)')
+    verdicts.add_fail_on_miss(parser)
     add('--part', help=argparse.SUPPRESS)  # the folder of a run of several processes
     parser.add_argument(
         'graph', metavar='GRAPH', nargs='?', type=options.Input,
@@ -126,7 +127,14 @@ def main(args: argparse.Namespace) -> int:
         task_set = replace(task_set, processes=())
     result, error = run_here(args, task_set)
     report(args, result)
-    return _end(error)
+    return _end(error, status(args, result))
+
+
+def status(args: argparse.Namespace, result: dict[str, Any]) -> int:
+    """Return the exit status of a run in which nothing failed."""
+    if not args.fail_on_miss:
+        return 0
+    return verdicts.exit_status(result['dags'], result['file'] or 'mddag run')
 
 
 def part(args: argparse.Namespace) -> int:
@@ -189,7 +197,7 @@ def run_here(
             raise
 
 
-def _end(error: BaseException | None) -> int:
+def _end(error: BaseException | None, status: int = 0) -> int:
     """
     Return the exit status, or raise what a node raised.
 
@@ -202,11 +210,11 @@ def _end(error: BaseException | None) -> int:
     left = [t.name for t in threading.enumerate()
             if not t.daemon and t is not threading.main_thread()]
     if not left:
-        return 0
+        return status
     warn(f'threads that nodes started still run and are left behind: {listed(left)}')
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(0)
+    os._exit(status)
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
@@ -216,6 +224,8 @@ def _check_arguments(args: argparse.Namespace) -> None:
         raise UsageError('--processes 0: give 1 or more, or a file')
     needs_graph = next((name for name in ('synthetic', 'processes', 'process')
                         if getattr(args, name) not in (None, '1')), None)
+    if args.graph is None and args.fail_on_miss:
+        raise UsageError('--fail-on-miss: without a GRAPH no deadline is judged: give one')
     if args.graph is None and needs_graph is not None:
         raise UsageError(f'--{needs_graph}: it is about the nodes of a declaration: give a GRAPH')
     if args.synthetic is None and args.utilisation is not None:

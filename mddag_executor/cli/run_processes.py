@@ -21,7 +21,7 @@ from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.cli import common
-from mddag_executor.cli.run import report, Signals, warn_of
+from mddag_executor.cli.run import report, Signals, status, warn_of
 from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
 from mddag_executor.report.live_runs import ended_line
@@ -107,7 +107,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         for process in result['processes']:
             if process['died']:
                 print(ended_line(process))
-    return EXIT_DIED if any(run.died for run in supervisor.runs) else 0
+    return EXIT_DIED if any(run.died for run in supervisor.runs) else status(args, result)
 
 
 def _warn_of_contested(task_set: TaskSet) -> None:

@@ -58,8 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Find the slack and print it."""
+    from mddag_executor.core.tolerances import NOTHING_DUE
     from mddag_executor.replay.slack import find_slack, slack_result
-    from mddag_executor.replay.tolerances import NOTHING_DUE
     from mddag_executor.report.slack import lines, page
     common.recording_and_graph(args)
     is_graph = str(args.trace).lower().endswith(_GRAPHS)

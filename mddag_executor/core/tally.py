@@ -33,7 +33,8 @@ from mddag_executor.core.state import (
     SINK_OVERDUE,
 )
 from mddag_executor.core.tables import Tables
-from msg_graph import Dag, TaskSet
+from mddag_executor.core.weakly_hard import MissWindow
+from msg_graph import Dag, TaskSet, Vertex, WeaklyHard
 
 VERDICTS = {
     SINK_IN_TIME: 'in_time', SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
@@ -92,6 +93,14 @@ def counts(sink: Mapping[str, Any]) -> Counts:
     return Counts(due, in_time, sink['late'], sink['expired'], aborted, failed)
 
 
+def is_kept(sink: Mapping[str, Any]) -> bool:
+    """Return whether a sink's result has no miss, or no more than its declaration tolerates."""
+    tolerate = sink.get('tolerate')
+    if tolerate is None:
+        return not counts(sink).missed
+    return bool(tolerate['worst'] <= tolerate['misses'])
+
+
 def total(dags: Mapping[str, Any]) -> Counts:
     """Return the verdicts about all sinks of a result."""
     return Counts.total(counts(sink) for dag in dags.values() for sink in dag['sinks'].values())
@@ -141,6 +150,10 @@ def _added(deadline: int, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for part in parts:
         for key in ('completed', 'late', 'overdue', 'expired', 'failed', 'aborted'):
             result[key] += part[key]
+        if 'tolerate' in part:
+            worst = result.get('tolerate', part['tolerate'])['worst']
+            result['tolerate'] = {
+                **part['tolerate'], 'worst': max(worst, part['tolerate']['worst'])}
     return result
 
 
@@ -238,6 +251,9 @@ class Tally:
         self.jobs = [0] * tables.n_dags
         self.ends = [dict.fromkeys(OUTCOMES, 0) for _ in range(tables.n_dags)]
         self.sinks = {v: SinkTally(tables.sink_deadline[v], keep) for v in tables.sinks}
+        #: By sink: its misses in any window, if the declaration tolerates some.
+        self.windows = {v: MissWindow(tolerate.of) for v in self.sinks
+                        if (tolerate := self._tolerate(v)) is not None}
         self.dropped = 0
         #: By vertex and job: the deadlines of sinks that are overdue and have no verdict yet.
         self.overdue: dict[tuple[int, int], int] = {}
@@ -284,6 +300,8 @@ class Tally:
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
     ) -> None:
         sink = self.sinks[vertex]
+        if vertex in self.windows:
+            self.windows[vertex].add(job)
         if kind == SINK_MISSED:
             sink.late += 1
             sink.overdue += 1
@@ -324,8 +342,24 @@ class Tally:
 
     def vertex_name(self, vertex: int) -> str:
         """Return the name of a global vertex."""
+        return self._vertex(vertex).name
+
+    def _vertex(self, vertex: int) -> Vertex:
         dag = self._dags[self._tables.dag_of[vertex]]
-        return dag.vertices[self._tables.index_in_dag[vertex]].name
+        return dag.vertices[self._tables.index_in_dag[vertex]]
+
+    def _tolerate(self, vertex: int) -> WeaklyHard | None:
+        return self._vertex(vertex).callback.tolerate if self._dags else None
+
+    def _sink_result(self, vertex: int) -> dict[str, Any]:
+        result = self.sinks[vertex].result()
+        tolerate = self._tolerate(vertex)
+        if tolerate is not None:
+            result['tolerate'] = {
+                'misses': tolerate.misses, 'of': tolerate.of,
+                'worst': self.windows[vertex].worst_with(
+                    job for v, job in self.overdue if v == vertex)}
+        return result
 
     @property
     def missed(self) -> bool:
@@ -339,7 +373,7 @@ class Tally:
             dags[dag.name] = {
                 'jobs': self.jobs[dag.index],
                 'ends': {OUTCOMES[e]: n for e, n in self.ends[dag.index].items()},
-                'sinks': {self.vertex_name(v): sink.result()
-                          for v, sink in self.sinks_of(dag).items()}}
+                'sinks': {self.vertex_name(v): self._sink_result(v)
+                          for v in self.sinks_of(dag)}}
         return {'deadline_missed': self.missed, 'first_miss': self._first_of_all(),
                 'never_due': never_due(dags), 'dags': dags}

@@ -49,7 +49,7 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.recording import tables as recorded
 from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by, Table
-from mddag_executor.replay.tolerances import MissTally
+from mddag_executor.replay.miss_tally import MissTally
 from mddag_executor.text import counted
 from msg_graph import TaskSet
 import numpy as np
@@ -355,6 +355,9 @@ class Judged:
             sink.responses = cast(Any, memoryview(responses))
             missed = mine[mine['kind'] != SINK_IN_TIME]
             tally.missed_jobs[v] = array('q', missed['job'].tobytes())
+            if v in tally.windows:
+                for job in np.sort(missed['job']).tolist():
+                    tally.windows[v].add(job)
         missed = self.missed
         if len(missed):
             first = missed[0]

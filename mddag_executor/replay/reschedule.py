@@ -24,8 +24,8 @@ from mddag_executor.recording.tables import Recording
 from mddag_executor.replay.as_recorded import recording_result, Replay
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
+from mddag_executor.replay.miss_tally import MissTally
 from mddag_executor.replay.run import Given, open_recording, Progress, undeclared
-from mddag_executor.replay.tolerances import MissTally
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import LogEntry, schedule, Settings
 from mddag_executor.simulate.intakes import Intakes

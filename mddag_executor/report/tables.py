@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from mddag_executor.core.tally import Counts, counts, never_due, total
+from mddag_executor.core.tally import Counts, counts, is_kept, never_due, total
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 
@@ -64,9 +64,13 @@ def sink_table(dags: Mapping[str, Any]) -> str:
     """
     Return a table for a terminal with a row for each sink, those that missed most first.
 
-    It has counts, and response times by the deadline.  Rows with misses are red on a terminal.
+    It has counts, and response times by the deadline. If the declaration tolerates misses of a
+    sink, `tolerates` and `worst` say how many, and how many missed in the worst window. Rows with
+    misses that are not tolerated are red on a terminal.
     """
     every = total(dags)
+    weakly_hard = [column for column in ('tolerates', 'worst') if any(
+        'tolerate' in sink for dag in dags.values() for sink in dag['sinks'].values())]
     rare = [name for name in ('expired', 'failed', 'aborted') if getattr(every, name)]
     found = [(sink, counts(sink.result)) for sink in each_sink(dags)]
     found.sort(key=lambda each: -missed_share(each[1]))
@@ -78,11 +82,19 @@ def sink_table(dags: Mapping[str, Any]) -> str:
             percent(verdicts.in_time, verdicts.due), verdicts.late,
             *(getattr(verdicts, name) for name in rare),
             *response_cells(sink.result['response_ns'], 3),
-            format_ns(sink.result['relative_deadline_ns'])])
+            format_ns(sink.result['relative_deadline_ns']),
+            *(weakly_hard and _tolerate_cells(sink.result))])
         above = sink.dag
     return table(
-        ('DAG', 'sink', 'due', 'in time', 'late', *rare, *HEADER[7:]), rows,
-        marked=[verdicts.in_time < verdicts.due for _, verdicts in found])
+        ('DAG', 'sink', 'due', 'in time', 'late', *rare, *HEADER[7:], *weakly_hard), rows,
+        marked=[not is_kept(sink.result) for sink, _ in found])
+
+
+def _tolerate_cells(sink: Mapping[str, Any]) -> list[Cell]:
+    tolerate = sink.get('tolerate')
+    if tolerate is None:
+        return ['', '']
+    return [f'{tolerate["misses"]} of {tolerate["of"]}', tolerate['worst']]
 
 
 def missed_share(verdicts: Counts) -> float:

@@ -65,6 +65,7 @@ nodes:
     (['untimed.yaml', '--synthetic', 'sleep', '--utilisation', '0.5'], 'declare execution_time'),
     (['--synthetic', 'sleep'], 'it is about the nodes of a declaration: give a GRAPH'),
     (['--node', 'a:b', '--processes', '2'], '--processes: it is about the nodes of a declaration'),
+    (['--node', 'a:b', '--fail-on-miss'], '--fail-on-miss: without a GRAPH no deadline is judged'),
     (['--node', 'a:b', '--process', 'x'], '--process: it is about the nodes of a declaration'),
     (['--node', 'nowhere:main', '--trace', 'r.mcap'], '--node nowhere:main: there is no module'),
 ])
@@ -173,6 +174,23 @@ def test_three_commands_from_a_robot_to_a_verdict(folder: Path, mddag: Mddag) ->
     verdicts = counts(json.loads(Path('r.json').read_text())['dags']['/camera']['sinks'][
         '/detector:detect'])
     assert verdicts.in_time + verdicts.late == ran > 0
+
+
+@pytest.mark.parametrize(('tolerate', 'status'), [('1 of 1000', 1), ('999 of 1000', 0)])
+@pytest.mark.parametrize('processes', ['1', '2'])
+def test_fail_on_miss_judges_by_what_the_declaration_tolerates(
+    graph: Path, mddag: Mddag, tolerate: str, status: int, processes: str
+) -> None:
+    """The slow sink misses every deadline; the other one may miss what a busy machine costs."""
+    text = graph.read_text().replace('500ms,', '500ms, tolerate: 999 of 1000,')
+    graph.write_text(text.replace('10ms,', f'10ms, tolerate: {tolerate},'))
+    done = mddag('run', 'graph.yaml', '--synthetic', 'sleep', '--duration', '300ms',
+                 '--processes', processes, '--fail-on-miss', '--json', 'out.json')
+    assert done.returncode == status, done.stderr
+    assert re.search(r'in time +late .* tolerates +worst\n', done.stdout)
+    dags = json.loads(Path('out.json').read_text())['dags']
+    found = dags['main']['sinks']['/slow:cb']
+    assert found['tolerate']['worst'] == counts(found).missed > 1
 
 
 def test_spinning_takes_cpu_which_is_not_overhead(graph: Path, mddag: Mddag) -> None:

@@ -10,7 +10,7 @@ from mddag_executor.core.rules import record
 from mddag_executor.core.state import Decision, IDLE, JOB_END, OPEN, SKIP
 from mddag_executor.core.tables import CONTINUE
 from mddag_executor.recording.tables import ABORTED, ALL_LEGS, EXPIRED, FAILED, Recording
-from mddag_executor.replay.tolerances import MissTally
+from mddag_executor.replay.miss_tally import MissTally
 
 _KINDS = ('released', 'completed', 'ended', 'judge_from', 'hosted', 'finished')
 

@@ -24,7 +24,9 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.core.tally import counts
-from mddag_executor.replay.tolerances import longest_run, MissTally, Tolerance
+from mddag_executor.core.tolerances import Tolerance
+from mddag_executor.replay.miss_tally import longest_run, MissTally
+from mddag_executor.report.github import annotations
 from mddag_executor.report.junit import junit
 from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
@@ -146,6 +148,58 @@ def test_the_exit_status(
         assert program.main(arguments) == status
         said = 'not tolerated: /n:a: ' in capsys.readouterr().out
         assert said == bool(options and status)
+
+
+@pytest.mark.parametrize(('tolerate', 'worst', 'kept'), [
+    ('2 of 3', 2, True), ('1 of 2', 2, False), ('2 of 100', 2, True), ('1 of 3', 2, False)])
+@pytest.mark.parametrize('mode', [[], ['--reschedule']])
+def test_the_declaration_says_what_a_sink_tolerates(
+    trace: Path, tmp_path: Path, tolerate: str, worst: int, kept: bool, mode: list[str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    graph, out = tmp_path / 'g.yaml', tmp_path / 'out.xml'
+    graph.write_text(GRAPH.replace('8ms}', f'8ms, tolerate: {tolerate}}}'))
+    # What the command line tolerates is for sinks that say nothing.
+    arguments = ['replay', str(trace), str(graph), *mode, '--tolerate-burst', '0']
+    assert program.main(
+        [*arguments, '--fail-on-miss', '--github', '--junit', str(out)]) == (not kept)
+    output = capsys.readouterr().out
+    assert ('all misses, if any, are within what is tolerated' in output) == kept
+    why = f'{worst} of {tolerate.split()[-1]} jobs in a row missed the deadline, ' \
+          f'tolerated: {tolerate}'
+    assert (f'not tolerated: /n:a: {why}' in output) != kept
+    assert (f'::error file={graph},title=Deadline of /n%3Aa::{why}\n' in output) != kept
+    failure = ElementTree.parse(out).getroot().find('testsuite/testcase/failure')
+    assert (None if failure is None else failure.attrib['message']) == (None if kept else why)
+    if not mode:
+        header, row = output[output.index('DAG '):].splitlines()[:2]
+        assert header.split()[-2:] == ['tolerates', 'worst']
+        assert row.split()[-4:] == [*tolerate.split(), str(worst)]
+    assert program.main([*arguments, '--fail-on-miss', '--json', '-']) == (not kept)
+    sink = json.loads(capsys.readouterr().out)['dags']['/n']['sinks']['/n:a']
+    misses, of = map(int, tolerate.split(' of '))
+    assert sink['tolerate'] == {'misses': misses, 'of': of, 'worst': worst}
+
+
+def test_a_simulation_respects_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    graph = tmp_path / 'g.yaml'
+    late = GRAPH.replace('8ms}', '8ms, execution_time: 9ms}')
+    for tolerate, status in (('', 1), (', tolerate: 9 of 10', 1), (', tolerate: 10 of 11', 0)):
+        graph.write_text(late.replace('9ms}', f'9ms{tolerate}}}'))
+        assert program.main(
+            ['simulate', str(graph), '--duration', '105ms', '--fail-on-miss']) == status
+        assert ' 10 of 11 ' in capsys.readouterr().out or status
+
+
+def test_annotations_with_hostile_names() -> None:
+    dags = {'d': {'sinks': {HOSTILE: sink_of([True]), 'none': sink_of([])}}}
+    broken = Tolerance().verdicts(dags)
+    bad, none = annotations(dags, broken, 'a,b:c%.yaml')
+    assert bad.startswith('::error file=a%2Cb%3Ac%25.yaml,title=Deadline of a"]]><&')
+    assert bad.isprintable() and bad.count('::') == 2
+    assert bad.endswith('::1 of 1 job missed the deadline')
+    assert none == ('::warning file=a%2Cb%3Ac%25.yaml,title=Deadline of none::'
+                    'no job of it was due')
 
 
 def test_a_failed_job_is_told_wherever_verdicts_are(
@@ -289,7 +343,7 @@ def test_a_run_in_which_nothing_was_due_is_no_better(
     (['--tolerate-ratio', '1.5', '--fail-on-miss'], "'1.5' is no number from 0 to 1"),
     (['--tolerate-ratio', 'nan', '--fail-on-miss'], "'nan' is no number from 0 to 1"),
     (['--tolerate-burst', '-1', '--fail-on-miss'], "'-1' is no whole number from 1 up"),
-    (['--tolerate-burst', '2'], 'it decides about --fail-on-miss and --junit: add one'),
+    (['--tolerate-burst', '2'], 'it decides about --fail-on-miss, --junit and --github: add'),
     (['--junit', '/gone/out.xml'], 'there is no directory /gone'),
     (['--junit', '-', '--json', '-'], 'can be only one of junit and json'),
 ])

@@ -5,8 +5,9 @@ How many missed deadlines are tolerated, and whether a run keeps within that.
 
 Theory of operation
 -------------------
-As in CARET's report (its callback validation), each sink is judged by two measures, and both have
-to hold:
+A sink whose declaration says `tolerate: m of k` is judged by that: of any k of its jobs in a row
+at most m miss (`mddag_executor/core/weakly_hard.py`). For the others two measures are given with
+the run, as in CARET's report (its callback validation), and both have to hold:
 
 * *ratio*: of the sink's jobs that were due, the share that missed the deadline is at most R;
 * *burst*: the longest run of consecutive jobs that missed it is at most B.
@@ -20,46 +21,14 @@ sink: then nothing has shown that deadlines hold, and all sinks fail.
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from mddag_executor.core import Tables, Tally
-from mddag_executor.core.tally import counts, total
+from mddag_executor.core.tally import counts, is_kept, total
 from mddag_executor.text import counted
-from msg_graph import TaskSet
-import numpy as np
 
 NOTHING_DUE = 'no job was due at any sink, so no deadline was judged'
-
-
-def longest_run(numbers: Sequence[int]) -> int:
-    """Return how many numbers follow each other at most, in whatever order and how often told."""
-    ordered = np.unique(np.array(numbers, dtype=np.int64))
-    last = np.flatnonzero(np.diff(ordered) != 1)    # of each run but the last one
-    return int(np.diff([-1, *last, len(ordered) - 1]).max())
-
-
-class MissTally(Tally):
-    """A tally that keeps which jobs missed at each sink."""
-
-    def __init__(self, task_set: TaskSet, tables: Tables, keep: int | None = None) -> None:
-        super().__init__(task_set, tables, keep)
-        #: By global vertex of each sink: the jobs that missed.
-        self.missed_jobs = {vertex: array('q') for vertex in self.sinks}
-
-    def _add_miss(
-        self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
-    ) -> None:
-        super()._add_miss(kind, dag, vertex, job, deadline, time)
-        self.missed_jobs[vertex].append(job)
-
-    def add_bursts(self, dags: Mapping[str, Any]) -> None:
-        """Add to each sink of a result its longest burst of misses, as `longest_burst`."""
-        for v, jobs in self.missed_jobs.items():
-            dag = self._dags[self._tables.dag_of[v]].name
-            dags[dag]['sinks'][self.vertex_name(v)]['longest_burst'] = longest_run(jobs)
 
 
 @dataclass(frozen=True)
@@ -75,11 +44,16 @@ class Tolerance:
 
         :param sink: its part of a result, with its `longest_burst`.
         """
+        if is_kept(sink):
+            return None
         verdicts = counts(sink)
         due, missed = verdicts.due, verdicts.missed
-        if not missed:
-            return None
         failed = f' ({verdicts.failed} failed: a callback raised)' if verdicts.failed else ''
+        declared = sink.get('tolerate')
+        if declared is not None:
+            misses, of, worst = declared['misses'], declared['of'], declared['worst']
+            return (f'{worst} of {of} jobs in a row missed the deadline{failed}, '
+                    f'tolerated: {misses} of {of}')
         if self.ratio is None and self.burst is None:
             return f'{missed} of {counted(due, "job")} missed the deadline{failed}'
         broken = []
@@ -101,3 +75,7 @@ class Tolerance:
                 if why is not None:
                     found[dag_name, name] = why
         return found
+
+
+NO_MISS = Tolerance()
+"""No miss is tolerated, but of sinks whose declaration tolerates some."""
