@@ -3,10 +3,9 @@
 """
 The verb `diff`: two recorded runs, sink by sink.
 
-The runs are of every kind that `replay` takes: traces of this executor, also those of several
-processes, which stand in a folder for each run, imported recordings, and
-with `--reschedule`, which is for the second run, ordinary bags.  Without a graph each is judged by
-the declaration that it was recorded with, and an imported one by the other run's.
+A run is a trace of this executor, an imported recording, or a folder with the traces of all its
+processes.  Without a graph each is judged by the declaration that it was recorded with, and an
+imported one by the other run's.
 
 Exit status: 0 when compared, whatever came of it; with `--fail-on-worse` 1 if a sink missed a
 larger share of its deadlines in the second run or was never due there, or (with `--tolerance`) if
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
 EXAMPLE = """\
 mddag diff before.mcap after.mcap
 mddag diff before.mcap after.mcap graph.yaml --fail-on-worse --tolerance 10% --json diff.json
-mddag diff run.mcap run.mcap --reschedule --workers 2
 mddag diff before/ after/
 
 exit status: 0 compared; 1 with --fail-on-worse when a sink got worse; 2 bad input"""
@@ -43,15 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('first', metavar='A.mcap', type=options.Input,
         help="the run to compare with: a trace, also an imported one ('-': standard input), or a "
-        'folder with the traces of all its processes; with --reschedule also an ordinary bag')
+        'folder with the traces of all its processes')
     add('second', metavar='B.mcap', type=options.Input,
         help="the run to compare, likewise ('-': standard input)")
     add('graph', metavar='GRAPH', nargs='?', type=options.Input,
         help="the declaration that judges both ('-': standard input; default: each by the one "
         "that it was recorded with, an imported one by the other's)")
-    recorded.add_arguments(
-        parser, 'compare with what the scheduler would have done in B with the recorded releases '
-        'and execution times (in an ordinary bag A, too)')
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
     add('--fail-on-worse', action='store_true',
         help='exit with status 1 if a sink missed a larger share of its deadlines in B, or its '
@@ -65,7 +60,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Compare two runs."""
     from mddag_executor.report import diff
-    recorded.check(args)
     task_set = None if args.graph is None else common.load_graph(args.graph)
     runs = common.two_runs(args.first, args.second, args.offset)
     with ExitStack() as files:
@@ -90,12 +84,12 @@ def _results(
         if not _has_declaration(second):
             recorded.check_deadlines(*first)
             recorded.check_deadlines(*second)
-        after, declared = _result(second, task_set, args, args.reschedule)
-        return _result(first, declared, args, False)[0], after
-    before, declared = _result(first, task_set, args, False)
+        after, declared = _result(second, task_set, args.skip)
+        return _result(first, declared, args.skip)[0], after
+    before, declared = _result(first, task_set, args.skip)
     if task_set is None and not _has_declaration(second):
         task_set = declared
-    return before, _result(second, task_set, args, args.reschedule)[0]
+    return before, _result(second, task_set, args.skip)[0]
 
 
 def _has_declaration(trace: Trace) -> bool:
@@ -105,12 +99,11 @@ def _has_declaration(trace: Trace) -> bool:
 
 
 def _result(
-    trace: Trace, task_set: TaskSet | None, args: argparse.Namespace, reschedule: bool
+    trace: Trace, task_set: TaskSet | None, skip: int
 ) -> tuple[dict[str, Any], TaskSet]:
     """Return the result of a run, and the declaration that judged it."""
     path, name = trace
-    outcome = recorded.outcome_of(
-        args, path, name, task_set, reschedule, doing=f'replaying {name}')
+    outcome = recorded.as_recorded(path, name, task_set, f'replaying {name}', skip)
     warn(*outcome.warnings)
     return outcome.result(), outcome.task_set
 

@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Explain the misses of a trace."""
     common.recording_and_graph(args)
-    span = recorded.span_of(args)
+    span = recorded.span_of(args.begin, args.end, args.skip)
     with recorded.opened(args) as (path, name, task_set):
         if task_set is None or recorded.is_bag(path):
             recorded.check_deadlines(path, name)

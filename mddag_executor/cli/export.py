@@ -6,8 +6,7 @@ The verb `export`: a recording as a file for other tools.
 The end of the file's name says which: `.pftrace` for Perfetto's viewer, `.csv` for spreadsheets,
 `.parquet` for data frames.  A name that ends in `/` is a folder for the tables of the
 recording (`mddag_executor.recording.tables`), one Parquet file for each.  The run is judged as
-`replay` does it, and recordings are of the same kinds: traces of this executor, imported ones,
-and with `--reschedule` ordinary bags.
+`replay` does it.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ EXAMPLE = """\
 mddag export run.mcap -o run.pftrace
 mddag export run.mcap graph.yaml -o jobs.csv --rows jobs
 mddag export run.mcap -o executions.parquet --from 90s --to 100s
-mddag export run.mcap -o tables/
-mddag export drive/ graph.yaml --reschedule --workers 4 -o drive.pftrace"""
+mddag export run.mcap -o tables/"""
 
 FORMS = ('pftrace', 'csv', 'parquet')
 _TABLES = 'tables'
@@ -37,8 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     options.add_recording(
-        parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
-        'ordinary bag, a folder or a file')
+        parser, "a recorded run, an MCAP file ('-': standard input)")
     add('-o', '--output', metavar='OUT', type=options.Export, required=True,
         help="the file to write: OUT.pftrace for Perfetto (ui.perfetto.dev), OUT.csv ('-': CSV to "
         'standard output), OUT.parquet, or OUT/, a folder with a Parquet file for each table of '
@@ -47,38 +44,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='for CSV and Parquet: one row for each execution of a callback (default), or for '
         'each job at each sink')
     options.add(parser, '--from', '--to')
-    recorded.add_arguments(
-        parser, 'export what the scheduler would have done with the recorded releases and '
-        'execution times')
 
 
 def main(args: argparse.Namespace) -> int:
     """Export a recording."""
     from mddag_executor.recording.frames import FILES, write_tables
-    from mddag_executor.replay import Replay, Reschedule
     from mddag_executor.report.export import check_available, write
     common.recording_and_graph(args)
     form = _form(args)
     check_available(form)
+    span = recorded.span_of(args.begin, args.end)
     if form == _TABLES:
         _check_folder(args.output, FILES)
     else:
         common.check_output(args.output)
     with recorded.opened(args) as (path, name, task_set):
-        if args.rows == 'jobs' and task_set is None and not args.reschedule:
+        if args.rows == 'jobs' and task_set is None:
             recorded.check_deadlines(path, name)
-        outcome = recorded.outcome_of(
-            args, path, name, task_set, args.reschedule, 'exporting')
-        replay = outcome if isinstance(outcome, Replay) else Replay(
-            outcome.computed().recording(outcome.workers))
-        assert isinstance(outcome, (Replay, Reschedule))
+        replay = recorded.as_recorded(path, name, task_set, 'exporting', span=span)
         if form == _TABLES:
             _write_folder(
                 args.output, FILES, lambda folder: write_tables(replay.recording, folder))
         else:
             with common.output_file(args.output) as file:
                 write(form, file, replay, args.rows or 'executions')
-    warn(*outcome.warnings)
+    warn(*replay.warnings)
     if args.output != '-':
         say(f'exported: {printable(args.output)}')
     return 0
@@ -123,5 +113,4 @@ def _form(args: argparse.Namespace) -> str:
         raise UsageError(
             f'--rows: {"a .pftrace gets" if form == "pftrace" else "the tables are"} both, '
             'executions and jobs: leave the option out')
-    recorded.check(args)
     return form

@@ -1,11 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What `replay`, `export` and `diff` share: how recordings of every kind become runs.
+What `replay`, `explain`, `export` and `diff` share: recordings of every kind become runs.
 
 A trace of this executor and an imported recording are replayed as they were recorded, or, with
-`--reschedule`, as the scheduler core would have run them; an ordinary bag has no jobs, so it can
-only be rescheduled: its messages are the releases.
+`replay --reschedule`, as the scheduler core would have run them; an ordinary bag has no jobs, so
+it can only be rescheduled: its messages are the releases.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ _RECORDED = -1
 """Overheads as they were recorded."""
 
 
-def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
-    """Declare `--reschedule` and what goes with it; ``what`` is its help."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare `--reschedule` and what belongs to it."""
     add = parser.add_argument
-    add('--reschedule', action='store_true', help=what)
+    add('--reschedule', action='store_true',
+        help='run the scheduler over the recorded releases and execution times')
     options.add(parser, '--workers', only=f'{_WITH}in each process, ', otherwise='as recorded')
     options.add(parser, '--cpus', only=_WITH, otherwise='as recorded, else enough for all')
     add('--processes', metavar='N|FILE', type=options.Input,
@@ -48,8 +49,6 @@ def add_arguments(parser: argparse.ArgumentParser, what: str) -> None:
         'none, or a time for each dispatch (50us); of a bag: none (default) or a time')
     options.add(parser, '--execution-times', '--seed',
                 only='with --reschedule of an ordinary bag: ')
-    # for verbs without --skip, --from and --to
-    parser.set_defaults(skip=0, begin=None, end=None)
 
 
 def _overheads(text: str) -> int:
@@ -59,17 +58,19 @@ def _overheads(text: str) -> int:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Check the arguments."""
-    span_of(args)
+    """Check the options that depend on each other."""
     if args.processes == '0':
         raise UsageError('--processes 0: give 1 or more, or a file')
     if args.execution_times is not None and args.seed is not None:
         raise UsageError(
-            '--seed: nothing is drawn where --execution-times are given: leave one out')
+            '--seed: nothing is drawn with --execution-times: leave one out')
     if args.execution_times is not None and args.graph is None:
         raise UsageError('--execution-times: they are of a declaration: give a GRAPH')
+    if span_of(args.begin, args.end, args.skip) is not None and args.reschedule:
+        raise UsageError('--reschedule: the scheduler runs over whole recordings: leave it out, '
+                         'or --from and --to')
     if args.reschedule:
-        if getattr(args, 'callbacks', False):
+        if args.callbacks:
             raise UsageError(
                 '--callbacks: it shows what was recorded: leave it or --reschedule out')
         return
@@ -116,34 +117,32 @@ def as_recorded(
 ) -> Replay:
     """Replay a recorded run."""
     from mddag_executor.replay import replay
+    if is_bag(path):
+        raise _no_graph(name)
     with Progress(doing) as line:
         return replay(path, task_set, name=name, progress=line.events, skip=skip, span=span)
 
 
-def span_of(args: argparse.Namespace) -> tuple[int, int] | None:
+def span_of(begin: int | None, end: int | None, skip: int = 0) -> tuple[int, int] | None:
     """Return the part of the recording that `--from` and `--to` name, None for all of it."""
-    if args.begin is None and args.end is None:
+    if begin is None and end is None:
         return None
-    if args.skip:
+    if skip:
         raise UsageError('--skip: the part begins with --from: leave one of them out')
-    if getattr(args, 'reschedule', False):
-        raise UsageError(
-            f'--{"to" if args.begin is None else "from"}: the scheduler runs over whole '
-            'recordings: leave it or --reschedule out')
-    begin, end = args.begin or 0, args.end or 2 ** 62
-    if begin >= end:
+    span = begin or 0, end or 2 ** 62
+    if span[0] >= span[1]:
         raise UsageError('--to: the part ends before it begins: give a time after --from')
-    return begin, end
+    return span
 
 
 def outcome_of(
-    args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None, reschedule: bool,
-    doing: str = 'replaying',
+    args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None
 ) -> Replay | Reschedule:
     """Reschedule a recording if that is wanted or it is a bag; else replay it as recorded."""
-    if reschedule or is_bag(path):
+    if args.reschedule or is_bag(path):
         return _rescheduled(args, path, name, task_set)
-    return as_recorded(path, name, task_set, doing, args.skip, span_of(args))
+    return as_recorded(
+        path, name, task_set, skip=args.skip, span=span_of(args.begin, args.end))
 
 
 def _rescheduled(

@@ -34,8 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_recording(
         parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
         'ordinary bag, a folder or a file')
-    recorded.add_arguments(
-        parser, 'run the scheduler over the recorded releases and execution times')
+    recorded.add_arguments(parser)
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
     verdicts.add_arguments(parser)
     options.add(parser, '--from', '--to', '--skip', '--report', '--json')
@@ -48,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
     verdicts.check(args)
     recorded.check(args)
     with recorded.opened(args) as (path, name, task_set):
-        outcome = recorded.outcome_of(args, path, name, task_set, args.reschedule)
+        outcome = recorded.outcome_of(args, path, name, task_set)
         drift = outcome.drift() if isinstance(outcome, Replay) else []
     warn(*outcome.warnings)
     result = outcome.result()
