@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 from pathlib import Path
 import stat
 
-from mddag_executor.cli import common, options
+from mddag_executor.cli import common
 from mddag_executor.errors import InputError, UsageError
 import numpy
 import pytest
@@ -40,21 +39,6 @@ def test_a_trace_from_standard_input_is_seekable(stdin) -> None:
     assert not path.exists()
 
 
-def test_a_graph_from_standard_input_is_called_so(stdin) -> None:
-    import msg_graph
-    stdin(b'mddag: 1\nnonsense: true\n')
-    with pytest.raises(msg_graph.GraphError, match=r'^<stdin>'):
-        common.load_graph('-')
-
-
-def test_text_that_is_not_utf8_names_the_line(tmp_path: Path) -> None:
-    path = tmp_path / 'latin1.yaml'
-    path.write_bytes(b'a: 1\nb: \xe4\n')
-    with pytest.raises(InputError) as caught:
-        common.read_text(str(path))
-    assert (caught.value.file, caught.value.line) == (str(path), 2)
-
-
 def test_json_is_written_whole(tmp_path: Path) -> None:
     path = tmp_path / 'result.json'
     value = {'name': 'ä\x1b', 'ns': numpy.int64(3), 'list': numpy.arange(2), 'path': Path('a')}
@@ -65,11 +49,6 @@ def test_json_is_written_whole(tmp_path: Path) -> None:
     umask = os.umask(0)
     os.umask(umask)
     assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~umask
-
-
-def test_json_to_standard_output(capsysbinary: pytest.CaptureFixture[bytes]) -> None:
-    common.write_json('-', {'a': 1})
-    assert json.loads(capsysbinary.readouterr().out) == {'a': 1}
 
 
 @pytest.mark.parametrize('value', [{'a': float('nan')}, {'a': object()}])
@@ -114,27 +93,8 @@ def test_an_output_may_be_a_pipe(tmp_path: Path) -> None:
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
-def test_outputs_are_checked_before_the_work(tmp_path: Path) -> None:
-    common.check_output(None)
-    common.check_output('-')
-    common.check_output(str(tmp_path / 'new.json'))
-    assert os.listdir(tmp_path) == []
-    with pytest.raises(InputError, match='is a directory: name a file'):
-        common.check_output(str(tmp_path))
-    with pytest.raises(InputError, match='there is no directory'):
-        common.check_output(str(tmp_path / 'missing' / 'new.json'))
-
-
 @pytest.mark.skipif(os.geteuid() == 0, reason='root may write everywhere')
 def test_a_folder_without_write_permission(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(InputError, match='cannot be written to'):
         common.check_output(str(tmp_path / 'new.json'))
-
-
-def test_tables_give_way_to_json_on_standard_output() -> None:
-    parser = argparse.ArgumentParser()
-    options.add(parser, '--json')
-    assert common.wants_tables(parser.parse_args([]))
-    assert common.wants_tables(parser.parse_args(['--json', 'file']))
-    assert not common.wants_tables(parser.parse_args(['--json', '-']))

@@ -95,55 +95,6 @@ def test_samples(graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert result['acceptance']['rad'][8] == 0.0  # 9 ms, and a deadline of 5 ms
 
 
-@pytest.mark.parametrize(('arguments', 'line'), [
-    (['--policies', 'rad,edf'], "policy 'edf': there is no such policy: choose one of rad, "),
-    (['--policies', ''], "policy '': there is no such policy: "),
-    (['--policies', 'rad,rad'], "--policies: 'rad' stands there twice: name each once"),
-    (['--runs', '0'], "mddag evaluate: argument --runs: '0' is no whole number from 1 up: "),
-    (['--runs', '99999999999'], 'runs: 99999999999 is too many: '),
-    (['--workers', '0'], "mddag evaluate: argument --workers: '0' is no whole number from 1"),
-    (['--jobs', '-1'], "mddag evaluate: argument --jobs: '-1' is no whole number from 1 up: "),
-    (['--seed', '-1'], "mddag evaluate: argument --seed: '-1' is no whole number from 0"),
-    (['--duration', '3'], 'mddag evaluate: argument --duration: '),
-    (['--overhead', 'x'], 'mddag evaluate: argument --overhead: '),
-    (['--dask', 'nonsense'], '--dask nonsense: '),
-    (['empty'], 'empty: there is no *.yaml in this folder: name a declaration, or make some'),
-    (['-', '-'], '-: standard input can be only one of graph and graph: name a file '),
-    (['none.yaml'], 'none.yaml: '),
-    (['--samples', 'none.npz'], 'none.npz: no such file or directory: check the path'),
-    (['--samples', 'graph.yaml'], 'graph.yaml: this is no .npz file: '),
-    (['--samples', 'few.npz'], 'few.npz: no values for /n:b: add an array of that name'),
-    (['--samples', '.'], '.: is a directory: name a file'),
-    (['--plot', 'a.gif'], 'a.gif: the ending names no kind of picture: use one of .png, '),
-    (['--plot', 'picture'], 'picture: the ending names no kind of picture: '),
-    (['--plot', 'nowhere/a.png'], 'nowhere/a.png: there is no directory nowhere: make it first'),
-    (['--json', 'nowhere/a.json'], 'nowhere/a.json: there is no directory nowhere: '),
-])
-def test_bad_input(
-    graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str],
-    line: str,
-) -> None:
-    """One line, exit status 2, nothing written, and before any run is done."""
-    np.savez(tmp_path / 'few.npz', **{'/n:a': [1]})
-    (tmp_path / 'empty').mkdir()
-    before = sorted(tmp_path.iterdir())
-    status, out, err = call(capsys, '--runs', '5000000', 'graph.yaml', *arguments)
-    assert (status, out) == (2, '')
-    assert err.startswith(f'error: {line}') and err.count('\n') == 1
-    assert sorted(tmp_path.iterdir()) == before
-
-
-def test_without_matplotlib(
-    graph: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from mddag_executor.laboratory import plot
-    monkeypatch.setattr(plot, 'find_spec', lambda name: None)
-    status, _, err = call(capsys, graph, '--runs', 5, '--plot', 'a.png')
-    assert status == 2
-    assert err == ('error: a.png: matplotlib, which draws it, is not there: '
-                   "install 'mddag_executor[batch]' with pip\n")
-
-
 def group_seconds(group: int) -> float:
     """Return the processor time that the processes of a group have taken so far."""
     total = 0.0

@@ -83,54 +83,6 @@ def test_another_graph_judges(
     assert all(line.endswith('in_time') for line in lines[1:])
 
 
-@pytest.mark.parametrize(('arguments', 'error'), [
-    (['export', 'TRACE', '-o', 'out.xlsx'], 'it is not known what to write'),
-    (['export', 'TRACE', '-o', 'copy.mcap'], 'it is not known what to write'),
-    (['export', 'TRACE', '-o', 'out'], 'let the name end in .pftrace, .csv, .parquet or /'),
-    (['export', 'TRACE', '-o', 'out.pftrace', '--rows', 'jobs'], '--rows: '),
-    (['export', '-', '-', '-o', 'out.csv'], 'standard input can be only one'),
-    (['export', 'GRAPH', '-o', 'out.csv'], 'error: '),
-    (['export', 'missing.mcap', '-o', 'out.csv'], 'missing.mcap'),
-    (['export', 'TRACE', '-o', 'no/such/out.csv'], 'there is no directory'),
-    (['diff', 'TRACE', 'missing.mcap'], 'missing.mcap'),
-    (['diff', '-', '-'], 'standard input can be only one'),
-    (['diff', 'TRACE', 'TRACE', '--tolerance', '5'], "'5' is no share"),
-    (['diff', 'TRACE', 'TRACE', '--tolerance', '-5%'], 'error: '),
-    (['replay', 'TRACE', '--report', 'no/such/out.html'], 'there is no directory'),
-    (['replay', 'GRAPH', '--report', 'out.html'], 'error: '),
-    (['replay', 'TRACE', '--report', 'x.pdf'], '--report x.pdf: a report is an HTML file: '),
-    (['simulate', 'GRAPH', '--report', 'x.PDF'], '--report x.PDF: a report is an HTML file: '),
-])
-def test_bad_input(
-    arguments: list[str], error: str, graph: Path, trace: Path, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    before = {path.name for path in tmp_path.iterdir()}
-    places = {'TRACE': str(trace), 'GRAPH': str(graph)}
-    status, out, err = call(capsys, *(places.get(word, word) for word in arguments))
-    assert (status, out, err.count('\n')) == (2, '', 1)
-    assert err.startswith('error: ') and error in err
-    assert {path.name for path in tmp_path.iterdir()} == before
-
-
-@pytest.mark.parametrize(('package', 'arguments', 'extra'), [
-    ('pyarrow', ['export', 'TRACE', '-o', 'out.parquet'], 'export'),
-    ('bokeh', ['replay', 'TRACE', '--report', 'out.html'], 'report'),
-    ('bokeh', ['simulate', 'GRAPH', '--report', 'out.html'], 'report')])
-def test_a_missing_package_is_named(
-    package: str, arguments: list[str], extra: str, graph: Path, trace: Path, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, package, None)
-    places = {'TRACE': str(trace), 'GRAPH': str(graph)}
-    status, out, err = call(capsys, *(places.get(word, word) for word in arguments))
-    assert (status, out, err.count('\n')) == (2, '', 1)
-    assert f"pip install 'mddag_executor[{extra}]'" in err
-    assert not list(tmp_path.glob('out.*'))
-
-
 def test_a_report_of_each_kind(
     graph: Path, trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -145,16 +97,6 @@ def test_a_report_of_each_kind(
         page = out.read_text()
         assert f'<h1>{name}: ' in page and page.endswith('</html>\n')
         assert not list(tmp_path.glob('.*.part'))
-
-
-def test_a_report_does_not_change_what_is_told(
-    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip('bokeh', reason='Bokeh is not installed')
-    plain = call(capsys, 'replay', trace, '--fail-on-miss', '--json', '-')
-    assert plain[0] == 1
-    assert call(capsys, 'replay', trace, '--fail-on-miss', '--json', '-',
-                '--report', tmp_path / 'out.html') == plain
 
 
 def test_a_report_that_fails_leaves_the_old_file(
@@ -270,17 +212,6 @@ def test_an_export_that_stops_leaves_what_was_there(
     call(capsys, 'export', DEMO, '-o', f'{out}/')
     assert os.listdir(tmp_path) == ['tables']
     assert (out / 'releases.parquet').read_bytes() == b'old'
-
-
-@pytest.mark.parametrize(('arguments', 'error'), [
-    (('--rows', 'jobs', '-o', 'x/'), 'the tables are both'),
-    (('-o', 'x.mcap'), 'it is not known what to write'),
-    (('-o', 'nowhere/x/'), 'there is no directory nowhere')])
-def test_outputs_that_cannot_be(
-    arguments: tuple[str, ...], error: str, trace: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    status, _, said = call(capsys, 'export', trace, *arguments)
-    assert status == 2 and error in said
 
 
 @pytest.mark.parametrize('command', [

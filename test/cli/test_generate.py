@@ -52,37 +52,3 @@ def test_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert file.read_bytes() == (folder / 'again' / file.name).read_bytes()
     assert len({file.read_text() for file in files}) == 5
     assert sorted(path.name for path in folder.iterdir()) == ['again', 'sets']
-
-
-@pytest.mark.parametrize(('arguments', 'line'), [
-    (['--sets', '0'], "mddag generate: argument --sets: '0' is no whole number from 1 up: "),
-    (['--sets', '3'], '--sets: several declarations make a folder: name one with -o OUT'),
-    (['--sets', '9999999', '-o', 'x'], '--sets 9999999: it is too many: '),
-    (['--sets', '3', '-o', 'full'], 'full: it is there already, and no empty folder: name'),
-    (['--sets', '3', '-o', 'full/file'], 'full/file: it is there already, and no empty folder: '),
-    (['--sets', '3', '-o', 'none/x'], 'none/x: there is no directory none'),
-    (['-o', 'full'], 'full: this is a directory: name a file'),
-    (['--utilisation', '0.2:0.6'], '--utilisation 0.2:0.6: one task set has one'),
-    (['--utilisation', '0.6:0.2', '--sets', '3', '-o', 'x'], '--utilisation 0.6:0.2: one '),
-    (['--utilisation', '-1'], '--utilisation -1: it is out of range: give above 0 to 100'),
-    (['--utilisation', 'a'], "mddag generate: argument --utilisation: 'a' is no number: "),
-    (['--utilisation', '0.1:3', '--sets', '9', '-o', 'x'], '--utilisation 3: a load of '),
-    (['--utilisation', '1e-7'], '--utilisation 1e-07: it leaves a callback less than 1 us: '),
-    (['--sinks', '5', '--vertices', '5'], '--sinks 5: a DAG of 5 vertices has at most 4: '),
-    (['--dags', '3:1'], '--dags 3:1: the first is larger: write the smaller one first'),
-    (['--dags', '0'], "mddag generate: argument --dags: '0' is no whole number from 1 up: "),
-    (['--workers', '0'], "mddag generate: argument --workers: '0' is no whole number from 1 to"),
-    (['--periods', '10'], 'mddag generate: argument --periods: '),
-    (['--edge-probability', '2'], '--edge-probability 2: it is out of range: give 0 to 1'),
-    (['--seed', 'x'], "mddag generate: argument --seed: invalid int value: 'x': "),
-])
-def test_bad_input(
-    folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], line: str
-) -> None:
-    (folder / 'full').mkdir()
-    (folder / 'full' / 'file').write_text('mine')
-    before = sorted(folder.rglob('*'))
-    status, out, err = call(capsys, *arguments)
-    assert (status, out) == (2, '')
-    assert err.startswith(f'error: {line}') and err.count('\n') == 1
-    assert sorted(folder.rglob('*')) == before

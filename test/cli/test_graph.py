@@ -29,40 +29,6 @@ paths:
 """
 
 
-def test_json(call: Mddag, tmp_path: Path) -> None:
-    (tmp_path / 'g.yaml').write_text(GRAPH)
-    done = call('graph', 'check', 'g.yaml', '--json', 'out.json', cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, '')
-    assert 'one' in done.stdout
-    result = json.loads((tmp_path / 'out.json').read_text())
-    assert result == {
-        'dags': {
-            'one': {
-                'period_ns': 10_000_000, 'vertices': ['/n:t', '/n:x', '/n:y'],
-                'edges': [[0, 1], [0, 2]], 'sinks': {'/n:x': 5_000_000, '/n:y': 50_000_000},
-                'rad_offset_ns': [5_000_000, 5_000_000, 50_000_000],
-                'critical_path_ns': 7_000_000, 'load': 0.9, 'utilisation': 0.9 / 7},
-            '/n': {
-                'period_ns': 20_000_000, 'vertices': ['/n:u'], 'edges': [],
-                'sinks': {'/n:u': 20_000_000}, 'rad_offset_ns': [20_000_000],
-                'critical_path_ns': None, 'load': None, 'utilisation': None}},
-        'vertices': 4, 'callbacks': 4, 'workers': 7, 'load': None, 'utilisation': None,
-        'queue_edges': [{'reader': '/n:y', 'topic': None, 'writers': ['/n:x']}],
-        'paths': {'p': ['/n:t', '/n:x', '/n:y']}}
-
-
-def test_table(call: Mddag, tmp_path: Path) -> None:
-    (tmp_path / 'g.yaml').write_text(GRAPH)
-    done = call('graph', 'check', 'g.yaml', cwd=tmp_path)
-    assert done.returncode == 0
-    rows = [line.split() for line in done.stdout.splitlines()]
-    assert rows[1] == ['one', '10', 'ms', '3', '7', 'ms', '0.9000', '/n:x', '5', 'ms']
-    assert rows[2] == ['/n:y', '50', 'ms']
-    assert rows[3] == ['/n', '20', 'ms', '1', '-', '-', '/n:u', '20', 'ms']
-    assert done.stdout.splitlines()[-1] == (
-        '2 DAGs, 4 vertices, 4 callbacks, 1 queue edge, 1 path')
-
-
 def test_standard_input_and_output(call: Mddag, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)
     text = msg_graph.load(CONFIG / 'autoware_multi.yaml').text
@@ -73,13 +39,6 @@ def test_standard_input_and_output(call: Mddag, monkeypatch: pytest.MonkeyPatch)
     control = result['dags']['control']
     assert control['rad_offset_ns'] == [15_000_000, 30_000_000, *[15_000_000] * 3]
     assert list(control['sinks'].values()) == [30_000_000, 15_000_000]
-
-
-def test_total_of_the_workload(call: Mddag) -> None:
-    done = call('graph', 'check', CONFIG / 'autoware.yaml')
-    assert done.stdout.splitlines()[-1] == (
-        '11 DAGs, 86 vertices, 84 callbacks, 32 queue edges, 5 paths, load 5.102, '
-        'utilisation 0.729 of 7 workers')
 
 
 def test_utilisation_is_one_thing_in_all_commands(call: Mddag, tmp_path: Path) -> None:
@@ -95,34 +54,6 @@ def test_utilisation_is_one_thing_in_all_commands(call: Mddag, tmp_path: Path) -
         result = json.loads(done.stdout)
         assert result['utilisation'] == pytest.approx(0.2, abs=0.002), command
         assert result.get('load', 0.4) == 0.4
-
-
-@pytest.mark.parametrize(('text', 'line'), [
-    (GRAPH.replace('deadline: 5ms', 'deadine: 5ms'),
-     "error: g.yaml:6: callback 2 of node '/n': unknown key 'deadine': did you mean 'deadline'?"),
-    (GRAPH.replace('subscription: /a, deadline: 5ms', 'subscription: /b, deadline: 5ms'),
-     "error: g.yaml:6: callback '/n:x': nobody publishes '/b': add it to a 'publishes:', "
-     "or add 'period:' if it comes from outside of the graph"),
-    ('', "error: g.yaml: the file is empty: write a declaration that starts with 'mddag: 1'"),
-])
-def test_bad_input_is_one_line(call: Mddag, tmp_path: Path, text: str, line: str) -> None:
-    (tmp_path / 'g.yaml').write_text(text)
-    done = call('graph', 'check', 'g.yaml', '--json', 'out.json', cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, '')
-    assert done.stderr == line + '\n'
-    assert not (tmp_path / 'out.json').exists()
-
-
-def test_missing_file_and_bad_usage(call: Mddag, tmp_path: Path) -> None:
-    done = call('graph', 'check', 'none.yaml', cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith('error: none.yaml: the file cannot be read (No such file')
-    assert done.stderr.count('\n') == 1
-    for arguments in (('graph',), ('graph', 'chek', 'g'), ('graph', 'check')):
-        done = call(*arguments)
-        assert done.returncode == 2
-        assert done.stderr.startswith('error: ')
-        assert done.stderr.count('\n') == 1
 
 
 @pytest.mark.parametrize(('text', 'workers', 'says'), [

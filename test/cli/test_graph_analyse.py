@@ -22,18 +22,6 @@ nodes:
 """
 
 
-def test_table(call: Mddag) -> None:
-    done = call('graph', 'analyse', '-', '--budget', 'mean', stdin=GRAPH)
-    assert (done.returncode, done.stderr) == (0, '')
-    assert 'after Melani et al. 2015' in done.stdout
-    assert done.stdout.splitlines()[-1] == (
-        '2 workers, budget mean: the deadlines hold under any work-conserving, preemptive or not; '
-        'rad, not preemptive (the live executor)')
-    done = call('graph', 'analyse', '-', stdin=GRAPH)
-    assert done.stdout.splitlines()[-1] == (
-        '2 workers, budget max: no scheduler can keep these deadlines')
-
-
 def test_ci_learns_of_deadlines_that_cannot_hold(call: Mddag) -> None:
     for budget, status in (('mean', 0), ('max', 1)):
         done = call('graph', 'analyse', '-', '--budget', budget, '--fail-on-unschedulable',
@@ -58,12 +46,3 @@ def test_json(call: Mddag) -> None:
         'says nothing'}
     assert all(test['reason'] and test['source'] and test['assumption']
                for test in result['tests'])
-
-
-def test_bad_input(call: Mddag) -> None:
-    text = GRAPH[:GRAPH.index(', execution')] + '}\n'
-    for arguments in (('-',), ('-', '--workers', '0'), ('-', '--budget', 'min')):
-        done = call('graph', 'analyse', *arguments, stdin=text)
-        assert (done.returncode, done.stdout) == (2, '')
-        assert done.stderr.startswith('error: ')
-        assert done.stderr.count('\n') == 1

@@ -81,30 +81,3 @@ def test_standard_input_and_output(
     assert status == 0
     assert out.startswith('# Mine.\n') and 'deadline: 4ms, execution_time: 1ms}  # urgent' in out
     assert 'rad accepts' in err
-
-
-@pytest.mark.parametrize(('arguments', 'line'), [
-    (['none.yaml'], 'none.yaml: no such file or directory: check the path'),
-    (['g.yaml', '--target', '1'], '--target 1: it is out of range: '),
-    (['g.yaml', '--target', '0.99', '--runs', '9'], '--target 0.99: 9 runs '),
-    (['g.yaml', '--policy', 'edf'], "policy 'edf': there is no such policy: choose one of rad"),
-    (['g.yaml', '--runs', '0'], "mddag graph assign-deadlines: argument --runs: '0' is no whole "),
-    (['g.yaml', '--workers', '0'], "mddag graph assign-deadlines: argument --workers: '0' is no "),
-    (['g.yaml', '-o', 'x/y'], 'x/y: there is no directory x: make it first'),
-    (['g.yaml', '--json', '-'], '-: standard output can be only one of output and json: '),
-    (['no_times.yaml'], 'no_times.yaml:7: /n:t (and 1 more callback) declares no '),
-    (['wrong.yaml'], "wrong.yaml:7: callback '/n:t': nothing says what starts the callback: "),
-    (['busy.yaml', '--target', '0.95', '--duration', '200ms', '--runs', '100', '--workers', '1'],
-     '--target 0.95: no scale with deadlines up to half of a run reaches it (the best'),
-])
-def test_bad_input(
-    folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], line: str
-) -> None:
-    (folder / 'no_times.yaml').write_text(GRAPH.replace(', execution_time: 1ms', ''))
-    (folder / 'wrong.yaml').write_text(GRAPH.replace('timer: 20ms, ', ''))
-    (folder / 'busy.yaml').write_text(GRAPH.replace('9ms', '90ms'))
-    before = sorted(folder.iterdir())
-    status, out, err = call(capsys, *arguments)
-    assert status == 2
-    assert err.startswith(f'error: {line}') and err.count('\n') == 1
-    assert sorted(folder.iterdir()) == before

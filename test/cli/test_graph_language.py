@@ -13,6 +13,7 @@ from msg_graph.language import schema
 
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
 
+
 def test_schema(call: Mddag, tmp_path: Path) -> None:
     done = call('graph', 'schema')
     assert (done.returncode, done.stderr) == (0, '')

@@ -61,24 +61,3 @@ def test_times_of_a_recorded_run(graph: Path, call: Mddag) -> None:
     assert run.returncode == 0, run.stderr
     result = json.loads(Path('out.json').read_text())
     assert sorted(result['loads']) == pytest.approx([0.45, 0.45], abs=0.01)
-
-
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['graph.yaml', '--processes', '4'], 'there are only 3 nodes to place'),
-    (['graph.yaml', '--processes', '2', '--together', '/x'], "node '/x'"),
-    (['graph.yaml', '--processes', '2', '--apart', '/a,/b,/c'], '--apart'),
-    (['graph.yaml', '--processes', '2', '--trace', 'no.mcap'], 'no.mcap'),
-    (['graph.yaml', '--processes', '2', '--trace', 'no.mcap', '--utilisation', '0.2'],
-     '--utilisation'),
-    (['graph.yaml', '--processes', '2', '--policy', 'ros2'], 'polling is known of one process'),
-    (['none.yaml', '--processes', '2'], 'none.yaml'),
-    (['bare.yaml', '--processes', '1'], 'declares no execution_time'),
-])
-def test_bad_input_is_one_line(
-        graph: Path, call: Mddag, arguments: list[str], message: str) -> None:
-    Path('bare.yaml').write_text(
-        'mddag: 1\nnodes:\n  - node: /a\n    callbacks: [{name: a, timer: 1ms, deadline: 1ms}]\n')
-    run = call('graph', 'place', *arguments, '-o', 'placed.yaml')
-    assert (run.returncode, run.stdout) == (2, '')
-    assert message in run.stderr and run.stderr.count('\n') == 1
-    assert not Path('placed.yaml').exists()

@@ -336,5 +336,3 @@ def test_includes(call: Mddag, tmp_path: Path) -> None:
     top.unlink()  # the trace holds all of the declaration
     done = call('replay', 's.mcap', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
-    done = call('graph', 'fmt', 'part.yaml', cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, '')

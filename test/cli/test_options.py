@@ -5,63 +5,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from contextlib import nullcontext
 import importlib
 from pathlib import Path
 
 from mddag_executor import defaults
 from mddag_executor.cli import main as program
-from mddag_executor.cli import options
-from mddag_executor.core import POLICIES, PolicyError
-from mddag_executor.errors import MddagError, UsageError
+from mddag_executor.errors import MddagError
 from mddag_executor.simulate import JUDGES, Settings
 from mddag_executor.simulate.run import check
 from msg_graph import GraphError, loads
 import pytest
 
 ONE = 'nodes: [{node: /n, callbacks: [{name: t, timer: 1s, deadline: 1s, execution_time: 1us}]}]\n'
-
-
-@pytest.mark.parametrize(('kind', 'text', 'value'), [
-    (options.duration, '20s', 20_000_000_000),
-    (options.duration, '1.5 ms', 1_500_000),
-    (options.positive_int, '7', 7),
-    (options.positive_float, '0.6', 0.6),
-    (options.number, '-1e3', -1000.0),
-    (options.ratio, '1', 1.0),
-    (options.seed, str(2 ** 64 - 1), 2 ** 64 - 1),
-    (options.or_zero(options.duration), '0', 0),
-    (options.or_zero(options.duration), '3ms', 3_000_000),
-    (options.list_of(options.positive_int), '1, 2,4', [1, 2, 4]),
-])
-def test_what_an_argument_is(kind: Callable[[str], object], text: str, value: object) -> None:
-    assert kind(text) == value
-
-
-@pytest.mark.parametrize(('kind', 'texts'), [
-    (options.duration, ('', '20', '0s', '-1s', 'nan', '20 parsecs')),
-    (options.positive_int, ('0', '-1', '1.5', 'x', '')),
-    (options.positive_float, ('0', '-1', 'nan', 'inf', '1e999', 'x', '')),
-    (options.number, ('nan', 'inf', 'x', '')),
-    (options.ratio, ('-0.1', '1.1', 'nan', 'x')),
-    (options.seed, ('-1', str(2 ** 64), 'x')),
-    (options.or_zero(options.positive_int), ('-1', 'x', '')),
-    (options.list_of(options.positive_int), ('1,,2', '1,x', '')),
-])
-def test_what_no_argument_is(kind: Callable[[str], object], texts: tuple[str, ...]) -> None:
-    for text in texts:
-        with pytest.raises(argparse.ArgumentTypeError):
-            kind(text)
-
-
-def test_policies() -> None:
-    assert options.policies('rad, fifo') == ('rad', 'fifo')
-    assert options.policies(','.join(POLICIES)) == tuple(POLICIES)
-    with pytest.raises(PolicyError, match="policy 'edf': there is no such policy"):
-        options.policies('rad,edf')
-    with pytest.raises(UsageError, match="--policies: 'rad' stands there twice"):
-        options.policies('rad,fifo,rad')
 
 
 def test_the_number_of_workers() -> None:

@@ -179,15 +179,3 @@ def test_a_part_by_time(
         jobs = tmp_path / 'jobs.csv'
         assert call(capsys, 'export', *given, *part, '--rows', 'jobs', '-o', str(jobs))[0] == 0
         assert len(jobs.read_text().splitlines()) == 1 + due
-
-
-@pytest.mark.parametrize(('arguments', 'error'), [
-    ('--from 2s --to 1s', '--to: the part ends before it begins'),
-    ('--to 1s --skip 1s', '--skip: the part begins with --from'),
-    ('--to 1s --reschedule', '--reschedule: the scheduler runs over whole recordings'),
-    ('--from 60min', 'it ends 1.000 s after its first release: give an earlier time')])
-def test_parts_that_cannot_be(
-    files: dict[str, str], arguments: str, error: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    status, _, said = call(capsys, 'replay', files['own.mcap'], *arguments.split())
-    assert status == 2 and error in said and len(said.splitlines()) == 1

@@ -9,7 +9,6 @@ import json
 from pathlib import Path
 import re
 import subprocess
-import sys
 from typing import Any
 
 from mddag_executor.trace import TraceFile
@@ -228,56 +227,6 @@ def test_what_is_no_trace_is_one_line(
     assert err.startswith(f'error: {path}: {says}')
     assert err.count('\n') == 1
     assert not result.exists()
-
-
-def test_other_bad_input_is_one_line(
-    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    wrong = tmp_path / 'wrong.yaml'
-    wrong.write_text('mddag: 1\nnodes: []\nnonsense: 1\n')
-    other = tmp_path / 'other.yaml'
-    other.write_text('mddag: 1\nnodes:\n  - node: /x\n    callbacks:\n'
-                     '      - {name: y, timer: 1s, deadline: 1s}\n')
-    empty = tmp_path / 'empty'
-    empty.mkdir()
-    for arguments, says in (
-        ([trace, wrong], f'{wrong}:'),
-        ([trace, tmp_path / 'gone.yaml'], f'{tmp_path}/gone.yaml: '),
-        ([trace, other], f'{trace}: none of the callbacks of {other} is in it: it has '
-         '/driver:tick, /filter:run: give the graph of the nodes that were recorded, or none'),
-        ([tmp_path], f'{tmp_path}: is a folder: give the trace {trace}'),
-        ([empty], f'{empty}: is an empty folder: give a trace, an .mcap file'),
-        ([trace, '--json', tmp_path / 'gone' / 'a.json'], f'{tmp_path}/gone/a.json: there is no'),
-        ([trace, '--workers', '2'], '--workers: a run is replayed as it was recorded: add '),
-        ([trace, '--policy', 'rad'], '--policy: a run is replayed as it was recorded: add '),
-        ([trace, '--preemptive'], '--preemptive: a run is replayed as it was recorded: add '),
-        ([trace, '--overheads', 'none'], '--overheads: a run is replayed as it was recorded'),
-        ([trace, '--seed', '0'], '--seed: a run is replayed as it was recorded: add '),
-        ([trace, '--reschedule', '--seed', '1'], '--seed: a trace has its own execution times'),
-        ([trace, '--reschedule', '--callbacks'], '--callbacks: '),
-        ([trace, '--reschedule', '--policy', 'best'], "policy 'best': there is no such policy: "),
-        ([trace, '--reschedule', '--workers', '0'], 'mddag replay: argument --workers: '),
-        ([trace, '--reschedule', '--workers', '99999'],
-         "mddag replay: argument --workers: '99999' is no whole number from 1 to 4096"),
-        (['-', '-'], '-: standard input can be only one of trace and trace: name a file '),
-        ([], 'mddag replay: the following arguments are required: TRACE'),
-    ):
-        status, out, err = call(capsys, *arguments)
-        assert (status, out) == (2, ''), arguments
-        assert err.startswith(f'error: {says}'), arguments
-        assert err.count('\n') == 1, arguments
-
-
-def test_help_and_start_up_load_neither_ros_nor_numpy(mddag, trace: Path) -> None:
-    script = ('import sys; from mddag_executor.cli.main import main; main(sys.argv[1:]); '
-              "print(sorted({'rclpy', 'rosbags', 'hypothesis'} & set(sys.modules)))")
-    import subprocess
-    done = subprocess.run([sys.executable, '-c', script, 'replay', str(trace)], text=True,
-                          capture_output=True, check=True)
-    assert done.stdout.splitlines()[-1] == '[]'
-    shown = mddag('replay', '--help')
-    assert shown.returncode == 0
-    assert 'mddag replay run.mcap graph.yaml --fail-on-miss' in shown.stdout
 
 
 def test_a_sink_is_named_as_tables_do_or_by_a_unique_end(

@@ -129,6 +129,7 @@ HASHES = """\
 import rclpy
 from std_msgs.msg import Float64, String
 
+
 def make():
     node = rclpy.create_node('tracker')
     node.create_subscription(Float64, '/distance', lambda message: None, 10)

@@ -136,29 +136,6 @@ def test_the_paper_workload(capsys: pytest.CaptureFixture[str]) -> None:
     assert result != result_of(capsys, AUTOWARE, '--preemptive', '--seed', 2)
 
 
-def test_the_table_for_people(capsys: pytest.CaptureFixture[str], graph: Path) -> None:
-    assert main(['simulate', str(graph), '--workers', '1', '--duration', '100ms']) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split()[:6] == ['DAG', 'sink', 'due', 'in', 'time', 'late']
-    assert lines[1].split()[:4] == ['lidar', 'filter:far', '9', '22.22']
-    assert lines[2].split()[:3] == ['filter:near', '10', '30.00']
-    assert lines[-3] == 'rad, 1 worker, not preemptive, 100 ms, utilisation 1.100'
-    assert lines[-2].startswith('10 jobs, 19 sink jobs due, ')
-    assert lines[-1] == ('first miss: /filter:far of job 2 of lidar, deadline at 32 ms, '
-                         'completed 1 ms late')
-    assert main(['simulate', str(graph), '--workers', '1', '--stop-at-first-miss']) == 0
-    assert 'stopped at the first miss, at 33 ms' in capsys.readouterr().out
-
-
-def test_the_table_and_a_file(
-    capsys: pytest.CaptureFixture[str], graph: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / 'out.json'
-    assert main(['simulate', str(graph), '--json', str(out)]) == 0
-    assert 'sink jobs due' in capsys.readouterr().out
-    assert json.loads(out.read_text())['deadline_missed'] is False
-
-
 @pytest.mark.parametrize(('workers', 'status'), [(1, 1), (2, 0)])
 def test_fail_on_miss(graph: Path, workers: int, status: int) -> None:
     command = ['simulate', str(graph), '--workers', str(workers), '--json', '/dev/null']
@@ -191,92 +168,6 @@ def test_standard_input(call: Mddag, graph: Path, times: Path) -> None:
     assert (first.returncode, first.stderr, second.returncode) == (0, '', 0)
     assert second.stdout == plain.stdout
     assert json.loads(first.stdout)['dags'] == json.loads(plain.stdout)['dags']
-
-
-def changed(**times: Any) -> str:
-    return json.dumps({'lidar': {**TIMES['lidar'], **times}})
-
-
-@pytest.mark.parametrize(('arguments', 'times', 'says'), [
-    (['--workers', '0'], None, "--workers: '0' is no whole number from 1 to 4096"),
-    (['--workers', '-2'], None, '--workers'),
-    (['--workers', 'many'], None, '--workers'),
-    (['--policy', 'edf'], None,
-     "policy 'edf': there is no such policy: choose one of rad, rm, wc, fifo, gedf, dm, "),
-    (['--duration', '-3s'], None, '--duration'),
-    (['--duration=-3s'], None, 'negative'),
-    (['--duration', '0s'], None, 'too short'),
-    (['--duration', '3'], None, 'no unit'),
-    (['--duration', '1e9s'], None, 'not a time'),
-    (['--judge', 'me'], None, '--judge'),
-    (['--seed', 'x'], None, '--seed'),
-    (['--utilisation', '0'], None, '--utilisation'),
-    (['--utilisation', 'nan'], None, '--utilisation'),
-    (['--trace', '-'], None, '--trace -'),
-    (['--trace', '/nowhere/x.mcap'], None, '/nowhere'),
-    (['--json', '/nowhere/x.json'], None, '/nowhere'),
-    (['--speed', '3'], None, "there is no option '--speed'"),
-    ([], '{', 'times.json:1: not JSON'),
-    ([], '[]', 'times.json: not an object of objects'),
-    ([], json.dumps({'lidra': TIMES['lidar']}),
-     "times.json: DAG 'lidra' is not in graph.yaml: its DAGs are lidar"),
-    ([], json.dumps({'lidar': {'/filter:near': 3}}),
-     'times.json: no execution time for /sensing/driver:tick of DAG lidar: add it'),
-    ([], changed(**{'/filter:mid': 3}), "times.json: '/filter:mid' is not a vertex of DAG lidar"),
-    ([], changed(**{'/filter:near': 0}), 'execution time of /filter:near of DAG lidar is 0'),
-    ([], changed(**{'/filter:near': -4}), 'is -4: give microseconds, above 0'),
-    ([], changed(**{'/filter:near': 'slow'}), "is 'slow'"),
-    ([], changed(**{'/filter:near': float('nan')}), 'is nan'),
-    ([], changed(**{'/filter:near': '\x1b[31m\n'}), 'execution time of /filter:near'),
-])
-def test_bad_input_is_one_line(
-    call: Mddag, graph: Path, arguments: list[str], times: str | None, says: str
-) -> None:
-    if times is not None:
-        (graph.parent / 'times.json').write_text(times)
-        arguments = [*arguments, '--execution-times', 'times.json']
-    before = sorted(graph.parent.iterdir())
-    done = call('simulate', 'graph.yaml', *arguments, cwd=graph.parent)
-    assert (done.returncode, done.stdout) == (2, '')
-    assert done.stderr.startswith('error: ')
-    assert done.stderr.count('\n') == 1
-    assert says in done.stderr
-    assert '\x1b' not in done.stderr
-    assert sorted(graph.parent.iterdir()) == before, 'nothing is left behind'
-
-
-@pytest.mark.parametrize(('graph_arguments', 'says'), [
-    (['missing.yaml'], 'missing.yaml: the file cannot be read'),
-    (['graph.yaml', '--execution-times', 'missing.json'], 'missing.json: no such file'),
-    (['graph.yaml', '--execution-times', '.'], '.: is a directory'),
-    (['-', '--execution-times', '-'], '-: standard input can be only one of'),
-    (['-'], '<stdin>: the file is empty'),
-    (['binary.yaml'], 'binary.yaml'),
-    (['bare.yaml'], 'bare.yaml:4: /a:b declares no execution_time: add one, or give '),
-    ([], 'required: GRAPH'),
-])
-def test_bad_files_are_one_line(
-    call: Mddag, graph: Path, graph_arguments: list[str], says: str
-) -> None:
-    (graph.parent / 'binary.yaml').write_bytes(bytes(range(256)))
-    (graph.parent / 'bare.yaml').write_text(
-        'mddag: 1\nnodes:\n  - node: /a\n    callbacks: [{name: b, timer: 1ms, deadline: 1ms}]\n')
-    done = call('simulate', *graph_arguments, cwd=graph.parent)
-    assert (done.returncode, done.stdout) == (2, '')
-    assert done.stderr.startswith('error: ')
-    assert done.stderr.count('\n') == 1
-    assert says in done.stderr
-
-
-def test_nothing_of_ros_is_loaded(graph: Path) -> None:
-    """It works on a machine without ROS."""
-    program = (
-        'import sys; from mddag_executor.cli.main import main; '
-        f'main(["simulate", {str(graph)!r}]); '
-        'assert not {"rclpy", "std_msgs"} & set(sys.modules), "ROS"')
-    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
-                          check=False)
-    assert (done.returncode, done.stderr) == (0, '')
 
 
 def test_a_disk_that_gets_full_leaves_nothing_and_promises_nothing(graph: Path) -> None:

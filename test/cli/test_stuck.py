@@ -14,6 +14,7 @@ import threading, time
 from mddag_executor.cli.stuck import dump_when_stuck
 from mddag_executor.hosting.session import Session
 
+
 class Executor:
     def spin(self):
         time.sleep(0.05)

@@ -64,20 +64,6 @@ def test_tables_align_names_left_and_numbers_right() -> None:
                     '/longer:c    12  100 ms  100.00  x\n')
 
 
-def test_a_table_of_nothing_is_its_header() -> None:
-    assert table(['a', 'b'], []) == 'a  b\n'
-
-
-def test_a_table_is_harmless() -> None:
-    assert '\x1b' not in table(['a'], [['\x1b[2J']])
-    assert table(['a'], [['x\ny']]) == 'a\nx\\ny\n'
-
-
-def test_a_row_of_wrong_length_is_an_error() -> None:
-    with pytest.raises(ValueError, match='1 cells under 2 titles'):
-        table(['a', 'b'], [['x']])
-
-
 class Terminal(io.StringIO):
 
     def isatty(self) -> bool:
@@ -149,12 +135,3 @@ def test_both_packages_make_names_harmless_alike() -> None:
     every = ''.join(map(chr, range(0x11000))) + '\U000e0001\U0010ffff'
     assert printable(every) == errors.printable(every)
     assert printable(every).isprintable()
-
-
-def test_progress_in_events() -> None:
-    now = [0.0]
-    stream = Terminal()
-    with Progress('reading', stream=stream, clock=lambda: now[0]) as line:
-        now[0] = 3.0
-        line.events(1_234_567)
-        assert stream.getvalue().strip() == 'reading: 1.2 million events'

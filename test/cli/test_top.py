@@ -44,6 +44,7 @@ POOL = {'idle_workers': '5', 'callbacks_per_s': '12.5', 'busy_ratio': '0.250'}
 
 # --- what is shown -------------------------------------------------------------------------------
 
+
 def test_the_newest_status_of_each_process_is_shown():
     board = Board()
     board.take(array(('b/2', 'mddag: x', 0, DAG), ('a/1', 'mddag: x', 1, DAG)))
@@ -129,6 +130,7 @@ def test_names_and_verdicts_are_whole_in_every_terminal(
 
 
 # --- over ROS ------------------------------------------------------------------------------------
+
 
 @pytest.fixture
 def running(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
