@@ -88,6 +88,10 @@ def test_ros2_finds_and_runs_it(workspace: Path, tmp_path: Path):
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count('mddag 1.') == 2 and '\n  mddag ' in done.stdout
     assert "'ros_args':" in done.stdout
+    line = 'ros2 mddag graph from-tr'
+    assert in_workspace(
+        workspace, f"_ARGCOMPLETE=1 _ARGCOMPLETE_STDOUT_FILENAME=out COMP_LINE='{line}' "
+        f'COMP_POINT={len(line)} ros2; cat out', tmp_path).stdout.strip() == 'from-trace'
 
 
 GRAPH = """

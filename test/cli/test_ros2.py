@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 from importlib.metadata import distribution
 from importlib.util import find_spec
+import os
 from pathlib import Path
 import sys
 from types import ModuleType, SimpleNamespace
@@ -76,3 +77,16 @@ def test_help_and_version(
 
 def test_the_list_of_commands_has_a_line_for_it(ros2: SimpleNamespace) -> None:
     assert ros2.summary.strip() and '\n' not in ros2.summary.strip()
+
+
+def test_completion_is_that_of_mddag(
+    ros2: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    monkeypatch.setattr('mddag_executor.cli.completion.complete', lambda: asked.append(
+        (os.environ['COMP_LINE'], os.environ['COMP_POINT'])))
+    for name, value in (('_ARGCOMPLETE', '1'), ('COMP_LINE', 'ros2 mddag expl'),
+                        ('COMP_POINT', '15')):
+        monkeypatch.setenv(name, value)
+    ros2.main('graph')
+    assert asked[0] == ('mddag expl', '10')
