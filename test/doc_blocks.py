@@ -5,9 +5,10 @@ The code blocks of a page, and how each is tried.
 
 Theory of operation
 -------------------
-A page (Markdown) has a folder of its own for its test, with `config/` and `bags/` of the checkout
-in it.  Its blocks are tried there in the order of the page, so that one may use what one before it
-has made.  What is done with a block depends on its language:
+A page (Markdown) has a folder of its own for its test, with `config/`, `bags/` and `examples/` of
+the checkout in it; `examples/rerun` is on Python's path, and `examples/third_party/install` is a
+sourced workspace.  Its blocks are tried there in the order of the page, so that one may use what
+one before it has made.  What is done with a block depends on its language:
 
 * `sh`: run by bash, which must end with status 0; `mddag` and `python` are those of this test.
 * `text` right behind: the output of that command.  `…` in it stands for anything.
@@ -116,6 +117,11 @@ def blocks(page: str, text: str | None = None) -> list[Block]:
     return found
 
 
+def _before(variable: str, *paths: Path) -> str:
+    """Return the value of a variable of the environment that lists paths, with some before it."""
+    return os.pathsep.join([*map(str, paths), *filter(None, [os.environ.get(variable)])])
+
+
 class Folder:
     """
     The folder in which the blocks of one page are tried.
@@ -127,7 +133,7 @@ class Folder:
     def __init__(self, path: Path, files: dict[str, str] | None = None) -> None:
         self.path = path
         self.output = ''
-        for name in ('config', 'bags'):
+        for name in ('config', 'bags', 'examples'):
             (path / name).symlink_to(TOP / name)
         for name, text in (files or {}).items():
             self.write(name, text)
@@ -138,8 +144,10 @@ class Folder:
             program.write_text(f'#!/bin/sh\nexec {sys.executable} {command} "$@"\n')
             program.chmod(0o755)
         self._environment = {
-            **os.environ, 'PYTHONPATH': os.pathsep.join(
-                [str(path), str(TOP), *filter(None, [os.environ.get('PYTHONPATH')])]),
+            **os.environ,
+            'PYTHONPATH': _before('PYTHONPATH', path, path / 'examples' / 'rerun', TOP),
+            'AMENT_PREFIX_PATH': _before(
+                'AMENT_PREFIX_PATH', path / 'examples' / 'third_party' / 'install'),
             'PATH': os.pathsep.join([str(programs), os.environ['PATH']])}
 
     def write(self, name: str, text: str) -> Path:

@@ -502,7 +502,7 @@ class WorkerPool:
             if self._muted_until and not self.engine.holders:
                 self._unmute()
             if (expired or self.timers.has_jumped) and self.running:
-                timed = self._on_time(now)
+                timed = self._on_time(now, waited=not has_ended)
             found = not timed and not is_last and self._choose(me, now)
             if (expired or self._may_expire_early and not found
                     or self._is_due_earlier(now - self.clock.offset_ns)):
@@ -566,10 +566,14 @@ class WorkerPool:
             if not self._closed:
                 self._parked.append(me)
 
-    def _on_time(self, now: int) -> list[Callable[[], None]]:
-        """Handle what is due by now; return what is to be called without the lock."""
+    def _on_time(self, now: int, waited: bool) -> list[Callable[[], None]]:
+        """
+        Handle what is due by now; return what is to be called without the lock.
+
+        :param waited: the thread has waited in the epoll until now.
+        """
         monotonic = now - self.clock.offset_ns
-        self._notice_stop(monotonic)
+        self._notice_stop(monotonic, waited)
         if monotonic > self._check_context_at:  # nobody says so if it was only destroyed
             self._check_context_at = monotonic + CONTEXT_CHECK_NS
             if self._context_ended():
@@ -706,12 +710,16 @@ class WorkerPool:
 
     # --- stops of the machine --------------------------------------------------------------------
 
-    def _notice_stop(self, now: int) -> None:
-        """Notice that nothing of the process ran since the timerfd was to expire."""
+    def _notice_stop(self, now: int, waited: bool) -> None:
+        """
+        Notice that nothing of the process ran since the timerfd was to expire.
+
+        If no thread waited for the timerfd, as all ran callbacks, its being late says nothing.
+        """
         at, cpu = self.loop.timer.at, process_time_ns()
         seen, used = self._seen
         self._seen = now, cpu
-        if at:
+        if at and waited:
             late = now - max(at, seen) - (cpu - used)
             if late >= STOP_NS:
                 self.stopped(now - late, now)

@@ -29,7 +29,8 @@ def short_names(names: Iterable[str]) -> dict[str, str]:
 
     A name that would then be ambiguous stays whole.
     """
-    shortened = {name: name[name.rfind('/') + 1:] for name in names}
+    shortened = {name: node.rpartition('/')[2] + colon + rest for name in names
+                 for node, colon, rest in [name.partition(':')]}
     used = Counter(shortened.values())
     return {name: short if used[short] == 1 else name for name, short in shortened.items()}
 

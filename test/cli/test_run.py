@@ -308,6 +308,22 @@ def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph: Path
     assert 10 <= stops['misses'] == int(line[1]) <= int(line[2]) == total(result['dags']).missed
 
 
+def test_workers_that_all_wait_in_callbacks_are_no_stop_of_the_machine(
+    folder: Path, mddag: Mddag
+) -> None:
+    Path('graph.yaml').write_text("""\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: tick, timer: 50ms, deadline: 50ms, execution_time: 1ms}
+      - {name: wait, timer: 200ms, deadline: 200ms, execution_time: 150ms}
+""")
+    mddag('run', 'graph.yaml', '--synthetic', 'sleep', '--workers', '1', '--duration', '1s',
+          '--json', 'out.json')
+    assert json.loads(Path('out.json').read_text())['stops']['total_ns'] < 500_000_000
+
+
 def test_a_later_sigint_interrupts_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
     class Ending:
         stops = 0
