@@ -5,6 +5,7 @@ VENV := .venv
 KILTED := .venv-kilted
 # Whole files of tests that run ROS come first, then the others one by one (see test/conftest.py).
 PYTEST_ARGS ?= -n 2
+TEST_TAKES := 6 minutes on two cores
 BIN := $(VENV)/bin
 
 # The environment brings its own ROS packages. What a sourced ROS (or another environment's
@@ -15,14 +16,17 @@ ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: help env demo test test-kilted check-fresh soak stress fuzz lint docs clean distclean
+.PHONY: help env demo test test-kilted check-fresh nightly mutations soak stress fuzz lint docs \
+	clean distclean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo       run the Autoware workload under the executor, record and replay it'
-	@echo 'make test       run all tests (PYTEST_ARGS=... for some of them)'
+	@echo 'make test       run all tests, about $(TEST_TAKES) (PYTEST_ARGS=... for some of them)'
 	@echo 'make test-kilted  the tests of what runs ROS, with ROS 2 Kilted, in $(KILTED)/'
 	@echo 'make check-fresh  make demo and make test in new installations of Debian (CHECK_FRESH=...)'
+	@echo 'make nightly    make mutations, soak, stress and fuzz, and 20 times the random examples'
+	@echo 'make mutations  break the executor in 28 ways, each of which a test must notice'
 	@echo 'make soak       the Autoware workload with random faults for SOAK_SECONDS (600)'
 	@echo 'make stress     deadline misses reported to all kinds of handlers, STRESS_SECONDS (20) each'
 	@echo 'make fuzz       read damaged traces and bags for FUZZ_SECONDS (600) each'
@@ -40,6 +44,7 @@ demo: env
 
 test: env
 	@sh .ci/tools install
+	@echo 'make test: about $(TEST_TAKES)'
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 # The tests that run ROS, in an environment with ROS 2 Kilted instead of Jazzy.
@@ -56,6 +61,13 @@ CHECK_FRESH ?= bookworm trixie
 
 check-fresh:
 	@bash .ci/check-fresh $(CHECK_FRESH)
+
+nightly: mutations soak stress fuzz
+	@MDDAG_THOROUGH=20 HARDENING_EXAMPLES=1000 $(BIN)/python -m pytest $(PYTEST_ARGS) -q \
+		test/core test/msg_graph test/hardening
+
+mutations: env
+	@$(BIN)/python -m pytest -q -m nightly test/executor/mutations
 
 FUZZ_SECONDS ?= 600
 

@@ -30,7 +30,7 @@ def soak(*arguments: str, timeout: float = 150.0) -> dict[str, Any]:
     return result
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_short_soak_loses_nothing_and_keeps_nothing():
     """Deadlines are left to `make soak`: they depend on what else the machine does."""
     result = soak(

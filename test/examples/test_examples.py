@@ -63,12 +63,6 @@ def test_hello_deadline() -> None:
     assert int(printed[1]) >= 29  # of the thirty, one may be open when the future is done
 
 
-def test_hello_deadline_has_thirty_lines() -> None:
-    text = (EXAMPLES / 'hello_deadline' / 'hello.py').read_text(encoding='utf-8')
-    code = text.split('"""')[2]
-    assert len([line for line in code.splitlines() if line.strip()]) <= 30
-
-
 def test_sensor_fusion(tmp_path: Path) -> None:
     found = result('sensor_fusion', tmp_path)
     sinks = found['dags']['fusion']['sinks']

@@ -106,7 +106,6 @@ def split(
 
 
 @pytest.mark.parametrize('processes', [
-    {'p1': 'one', 'p2': 'two three', 'p3': 'four five'},
     {'p1': 'one four', 'p2': 'two three', 'p3': 'five'},  # it leaves and comes back
     {'p1': 'one two', 'p2': 'three four five'},  # one leg is here, and one is not
 ])

@@ -167,6 +167,7 @@ from rclpy.executors import ExternalShutdownException
 from std_srvs.srv import Trigger
 from mddag_executor import MultiDeadlineExecutor
 
+
 def busy():
     running.add(threading.get_ident())
     if len(running) >= 5:
@@ -174,6 +175,7 @@ def busy():
     end = time.monotonic() + 0.02
     while time.monotonic() < end:
         node.get_logger().debug('busy')
+
 
 def ask():
     client.call(Trigger.Request())

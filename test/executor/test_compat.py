@@ -54,6 +54,7 @@ def until_there(take):
 
 # --- taking --------------------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize('raw', [False, True])
 def test_a_message_is_taken_with_its_info(make_node, raw):
     node = make_node()
@@ -92,6 +93,7 @@ def test_whether_a_callback_takes_the_info_is_known(make_node):
 
 
 # --- timers --------------------------------------------------------------------------------------
+
 
 def test_a_timer_is_asked_and_called(make_node):
     node = make_node()
@@ -140,6 +142,7 @@ def test_a_rates_timer_is_known(make_node):
 
 
 # --- futures and tasks ---------------------------------------------------------------------------
+
 
 class Answering:
     """An executor as far as futures need one."""
@@ -273,6 +276,7 @@ def test_what_a_coroutine_waits_for_is_found():
 
 # --- executors and nodes -------------------------------------------------------------------------
 
+
 def test_the_bare_executor_knows_of_signals_and_of_its_end(ros_context):
     executor = compat.BareExecutor(context=ros_context)
     assert alive(executor.signal_guard())
@@ -374,6 +378,7 @@ def test_names_of_services(pair):
 
 
 # --- what is behind a handle ---------------------------------------------------------------------
+
 
 def is_written(fd: int) -> bool:
     try:

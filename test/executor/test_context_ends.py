@@ -15,7 +15,6 @@ from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor.shutdown import call_at_shutdown
-from msg_graph import loads
 import pytest
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -109,21 +108,6 @@ def test_what_the_callback_raises_that_shuts_down_comes_out(make_executor, make_
     executor.add_node(node)
     with pytest.raises(SystemExit, match='done'):
         executor.spin()
-
-
-def test_the_handler_of_misses_may_shut_down(ros_context, make_node):
-    node = make_node('node')
-    node.create_timer(0.01, lambda: None)
-    executor = MultiDeadlineExecutor(
-        loads("""
-mddag: 1
-nodes:
-  - node: /node
-    callbacks: [{name: tick, timer: 10ms, deadline: 1us}]
-"""), context=ros_context, on_deadline_miss=lambda miss: ros_context.try_shutdown())
-    executor.add_node(node)
-    executor.spin()
-    assert not ros_context.ok()
 
 
 def test_what_a_callback_raises_of_a_context_that_is_there_comes_out(make_executor):

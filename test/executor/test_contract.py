@@ -173,6 +173,7 @@ from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 from mddag_executor import MultiDeadlineExecutor
 
+
 def spin(name, executor):
     try:
         executor.spin()

@@ -10,7 +10,7 @@ import threading
 from typing import Any
 
 from mddag_executor.core import NEVER
-from mddag_executor.core.state import N_HOLDING, N_IDLE, N_STALE, RUNNING, WAITING
+from mddag_executor.core.state import N_HOLDING, N_IDLE, N_STALE, WAITING
 from mddag_executor.executor.debugging import CheckedLock, engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, SUBSCRIPTION
@@ -69,18 +69,6 @@ def busy_engine() -> Engine:
     return engine
 
 
-def twice(engine: Engine) -> None:
-    engine._state.ready.append(engine._state.group_heap[0][0])
-
-
-def reordered(engine: Engine) -> None:
-    engine._state.group_heap[0].reverse()
-
-
-def forgotten(engine: Engine) -> None:
-    engine._work.popitem()
-
-
 def count(engine: Engine, column: int) -> None:
     engine._state.scalars[column] += 1
 
@@ -100,48 +88,18 @@ def waiting(engine: Engine, group: int = -1) -> int:
                 if state.x_state[x] == WAITING and state.x_group[x] == group)
 
 
-def unknown_overtaking(engine: Engine) -> None:
-    """Let another one begin that holds the GIL, though it is no more urgent."""
-    x = engine._state.held_back[0][4]
-    engine._state.held_back.pop(0)
-    work = engine._work.pop(x)
-    work.entity.waiting.pop(x)
-    engine._state.x_holds[x] = 0
-    engine._state.ready.insert(0, engine._state.x_key[x])
-    engine.scheduler.take(engine._state.worker_x.index(-1), 0)
-    engine._state.x_holds[x] = 1
-    engine._state.scalars[N_HOLDING] += 1
-    engine.holders.append(work)
-
-
 BREAKS: dict[str, tuple[str, Callable[[Engine], Any]]] = {
     'lost': ('in no queue', lambda e: e._state.held_back.pop()),
-    'in two queues': ('waits in', twice),
-    'no heap': ('not a heap', reordered),
     'wrong group': ('waits for group', lambda e: e._state.x_group.__setitem__(
         e._state.group_heap[0][0][4], -1)),
     'stale': ('are stale', lambda e: count(e, N_STALE)),
     'idle workers': ('are idle', lambda e: count(e, N_IDLE)),
     'holders counted': ('hold the interpreter', lambda e: count(e, N_HOLDING)),
-    'holders noted': ('hold the GIL', lambda e: e.holders.clear()),
-    'overtaking': ('not more urgent', unknown_overtaking),
     'worker': ('runs execution', lambda e: set_state(e, running(e), WAITING)),
-    'two workers': ('does not run it', lambda e: e._state.x_worker.__setitem__(
-        waiting(e), 3)),
-    'ghost': ('group 0 is owned', lambda e: set_state(e, waiting(e, 0), RUNNING)),
     'owner': ('nothing brings', lambda e: e._state.group_owner.__setitem__(0, -1)),
-    'other owner': ('is owned by', lambda e: e._state.group_owner.__setitem__(0, waiting(e))),
-    'unknown work': ('work is known', forgotten),
-    'decision': ('not carried out', lambda e: e._state.decisions.append((0, 0, 0, 0, 0, 0))),
-    'depth': ('queue of depth', lambda e: setattr(
-        next(w.entity for w in e._work.values() if w.entity.depth == 1), 'waiting',
-        dict.fromkeys((1, 2)))),
     'active': ('counted are', lambda e: e._state.job_active.__setitem__(0, 9)),
     'open jobs': ('jobs of DAG 0 are open', lambda e: e._state.n_open.__setitem__(0, 0)),
-    'list of jobs': ('list of open jobs', lambda e: e._state.oldest.__setitem__(0, -1)),
-    'free slots': ('free slots', lambda e: e._state.free_slot.__setitem__(1, 0)),
     'deadline': ('next deadline', lambda e: setattr(e.deadlines, 'next', 5)),
-    'watched': ('nobody watches', lambda e: e.deadlines._entry.clear()),
 }
 
 
@@ -154,24 +112,6 @@ def test_each_broken_invariant_is_found(broken):
         engine.validate()
 
 
-def test_a_section_is_checked_at_its_end_and_only_once_when_broken(monkeypatch):
-    monkeypatch.setenv('MDDAG_DEBUG', '1')
-    engine = busy_engine()
-    lock = engine_lock(engine.validate, engine.size)
-    with lock:
-        with lock:
-            count(engine, N_IDLE)
-        assert lock._is_owned()
-        engine._state.scalars[N_IDLE] -= 1  # it is right at the end
-    assert not lock._is_owned()
-    with pytest.raises(InvariantError, match='are idle'):
-        with lock:
-            count(engine, N_IDLE)
-    assert not lock._is_owned()
-    with lock:
-        pass  # that is known
-
-
 def test_what_a_section_raises_is_not_hidden():
     def fail() -> None:
         raise AssertionError('not called')
@@ -181,15 +121,6 @@ def test_what_a_section_raises_is_not_hidden():
         with lock:
             raise ZeroDivisionError
     assert not lock._is_owned()
-
-
-def test_what_is_large_is_checked_after_some_sections_only():
-    checked: list[None] = []
-    lock = CheckedLock(lambda: checked.append(None), lambda: 1000)
-    for _ in range(100):
-        with lock:
-            pass
-    assert len(checked) == 10
 
 
 def test_without_the_variable_there_is_a_plain_lock(monkeypatch):

@@ -12,16 +12,14 @@ import time
 from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.executor import publishing, work, workers
-from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.work import Work
+from mddag_executor.executor import publishing
 from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
 from std_msgs.msg import Header
 
-from .conftest import is_idle, Spinning, wait_for
+from .conftest import Spinning, wait_for
 
 CHAIN = """
 mddag: 1
@@ -242,39 +240,6 @@ def test_a_destroyed_subscription_is_no_harm(make_executor, make_node):
     assert got.count('first') == 1
 
 
-def test_a_chain_goes_on_in_one_thread_when_callbacks_end_after_publishing(
-    make_executor, make_node, monkeypatch,
-):
-    monkeypatch.setattr(workers, 'SOON_NS', 10 ** 9)  # on the busiest machine
-    monkeypatch.setattr(workers, 'WAKE_GUARD_NS', 10 ** 9)
-    node, threads = make_node(), []
-    one, two = node.create_publisher(Header, '/one', 1), node.create_publisher(Header, '/two', 1)
-    group = ReentrantCallbackGroup()
-    here: list[int] = []
-
-    def tick() -> None:
-        here[:] = [threading.get_ident()]
-        one.publish(Header())
-
-    def step(_: Any) -> None:
-        here.append(threading.get_ident())
-        two.publish(Header())
-
-    def sink(_: Any) -> None:
-        threads.append((*here, threading.get_ident()))
-
-    node.create_timer(0.02, tick, callback_group=group)
-    node.create_subscription(Header, '/one', step, 1, callback_group=group)
-    node.create_subscription(Header, '/two', sink, 1, callback_group=group)
-    executor = make_executor(loads(CHAIN, 'chain.yaml'))
-    executor.add_node(node)
-    with Spinning(executor):
-        assert wait_for(lambda: len(threads) >= 40, 20)
-    assert executor.statistics()['undeclared'] == 0
-    same = [len(set(idents)) == 1 for idents in threads[10:]]
-    assert sum(same) > len(same) / 2
-
-
 @pytest.mark.parametrize('waits', ['always', 'seldom'])
 def test_work_does_not_wait_for_a_callback_that_goes_on_after_publishing(
     make_executor, make_node, waits,
@@ -297,47 +262,6 @@ def test_work_does_not_wait_for_a_callback_that_goes_on_after_publishing(
     with Spinning(executor):
         assert wait_for(lambda: len(waited) >= 10, 40.0)
     assert all(waited)
-
-
-def test_what_was_left_to_a_callback_is_looked_at_though_the_timer_is_armed_anew(
-        make_executor, monkeypatch):
-    pool = make_executor()._pool
-    me = workers.WorkerThread(pool, None)
-    me.published, me.work = 1, Work(Entity('task', None, '', None, -1, 0, ''), print)
-    monkeypatch.setattr(work.current, 'running', me)
-    with pool.stepping():
-        before = time.monotonic_ns()
-        pool.report(pool.engine.ready, Work(me.work.entity, print))
-        guard = pool.loop.timer.at
-        pool.arm()  # as for timers that have come
-        assert before < pool.loop.timer.at == guard
-        assert pool._turn(me, False, [])
-
-
-def test_subscriptions_of_one_message_are_chosen_among_by_deadline(make_executor, make_node):
-    node, order = make_node(), []
-    graph = """
-mddag: 1
-nodes:
-  - node: /node
-    callbacks:
-      - {name: tick, timer: 50ms, publishes: [/one]}
-      - {name: patient, subscription: /one, deadline: 50ms}
-  - node: /other
-    callbacks:
-      - {name: urgent, subscription: /one, deadline: 10ms}
-"""
-    other = make_node('other')
-    publisher = node.create_publisher(Header, '/one', 1)
-    node.create_timer(0.05, lambda: publisher.publish(Header()))
-    node.create_subscription(Header, '/one', lambda m: order.append('patient'), 1)
-    other.create_subscription(Header, '/one', lambda m: order.append('urgent'), 1)
-    executor = make_executor(loads(graph, 'graph.yaml'), num_workers=1)
-    executor.add_node(node)
-    executor.add_node(other)
-    with Spinning(executor):
-        assert wait_for(lambda: len(order) >= 12)
-    assert order[:12] == ['urgent', 'patient'] * 6
 
 
 @pytest.mark.parametrize('takes_first', [True, False])
@@ -417,23 +341,3 @@ def test_a_message_of_a_publisher_that_was_there_for_a_moment_does_not_wait(
         foreign.publish(Header(frame_id='brief'))
         other.destroy_publisher(foreign)
         assert wait_for(lambda: got == ['brief'])
-
-
-def test_what_nobody_subscribes_to_is_published_as_ever(make_executor, make_node):
-    node, got = make_node(), []
-    publisher = node.create_publisher(Header, '/a', 10)
-    executor = make_executor()
-    executor.add_node(node)
-    with Spinning(executor):
-        executor.create_task(publisher.publish, Header(frame_id='to nobody'))
-        assert wait_for(lambda: is_idle(executor))
-        with pytest.raises(TypeError):
-            publisher.publish('no message')
-        subscription = node.create_subscription(
-            Header, '/a', lambda m: got.append(m.frame_id), 10)
-        assert sees_all(publisher)
-        with pytest.raises(TypeError):
-            publisher.publish('no message')
-        publisher.publish(Header(frame_id='to one'))
-        assert wait_for(lambda: got == ['to one'])
-        node.destroy_subscription(subscription)

@@ -24,6 +24,7 @@ SECOND = 1_000_000_000
 
 # --- the verdicts, without ROS -------------------------------------------------------------------
 
+
 class Watched:
     """A DAG of one sink whose results are made up; each ``after`` is one period."""
 
@@ -120,6 +121,7 @@ def test_the_period():
 
 # --- published -----------------------------------------------------------------------------------
 
+
 class Listener:
     """Keeps the newest status by name, from an executor of its own."""
 
@@ -203,21 +205,6 @@ def test_drops_are_a_warning_of_the_pool(make_executor, make_node):
         assert (status.name, status.level) == ('mddag: workers', WARN)
         assert f'{status.values["dropped"]} dropped' in status.message
         assert wait_for(lambda: executor._diagnostics.statuses()[-1].level == OK)
-
-
-def test_it_ends_with_the_executor_and_costs_little(make_executor, make_node):
-    chain = Chain(make_node)
-    executor = make_executor(loads(CHAIN), diagnostics_period='20ms')
-    with Spinning(executor):
-        chain.start(executor)
-        assert wait_for(lambda: len(chain.jobs['last']) >= 5)
-        start = time.thread_time_ns()
-        for _ in range(100):
-            executor._diagnostics.statuses()
-        assert (time.thread_time_ns() - start) / 100 < 5_000_000
-        thread = executor._diagnostics._thread
-        assert thread.is_alive()
-    assert not thread.is_alive()
 
 
 def test_a_shutdown_of_the_context_ends_it_quietly(make_executor, make_node, ros_context, capfd):

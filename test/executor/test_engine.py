@@ -162,19 +162,6 @@ def test_nothing_waits_that_may_run_beside_who_computes(steps: list[bool | int])
         assert sum(work.entity.habit.holds for work in running.values()) <= 1
 
 
-def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
-    engine = Engine(None, 1, 'rad', default_deadline=100, max_active_jobs=64, expire_after=NEVER)
-    entity = Entity('waitable', None, '/n', None, -1, 2, '/t')
-    works = [Work(entity, print, (number,)) for number in range(5)]
-    for now, work in enumerate(works):
-        engine.arrived(work, None, -1, -1, now)
-    ran = []
-    while (ready := engine.dispatch(0, 10)) is not None:
-        ran.append(ready.args[0])
-        engine.finished(ready, 10, 11, 11, 0, ready.worker)
-    assert (ran, entity.dropped, entity.ran) == ([3, 4], 3, 2)
-
-
 def test_it_needs_no_rclpy_and_no_thread() -> None:
     program = (
         'import sys; sys.modules["rclpy"] = None\n'
@@ -192,39 +179,6 @@ def without_job(group: int = -1, most_waiting: int = 0) -> Entity:
 def new_engine(workers: int = 2, policy: str = 'rad') -> Engine:
     return Engine(None, workers, policy, default_deadline=100, max_active_jobs=64,
                   expire_after=NEVER)
-
-
-def test_of_a_group_one_runs_and_the_next_one_when_it_has_ended() -> None:
-    engine = new_engine()
-    entity, other = without_job(engine.scheduler.new_group()), without_job()
-    works = [Work(each, print) for each in (entity, entity, other)]
-    for now, work in enumerate(works):
-        engine.ready(work, now)
-    assert engine.dispatch(0, 5) is works[0]
-    assert engine.may_start_more(5)
-    assert engine.dispatch(1, 5) is works[2]
-    assert not engine.may_start_more(5) and engine.dispatch(1, 5) is None
-    engine.finished(works[2], 5, 6, 6, 0, works[2].worker)
-    assert engine.dispatch(1, 6) is None
-    engine.finished(works[0], 5, 7, 7, 0, works[0].worker)
-    assert engine.dispatch(1, 7) is works[1]
-
-
-def test_a_suspended_execution_keeps_its_group_and_no_worker() -> None:
-    engine = new_engine(1)
-    entity, other = without_job(engine.scheduler.new_group()), without_job()
-    works = [Work(each, print) for each in (entity, entity, other)]
-    for work in works:
-        engine.ready(work, 0)
-    assert engine.dispatch(0, 0) is works[0]
-    engine.suspended(works[0], 0, 1, 0, works[0].worker)
-    assert engine.dispatch(0, 1) is works[2]
-    engine.finished(works[2], 1, 2, 2, 0, works[2].worker)
-    assert engine.dispatch(0, 2) is None and engine.idle_workers == 1
-    engine.resume(works[0])
-    assert engine.dispatch(0, 3) is works[0]
-    engine.finished(works[0], 3, 4, 4, 0, works[0].worker)
-    assert engine.dispatch(0, 4) is works[1]
 
 
 def test_more_is_collected_when_one_that_waits_starts() -> None:

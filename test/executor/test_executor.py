@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 import gc
 import os
 import sys
@@ -17,14 +16,11 @@ from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.errors import MddagError
 from mddag_executor.trace import TraceWriter
 import pytest
-import rclpy
-from rclpy.action import ActionClient, ActionServer
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
-from test_msgs.action import Fibonacci
 
 from .conftest import is_idle, Spinning, wait_for
 
@@ -33,21 +29,6 @@ def publish_when_matched(publisher: Any, message: Any, count: int = 1) -> None:
     assert wait_for(lambda: publisher.get_subscription_count() > 0)
     for _ in range(count):
         publisher.publish(message)
-
-
-def test_timer_runs_at_its_rate(make_executor, make_node):
-    node, calls = make_node(), []
-    begin = time.monotonic()
-    node.create_timer(0.01, lambda: calls.append(time.monotonic()))
-    executor = make_executor()
-    executor.add_node(node)
-    with Spinning(executor) as spinning:
-        assert wait_for(lambda: len(calls) >= 30)
-    end = time.monotonic()
-    assert spinning.error is None
-    [counts] = executor.statistics()['callbacks'].values()
-    periods = counts['ready'] + counts['skipped']  # a busy machine skips some
-    assert (calls[-1] - calls[0]) / 0.01 - 1 <= periods <= (end - begin) / 0.01
 
 
 def test_subscriptions_of_each_kind(make_executor, make_node):
@@ -185,60 +166,6 @@ def test_shutdown_does_not_wait_for_the_second_call_of_a_callback(make_executor,
     assert done.wait(5.0)
 
 
-def test_action_with_feedback_result_and_cancel(make_executor, make_node):
-    node, feedback = make_node(), []
-
-    async def execute(goal: Any) -> Any:
-        for i in range(3):
-            goal.publish_feedback(Fibonacci.Feedback(sequence=[i]))
-        if goal.request.order == 99:
-            while not goal.is_cancel_requested:
-                await asleep(executor, node)
-            goal.canceled()
-            return Fibonacci.Result()
-        goal.succeed()
-        return Fibonacci.Result(sequence=[goal.request.order])
-
-    server = ActionServer(
-        node, Fibonacci, 'fibonacci', execute, callback_group=ReentrantCallbackGroup(),
-        cancel_callback=lambda goal: rclpy.action.CancelResponse.ACCEPT)
-    client = ActionClient(node, Fibonacci, 'fibonacci', callback_group=ReentrantCallbackGroup())
-    executor = make_executor()
-    executor.add_node(node)
-    with Spinning(executor) as spinning:
-        assert client.wait_for_server(5.0)
-        # The server may see the client later than the client the server: what it publishes until
-        # then is gone.
-        assert wait_for(lambda: wait_for(lambda: feedback, 0.1) or client.send_goal_async(
-            Fibonacci.Goal(order=1), feedback_callback=feedback.append) is None)
-        assert wait_for(lambda: len(feedback) % 3 == 0)
-        feedback.clear()
-        handles = [
-            client.send_goal_async(Fibonacci.Goal(order=n), feedback_callback=feedback.append)
-            for n in (3, 4, 99)]
-        assert wait_for(lambda: all(h.done() for h in handles))
-        assert all(h.result().accepted for h in handles)
-        # Before the results: rclpy's client ignores feedback of a goal whose result has come.
-        assert wait_for(lambda: len(feedback) == 9)
-        results = [h.result().get_result_async() for h in handles]
-        assert wait_for(lambda: results[0].done() and results[1].done())
-        assert [list(r.result().result.sequence) for r in results[:2]] == [[3], [4]]
-        handles[2].result().cancel_goal_async()
-        assert wait_for(results[2].done)
-    assert len(feedback) == 9
-    assert spinning.error is None
-    server.destroy()
-    client.destroy()
-
-
-async def asleep(executor: MultiDeadlineExecutor, node: Any) -> None:
-    """Await a future that a timer completes."""
-    future = Future(executor=executor)
-    timer = node.create_timer(0.005, lambda: future.set_result(None))
-    await future
-    node.destroy_timer(timer)
-
-
 def test_tasks_functions_coroutines_and_futures_across_them(make_executor):
     executor = make_executor()
     future = Future(executor=executor)
@@ -312,7 +239,7 @@ def test_entities_created_and_destroyed_while_it_spins(make_executor, make_node)
     executor.add_node(node)
     publisher = node.create_publisher(Header, '/topic', 10)
     with Spinning(executor) as spinning:
-        for _ in range(20):
+        for _ in range(8):
             calls.clear()
             subscription = node.create_subscription(Header, '/topic', calls.append, 10)
             assert wait_for(lambda: publisher.get_subscription_count() == 1)
@@ -326,7 +253,7 @@ def test_a_node_destroyed_while_it_spins_and_one_made_instead(make_executor, mak
     executor = make_executor()
     total = 0
     with Spinning(executor) as spinning:
-        for _ in range(20):
+        for _ in range(8):
             calls: list[int] = []
             node = make_node()
             node.create_timer(0.001, lambda some=calls: some.append(1))
@@ -377,22 +304,6 @@ def test_reentrant_group_fills_all_workers(make_executor):
     assert sorted(t.result() for t in tasks) == list(range(7))
 
 
-def test_never_more_than_the_workers(make_executor):
-    executor = make_executor(num_workers=3)
-    running, most = set(), [0]
-
-    def work() -> None:
-        running.add(threading.get_ident())
-        most[0] = max(most[0], len(running))
-        time.sleep(0.01)
-        running.discard(threading.get_ident())
-
-    tasks = [executor.create_task(work) for _ in range(30)]
-    with Spinning(executor):
-        assert wait_for(lambda: all(t.done() for t in tasks))
-    assert most[0] == 3
-
-
 def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):
     """A bounded queue, the policy is that of its QoS: the oldest goes (rclcpp#3213)."""
     node, got, gate = make_node(), [], threading.Event()
@@ -417,24 +328,6 @@ def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):
         assert stays(got)
     assert got == [0, 8, 9, 10]
     assert sum(executor.statistics()['dropped'].values()) == 7
-
-
-def test_no_message_is_lost(make_executor, make_node):
-    node, got = make_node(), []
-    node.create_subscription(
-        Header, '/topic', lambda m: got.append(m.stamp.sec), 1000,
-        callback_group=ReentrantCallbackGroup())
-    publisher = node.create_publisher(Header, '/topic', 1000)
-    executor = make_executor()
-    executor.add_node(node)
-    with Spinning(executor):
-        assert wait_for(lambda: publisher.get_subscription_count() > 0)
-        for i in range(1000):
-            publisher.publish(Header(stamp=Time(sec=i)))
-            if i % 50 == 0:
-                time.sleep(0.01)
-        assert wait_for(lambda: len(got) == 1000)
-    assert sorted(got) == list(range(1000))
 
 
 @pytest.mark.parametrize('kwargs, says', [
@@ -463,7 +356,7 @@ def test_a_destroyed_subscription_does_not_run_what_it_has_queued(make_executor,
         gate.acquire(timeout=15.0)
 
     with Spinning(executor):
-        for _ in range(200):
+        for _ in range(50):
             subscription = node.create_subscription(Header, '/topic', got.append, 10)
             assert wait_for(lambda: publisher.get_subscription_count() == 1)
             executor.create_task(hold)
@@ -474,21 +367,6 @@ def test_a_destroyed_subscription_does_not_run_what_it_has_queued(make_executor,
             gate.release()
             assert wait_for(lambda: is_idle(executor) and not publisher.get_subscription_count())
     assert got == []
-
-
-def test_a_node_that_is_destroyed_before_the_executor_looks_at_it_harms_nobody(
-        make_executor, make_node):
-    node, ran = make_node(), []
-    node.create_timer(0.001, lambda: ran.append(1))
-    executor = make_executor()
-    executor.add_node(node)
-    for spins in (False, True):
-        with Spinning(executor) if spins else nullcontext():
-            for number in range(20):
-                gone = rclpy.create_node(f'gone_{number}', context=node.context)
-                executor.add_node(gone)
-                gone.destroy_node()
-            assert not spins or wait_for(lambda: len(ran) > 10)
 
 
 def test_executors_that_are_shut_down_leave_no_files(ros_context):
@@ -534,7 +412,7 @@ def test_statistics_while_entities_come_and_go(make_executor, make_node):
         with Spinning(executor) as spinning:
             sys.setswitchinterval(1e-6)
             asking.start()
-            for number in range(100):
+            for number in range(30):
                 # each period has a name of its own in the counts
                 timers = [node.create_timer((1_000_000 + 20 * number + i) / 1e9, lambda: None)
                           for i in range(20)]

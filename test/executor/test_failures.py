@@ -164,24 +164,7 @@ def test_a_listener_may_handle_exceptions_of_callbacks(make_executor, make_node)
         (timers[0], 'None'), (timers[0], 'odd'), (timers[1], 'None')}
 
 
-def test_an_exception_that_is_handled_changes_nothing(make_executor, make_node) -> None:
-    def handles() -> None:
-        try:
-            odd_jobs_raise()
-        except Wrong:
-            pass
-
-    chain = Chain(make_node, {'relay': handles})
-    executor = make_executor(loads(CHAIN))
-    chain.start(executor)
-    assert spin_until(executor, lambda: any(j.job % 2 for j in chain.jobs['last'])) == []
-    executor.shutdown(5.0)
-    assert executor.statistics()['dags']['chain']['ends']['failed'] == 0
-    assert executor.statistics()['callbacks']['/middle:relay']['failed'] == 0
-
-
-@pytest.mark.parametrize('leg', ['/a', '/b'])
-def test_a_leg_of_a_sync_that_raises(make_executor, make_node, leg: str) -> None:
+def test_a_leg_of_a_sync_that_raises(make_executor, make_node) -> None:
     source, join = make_node('source'), make_node('join')
     publishers = [source.create_publisher(Header, topic, 10) for topic in ('/a', '/b')]
     ran: list[int] = []
@@ -191,7 +174,7 @@ def test_a_leg_of_a_sync_that_raises(make_executor, make_node, leg: str) -> None
             publisher.publish(Header())
 
     def take(topic: str) -> None:
-        if topic == leg:
+        if topic == '/b':
             ran.append(current_job().job)
             odd_jobs_raise()
 

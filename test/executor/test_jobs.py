@@ -54,30 +54,6 @@ class Bench:
         return None if origin is None else origin.job
 
 
-def test_the_window_that_holds_the_stamp():
-    bench = Bench()
-    for job in range(KEEP):
-        bench.published(job * 1000, job * 1000 + 10, job)
-    assert [bench.job(job * 1000 + 5) for job in range(KEEP)] == list(range(KEEP))
-    assert bench.job(50_000 + 10 + ROUNDING_NS) == 50
-    assert bench.job(50_500) is None
-    assert bench.job(-5) is None
-    assert bench.jobs.unknown == 2
-
-
-def test_a_publication_that_has_not_returned_yet():
-    bench = Bench()
-    bench.published(1000, None, 7)
-    assert bench.job(1500) == 7
-
-
-def test_other_topics_and_empty_ones_are_unknown():
-    bench = Bench()
-    assert bench.job(5) is None
-    assert bench.jobs.find('/other', 5, None) is None
-    assert bench.jobs.unknown == 2
-
-
 def test_the_sequence_number_decides_between_publishers():
     bench = Bench()
     bench.published(0, 10, 1, publisher=0)
@@ -118,13 +94,6 @@ def test_messages_of_a_stranger_in_the_window_are_nobody_s():
     assert bench.jobs.unknown == 198
 
 
-def test_equal_numbers_of_two_publishers_stay_a_doubt():
-    bench = Bench()
-    bench.published(0, 10, 1, publisher=0)
-    bench.published(5, 15, 2, publisher=1)
-    assert bench.job(7, 1) is None
-
-
 def test_a_long_publication_is_found_behind_many_short_ones():
     bench = Bench()
     bench.published(0, 10 ** 12, 42, publisher=1)
@@ -150,29 +119,8 @@ def test_it_never_guesses(steps, data):
     assert bench.job(stamp) == (holds[0] if len(holds) == 1 else None)
 
 
-def test_publish_notes_its_window_and_passes_exceptions_on():
-    bench = Bench()
-    state = bench.publishers[0]
-    state.count = 1
-    sent = []
-    bench.jobs.publish(
-        lambda publisher, msg: sent.append((publisher, msg)), 'p', 'm', state,
-        bench.topic, Origin(1, 2, 3, 4))
-    publication = bench.topic.publications[0]
-    assert sent == [('p', 'm')] and publication.begin <= publication.end
-    assert publication.sequence == 1 and publication.origin.job == 3
-
-    def fail(publisher: Any, msg: Any) -> None:
-        raise TypeError('no such message')
-
-    try:
-        bench.jobs.publish(fail, 'p', 'm', state, bench.topic, Origin(1, 2, 3, 4))
-    except TypeError:
-        pass
-    assert bench.topic.publications[1].end < 2 ** 62
-
-
 # --- publications of other processes -------------------------------------------------------------
+
 
 def announced(bench: Bench, begin: int, end: int, number: int, sequence: int,
               publisher: PublisherNumbers) -> None:
@@ -183,14 +131,6 @@ def announced(bench: Bench, begin: int, end: int, number: int, sequence: int,
 def number(bench: Bench, stamp: int, sequence: int | None = None) -> int | None:
     found = bench.jobs.find(TOPIC, stamp, sequence, counted=False)
     return found.name[1] if isinstance(found, Announced) else None
-
-
-def test_an_announced_publication_is_found_by_its_window():
-    bench, publisher = Bench(), PublisherNumbers()
-    bench.published(0, 10, 5)
-    announced(bench, 1000, 1010, 7, 1, publisher)
-    assert (bench.job(5), number(bench, 1005, 1), number(bench, 500)) == (5, 7, None)
-    assert (bench.jobs.unknown, bench.jobs.doubtful) == (0, 0)
 
 
 def test_the_sequence_number_decides_between_announced_publications():

@@ -5,16 +5,12 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-import threading
 import time
 
 from mddag_executor.executor.compat import TASKS_NEWEST_FIRST
 import pytest
-from rclpy.action import ActionClient, ActionServer
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
-from test_msgs.action import Fibonacci
 
 from .conftest import Spinning, wait_for
 
@@ -89,54 +85,6 @@ def test_a_task_awaits_one_future_after_another(make_executor, mine, generates):
     assert spinning.error is None
     # where rclpy's own executors keep tasks that are to go on, which nobody would take out here
     assert not getattr(executor, '_ready_tasks', ())
-
-
-def test_feedback_is_handled_before_a_goals_future_ends_the_spin(make_executor, make_node):
-    """The server publishes it before it succeeds, right after it has accepted the goal."""
-    node, feedback = make_node(), []
-    group = ReentrantCallbackGroup()
-
-    def execute(goal_handle):
-        goal_handle.publish_feedback(Fibonacci.Feedback(sequence=[1, 1, 2, 3]))
-        goal_handle.succeed()
-        return Fibonacci.Result()
-
-    server = ActionServer(node, Fibonacci, 'fibonacci', execute, callback_group=group)
-    client = ActionClient(node, Fibonacci, 'fibonacci', callback_group=group)
-    executor = make_executor()
-    executor.add_node(node)
-    assert client.wait_for_server(5.0)
-    # A subscription that has not been matched yet gets nothing, whoever runs its callback.
-    assert wait_for(lambda: node.count_subscribers('/fibonacci/_action/feedback') == 1)
-    in_time = 0
-    for number in range(1, 6):
-        sent = client.send_goal_async(
-            Fibonacci.Goal(), feedback_callback=lambda m: feedback.append(m))
-        executor.spin_until_future_complete(sent, 5.0)
-        assert sent.done() and sent.result().accepted
-        in_time += len(feedback) == number
-        end = time.monotonic() + 10.0
-        while len(feedback) < number and time.monotonic() < end:
-            executor.spin_once(0.1)
-        assert len(feedback) == number
-    assert in_time >= 4  # of what is on its way on a busy machine it knows nothing
-    server.destroy()
-    client.destroy()
-
-
-def test_default_deadline_orders_undeclared_callbacks(make_executor):
-    """Undeclared ones go by ready time plus default_deadline: in the order of becoming ready."""
-    executor = make_executor(num_workers=1, default_deadline='100ms')
-    ran: list[int] = []
-    gate = threading.Event()
-    with Spinning(executor):
-        assert wait_for(lambda: executor._pool.running)
-        executor.create_task(gate.wait, 5.0)
-        for i in range(5):
-            executor.create_task(ran.append, i)
-        gate.set()
-        assert wait_for(lambda: len(ran) == 5)
-    assert ran == [0, 1, 2, 3, 4]
 
 
 def test_a_step_does_not_wait_for_a_future_that_is_done_already(make_executor):

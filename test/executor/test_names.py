@@ -4,12 +4,9 @@
 
 from __future__ import annotations
 
-import csv
-from pathlib import Path
 from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.cli import main as program
 from mddag_executor.executor.name_check import LEAST_S
 from msg_graph import loads
 import pytest
@@ -69,37 +66,6 @@ def test_undeclared_callbacks_have_names(make_executor: Any, make_node: Any) -> 
     assert expected <= {*executor.statistics()['callbacks']}
     server.destroy()
     action.destroy()
-
-
-def test_names_in_an_export(make_executor: Any, make_node: Any, tmp_path: Path) -> None:
-    trace, rows = tmp_path / 'run.mcap', tmp_path / 'rows.csv'
-    executor = make_executor(loads(
-        'mddag: 1\nnodes: [{node: /robot, callbacks: [{name: a, timer: 20ms, deadline: 20ms}]}]'
-    ), trace=str(trace))
-    node = make_node('robot')
-    done: list[int] = []
-
-    def tick() -> None:
-        guard.trigger()
-
-    def wake() -> None:
-        executor.create_task(work)
-
-    async def work() -> None:
-        done.append(1)
-
-    guard = node.create_guard_condition(wake)
-    node.create_timer(0.02, lambda: None)
-    node.create_timer(0.0333, tick)
-    executor.add_node(node)
-    with Spinning(executor):
-        assert wait_for(lambda: len(done) >= 3)
-        assert executor.shutdown(5.0)
-    assert program.main(['export', str(trace), '-o', str(rows)]) == 0
-    with rows.open() as file:
-        names = {row['vertex'] for row in csv.DictReader(file)}
-    assert names == {'/robot:a', '/robot: tick (timer 33.3ms)', '/robot: wake (guard condition)',
-                     'callback (task)'}
 
 
 CAMERA = """

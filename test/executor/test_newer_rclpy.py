@@ -17,7 +17,6 @@ import pytest
 from rclpy.task import Future, Task
 
 from .test_executor import (  # noqa: F401
-    test_action_with_feedback_result_and_cancel,
     test_service_and_client_from_a_coroutine,
     test_tasks_functions_coroutines_and_futures_across_them,
 )
@@ -29,6 +28,7 @@ from .test_spin import (  # noqa: F401
     test_a_coroutine_that_awaits_something_unknown_is_asked_again,
     test_an_exception_that_somebody_awaits_does_not_end_spin,
 )
+from .test_waitables import test_many_goals_at_once  # noqa: F401
 
 
 @pytest.fixture(autouse=True)

@@ -122,15 +122,8 @@ def test_what_is_elsewhere_does_not_expire_here():
     assert part.decisions() == [(SINK_MISSED, TWO)]
 
 
-def test_a_whole_dag_is_judged_as_ever():
-    part = Part(SOURCE, LEFT, RIGHT, ONE, TWO)
-    for vertex in (SOURCE, LEFT, RIGHT):
-        assert part.run(vertex, MS) == []
-    assert part.run(ONE, 2 * MS) == [(SINK_IN_TIME, ONE)]
-    assert part.run(TWO, 2 * MS) == [(SINK_IN_TIME, TWO), (JOB_END, COMPLETED)]
-
-
 # --- stamps --------------------------------------------------------------------------------------
+
 
 class Thing:
     """A message of an odd kind."""
@@ -153,6 +146,7 @@ def test_stamps_of_a_header_and_of_a_message_that_has_one():
 
 
 # --- two executors are as two processes ----------------------------------------------------------
+
 
 class Nodes:
     """The nodes of CHAIN; jobs by node, each as (job, release, stamp)."""
@@ -254,15 +248,6 @@ def test_a_dag_leaves_and_comes_back_to_the_same_job(make_executor, make_node):
     assert outer.statistics()['dags']['chain']['jobs'] == n + skipped
     assert ends(outer)['completed'] == ends(inner)['completed'] == n
     assert outer.statistics()['undeclared'] == inner.statistics()['undeclared'] == 0
-
-
-def test_without_the_declaration_messages_from_elsewhere_are_undeclared(
-        make_executor, make_node):
-    nodes, _, down = in_two(
-        make_executor, make_node,
-        CHAIN.replace(',\n                 release_from: header_stamp', ''))
-    assert {job for job, _ in nodes.jobs['last']} == {None}
-    assert down.statistics()['dags']['chain']['jobs'] == 0
 
 
 @pytest.fixture
@@ -371,12 +356,10 @@ class Run:
         self._process.wait()
 
 
-@pytest.mark.parametrize(('takes', 'late'), [('0', False), ('0.12', True)])
-def test_two_processes_share_a_graph_and_the_sink_judges(
-        tmp_path: Path, takes: str, late: bool):
+def test_two_processes_share_a_graph_and_the_sink_judges(tmp_path: Path):
     (tmp_path / 'graph.yaml').write_text(CHAIN)
     mark = tmp_path / 'enough'
-    down = Run(tmp_path, 'down', ['second', 'last'], RELAY_TAKES=takes, RELAY_MARK=str(mark))
+    down = Run(tmp_path, 'down', ['second', 'last'], RELAY_TAKES='0.12', RELAY_MARK=str(mark))
     up = Run(tmp_path, 'up', ['sensor', 'first'])
     try:
         assert wait_for(mark.exists, 30.0)
@@ -406,11 +389,8 @@ def test_two_processes_share_a_graph_and_the_sink_judges(
     assert judged - chain['ends']['expired'] - early - 5 <= sink['completed'] <= judged
     assert sink['completed'] <= chain['jobs']
     assert 0.8 * chain['jobs'] <= sink['completed']
-    if late:
-        assert sink['late'] == sink['completed'] and lower['deadline_missed']
-        assert sink['response_ns']['min'] >= 120 * MS
-    else:
-        assert sink['late'] <= sink['completed'] / 2
+    assert sink['late'] == sink['completed'] and lower['deadline_missed']
+    assert sink['response_ns']['min'] >= 120 * MS
     # each job here is one of there, a little later: the node's clock was read in its callback
     after = sorted(min(r - d for d in due if r - d > -2 * MS) for r in releases)
     assert after[len(after) // 2] < 15 * MS

@@ -32,8 +32,8 @@ print([t.name for t in threading.enumerate() if t.name.startswith('mddag')])
 """
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('spin', ['executor.spin()', 'rclpy.spin(node, executor)'])
+@pytest.mark.parametrize(('number', 'spin'), [
+    (signal.SIGTERM, 'executor.spin()'), (signal.SIGINT, 'rclpy.spin(node, executor)')])
 def test_a_signal_ends_spin(number, spin):
     process = subprocess.Popen(
         [sys.executable, '-c', PROGRAM.format(spin=spin)], stdout=subprocess.PIPE,
@@ -78,6 +78,7 @@ executor.add_node(node)
 where = sys.argv[1]
 stops = 0
 
+
 def stop(*_):
     global stops
     publisher.publish(String(data='stop'))
@@ -87,6 +88,7 @@ def stop(*_):
 
 signal.signal(signal.SIGALRM, stop)
 signal.setitimer(signal.ITIMER_REAL, 0.001)
+
 
 def done():
     return stops == 200 and heard.count('stop') >= 200

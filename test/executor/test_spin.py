@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterator
-import gc
 import threading
 import time
 from typing import Any
@@ -322,25 +321,6 @@ def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros
         # between two spins these wait for the next one
         return {name for name in names if 'worker' not in name and 'wait-set' not in name}
     assert wait_for(lambda: not left()), left()
-
-
-def test_freeze_gc_leaves_what_there_is_alone(make_executor):
-    before = gc.get_freeze_count()
-    executor = make_executor(freeze_gc=True)
-    try:
-        executor.spin_until_future_complete(Future(), 0.05)
-        assert gc.get_freeze_count() > before + 1000
-    finally:
-        gc.unfreeze()
-
-
-def test_rclpy_spin_uses_all_workers(make_executor, make_node, ros_context):
-    node, together = make_node(), threading.Barrier(7)
-    executor = make_executor()
-    tasks = [executor.create_task(together.wait, 5.0) for _ in range(7)]
-    tasks[0].add_done_callback(lambda _: ros_context.shutdown())
-    rclpy.spin(node, executor)
-    assert tasks[0].done()
 
 
 def test_wait_for_message_from_a_callback(make_executor, make_node, ros_context):

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-import subprocess
-import sys
 import time
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints, is_typeddict, Union
@@ -15,7 +13,6 @@ from typing import Any, get_args, get_origin, get_type_hints, is_typeddict, Unio
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor.statistics_types import Statistics
 from msg_graph import loads
-import pytest
 
 from .conftest import Spinning, wait_for
 
@@ -23,18 +20,6 @@ GRAPH = """\
 mddag: 1
 nodes:
   - {node: /n, callbacks: [{name: t, timer: 20ms, deadline: 1us}]}
-"""
-PROGRAM = """\
-from pathlib import Path
-
-from mddag_executor import MultiDeadlineExecutor
-
-with MultiDeadlineExecutor(
-        Path('graph.yaml'), trace=Path('run.mcap'), worker_cpus=[0]) as executor:
-    executor.spin()
-    sink = executor.statistics()['dags']['camera']['sinks']['/detector:detect']
-    response = sink['response_ns']
-    late: int = sink['late'] if response is None else response['p99']
 """
 
 
@@ -80,21 +65,3 @@ def test_statistics_have_the_declared_types(
     assert found['trace'] == {'path': str(trace), 'lost': 0, 'error': None}
     assert found['dags']['/n']['sinks']['/n:t']['response_ns'] is not None
     assert {'/n:t'} < set(found['callbacks'])
-
-
-@pytest.mark.linter
-@pytest.mark.skipif(sys.version_info[:2] != (3, 12), reason='mypy runs with Python 3.12 only')
-def test_a_program_of_a_user_is_checked(tmp_path: Path) -> None:
-    """Also from the environment of `make env`, where the package is installed editable."""
-    (tmp_path / 'program.py').write_text(PROGRAM)
-    done = subprocess.run(
-        [sys.executable, '-m', 'mypy', '--strict', '--cache-dir', tmp_path / 'cache',
-         'program.py'],
-        cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, ''), done.stdout
-    (tmp_path / 'program.py').write_text(PROGRAM.replace("['late']", "['missed']"))
-    done = subprocess.run(
-        [sys.executable, '-m', 'mypy', '--strict', '--cache-dir', tmp_path / 'cache',
-         'program.py'],
-        cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert 'TypedDict "SinkCounts" has no key "missed"' in done.stdout

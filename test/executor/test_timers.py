@@ -130,6 +130,7 @@ def test_timers_of_each_clock_run(make_executor, make_node, kind):
 
 # --- simulated time ------------------------------------------------------------------------------
 
+
 class Simulated(Simulation):
     """Simulated time, with an executor and a timer that notes its clock's time."""
 

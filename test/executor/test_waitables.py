@@ -12,8 +12,7 @@ from mddag_executor.executor import waitables
 import pytest
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.guard_condition import GuardCondition
 from rclpy.qos import QoSProfile
 from rclpy.waitable import NumberOfEntities, Waitable
@@ -165,38 +164,7 @@ class spun:
         assert not self._thread.is_alive()
 
 
-def test_an_action_server_may_go_and_another_one_come(make_executor, make_node):
-    node = make_node()
-    executor = make_executor()
-    executor.add_node(node)
-    with Spinning(executor) as spinning:
-        for _ in range(3):
-            counting = Counting(node, node)
-            assert counting.client.wait_for_server(15.0)
-            task = executor.create_task(counting.ask(3))
-            assert wait_for(task.done) and task.result()[0] == SUCCEEDED
-            counting.destroy()
-    assert spinning.error is None
-
-
 # --- QoS events ----------------------------------------------------------------------------------
-
-def test_a_deadline_that_nobody_keeps_is_told_again_and_again(make_executor, make_node):
-    node, told = make_node(), {'offered': [], 'requested': []}
-    qos = QoSProfile(depth=10, deadline=Duration(nanoseconds=50_000_000))
-    publisher = node.create_publisher(
-        Header, '/a', qos, event_callbacks=PublisherEventCallbacks(
-            deadline=lambda event: told['offered'].append(event.total_count)))
-    node.create_subscription(
-        Header, '/a', lambda message: None, qos, event_callbacks=SubscriptionEventCallbacks(
-            deadline=lambda event: told['requested'].append(event.total_count)))
-    executor = make_executor()
-    executor.add_node(node)
-    with Spinning(executor):
-        publisher.publish(Header())
-        assert wait_for(lambda: all(len(counts) >= 3 for counts in told.values()))
-    for counts in told.values():
-        assert counts == sorted(set(counts)), 'each only once'
 
 
 def test_who_comes_and_goes_is_told(make_executor, make_node):
@@ -286,6 +254,7 @@ def test_what_happened_before_the_executor_came_is_told(make_executor, make_node
 
 # --- guard conditions, and waitables of a user's own ---------------------------------------------
 
+
 def wait_set_threads() -> int:
     return sum(thread.name == 'mddag-wait-set' for thread in threading.enumerate())
 
@@ -339,22 +308,3 @@ def test_each_trigger_of_a_guard_condition_is_noticed(make_executor, make_node, 
             rounds()
         assert spinning.error is None
         assert wait_set_threads() == 0
-
-
-def test_a_guard_condition_that_a_callback_triggers(make_executor, make_node):
-    node, calls = make_node(), []
-    guards: list[Any] = []
-
-    def first() -> None:
-        calls.append('first')
-        guards[1].trigger()
-
-    guards += [node.create_guard_condition(first),
-               node.create_guard_condition(lambda: calls.append('second'))]
-    executor = make_executor(num_workers=1)
-    executor.add_node(node)
-    with Spinning(executor):
-        for number in range(1, 11):
-            guards[0].trigger()
-            assert wait_for(lambda n=number: len(calls) == 2 * n)
-    assert calls == ['first', 'second'] * 10

@@ -11,7 +11,6 @@ from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.errors import MddagError
-from mddag_executor.executor.settings import Thresholds
 import msg_graph
 import pytest
 import rclpy
@@ -73,14 +72,6 @@ def test_a_wrong_time_is_a_graph_error(ros_context: Any, period: str) -> None:
     for name in ('default_deadline', 'diagnostics_period'):
         with pytest.raises(ValueError, match='is not a time|unit|time'):
             MultiDeadlineExecutor(context=ros_context, **{name: period})
-
-
-@pytest.mark.parametrize('wrong', [
-    {'warn_ratio': 'x'}, {'warn_ratio': 0.0}, {'error_ratio': 2}, {'warn_burst': 0},
-    {'window': 1.5}, {'stale_periods': None}])
-def test_wrong_thresholds(wrong: dict[str, Any]) -> None:
-    with pytest.raises(MddagError, match=next(iter(wrong))):
-        Thresholds(**wrong)
 
 
 @pytest.mark.parametrize('graph', ['', 'no/such.yaml', '/', 'a\0b'])
@@ -167,19 +158,9 @@ def in_a_callback(executor: Any, node: Any, action: Any) -> Any:
     return got[0]
 
 
-def test_spinning_twice(executor: Any, node: Any) -> None:
-    errors = [in_a_callback(executor, node, action) for action in (executor.spin,)]
-    assert [type(error) for error in errors] == [RuntimeError]
-
-
 def test_stepping_within_a_callback(executor: Any, node: Any) -> None:
     error = in_a_callback(executor, node, lambda: executor.spin_once(0.1))
     assert isinstance(error, RuntimeError) and 'already spinning' in str(error)
-
-
-@pytest.mark.parametrize('timeout', [None, 0.5, -1.0])
-def test_shutdown_within_a_callback(executor: Any, node: Any, timeout: float | None) -> None:
-    assert in_a_callback(executor, node, lambda: executor.shutdown(timeout)) is True
 
 
 def test_removing_the_node_within_its_callback(executor: Any, node: Any) -> None:

@@ -69,13 +69,6 @@ def test_cpu_is_shared_among_the_callbacks_of_the_window() -> None:
         **slept, 'cpu_us_per_callback': 10_000}  # too short to be slept: waited out busily
 
 
-def test_nothing_due_is_no_division_by_zero() -> None:
-    task_set = loads(SINGLE)
-    result = measure(Ledger(task_set), ExecutionPlan(task_set))
-    assert result['on_time_ratio'] is None
-    assert result['cpu_us_per_callback'] is None
-
-
 def test_the_ledgers_of_several_processes_are_that_of_one_run():
     task_set = loads("""
 mddag: 1

@@ -14,11 +14,9 @@ from mddag_executor.executor.executor import MultiDeadlineExecutor
 from mddag_executor.hosting.measure import BODIES, ExecutionPlan, Ledger, measure, PlanError
 from mddag_executor.hosting.session import Session
 from mddag_executor.hosting.synthetic import (
-    Grid,
     JOIN_LIMIT,
     native,
     Role,
-    sleeper,
     spinner,
     SyntheticWorkload,
 )
@@ -26,9 +24,6 @@ from mddag_executor.simulate import draw_execution_times
 from msg_graph import load, loads, TaskSet
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.node import Node
 
 TOP = Path(__file__).resolve().parents[2]
 MS = 1_000_000
@@ -83,6 +78,7 @@ def autoware() -> TaskSet:
 
 # --- the plan ------------------------------------------------------------------------------------
 
+
 def drawn(task_set: TaskSet, plan: ExecutionPlan) -> list[list[int]]:
     return [[plan.execution_ns(d.index, v.index) for v in d.vertices] for d in task_set.dags]
 
@@ -92,17 +88,8 @@ def test_a_seed_gives_the_draw_that_the_simulator_gives(autoware: TaskSet) -> No
     assert drawn(autoware, ExecutionPlan(autoware, 6)) != draw_execution_times(autoware, 5)
 
 
-def test_a_draw_stays_within_the_quantiles(autoware: TaskSet) -> None:
-    plan = ExecutionPlan(autoware, 3)
-    for vertex in autoware.vertices:
-        declared = vertex.callback.execution_time
-        assert declared is not None
-        time_ns = plan.execution_ns(vertex.dag, vertex.index)
-        assert declared.quantiles_ns[0] <= time_ns <= declared.quantiles_ns[-1]
-
-
-@pytest.mark.parametrize('workers', [1, 7])
-def test_scaling_gives_the_utilisation_asked_for(autoware: TaskSet, workers: int) -> None:
+def test_scaling_gives_the_utilisation_asked_for(autoware: TaskSet) -> None:
+    workers = 7
     plan = ExecutionPlan(autoware, 1, 0.6, workers)
     total = sum(plan.execution_ns(v.dag, v.index) / autoware.dags[v.dag].period_ns
                 for v in autoware.vertices)
@@ -133,8 +120,8 @@ nodes:
 
 
 def test_the_demo_draw_is_feasible(autoware: TaskSet) -> None:
-    from mddag_executor.cli.demo import DEFAULT_SEED, WORKERS
-    assert ExecutionPlan(autoware, DEFAULT_SEED, 0.6, WORKERS).infeasible() == []
+    from mddag_executor.cli.demo import SEED, WORKERS
+    assert ExecutionPlan(autoware, SEED, 0.6, WORKERS).infeasible() == []
 
 
 @pytest.mark.parametrize('utilisation', [0.0, -1.0, math.nan, math.inf])
@@ -152,19 +139,6 @@ def test_nothing_to_scale_is_refused() -> None:
 
 
 # --- emulation -----------------------------------------------------------------------------------
-
-def test_a_sleep_is_asked_for_less_than_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[float] = []
-    monkeypatch.setattr(time, 'sleep', asked.append)
-    emulate = sleeper(oversleep_ns=70_000)
-    emulate(2 * MS)
-    assert asked == [pytest.approx(1.93e-3)]
-    # What is shorter than that is waited out.
-    start = time.monotonic_ns()
-    emulate(30_000)
-    assert time.monotonic_ns() - start >= 30_000
-    emulate(0)
-    assert len(asked) == 1
 
 
 def test_spinning_takes_cpu_of_its_own_thread_only() -> None:
@@ -205,6 +179,7 @@ def test_native_bodies_take_cpu_time() -> None:
 
 # --- joins and releases --------------------------------------------------------------------------
 
+
 def role(task_set: TaskSet, ledger: Ledger, senders: str) -> Role:
     return Role(task_set.vertex('/join:cb'), list(senders), '', 0, [], lambda ns: None, ledger)
 
@@ -228,36 +203,8 @@ def test_incomplete_joins_are_bounded_and_counted(task_set: TaskSet) -> None:
     assert join.is_whole(JOIN_LIMIT + 2, 'b')
 
 
-def test_a_late_timer_call_does_not_move_the_release(ros_context: Any) -> None:
-    period = 400 * MS  # a busy machine may stop for less than that
-    node = Node('grid', context=ros_context)
-    timer = node.create_timer(
-        period / 1e9, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME),
-        autostart=False)
-    before = time.monotonic_ns()
-    timer.reset()
-    after = time.monotonic_ns()
-    grid = Grid(timer, 0)
-    first = grid.first_release
-    assert before + period - 50_000 <= first <= after + period + 50_000
-
-    def call() -> int:
-        timer.handle.call_timer()
-        return grid.release()
-
-    time.sleep(max(0, first - time.monotonic_ns() + 5 * MS) / 1e9)
-    assert call() == first
-    # The next two become due; the late call stands for the first of them, the other is lost.
-    time.sleep(max(0, first + 2 * period - time.monotonic_ns() + 5 * MS) / 1e9)
-    assert call() == first + period
-    time.sleep(max(0, first + 3 * period - time.monotonic_ns() + 5 * MS) / 1e9)
-    late = call()
-    assert late >= first + 3 * period
-    assert (late - first) % period == 0
-    node.destroy_node()
-
-
 # --- nodes ---------------------------------------------------------------------------------------
+
 
 def test_nodes_have_exactly_what_is_declared(task_set: TaskSet, ros_context: Any) -> None:
     workload = SyntheticWorkload(task_set, ExecutionPlan(task_set), context=ros_context)
@@ -324,44 +271,3 @@ def test_every_release_reaches_every_sink(task_set: TaskSet, ros_context: Any) -
     assert result['attribution'] == {'wrong': 0, 'none': 0}
     assert result['incomplete_joins_dropped'] == 0
     workload.destroy()
-
-
-def test_groups_keep_their_callbacks_apart(task_set: TaskSet, ros_context: Any) -> None:
-    executor = MultiDeadlineExecutor(task_set, context=ros_context)
-    workload = SyntheticWorkload(
-        task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
-    running: list[int] = []
-    most = []
-    for subscription in next(
-            n for n in workload.nodes if n.get_name() == 'left').subscriptions:
-        inner = subscription.callback
-
-        def watched(message: Any, inner: Any = inner) -> None:
-            running.append(1)
-            most.append(len(running))
-            inner(message)
-            running.pop()
-
-        subscription.callback = watched
-    for node in workload.nodes:
-        executor.add_node(node)
-    with Session(executor) as session:
-        workload.run(session, 0.5, warm_up_s=0.1)
-    assert len(most) > 10
-    assert max(most) == 1
-    workload.destroy()
-
-
-def test_a_session_gives_out_what_a_callback_raised(ros_context: Any) -> None:
-    node = Node('raiser', context=ros_context)
-
-    def boom() -> None:
-        raise ValueError('on purpose')
-
-    node.create_timer(0.01, boom)
-    executor = MultiDeadlineExecutor(context=ros_context)
-    executor.add_node(node)
-    with Session(executor) as session:
-        assert session.wait(5.0)
-    assert isinstance(session.error, ValueError)
-    node.destroy_node()

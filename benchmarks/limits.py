@@ -3,7 +3,7 @@
 """
 What Python's lock, its garbage collector and the system's scheduler let an executor do.
 
-    python test/endurance/limits.py gil|gc|policy [--seconds 2] [--workers 7]
+    python benchmarks/limits.py gil|gc|policy [--seconds 2] [--workers 7]
 
 * ``gil``: callbacks a second with one, two and all workers, for callbacks that wait (``sleep``),
   that compute in C without the interpreter lock (``sha256``), and that compute in Python
