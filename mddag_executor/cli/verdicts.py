@@ -70,9 +70,9 @@ def judge(args: argparse.Namespace, tally: MissTally, result: dict[str, Any]) ->
         with common.output_file(args.junit) as file:
             file.write(junit(result, broken, str(args.trace)))
     if args.github:
-        from mddag_executor.report.github import annotations
+        from mddag_executor.report.github import annotation_lines
         graph = None if args.graph in (None, '-') else str(args.graph)
-        for line in annotations(result['dags'], broken, graph):
+        for line in annotation_lines(result['dags'], broken, graph):
             print(line, file=sys.stdout if common.wants_tables(args) else sys.stderr)
     if not args.fail_on_miss:
         return 0

@@ -15,7 +15,7 @@ from mddag_executor.core.tally import counts
 from mddag_executor.report.text import printable
 
 
-def annotations(
+def annotation_lines(
     dags: Mapping[str, Any], broken: Mapping[tuple[str, str], str], file: str | None
 ) -> Iterator[str]:
     """
