@@ -26,7 +26,7 @@ from mddag_executor.core.state import (
 from mddag_executor.core.tally import counts
 from mddag_executor.core.tolerances import Tolerance
 from mddag_executor.replay.miss_tally import longest_run, MissTally
-from mddag_executor.report.github import annotations
+from mddag_executor.report.github import annotation_lines
 from mddag_executor.report.junit import junit
 from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
@@ -194,7 +194,7 @@ def test_a_simulation_respects_it(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_annotations_with_hostile_names() -> None:
     dags = {'d': {'sinks': {HOSTILE: sink_of([True]), 'none': sink_of([])}}}
     broken = Tolerance().verdicts(dags)
-    bad, none = annotations(dags, broken, 'a,b:c%.yaml')
+    bad, none = annotation_lines(dags, broken, 'a,b:c%.yaml')
     assert bad.startswith('::error file=a%2Cb%3Ac%25.yaml,title=Deadline of a"]]><&')
     assert bad.isprintable() and bad.count('::') == 2
     assert bad.endswith('::1 of 1 job missed the deadline')
