@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What is meant where neither a command line nor a declaration says it: the paper's experiment."""
+"""Defaults of command line and declaration: the paper's experiment."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ POLICIES = ('rad', 'rm', 'wc', 'fifo')
 DURATION_NS = 3_000_000_000
 """Virtual time of a simulated run."""
 BUDGETS = ('max', 'p99', 'mean')
-"""What of a declared execution time an analysis may count."""
+"""Which value of a declared execution time an analysis may count."""
 LIVE_SEED = 2
 """Of the execution times of live runs: each deadline of the Autoware workload leaves room."""
 
 
 def workers(asked: int | None, task_set: TaskSet | None) -> int:
-    """Return the number of workers: what was asked for, else what is declared, else seven."""
+    """Return the given number of workers, else the declared one, else seven."""
     declared = None if task_set is None else task_set.workers
     return asked or declared or WORKERS
 

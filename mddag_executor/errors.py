@@ -7,7 +7,7 @@ Theory of operation: whatever is wrong with a file, an argument or a recording b
 of this tree whose text is the one line that the user sees, `FILE[:LINE]: what is wrong: what to
 do`. The command line prints it after `error: ` and exits with status 2; a Python user catches
 `MddagError`. An exception outside this tree is a defect of the program and keeps its traceback.
-(`msg_graph` stands below this package and has `msg_graph.GraphError`, with the same form.)
+(`msg_graph` is below this package and has `msg_graph.GraphError`, with the same form.)
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Reports of work that takes long and that nobody asked for, as compiling."""
+"""Reports of long work in the background of another, such as compiling."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 LISTENERS: list[Callable[[str], None]] = []
-"""The last one gets the reports; whoever shows progress adds itself."""
+"""The last one gets the reports; a progress line adds itself."""
 
 
 def report(what: str) -> None:

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What does something else for as long as a run lasts."""
+"""Functions and methods that are replaced for the duration of a run."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import Any
 
 
 def instead(function: Callable[..., Any]) -> Callable[[Any], Any]:
-    """Return what puts a function, or a bound method, in the place of a method."""
+    """Return a `make` (see `replace`) that puts a function in the place of a method."""
     return lambda original: lambda *args, **more: function(*args, **more)
 
 
 class Replacements(ExitStack):
-    """What has been replaced; ``close`` puts it back."""
+    """The replaced functions; ``close`` restores the originals."""
 
     def replace(self, owner: Any, name: str, make: Callable[[Any], Any]) -> None:
         """
         Replace a function of a module, or a method or property of a class.
 
-        :param make: returns what stands there from now on, given what stood there.
+        :param make: returns the new value, given the original one.
         """
         original = vars(owner)[name]
         replacement = make(original)

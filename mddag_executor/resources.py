@@ -4,7 +4,7 @@
 Find the files that ship with the package, and the package itself: in another process, too.
 
 Theory of operation: the files that belong to the code that runs come first. A checkout (also one
-that is installed with `pip install -e`) has them beside the package, and an installation under a
+that is installed with `pip install -e`) has them next to the package, and an installation under a
 prefix has them in `PREFIX/share/mddag_executor`, be it a virtual environment, a colcon workspace
 or /usr/local. Only then other prefixes are searched: those of the ament index (REP 122 layout,
 `AMENT_PREFIX_PATH`), the interpreter's, and the user's.

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""How numbers and lists stand in messages: `1 DAG`, `2 DAGs`, `a, b, … (7 more)`."""
+"""Numbers and lists in messages: `1 DAG`, `2 DAGs`, `a, b, … (7 more)`."""
 
 from __future__ import annotations
 

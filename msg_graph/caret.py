@@ -107,7 +107,7 @@ class _Reader:
             callback = self.callback(each, node.name)
             full = self.text(each, 'callback_name')
             if full in node.callbacks:
-                raise self.error(each, f'the callback {shown(full)} stands there twice')
+                raise self.error(each, f'the callback {shown(full)} is listed twice')
             node.callbacks[full] = callback
         for each in self.mappings(tree, 'callback_groups'):
             self._group(node, each)

@@ -282,7 +282,7 @@ def texts(item: Kind, least: int = 0, *too_few: str) -> Kind:
             found = item.read(entry, key, each)
             if found in result:
                 raise entry.value_error(
-                    key, each, f'{shown(found)} stands there twice', 'remove one of them')
+                    key, each, f'{shown(found)} is listed twice', 'remove one of them')
             result[found] = None
         if least and not result:
             raise entry.error(key, f'{shown(key)} is empty', 'add an entry')

@@ -1,12 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What the verbs share: reading files and standard input, and writing results (see `options`, too).
+Files of the verbs: reading files and standard input, and writing results (see `options`, too).
 
-Theory of operation for outputs: a result goes to a temporary file beside its target and takes the
-target's name in one step when it is whole, so an interrupted or failed run never leaves half a
-file, and never harms the file that was there before. `check_output` is called before long work
-starts, so a mistyped path costs nothing.
+Theory of operation for outputs: a result is written to a temporary file in the folder of its
+target, which is renamed when it is complete. So an interrupted or failed run leaves no incomplete
+file, and an earlier file intact. `check_output` is called before long work starts, so a mistyped
+path costs nothing.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | T
     """
     Return the one recording that is given, or the several traces of one run.
 
-    One folder stands for all traces in it, as `mddag run --trace FOLDER` leaves them.
+    One folder means all traces in it, as `mddag run --trace FOLDER` writes them.
     """
     if len(paths) == 1:
         paths = _traces_in(paths[0])

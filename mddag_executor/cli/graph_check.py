@@ -3,8 +3,8 @@
 """
 The verb `graph check`: validate a declaration and show the DAG tasks that it gives.
 
-Critical path, load and utilisation are those of the mean execution times. Where an execution time
-is not declared they are not known (`-`, in JSON null).
+Critical path, load and utilisation are those of the mean execution times. They are unknown (`-`,
+in JSON null) if an execution time is not declared.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
 
 
 def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
-    """Yield a row for each sink; what concerns the whole DAG stands at its first one."""
+    """Yield a row for each sink; the first one of a DAG has the figures of the whole DAG."""
     for name, dag in result['dags'].items():
         path, load = dag['critical_path_ns'], dag['load']
         row: list[Cell] = [

@@ -42,8 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(parser, '--workers', only='in each process, ')
     options.add_policy(parser)
     add('--trace', metavar='TRACE', type=options.Input, action='append', default=[],
-        help='take execution times, and who computes in Python, from a recorded run (default: '
-        'those that are declared); repeat it for the traces of several processes')
+        help='use the execution times of a recorded run, and which callbacks compute in Python '
+        'there (default: as declared); repeat it for the traces of several processes')
     add('--utilisation', type=options.positive_float, metavar='U',
         help='scale declared execution times to this normalised utilisation, sum(C/T)/workers')
     options.add_seed(parser, 'seed of the drawn execution times', int)

@@ -98,7 +98,7 @@ def policies(text: str) -> tuple[str, ...]:
     for i, name in enumerate(names):
         policy(name)
         if name in names[:i]:
-            raise UsageError(f"--policies: '{name}' stands there twice: name each once")
+            raise UsageError(f"--policies: '{name}' is listed twice: name each once")
     return tuple(names)
 
 
@@ -272,7 +272,7 @@ def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
 def add_policy(
     parser: argparse.ArgumentParser, prefix: str = '', default: str = 'rad',
 ) -> None:
-    """Declare `--policy`; a default with a blank in it is words, and stands for none."""
+    """Declare `--policy`; a default that is no policy is only shown, and its value is None."""
     from mddag_executor.core import POLICIES, policy
     parser.add_argument(
         '--policy', metavar='P', type=lambda text: policy(text).name,

@@ -1,10 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The verb `replay`: what a recorded run did, or what the scheduler core would have done with it.
+The verb `replay`: a recorded run, or what the scheduler core would have done with it.
 
-Without a graph the declaration in the trace judges.  What is missing of a trace is a warning on
-standard error; everything before the damage is used.
+Without a graph the declaration in the trace judges.  A warning says what is missing of a damaged
+trace; everything before the damage is used.
 
 An ordinary bag (a folder with metadata.yaml, or one of its files) has no jobs; with a graph and
 `--reschedule` its messages are the releases.
@@ -75,7 +75,7 @@ def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
         yield ('transport, dispatch and other load are not in a bag: they are left out '
                '(--overheads)')
     elif result['rescheduled']:
-        yield 'Rescheduled, beside what was recorded:'
+        yield 'Rescheduled, compared with the recording:'
         yield comparison_table(result['dags'], result['recorded']['dags'])
     elif result['dags'] or 'recorded_callbacks' not in result:
         yield sink_table(result['dags'])

@@ -53,13 +53,13 @@ mddag run graph.yaml --node my_package/driver --node my_package.filter:main --tr
 mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20s
 mddag run --node my_package/driver --node my_package/filter --trace run.mcap"""
 
-# SIGINTs within this time are one: who ends a process group sends it to all processes of it, and
-# `ros2 launch`, where it reads from no terminal, then once more to those that it started.
+# SIGINTs within this time are one: Ctrl-C sends one to all processes of the group, and `ros2
+# launch` without a terminal another one to those that it started.
 _SAME_INTERRUPT_S = 1.0
-# A part must not stay for ever once its end has begun, whatever its nodes do.
+# A part ends at last, whatever its nodes do.
 _PART_ENDS_S = 60
-# So long nodes of several processes wait for each other, once the programs have started: where
-# the run has started all of them, and where nobody knows whether the others will come.
+# How long nodes of several processes wait for each other, once the programs have started: if the
+# run has started all of them, and if it is unknown whether the others will come.
 _MEET_S, _ALONE_S = 10.0, 4.0
 
 
@@ -150,7 +150,7 @@ def part(args: argparse.Namespace) -> int:
             names = nodes_of(args.node, ros_arguments(args.ros_args))
         the_part.leave(names)
         sys.stdout.flush()
-        os._exit(0)  # without the ends of programs that were only looked at
+        os._exit(0)  # without the ends of programs that were only probed
     result, error = run_here(args, task_set)
     the_part.leave(result)
     return _end(error)

@@ -115,8 +115,8 @@ def _warn_of_contested(task_set: TaskSet) -> None:
     dags = divided(task_set)
     topics = {t for v in task_set.vertices if v.dag in dags for t in v.callback.publishes}
     for topic in sorted(contested(task_set) & topics):
-        warn(f'{topic}: nodes of several processes publish it, so nobody knows which job a '
-             'message belongs to: put them into one process')
+        warn(f'{topic}: nodes of several processes publish it, so the job of a message is '
+             'unknown: put these nodes into one process')
 
 
 def _placed(

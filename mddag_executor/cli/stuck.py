@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Where a run stands that does not come to its end."""
+"""Where the threads of a run are that does not end."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import faulthandler
 from functools import partial
 
 STUCK_S = 30.0
-"""Well above what the end takes where callbacks, the middleware and the disk are slow."""
+"""Well above the duration of an end with slow callbacks, middleware and disk."""
 _STDERR = 2
 
 
@@ -19,9 +19,9 @@ def dump_when_stuck(seconds: float = STUCK_S) -> Iterator[Callable[[], None]]:
     """
     Give a function to call when the end begins.
 
-    When this context is not left within a time from then, ``Timeout`` and the place where each
-    thread stands are written to standard error, once, and the process goes on.  That is done by a
-    native thread, which needs no interpreter lock: it also works where who holds that is stuck.
+    When this context is not left within a time from then, ``Timeout`` and the stack of each thread
+    are written to standard error, once, and the process goes on.  A native thread does that, which
+    needs no interpreter lock: it also works if the thread that holds the lock is stuck.
     """
     try:
         yield partial(faulthandler.dump_traceback_later, seconds, file=_STDERR)

@@ -5,13 +5,13 @@ The verdicts of all tests on a declaration, in words.
 
 Theory of operation
 -------------------
-A necessary test *holds* or *fails*: where it fails, no scheduler can keep the deadlines. A
-sufficient test *holds*, for the scheduler that it is about, or *says nothing*: because its figure
-is too large, or because one of its assumptions is not met. No sufficient test ever fails.
+A necessary test *holds* or *fails*: if it fails, no scheduler can keep the deadlines. A sufficient
+test *holds*, for its scheduler, or *says nothing*: because its figure is too large, or because one
+of its assumptions is not met. No sufficient test ever fails.
 
-All sufficient tests here share the assumptions of ``SHARED``; where the declaration shows that one
-is not met, they say nothing. They are proven for sinks with different deadlines, and without
-preemption: of the schedulers they are about, the live executor's is one.
+All sufficient tests share the assumptions of ``SHARED``; if the declaration shows that one is not
+met, they say nothing. They are proven for sinks with different deadlines and without preemption,
+as the live executor schedules.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def _demand(tasks: Sequence[Task], workers: int) -> Verdict:
     if not fits:
         reason = 'when all first releases come together, more is due than can be done'
     elif not demand.complete:
-        reason += f', in the {counted(demand.points, "instant")} that were looked at'
+        reason += f', in the {counted(demand.points, "instant")} that were checked'
     figure = (f'{format_duration(demand.work)} due within {format_duration(demand.time)}, '
               f'of {format_duration(workers * demand.time)}')
     if demand.time == 1:
@@ -163,7 +163,7 @@ def _obstacle(tasks: Sequence[Task]) -> str | None:
                 return f'{vertex.callback.key} is in a callback group, which can keep it waiting'
             if vertex.callback.holds_interpreter:
                 return (f'{vertex.callback.key} computes in Python, which can keep others waiting '
-                        'beside a free worker')
+                        'although a worker is free')
         if dag.release_from != 'arrival':
             return (f'DAG {dag.name} is released from {dag.release_from}, so its messages come an '
                     'unknown time later')

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Necessary tests: where one fails, no scheduler can keep the deadlines.
+Necessary tests: if one fails, no scheduler can keep the deadlines.
 
 Theory of operation
 -------------------
@@ -12,8 +12,8 @@ Theory of operation
    what has to be done in [0, t] is no more than m t. What has to be done is refined for each sink:
    a vertex counts by when it has to be done so that each sink after it can still be in time
    (``Task.latest``), not by the deadline of the whole DAG. (Baruah, Mok and Rosier, RTSS 1990, for
-   one processor and sequential tasks.)  Where U < m only a bounded number of t can fail; of those
-   at most ``MOST_POINTS`` are looked at, the smallest.
+   one processor and sequential tasks.)  If U < m only a bounded number of t can fail; of those
+   at most ``MOST_POINTS`` are checked, the smallest.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ MOST_POINTS = 300_000
 
 
 def late_paths(tasks: Sequence[Task]) -> list[tuple[Task, int, int, int]]:
-    """Return task, sink, deadline and length of the longest path, where that is too long."""
+    """Return task, sink, deadline and longest path of the sinks whose path is too long."""
     return [(task, *sink) for task in tasks for sink in task.sinks if sink[2] > sink[1]]
 
 
 class Demand(NamedTuple):
-    """The largest demand found: at ``time`` ns that much work, ns; ``points`` were looked at."""
+    """The largest demand found: at ``time`` ns that much work, ns; ``points`` were checked."""
 
     time: int
     work: int
@@ -42,7 +42,7 @@ class Demand(NamedTuple):
 
 
 def largest_demand(tasks: Sequence[Task], workers: int) -> Demand:
-    """Return the point where demand by time is largest, or the first one that is too large."""
+    """Return the point with the largest demand by time, or the first with too large a demand."""
     heap = [(max(1, latest), cost, task.period)
             for task in tasks for latest, cost in zip(task.latest, task.costs) if cost]
     if not heap:

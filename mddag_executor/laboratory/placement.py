@@ -5,15 +5,15 @@ Which node runs in which process: packed by the time that nodes need the interpr
 
 Theory of operation
 -------------------
-One process computes Python on one core, so what a process can take is bounded by its interpreter.
+A process computes Python on one core, so its interpreter bounds its load.
 
-1. The *load* of a node is the share of time that its callbacks hold the interpreter: execution
-   time over period, of all vertices that do not say ``holds_interpreter: false``.
+1. The *load* of a node is the share of time for which its callbacks hold the interpreter:
+   execution time over period, of all vertices without ``holds_interpreter: false``.
 2. A message that leaves its process costs ``TRANSPORT_NS`` more at either end.
-3. Nodes that stay together are one *block*; those that publish one topic do, since else nobody
-   could find which of them a message is of.  Blocks are placed, the largest first, where the
-   largest load of a process is least; then single blocks are moved, and pairs exchanged, as long
-   as that lowers the largest load, or the sum of all loads at an equal largest one.
+3. Nodes that stay together are one *block*.  Nodes that publish one topic do, since otherwise the
+   publisher of a message is unknown.  Each block, the largest first, is placed so that the largest
+   load of a process is least; then single blocks are moved, and pairs exchanged, as long as that
+   lowers the largest load, or the sum of all loads at an equal largest one.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ _STYLES = (
 )
 _MOST_TICKS = 15
 _SHIFT = 0.003
-"""How far the points of neighbouring policies stand apart, so that no bar hides another's."""
+"""Distance of the points of neighbouring policies, so that no bar hides another."""
 
 
 def check_plot(path: str) -> None:
@@ -53,7 +53,7 @@ def draw(evaluation: Evaluation, file: BinaryIO, path: str) -> None:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
     kind = os.path.splitext(path)[1].lower()[1:]
-    width = 6.4 if len(evaluation.experiments) == 1 else 8.8  # with the legend beside it
+    width = 6.4 if len(evaluation.experiments) == 1 else 8.8  # with the legend at its side
     # Without these, two figures of the same data would differ.
     metadata: dict[str, Any] = {'png': {}, 'svg': {'Date': None}, 'pdf': {'CreationDate': None}}
     with rc_context({'svg.hashsalt': 'mddag', 'font.size': 9.0}):

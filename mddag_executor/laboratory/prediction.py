@@ -1,21 +1,20 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A placement in virtual time: what the scheduler's rules make of it.
+A placement in virtual time: which deadlines hold with it.
 
 Theory of operation
 -------------------
 1. Each process has its workers and its interpreter, all in one state of the core (its rules 11 and
    12): of those that compute in Python the most urgent goes first, and one at a time computes.
 2. All processes share the CPUs (``simulate.machine``).
-3. What the executor and the middleware take is added to execution times: ``CALLBACK_NS`` for each
-   callback, ``PUBLISH_NS`` for each callback that it sends a message to.  DAGs are released
-   ``APART_NS`` after one another: timers that start together are never due at the very same time,
-   so there are no ties.
-4. What timers and messages of other processes take to be noticed: see ``simulate.intakes``.
-5. One placement is better than another where fewer deadlines are missed, then where the response
-   that uses most of its deadline uses less of it.  Placements that differ in one block of nodes or
-   two are tried, those of the least load first, until none is better or ``MOST_TRIES`` were tried.
+3. The cost of the executor and the middleware is added to execution times: ``CALLBACK_NS`` for
+   each callback, ``PUBLISH_NS`` for each callback that it sends a message to.  DAGs are released
+   ``APART_NS`` after one another: timers that start together are never due at the same time.
+4. How processes notice timers and messages of other processes: see ``simulate.intakes``.
+5. A placement is better if fewer deadlines are missed, then if the largest response time, as a
+   share of its deadline, is smaller.  Placements that differ in one block of nodes or two are
+   tried, those of the least load first, until none is better or ``MOST_TRIES`` were tried.
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ class Predictor:
     :param workers: of each process.
     :param cpus: that all processes share; None: enough for all.
     :param duration_ns: virtual time of a run.
-    :param publish_ns: what publishing takes beside execution times, for each callback that it is
-        to; recorded ones have it in them.
+    :param publish_ns: cost of publishing in addition to execution times, for each receiving
+        callback; recorded execution times include it.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Sufficient tests: where one holds, its scheduler keeps all deadlines.
+Sufficient tests: if one holds, its scheduler keeps all deadlines.
 
 Theory of operation
 -------------------
@@ -55,7 +55,7 @@ _MOST_JOBS = 1_000  # of more jobs than these, in one window, each counts in ful
 
 
 class Bound(NamedTuple):
-    """A bound on a sink's response time, ns; None where none below its deadline was found."""
+    """A bound on a sink's response time, ns; None: none below its deadline was found."""
 
     task: Task
     sink: int
@@ -64,7 +64,7 @@ class Bound(NamedTuple):
 
 
 def graham(task: Task, workers: int) -> list[Bound]:
-    """Return the bounds of test 1; None for all where the DAG is not done within its period."""
+    """Return the bounds of test 1; None for all if the DAG is not done within its period."""
     responses = [length + (task.volume - length) // workers for _, _, length in task.sinks]
     alone = max(responses) <= task.period
     return [Bound(task, sink, deadline, response if alone and response <= deadline else None)
@@ -115,8 +115,8 @@ def _bounds(
 
     A first sink with none up to its deadline is the last one: those after it would mean nothing.
 
-    :param work_of: of a task, its sink, deadline and longest path there: what is done beside that
-        path in a window, ns; it grows with the window.
+    :param work_of: of a task, its sink, deadline and longest path there: what is done in
+        addition to that path in a window, ns; it grows with the window.
     """
     bounds = []
     for task in tasks:
@@ -140,7 +140,7 @@ def _workloads(tasks: Sequence[Task], task: Task, window: int, workers: int) -> 
 
 
 def _all_work(task: Task, length: int, loads: list[int], window: int, workers: int) -> int:
-    """Return what test 2 counts beside the longest path, ns."""
+    """Return what test 2 counts in addition to the longest path, ns."""
     return task.volume - length + own_jobs(task, window, workers) + sum(loads)
 
 

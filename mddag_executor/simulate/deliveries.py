@@ -1,17 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What executions deliver in virtual time, where that is more than the edges of the graph at once.
+Messages in virtual time, if they take time or executions may fail.
 
 Theory of operation
 -------------------
-Where messages take time, what a vertex publishes makes its edge to a successor true ``delay``
-after the vertex completes; the core gets each by ``rules.edge``.  A delay may be negative:
-the callback published before its end.  Then the edge comes true that long before the end, as far
-as the execution had begun.  Where executions may be preempted, their edges come true at the end.
-A delay of NEVER stands for what is not published: its edge never comes true.
-Where they may stand still (see ``machine``), the end is not known in advance; but how far the
-execution is when it publishes, its *place*, is.
+If messages take time, an edge to a successor comes true ``delay`` after its vertex completes; the
+core gets each by ``rules.edge``.  A negative delay: the callback published before its end.  Then
+the edge comes true that long before the end, but not before the execution began.  With
+preemption, edges come true at the end.  A delay of NEVER means that nothing is published.
+If executions may be stopped (see ``machine``), the end is not known in advance; but the progress
+of the execution when it publishes, its *place*, is.
 
 A message whose job has ended meanwhile is ignored.
 """
@@ -29,7 +28,7 @@ from mddag_executor.simulate.load import FAILS, Load, place_of
 from mddag_executor.simulate.machine import Machine
 
 DELAY_NS = 1_000_000
-"""What a message takes to another process of this machine, whose interpreter is in use."""
+"""Time of a message to another process of this machine, whose interpreter is in use."""
 
 
 class Deliveries(NamedTuple):
@@ -38,7 +37,7 @@ class Deliveries(NamedTuple):
 
     ``messages`` are those under way, a heap: (time, order, slot, job, vertex that it starts);
     ``sent`` has one element: how many there were.  ``next_vertex`` says, by execution that runs
-    and may stand still, what it starts next before its end, at ``Machine.publishes_at``.
+    and may be stopped, what it starts next before its end, at ``Machine.publishes_at``.
     """
 
     messages: list[QueueEntry]

@@ -1,22 +1,22 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What processes take to notice what comes to them, in virtual time.
+The time that processes need to notice messages and timers, in virtual time.
 
 Theory of operation
 -------------------
-1. Each process has one more thread, its *intake*.  It notices that a timer is due, and takes the
-   messages of other processes.  (Who publishes within a process takes the message itself.)
+1. Each process has one more thread, its *intake*.  It notices that a timer is due, and receives
+   the messages of other processes.  (Within a process the publishing thread delivers them.)
 2. For that it needs Python's lock of its process (``machine``): where a callback computes, it
-   waits a switch interval, and meanwhile that one stands still.  What the message or timer starts
-   is ready when the intake has done so.
+   waits a switch interval, in which the callback is stopped.  What the message or timer starts is
+   ready when the intake has noticed it.
 3. So a *way* into a process, the edge from a vertex of another one, or to a source that is a
-   timer, leads over one more vertex.  It has no group and holds nothing, and belongs to a pool of
-   one worker, behind those of the processes: of what has come the most urgent is taken first.
+   timer, gets one more vertex.  It has no group, holds nothing, and belongs to a pool of one
+   worker, numbered after those of the processes: the most urgent message is received first.
 4. Timers that are due while another one of their process is noticed are noticed with it.
 
-What comes of a run is in terms of the tables without these vertices.  The log has the end of a
-vertex ``~v`` where the intake is done with what starts vertex ``v``.
+The outcome of a run is in terms of the tables without these vertices.  The log has the end of a
+vertex ``~v`` when the intake has noticed what starts vertex ``v``.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ Way = tuple[int | None, int]
 
 class Costs(NamedTuple):
     """
-    What intakes take, ns; by default as on a machine with two cores.
+    What intakes cost, ns; by default as on a machine with two cores.
 
     :ivar timer_ns: a timer of the interpreter, ``timer_ready_ns`` from when it is due until its
         callback is ready where nothing computes; ``message_ns`` a message of another process,
         ``message_ready_ns`` from when its publisher has ended.
-    :ivar send_ns: what a publisher takes more for a message to another process.
+    :ivar send_ns: the additional cost of a message to another process for its publisher.
     """
 
     timer_ns: int = 280_000
@@ -199,7 +199,7 @@ class Intakes:
         places: list[list[int]] = [[] for _ in self._ways]
         for a, b in edge_numbers(self._tables):
             before, after = self._vertex[a], self._vertex[b]
-            # those of intakes stand behind the others: of messages, and of timers
+            # the edges of intakes follow the others: those of messages, then those of timers
             places[self._tables.dag_of[a]].append(
                 numbers[before, max(after, ~after)] if before >= 0
                 else -1 - (self._tables.n_predecessors[a] > 0))

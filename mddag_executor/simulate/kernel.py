@@ -36,7 +36,7 @@ MACHINE_FIELDS = len(Machine._fields)
 
 
 def clear_state(state: int) -> None:
-    """Empty all columns of a state and keep their memory, but for what queues hold."""
+    """Empty all columns of a state and keep their memory, except for that of nested queues."""
     s = as_state(state)
     for group in range(len(s.group_heap)):
         free(s.group_heap[group])
@@ -72,8 +72,8 @@ def entry_points(sources: str) -> tuple[FunctionType, ...]:
         """
         Simulate runs up to the first miss; return which of them had none.
 
-        :param costs: address of the first run's execution times, from where run after run stands.
-        :param row: bytes from one run's to the next.
+        :param costs: address of the execution times of the first run; the others follow.
+        :param row: bytes from one run to the next.
         :param accepted: array of bool, one for each run.
         """
         sources  # noqa: B018
@@ -95,7 +95,7 @@ def entry_points(sources: str) -> tuple[FunctionType, ...]:
         tables: int, load: int, orders: int, state: int, deliveries: int, machine: int, busy: int,
         log: int,
     ) -> int:
-        """Run a load and return when it ended; what it leaves is the caller's to free."""
+        """Run a load and return when it ended; the caller frees what it leaves."""
         sources  # noqa: B018
         return run_load(
             as_tables(tables), as_state(state), as_deliveries(deliveries), as_machine(machine),

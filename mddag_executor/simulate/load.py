@@ -9,27 +9,27 @@ from typing import NamedTuple
 from mddag_executor.core.state import State
 from mddag_executor.core.tables import Tables
 
-# What becomes of an execution: it runs, fails at its end, or does not run and its job expires.
+# The fate of an execution: it runs, fails at its end, or does not run and its job expires.
 RUNS, FAILS, SKIPPED = range(3)
 
 
 class Load(NamedTuple):
     """
-    What arrives: releases in order of (time, DAG), with their jobs' indices and execution times.
+    Releases in order of (time, DAG), with the indices and execution times of their jobs.
 
     Times are in ns.  The execution time of vertex v in job k of DAG d is ``costs[cost_base[d] +
     k * cost_stride[d] + local index of v]``: a stride of zero gives every job the same times, the
-    number of vertices of the DAG a row for each job.  Columns beside it are as ``costs`` is,
-    and may be empty:
+    number of vertices of the DAG a row for each job.  The other columns are indexed like
+    ``costs``, and may be empty:
 
-    * ``releases``: by release, where a source becomes ready later (``times``) than it is released;
+    * ``releases``: by release, if a source becomes ready later (``times``) than it is released;
     * ``holds``: which interpreter an execution holds (from 1; 0: none);
     * ``computed``: its CPU time; -1: it waits, as far as is known.  Empty: it computes all the
       time;
     * ``locks``: whether it computes with Python's lock, as those do that hold the interpreter;
-    * ``warmth``: how much longer it takes, since its worker had slept before, than on one that has
-      only just ended another; below 0: it takes so much longer on one that has slept, ns;
-    * ``fates``: what becomes of it (``RUNS``, …; ``SKIPPED`` stands at a source).
+    * ``warmth``: how much longer it took, ns, because its worker had slept before; below 0: how
+      much longer it would take on a worker that has slept;
+    * ``fates``: its fate (``RUNS``, …; ``SKIPPED`` is given at a source).
 
     ``delays[delay_base[d] + k * delay_stride[d] + e]`` is how long after a vertex's completion its
     edge e in job k of DAG d comes true (see ``deliveries``); the edges of a DAG are numbered as in
@@ -54,18 +54,18 @@ class Load(NamedTuple):
 
 
 def as_lists(load: Load) -> Load:
-    """Return a load whose columns are lists, also where some were arrays."""
+    """Return a load whose columns are lists, not arrays."""
     return Load(*(column if isinstance(column, list) else column.tolist() for column in load))
 
 
 def as_arrays(load: Load) -> Load:
-    """Return a load whose columns are arrays: these are sooner changed, and lent."""
+    """Return a load whose columns are arrays, which are faster to change and to lend."""
     import numpy as np
     return Load(*(np.array(column, dtype=np.int64) for column in load))  # type: ignore[arg-type]
 
 
 def needs_python(load: Load) -> bool:
-    """Return whether it is known what needs the interpreter, so that all else does at its end."""
+    """Return whether executions that do not hold the interpreter need it at their end."""
     return len(load.computed) > 0 and len(load.holds) > 0
 
 

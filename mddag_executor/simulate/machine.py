@@ -5,25 +5,25 @@ The machine in virtual time: CPUs, and the interpreter that one thread at a time
 
 Theory of operation
 -------------------
-Alone, an execution takes its cost.  What it needs meanwhile depends on how far it is; in turn
+In isolation, an execution takes its cost.  What it needs depends on its progress; in order
 
-1.  it computes with Python's lock: half of its CPU time if it is one that does so, all of it if
-    it hardly waits besides; if it only waits, the little that Python takes to begin;
+1.  it computes with Python's lock: half of its CPU time if it computes with the lock, all of it if
+    it hardly waits; if it only waits, the little that Python needs to begin;
 2.  it computes without the lock: CPU time of one that computes and does not hold the interpreter;
 3.  it waits, and needs nothing;
 4.  it computes with the lock again: the rest of its CPU time, in which it publishes.
 
-Where what it needs is not free, it stands still.  The rules of the core (rule 11) decide which of
-those that hold the interpreter are started; this module, how those that run share it:
+If what it needs is not free, it is stopped.  The rules of the core (rule 11) decide which of the
+executions that hold the interpreter are started; this module, how the running ones share it:
 
-* **The lock.**  Who has it keeps it until it needs it no more, or until another has waited for a
-  *switch interval*; then they take turns, in the order in which they asked, as in CPython.  What
-  starts when one of its process ends goes on in its thread, and with the lock.
-* **CPUs.**  Those that compute, of those with the lock only the one that has it, share the CPUs.
-  Where there are more, they take turns by *slices*; what begins to compute goes first.
+* **The lock.**  An execution keeps it until it needs it no more, or until another one has waited
+  for a *switch interval*; then they alternate, in the order in which they asked, as in CPython.
+  What starts when an execution of its process ends goes on in its thread, and with the lock.
+* **CPUs.**  Executions that compute share the CPUs; of those with the lock only the one that has
+  it.  If there are too many, they alternate by *slices*; what begins to compute goes first.
 
-A stop makes what is left of an execution longer (``State.x_left``), so the core, which puts
-preempted executions back, knows of none.  All is in whole nanoseconds.
+A stop makes the rest of an execution longer (``State.x_left``), so the core, which puts preempted
+executions back, needs to know of none.  All times are integers, ns.
 """
 
 from __future__ import annotations
@@ -41,48 +41,48 @@ SWITCH_NS = 1_000_000
 SLICE_NS = 3_000_000
 """How long the operating system lets a thread compute while others wait for a CPU."""
 BRIEF_NS = 100_000
-"""What one that computes without the lock takes in Python at its end, at most."""
+"""CPU time in Python, at most, at the end of an execution that computes without the lock."""
 WARM_NS = 100_000
 """A worker is warm for so long after an execution has ended: its thread does not sleep yet."""
 HARDLY = 8
-"""One that holds the interpreter and waits for less than this part of it keeps it meanwhile."""
+"""An execution that waits for less than this part of its time keeps the interpreter."""
 
 # What an execution needs.
 _LOCK, _CPU, _NOTHING = range(3)
 
-# Columns of ``Machine.scalars``: how many CPUs there are; whether executions that do not hold the
-# interpreter need it at their end; up to when time has been taken in; when CPUs change hands, if
-# nothing happens before; when somebody needs something else, or must wait; how often it was found
-# out who goes on; when overtaking pays that does not pay now; how many interpreters there are, of
-# which those of further pools (``intakes``) are the same once more.
+# Columns of ``Machine.scalars``: number of CPUs; whether executions that do not hold the
+# interpreter need it at their end; the time up to which the machine is up to date; when the slices
+# end, if nothing happens before; when an execution needs something else; how often the CPUs were
+# shared out; when overtaking pays that does not pay now; number of interpreters, which the further
+# pools (``intakes``) use, too.
 CPUS, PYTHON, SETTLED, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT, INTERPRETERS = range(8)
 
 
 class Machine(NamedTuple):
-    """Who computes, among those that run; made by ``new_machine``."""
+    """Which running executions compute; made by ``new_machine``."""
 
     scalars: list[int]
-    # by execution that was started: up to where it computes with the lock, computes without it,
-    # and waits; where it publishes next before its end (``deliveries``; NEVER: nowhere)
+    # by started execution: the progress up to which it computes with the lock, computes without
+    # it, and waits; at which it publishes next before its end (``deliveries``; NEVER: never)
     locked_until: list[int]
     computes_until: list[int]
     waits_until: list[int]
     publishes_at: list[int]
-    # how far it is, what it needs and up to where; in which of the shares it had a CPU last
+    # its progress, what it needs and up to which progress; in which sharing it had a CPU last
     at: list[int]
     need: list[int]
     until: list[int]
     share: list[int]
-    # those that stand still, and those that compute, first who have a CPU; those that do so anew
+    # the stopped ones; those that compute, first those with a CPU; those that begin to compute
     still: list[int]
     computing: list[int]
-    anew: list[int]
-    # by interpreter, from 1: those that want its lock, first who has it; who had it while others
-    # waited, or -1; when the next one gets it
+    joining: list[int]
+    # by interpreter, from 1: those that want its lock, first the one that has it; the one that had
+    # it while others waited, or -1; when the next one gets it
     lock_queue: list[list[int]]
     lock_had: list[int]
     switch_at: list[int]
-    # by worker: when it ended an execution, and has not begun another since; or -NEVER
+    # by worker: when it ended an execution without having begun another since; or -NEVER
     ended_at: list[int]
 
 
@@ -124,7 +124,7 @@ def settle(s: State, m: Machine, now: int) -> None:
 
 
 def decide(t: Tables, s: State, m: Machine, now: int) -> None:
-    """Decide by process whether what waits first may overtake who began last to hold it."""
+    """Decide by process whether the first waiting execution may overtake the last holder."""
     m.scalars[OVERTAKE_AT] = NEVER
     if s.scalars[N_HOLDING] == 0 or (len(s.ready) == 0 and len(s.held_back) == 0):
         return
@@ -149,7 +149,7 @@ def decide(t: Tables, s: State, m: Machine, now: int) -> None:
 
 
 def _is_warm(s: State, m: Machine, worker: int, now: int) -> bool:
-    """Return whether a worker of the process has only just ended another and goes on, once."""
+    """Return whether a worker of the process has just ended another execution; true once."""
     for w in range(len(s.worker_x)):
         if (now - m.ended_at[w] <= WARM_NS and (w == worker or s.worker_x[w] < 0)
                 and (len(s.pool) == 0 or s.pool[w] == s.pool[worker])):
@@ -175,7 +175,7 @@ def starts(s: State, load: Load, m: Machine, x: int, now: int) -> None:
 
 
 def begins(s: State, m: Machine, x: int, cost: int, cpu: int, locks: bool) -> None:
-    """Note what an execution that has been dispatched takes, and what it computes of it."""
+    """Note the cost of a dispatched execution, and which part of it computes."""
     while len(m.at) <= x:
         for column in (m.locked_until, m.computes_until, m.waits_until, m.publishes_at, m.at,
                        m.need, m.until, m.share):
@@ -205,9 +205,9 @@ def _set_parts(m: Machine, x: int, first: int, second: int, third: int) -> None:
 
 
 def share(t: Tables, s: State, m: Machine, now: int, finish_at: list[int]) -> None:
-    """Find out who goes on, and set when they finish."""
+    """Share lock and CPUs out, and set when executions finish."""
     number = m.scalars[SHARES] = m.scalars[SHARES] + 1
-    m.anew.clear()
+    m.joining.clear()
     on = s.worker_x
     for worker in range(len(on)):
         x = on[worker]
@@ -239,7 +239,7 @@ def share(t: Tables, s: State, m: Machine, now: int, finish_at: list[int]) -> No
 
 
 def _find_need(t: Tables, s: State, m: Machine, x: int, at: int) -> None:
-    """Find what an execution needs that is so far; where that is anew, it queues for it."""
+    """Find what an execution needs at its progress; if it did not before, it queues for it."""
     need, until = _NOTHING, s.x_cost[x]
     if at < m.locked_until[x]:
         need, until = _LOCK, m.locked_until[x]
@@ -259,11 +259,11 @@ def _find_need(t: Tables, s: State, m: Machine, x: int, at: int) -> None:
         if x not in m.lock_queue[interpreter]:
             _ask(t, s, m, x, interpreter)
     elif need == _CPU and x not in m.computing:
-        m.anew.append(x)
+        m.joining.append(x)
 
 
 def _ask(t: Tables, s: State, m: Machine, x: int, interpreter: int) -> None:
-    """Queue for the lock; what starts where one that had it has just ended takes its place."""
+    """Queue for the lock; an execution after one that had it and has ended gets its place."""
     queue = m.lock_queue[interpreter]
     if len(queue) > 0 and m.at[x] == 0:
         first = queue[0]
@@ -277,7 +277,7 @@ def _ask(t: Tables, s: State, m: Machine, x: int, interpreter: int) -> None:
 
 
 def _pass_lock(s: State, m: Machine, process: int, now: int) -> None:
-    """Find out who has the lock of an interpreter now: it needs a CPU."""
+    """Find which execution has the lock of an interpreter now: it needs a CPU."""
     queue = m.lock_queue[process]
     kept = 0
     for i in range(len(queue)):
@@ -303,17 +303,17 @@ def _pass_lock(s: State, m: Machine, process: int, now: int) -> None:
         first = queue[0]
         m.need[first] = _CPU
         if first not in m.computing:
-            m.anew.append(first)
+            m.joining.append(first)
 
 
 def _pass_cpus(s: State, m: Machine, now: int) -> None:
-    """Find out who has a CPU now."""
+    """Find which executions have a CPU now."""
     number, cpus = m.scalars[SHARES], m.scalars[CPUS]
     for i in range(len(m.computing)):
         x = m.computing[i]
         if s.x_worker[x] >= 0 and m.need[x] == _CPU:
-            m.anew.append(x)
-    wanted = len(m.anew)
+            m.joining.append(x)
+    wanted = len(m.joining)
     turns = False
     if wanted <= cpus:
         m.scalars[SLICE_AT] = NEVER
@@ -323,12 +323,12 @@ def _pass_cpus(s: State, m: Machine, now: int) -> None:
             m.scalars[SLICE_AT] = now + SLICE_NS
     m.computing.clear()
     for i in range(wanted):
-        x = m.anew[i]
+        x = m.joining[i]
         if not turns or m.share[x] != number - 1:
             m.computing.append(x)
     if turns:
         for i in range(wanted):
-            x = m.anew[i]
+            x = m.joining[i]
             if m.share[x] == number - 1:
                 m.computing.append(x)
     for i in range(min(cpus, wanted)):

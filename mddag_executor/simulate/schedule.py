@@ -17,11 +17,10 @@ from mddag_executor.simulate.engine import LogEntry, Orders, run_load
 from mddag_executor.simulate.load import as_lists, Load
 from mddag_executor.simulate.machine import Machine
 
-# Roughly, to choose what is sooner done: plain Python's time for each execution, and for each
-# where those that run may stand still.
+# About plain Python's time for each execution, without and with a machine, to choose the faster.
 _PLAIN_S, _STOPS_S = 10e-6, 50e-6
 SOON_S = 1.0
-"""What plain Python has done so soon is not worth loading what is compiled."""
+"""Below this, loading compiled code does not pay."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +30,12 @@ class Settings:
 
     :ivar workers: of each process.
     :ivar duration_ns: when the run ends, on the load's clock.
-    :ivar preemptive: None takes the policy's own mode of the paper's experiment.
+    :ivar preemptive: None: the policy's own mode of the paper's experiment.
     :ivar judge: ``horizon`` judges what is open at the end, ``completions`` (the paper's way)
         only what completed.
     :ivar dispatch_overhead_ns: added to an execution at each dispatch; ``switch_overhead_ns``: at
         each preemption.
-    :ivar cpus: that those who compute share; None: enough for all.
+    :ivar cpus: shared by the executions that compute; None: enough for all.
     :ivar judge_from: jobs released before are not judged.
     :ivar processes: how many there are, each with an interpreter of its own; ``intakes``: and a
         pool of one more worker, behind those of all (see ``intakes``).
@@ -57,7 +56,7 @@ class Settings:
 
     @property
     def preempts(self) -> bool:
-        """Return whether what is more urgent takes the worker of what runs."""
+        """Return whether a more urgent execution takes the worker of a running one."""
         return find_policy(self.policy).mode(self.preemptive, self.processes)
 
     @property
@@ -72,7 +71,7 @@ class Settings:
 
 class Scheduled(NamedTuple):
     """
-    What came of a load: when the run ended, and, in order of time, log and decisions.
+    The outcome of a load: when the run ended, and, in order of time, log and decisions.
 
     :ivar busy: how long each worker was busy, ns.
     """
@@ -92,7 +91,7 @@ def schedule(
 
     :param log: keep the log of every worker.
     :param progress: gets the virtual time (ns) now and then, by plain Python.
-    :param compiled: whether compiled, which gives the same; None: what is sooner done.
+    :param compiled: whether to use the compiled core; None: if that is faster.
     """
     orders = settings.orders._replace(keep_log=int(log))
     if compiled is None:
@@ -111,7 +110,7 @@ def schedule(
 
 
 def prepare(tables: Tables, load: Load, settings: Settings, runs: int = 1) -> bool:
-    """Return whether so many runs are sooner done compiled; if so, compile, or load what was."""
+    """Return whether so many runs are faster compiled; if so, compile, or load the code."""
     executions = runs * len(load.times) * max(1, tables.n_vertices // max(1, tables.n_dags))
     stops = len(load.holds) > 0 or settings.cpus is not None
     plain_s = executions * (_STOPS_S if stops else _PLAIN_S)

@@ -32,14 +32,14 @@ _KINDS = {
 
 
 def _structure(row: Any, **more: Any) -> Any:
-    """Return the structure type that stands for a class of named tuples, with more fields."""
+    """Return the structure type of a class of named tuples, with more fields."""
     fields = {
         name: _KINDS[str(getattr(kind, '__forward_arg__', kind))]
         for name, kind in row.__annotations__.items()}
     return StructureType(row.__name__, {**fields, **more})
 
 
-# What makes an address a structure or vector.
+# Functions for compiled code that make an address a structure or vector.
 as_tables = at(_structure(Tables, policy=types.int64))
 as_state = at(_structure(State))
 as_load = at(_structure(Load))
@@ -54,8 +54,8 @@ def key_of_policy(t: Any, v: int, release: int, job: int, order: int) -> Key:
     """
     Return the key of the policy whose number the tables have in one more field, ``policy``.
 
-    This is no compiled function but one for which numba gets a recipe, because only these can
-    be handed from function to function in code that is kept on disk.
+    This is not a compiled function but an overloaded one: only these can be passed from function
+    to function in code that is kept on disk.
     """
     key: Key = list(POLICIES.values())[t.policy].key(t, v, release, job, order)
     return key

@@ -5,17 +5,18 @@ Growing arrays and structures of them for compiled code, used as lists and named
 
 Theory of operation
 -------------------
-The core's functions work on named tuples of lists.  numba can compile that as it stands, but then
-each call hands over some thirty reference-counted lists, which takes as long as the interpreter.
-The types in here look the same to the source and cost what they cost in C:
+The core's functions work on named tuples of lists.  numba can compile that with its own typed
+lists, but then each call passes some thirty reference-counted lists: a run of the Autoware
+workload took 44 to 55 ms instead of 0.8 ms on the same (busy) machine, and compiling 133 s.  The
+types here look the same to the source and cost what they cost in C:
 
 * a *vector* is the address of three words: address of its data, length, capacity.  An element is
   a 64-bit integer, or a tuple of them, or a vector.  ``append`` grows the data with ``realloc``;
 * a *structure* is the address of three words for each field: those of a vector, or an integer.
 
-Nothing is counted or checked: an index must be within 0 and the length.  (What the plain core does
-on lists, where Python checks, is tested to be the same.)  Whoever makes a structure frees it, with
-``free``, or lends it memory that stays where it is while the structure is used.
+Nothing is counted or checked: an index must be within 0 and the length.  (Tests compare with the
+plain core on lists, where Python checks.)  The code that makes a structure frees it, with
+``free``, or lends it memory that stays in place while the structure is used.
 
 This module needs numba; nothing is compiled when it is imported.
 """
@@ -75,7 +76,7 @@ class StructureType(types.Type):
 
 
 class AddressModel(models.PrimitiveModel):
-    """What stands for a vector, a structure and whatever else is an address."""
+    """The data model of vectors and structures: an address."""
 
     def __init__(self, manager: Any, fe_type: types.Type) -> None:
         super().__init__(manager, fe_type, _I64)
@@ -181,7 +182,7 @@ def at(kind: types.Type) -> Callable[..., Any]:
     return function
 
 
-# --- what lists have -----------------------------------------------------------------------------
+# --- methods of lists ----------------------------------------------------------------------------
 
 @njit
 def _grow(vector, words):
@@ -275,13 +276,13 @@ def add_queue(vector):
 
 @njit
 def free(vector):
-    """Free what a vector holds, which must have no vectors in it any more."""
+    """Free the data of a vector, which must contain no vectors any more."""
     _free(_get_word(vector, 0))
     for place in range(3):
         _set_word(vector, place, 0)
 
 
-# --- what heapq has ------------------------------------------------------------------------------
+# --- heapq ------------------------------------------------------------------------------
 
 @njit
 def _rise(heap, place):
@@ -337,9 +338,9 @@ def heapify(heap):
         _sink(heap, place)
 
 
-# --- what the compiled core needs besides --------------------------------------------------------
+# --- memory that is lent --------------------------------------------------------
 
 @njit
 def set_address(vector, address):
-    """Let a vector that is lent its data stand for other data of the same length."""
+    """Let a vector that is lent its data use other data of the same length."""
     _set_word(vector, 0, address)

@@ -75,7 +75,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
      "policy 'edf': there is no such policy: choose one of rad, rm, wc, fifo, gedf, dm, "),
     ('evaluate g.yaml --seed -1',
      "mddag evaluate: argument --seed: '-1' is no whole number from 0 to 2**64 - 1"),
-    ('evaluate g.yaml --policies rad,rad', "--policies: 'rad' stands there twice: name each once"),
+    ('evaluate g.yaml --policies rad,rad', "--policies: 'rad' is listed twice: name each once"),
     ('diff run.mcap run.mcap --tolerance 5', "mddag diff: argument --tolerance: '5' is no share"),
     # files to read
     ('graph check none.yaml', 'none.yaml: the file cannot be read (No such file'),

@@ -36,7 +36,7 @@ def test_nodes_that_no_process_names_run_in_the_first() -> None:
     (['  one: [/a, /b]', f'  two: [/a] {MARK}'], "'/a' is in process 'one', too"),
     (['  one:', f'    - /a {MARK}'.replace('/a', '/aa')], "'/a'"),
     ([f'  one/two: [/a] {MARK}'], 'no name for a process'),
-    ([f'  one: [/a, /a] {MARK}'], 'stands there twice'),
+    ([f'  one: [/a, /a] {MARK}'], 'is listed twice'),
     ([f'  one: /a {MARK}'], 'write a list'),
 ])
 def test_errors(lines: list[str], says: str) -> None:
