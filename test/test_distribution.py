@@ -222,7 +222,7 @@ def test_the_distributions_hold_what_they_should(built: Path) -> None:
         built / 'checkout', NAME, 'msg_graph')
     share = {n.removeprefix(data) for n in names if n.startswith(data)}
     assert {f'share/ament_index/resource_index/packages/{NAME}', f'lib/{NAME}/mddag'} <= share
-    assert {f'{SHARE}/{name}' for name in ('package.xml', 'launch/autoware_demo.launch.py',
+    assert {f'{SHARE}/{name}' for name in ('package.xml', 'launch/run.launch.py',
                                            'config/autoware.yaml')} <= share
 
 
