@@ -5,9 +5,8 @@ All that this program uses of rclpy beyond its documented interface.
 
 Nobody else uses a private name of rclpy, or what is behind a handle: ``test/test_layers.py`` holds
 that. Each entry says in which versions it was seen. *7.1* is Jazzy: 7.1.5, which the package index
-has, and what is known of the releases up to 7.1.9. *9.1* is Kilted: 9.1.2. Where nothing else is
-said, it is in both, and the executor cannot do without it. ``test/executor/test_compat.py`` tries
-each on the rclpy that is installed.
+has, to 7.1.11. *9.1* is Kilted: 9.1.2. Where nothing else is said, it is in both, and the executor
+cannot do without it. ``test/executor/test_compat.py`` tries each on the rclpy that is installed.
 
 Two adapters have modules of their own: ``listeners`` (``handle.pointer``) and ``waitsets``.
 """
@@ -36,7 +35,7 @@ from rclpy.time_source import TimeSource
 import rclpy.timer
 
 RCLError: type[Exception] = _rclpy.RCLError
-"""What rcl reports. 9.1 has it as ``rclpy.subscription.RCLError``, too."""
+"""What rcl reports. From 7.1.8 on it is ``rclpy.subscription.RCLError``, too."""
 
 RCL_ERRORS = (InvalidHandle, RCLError)
 """What rclpy raises of anything whose context has ended, among others."""
@@ -156,8 +155,12 @@ def sender_is_behind(waitable: Any, data: Any) -> bool:
     Return whether an action client has taken a response to a request that it does not know yet.
 
     In 7.1.5 it sends a request before it notes its number, and throws away what comes in between:
-    the future would never be done (rclpy issue 1123).
+    the future would never be done (rclpy issue 1123). From 7.1.6 on it has a lock for that.
+
+    :param data: what the waitable has taken.
     """
+    if type(data) is not dict or hasattr(waitable, '_lock'):
+        return False
     return all(hasattr(waitable, numbers) for numbers in _NUMBERS.values()) and any(
         name in data and data[name][0] not in getattr(waitable, numbers)
         for name, numbers in _NUMBERS.items())
@@ -171,7 +174,7 @@ def feedback_taken(waitable: Any, data: Any, most: int) -> list[tuple[Callable[.
     that is there is taken, too: another thread may have the result in its hands soon, and then
     the client has forgotten the callback. Other waitables have none.
 
-    In 9.1 a client has a lock for its handle.
+    From 7.1.6 on a client has a lock for its handle.
     """
     callbacks = getattr(waitable, '_feedback_callbacks', None)
     if callbacks is None:  # without a look at the type: rclpy.action loads much
@@ -204,7 +207,7 @@ class BareTask(Task):
     """
     A task that does not go on by itself when what it waits for is done.
 
-    :ivar waits_for: the future that its coroutine waits for, where rclpy says so (7.1.9).
+    :ivar waits_for: the future that its coroutine waits for, if rclpy reports it (7.1.9).
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -233,13 +236,24 @@ def forget_task_frames(error: BaseException) -> None:
     error.__traceback__ = trace
 
 
-UNKNOWN = object()
-"""Stands for something awaited that cannot be found out: it is asked again now and then."""
+HAS_NEXT_SPIN = hasattr(Executor, '_call_task_in_next_spin')
+"""Whether tasks are those of 7.1.9 and later; 9.1.2 does not have them yet."""
+
+NEXT_TURN = object()
+"""What a coroutine waits for that yields None: it continues in the next turn of the executor."""
+
+
+def adopt_awaited(future: Any, executor: Any) -> None:
+    """Have the done callbacks of an awaited future run in the executor, as from 7.1.9 on."""
+    if HAS_NEXT_SPIN and isinstance(future, Future):
+        reference: Any = future._executor
+        if reference() is None:
+            future._set_executor(executor)
 
 
 def awaited(coroutine: Any) -> Any:
     """
-    Return the rclpy future that a suspended coroutine waits for, or UNKNOWN.
+    Return the rclpy future that a suspended coroutine waits for, or NEXT_TURN.
 
     From 7.1.9 on, the coroutine says it itself. In 7.1.5 and 9.1 ``Future.__await__`` is a
     generator that yields nothing. So the future is looked up where the chain of awaits ends.
@@ -256,13 +270,13 @@ def awaited(coroutine: Any) -> Any:
             break
     if type(inner) is types.GeneratorType and inner.gi_frame is not None:
         inner = inner.gi_frame.f_locals.get('self')
-    return inner if hasattr(inner, 'add_done_callback') else UNKNOWN
+    return inner if hasattr(inner, 'add_done_callback') else NEXT_TURN
 
 
 # --- executors and nodes -------------------------------------------------------------------------
 
-TASKS_NEWEST_FIRST = TimerInfo is None
-"""Whether tasks that wait run in the reverse of their order: in all of 7.1, but not in 9.1."""
+TASKS_NEWEST_FIRST = TimerInfo is None and not HAS_NEXT_SPIN
+"""Whether waiting tasks run in the reverse of their order: in 7.1 before 7.1.9."""
 
 
 def _nothing() -> None:

@@ -33,6 +33,7 @@ from mddag_executor.executor import publishing, settings
 from mddag_executor.executor.announcements import Announcements
 from mddag_executor.executor.at_once import AtOnce
 from mddag_executor.executor.compat import (
+    adopt_awaited,
     BareExecutor,
     ends_call,
     is_called_by_spin,
@@ -77,9 +78,14 @@ if TYPE_CHECKING:
 
 MOST_SELECTED = 1024
 """``select`` takes descriptors below this."""
-SETTLE_TURNS = 20
-"""So many milliseconds after a future is done its action's callbacks may still take."""
-SETTLED_TURNS = 3
+SETTLE_S, SETTLE_CHECK_S = 0.1, 0.00005
+"""How long, and how often, to check whether the callback has ended that completed a future."""
+QUIET_TURNS, MOST_TURNS = 3, 20
+"""
+A spin that has handled actions ends after so many milliseconds without anything to do.
+
+That is, after ``MOST_TURNS`` of them in any case.
+"""
 
 
 def deadline_of(timeout_sec: float | None) -> float | None:
@@ -192,6 +198,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._at_once = AtOnce(self._engine, self._pool.lock, self._fail)
         self._pool.serve_meanwhile = self._serve_meanwhile
         self._pool.stopped = self._stopped
+        self._pool.adopt = lambda future: adopt_awaited(future, self)
         self._pool.context_ended = self._at_once.ring
         self._pool.entities_changed = self.wake
         self._miss_log = MissLog(self._engine.verdicts)
@@ -332,7 +339,7 @@ class MultiDeadlineExecutor(BareExecutor):
 
     @property
     def is_spinning(self) -> bool:
-        """Return whether somebody spins (rclpy from 7.1.9 on)."""
+        """Return whether a thread spins (rclpy from 7.1.9 on)."""
         return self._spinning.locked()
 
     def spin(self) -> None:
@@ -353,11 +360,37 @@ class MultiDeadlineExecutor(BareExecutor):
     def spin_until_future_complete(
         self, future: Future, timeout_sec: float | None = None
     ) -> None:
-        """Run callbacks on the pool until a future is done or the time is over."""
-        future.add_done_callback(QuickCallback(self._at_once.ring))
+        """
+        Run callbacks on the pool until a future is done or the time is over.
+
+        The callback that completes the future has ended then, unless it takes much longer.
+
+        :param timeout_sec: seconds; None or negative: for ever; 0: run one callback at most.
+        """
+        if timeout_sec == 0:
+            with suppress(ExternalShutdownException):
+                if not (future.done() or future.cancelled()):
+                    self.spin_once_until_future_complete(future, 0)
+            return
+        completed_by: list[tuple[Any, Work | None] | None] = []
+        handled = self._upkeep.handled_waitables()
+
+        def note() -> None:
+            running = current.running
+            is_mine = running is not None and running.pool is self._pool
+            completed_by.append((running, running.work) if is_mine and running else None)
+            self._at_once.ring()
+
+        def is_done() -> bool:
+            if not (future.done() or future.cancelled()):
+                return False
+            self._settle(completed_by, handled)
+            return True
+
+        future.add_done_callback(QuickCallback(note))
         try:
             with short_switch_interval():
-                self._spin(lambda: future.done() or future.cancelled(), timeout_sec)
+                self._spin(is_done, timeout_sec)
         except ExternalShutdownException:
             pass
 
@@ -382,7 +415,6 @@ class MultiDeadlineExecutor(BareExecutor):
             while not self.is_ending():
                 self._raise_error()
                 if done():
-                    self._settle()
                     self._raise_error()  # of what ran before it was done
                     return
                 if self._was_ended():
@@ -423,19 +455,30 @@ class MultiDeadlineExecutor(BareExecutor):
             times.append(max(0.0, deadline - time.monotonic()))
         return min((each for each in times if each is not None), default=None)
 
-    def _settle(self) -> None:
+    def _settle(
+        self, completed_by: list[tuple[Any, Work | None] | None], handled: int
+    ) -> None:
         """
-        Let run what belongs to a completed future's action, where there are any: its feedback.
+        Wait a moment for what would have ended before a future is done, if one thread ran all.
 
-        With one thread that was published before the answer which completed the future; with
-        several it may take a moment longer.  So wait until nothing has been to do for a while.
+        That is the callback that has completed the future, and what belongs to an action: its
+        feedback was published before its result, but may arrive later.
+
+        :param completed_by: gets the pool's thread in which the future was completed, with its
+            execution, or None for another thread; not necessarily before the future is done.
+        :param handled: ``Upkeep.handled_waitables`` when the spin began.
         """
-        if not self._upkeep.has_waitables:
+        end = time.monotonic() + SETTLE_S
+        while time.monotonic() < end and (
+                not completed_by
+                or any(each is not None and each[0].work is each[1] for each in completed_by)):
+            time.sleep(SETTLE_CHECK_S)
+        if self._upkeep.handled_waitables() == handled:
             return
         quiet = 0
-        for _ in range(SETTLE_TURNS):
+        for _ in range(MOST_TURNS):
             quiet = quiet + 1 if self._pool.is_idle() else 0
-            if quiet >= SETTLED_TURNS:
+            if quiet >= QUIET_TURNS:
                 return
             time.sleep(0.001)
 
@@ -571,6 +614,7 @@ class MultiDeadlineExecutor(BareExecutor):
         """Handle what is ready; run one callback if there is one, and return whether one ran."""
         self._upkeep.refresh()
         ran = self._at_once.handle(self._at_once.loop.wait(0))
+        self._wait_sets.poll()
         self._submit_tasks()
         return self._pool.run_one(self._pool.loop.wait(0)) or ran
 

@@ -1,12 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Two places in rclpy at which the executor must know what a callback does.
+Three places in rclpy at which the executor must know what a program does.
 
 Theory of operation
 -------------------
-``Publisher.publish`` and ``Client.call`` are wrapped once for the process, when the first executor
-is made.
+``Publisher.publish``, ``Client.call`` and ``Subscription.set_content_filter`` are wrapped once for
+the process, when the first executor is made.
 
 1.  *A callback in* ``Client.call`` lends its worker to a spare thread (``workers``).
 2.  *A publication on a trigger topic* is noted, so that its messages find their job (``jobs``).
@@ -18,9 +18,11 @@ is made.
     arrives otherwise, or later, wakes a worker.
 4.  A thread that publishes while it has the engine's lock (a signal handler can) leaves the
     message to a worker.
+5.  *A new content filter* makes rmw_fastrtps replace the subscription's reader, and the listener
+    is lost with the old one (rclpy from 7.1.8 on).  So it is set again.
 
-Outside of callbacks of this executor, on topics that nobody here subscribes to, both methods do
-what they always did.
+Outside of callbacks of this executor, on topics that no executor here subscribes to, the methods
+do what they always did.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from mddag_executor.executor.jobs import NO_ORIGIN, Publication, PublisherState
 from mddag_executor.executor.work import current
 from rclpy.client import Client
 from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
 
 
 class Delivery(Protocol):
@@ -42,6 +45,9 @@ class Delivery(Protocol):
 
     def collect_published(self, publication: Publication | None) -> None:
         """Take what was announced since ``hold``, and announce again."""
+
+    def listen_again(self, subscription: Any) -> None:
+        """Have a subscription announced again whose reader the middleware has replaced."""
 
 
 _STATE = '_mddag_publisher_state'
@@ -90,7 +96,7 @@ def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Pub
 
 
 def install() -> None:
-    """Wrap rclpy's two methods; further calls change nothing."""
+    """Wrap rclpy's methods; further calls change nothing."""
     global _installed
     with _lock:
         if _installed:
@@ -98,6 +104,7 @@ def install() -> None:
         _installed = True
     send = Publisher.publish
     call = Client.call
+    set_filter = getattr(Subscription, 'set_content_filter', None)
 
     def publish(self: Any, msg: Any) -> None:
         state = self.__dict__.get(_STATE)
@@ -126,7 +133,15 @@ def install() -> None:
         with running.lend():
             return call(self, request, *args, **kwargs)
 
+    def set_content_filter(self: Any, *args: Any, **kwargs: Any) -> None:
+        set_filter(self, *args, **kwargs)  # type: ignore[misc]
+        for delivery in _deliveries.get(self.topic_name, ()):
+            delivery.listen_again(self)
+
     publish.__doc__ = send.__doc__
     call_and_wait.__doc__ = call.__doc__
     Publisher.publish = publish  # type: ignore[method-assign]
     Client.call = call_and_wait  # type: ignore[method-assign]
+    if set_filter is not None:
+        set_content_filter.__doc__ = set_filter.__doc__
+        Subscription.set_content_filter = set_content_filter  # type: ignore[attr-defined]

@@ -63,7 +63,7 @@ class Upkeep:
         wait_sets: WaitSetThread, fail: Callable[[BaseException], None],
     ) -> None:
         self.changed = True
-        self.has_waitables = False
+        self._has_waitables = False
         self._nodes = nodes
         self._registry = registry
         self._pool = pool
@@ -216,6 +216,14 @@ class Upkeep:
             if loop.has(source):
                 loop.remove(source)
 
+    def handled_waitables(self) -> int:
+        """Return how many executions of actions and a user's waitables have been made ready."""
+        if not self._has_waitables:
+            return 0
+        return sum(
+            each.ready for each in list(self._registry.by_id.values())
+            if each.kind == WAITABLE and not is_qos_event(each.rclpy))
+
     # --- waitables -------------------------------------------------------------------------------
 
     def _refresh_waitables(self, added: list[Entity], gone: list[Entity]) -> None:
@@ -248,7 +256,7 @@ class Upkeep:
         if self._events is None:
             left += [e for e in events if e not in left]
         self._unlistened = left
-        self.has_waitables = len(present) > len(events)
+        self._has_waitables = len(present) > len(events)
         self._wait_sets.update(left)
 
     def _listen_to(

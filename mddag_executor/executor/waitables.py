@@ -40,7 +40,10 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
 from rclpy.waitable import Waitable
 
-_SENDER_CHECKS, _SENDER_CHECK_S = 500, 0.001
+SENDER_CHECKS, SENDER_CHECK_NS = 500, 1_000_000
+"""How often and after what time a response is posted whose request is not noted yet (7.1.5)."""
+POLL_CHECKS, POLL_CHECK_S = 5, 0.1
+"""How often and how long ``WaitSetThread.poll`` waits if what it waits for is being destroyed."""
 
 Post = Callable[[list[Work]], None]
 """Makes executions ready; not to be called under the engine's lock."""
@@ -59,19 +62,8 @@ def executions_of(entity: Entity, executor: Any) -> list[Work]:
     found = [Work(entity, callback, (message,))
              for callback, message in compat.feedback_taken(waitable, data, MOST_AT_ONCE)]
     if data or not found:
-        is_early = compat.sender_is_behind(waitable, data)
-        execute = partial(_execute_late, waitable) if is_early else waitable.execute
-        found.append(Work(entity, execute, (data,)))
+        found.append(Work(entity, waitable.execute, (data,)))
     return found
-
-
-def _execute_late(client: Any, data: Any) -> Any:
-    """Execute an action client's work once the thread that has sent the request has noted it."""
-    for _ in range(_SENDER_CHECKS):
-        if not compat.sender_is_behind(client, data):
-            break
-        time.sleep(_SENDER_CHECK_S)
-    return client.execute(data)
 
 
 class WaitableSource:
@@ -164,12 +156,22 @@ class WaitableSource:
         else:  # there may be more, after the others have had their turn
             self._at(time.monotonic_ns(), self.collect)
         if found:
-            self._post(found)
+            self._post_noted(found)
         with self._set.held():
             times = [timer.until() for timer in self._timers]
         for until in times:
             if until is not None and until > 0:  # else its handling is posted, which resets it
                 self._at(time.monotonic_ns() + until, self.collect)
+
+    def _post_noted(self, found: list[Work], checks: int = 0) -> None:
+        """Post executions; a response only when the thread that sent the request has noted it."""
+        early = [] if checks >= SENDER_CHECKS else [
+            work for work in found if compat.sender_is_behind(work.entity.rclpy, work.args[0])]
+        if len(early) < len(found):
+            self._post([work for work in found if work not in early])
+        if early:
+            self._at(time.monotonic_ns() + SENDER_CHECK_NS,
+                     partial(self._post_noted, early, checks + 1))
 
 
 _known: weakref.WeakKeyDictionary[Entity, list[int]] = weakref.WeakKeyDictionary()
@@ -228,6 +230,8 @@ class WaitSetThread:
         self._changed = False
         self._ending = False
         self._applied = threading.Event()
+        self._asked = self._answered = 0
+        self._has_answered = threading.Event()
         self._thread: threading.Thread | None = None
         call_at_shutdown(context, self.wake)
 
@@ -246,6 +250,19 @@ class WaitSetThread:
             self.wake()
             while self._changed and self._thread.is_alive() and not self._applied.wait(0.1):
                 pass
+
+    def poll(self) -> None:
+        """Have posted what is ready by now, for a thread that steps; not for several at once."""
+        thread = self._thread
+        if self._entities and thread is not None:
+            self._has_answered.clear()
+            self._asked += 1
+            self.wake()
+            for _ in range(POLL_CHECKS):
+                if self._answered == self._asked or not thread.is_alive():
+                    break
+                self._has_answered.wait(POLL_CHECK_S)
+                self._has_answered.clear()
 
     def wake(self) -> None:
         """End the present wait."""
@@ -281,7 +298,10 @@ class WaitSetThread:
                     by_id = {id(each.rclpy): each for each in self._entities}
                     waiting = self._build(self._entities)
                     self._applied.set()
-                self._wait(waiting, by_id)
+                asked = self._asked
+                self._wait(waiting, by_id, -1 if asked == self._answered else 0)
+                self._answered = asked
+                self._has_answered.set()
             except Exception as error:
                 waiting = None
                 if is_over(self._context):
@@ -306,13 +326,13 @@ class WaitSetThread:
             self._context, [each for each in alive if isinstance(each, Waitable)],
             [*own, *(each for each in alive if not isinstance(each, Waitable))])
 
-    def _wait(self, waiting: FilledSet, by_id: dict[int, Entity]) -> None:
+    def _wait(self, waiting: FilledSet, by_id: dict[int, Entity], timeout_ns: int) -> None:
         found: list[Work] = []
 
         def take(waitable: Waitable) -> None:
             found.extend(executions_of(by_id[id(waitable)], self._executor))
 
-        for guard in waiting.wait(-1, take):
+        for guard in waiting.wait(timeout_ns, take):
             entity = by_id.get(id(guard))
             if guard is self._signals:
                 self._on_signal()

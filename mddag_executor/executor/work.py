@@ -81,11 +81,12 @@ class Work:
     :ivar is_known: whether the executor would know if the entity were destroyed.
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar cpu_ns: how long it has computed.
+    :ivar yields: how many times in a row its coroutine has yielded without awaiting a future.
     """
 
     __slots__ = (
         'entity', 'function', 'args', 'then', 'x', 'coroutine', 'origin', 'worker', 'is_known',
-        'ready_ns', 'cpu_ns')
+        'ready_ns', 'cpu_ns', 'yields')
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -99,7 +100,7 @@ class Work:
         self.origin: Origin | None = None
         self.x = self.worker = -1
         self.is_known = False
-        self.ready_ns = self.cpu_ns = 0
+        self.ready_ns = self.cpu_ns = self.yields = 0
 
     def step(self) -> Any:
         """

@@ -42,7 +42,7 @@ from typing import Any
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core import NEVER
-from mddag_executor.executor.compat import UNKNOWN
+from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.debugging import engine_lock
 from mddag_executor.executor.engine import Engine, LONG_NS
 from mddag_executor.executor.entity import Entity
@@ -71,8 +71,12 @@ WAKE_GUARD_NS = 1_000_000
 """The longest that something ready waits because a callback was expected to end."""
 STOP_NS = 5_000_000
 """A wake-up that is late by this, while the process computes nothing, is a stop of the machine."""
-POLL_NS = 2_000_000
-"""A coroutine that awaits something unknown is resumed after this, if threads spin."""
+YIELD_STEP_NS, MOST_YIELD_NS = 1_000, 2_000_000
+"""
+A coroutine that yields continues in the next turn, each time in a row this much later, up to 2 ms.
+
+So one that yields a few times loses nothing, and one that polls does not compute all the time.
+"""
 ASK_AGAIN_NS = 10_000_000
 """A callback group that has refused an execution is asked again after this."""
 CONTEXT_CHECK_NS = 100_000_000
@@ -178,6 +182,8 @@ class WorkerPool:
         self.lent = 0
         #: called with something to run while a callback of ``spin_once`` waits in ``Client.call``
         self.serve_meanwhile: Callable[[], Any] | None = None
+        #: called with a future that a coroutine awaits
+        self.adopt: Callable[[Any], None] = lambda future: None
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
         self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
         #: called when there is something that the registry does not know of
@@ -201,7 +207,7 @@ class WorkerPool:
         self._leaving = False
         self._all_left = threading.Event()
         self._is_stepping = False
-        # the coroutines that await something unknown: they go on in the next step
+        # the coroutines that have yielded: they continue in the next step
         self._of_next_step: list[Work] = []
         self._last = 0
         self._misses = 0
@@ -805,12 +811,16 @@ class WorkerPool:
     def _settle_end(self, work: Work, waits_for: Any, raised: BaseException | None) -> None:
         """Have a suspended execution resumed, or an exception reported; without the lock."""
         if waits_for is not None:
-            if waits_for is UNKNOWN or not hasattr(waits_for, 'add_done_callback'):
+            if waits_for is NEXT_TURN or not hasattr(waits_for, 'add_done_callback'):
                 if self._is_stepping:
                     self._of_next_step.append(work)
                     return
-                self.call_at(monotonic_ns() + POLL_NS, partial(self.resume, work))
+                work.yields += 1
+                rest = min(work.yields * YIELD_STEP_NS, MOST_YIELD_NS)
+                self.call_at(monotonic_ns() + rest, partial(self.resume, work))
             else:
+                work.yields = 0
+                self.adopt(waits_for)
                 waits_for.add_done_callback(QuickCallback(partial(self.resume, work)))
         elif isinstance(raised, Refused):
             self.call_at(monotonic_ns() + ASK_AGAIN_NS, self._ask_again)
@@ -922,6 +932,12 @@ class LocalDelivery:
     def hold(self) -> None:
         """Announce nothing for now."""
         self._pool.loop.hold(self.sources)
+
+    def listen_again(self, subscription: Any) -> None:
+        """Have a subscription announced again whose reader the middleware has replaced."""
+        for source in self.sources:
+            if source.entity.rclpy is subscription:
+                source.listen()
 
     def collect_published(self, publication: Publication | None) -> None:
         """Take what was announced since ``hold``, and announce again."""

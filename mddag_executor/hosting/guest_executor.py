@@ -49,6 +49,12 @@ class GuestExecutor:
     _is_stopped: bool
     _turns: int  # callbacks that have run since the last spin
     _n_stepping: int
+    _n_spinning: int
+
+    @property
+    def is_spinning(self) -> bool:
+        """Return whether a thread spins (rclpy from 7.1.9 on)."""
+        return self._n_spinning > 0
 
     def spin(self) -> None:
         """Have the nodes run, and wait for the end."""
@@ -97,8 +103,14 @@ class GuestExecutor:
                 raised.append(self._errors.popleft())
             return bool(raised) or self._is_stopped or until()
 
-        self.host.wait(
-            self._changed, is_over, getattr(timeout_sec, 'timeout', timeout_sec), self.guest)
+        with self._changed:
+            self._n_spinning += 1
+        try:
+            self.host.wait(
+                self._changed, is_over, getattr(timeout_sec, 'timeout', timeout_sec), self.guest)
+        finally:
+            with self._changed:
+                self._n_spinning -= 1
         if raised:
             raise raised[0]
 
@@ -171,7 +183,7 @@ def make_guest(executor: Any, host: Host, guest: Guest | None) -> None:
     executor._changed = threading.Condition()
     executor._errors = deque()
     executor._has_spun = executor._is_stopped = False
-    executor._turns = executor._n_stepping = 0
+    executor._turns = executor._n_stepping = executor._n_spinning = 0
 
 
 @cache
@@ -181,4 +193,5 @@ def _guest_class(kind: type[Executor]) -> type[Any]:
         name: method for name, method in vars(GuestExecutor).items() if callable(method) and (
             getattr(kind, name, method).__module__.partition('.')[0]
             in ('rclpy', 'mddag_executor'))}
+    methods['is_spinning'] = GuestExecutor.is_spinning
     return type(kind.__name__, (kind, GuestExecutor), methods)

@@ -41,7 +41,7 @@ from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import DONE
-from mddag_executor.executor.compat import UNKNOWN
+from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.groups import Refused
 from mddag_executor.executor.jobs import Origin
@@ -355,7 +355,7 @@ class Loop:
 
     def _resume_when_done(self, work: Work, waits_for: Any) -> None:
         resume = partial(self.engine.resume, work)
-        if waits_for is UNKNOWN or not hasattr(waits_for, 'add_done_callback'):
+        if waits_for is NEXT_TURN or not hasattr(waits_for, 'add_done_callback'):
             self.at(self.now + POLL_NS, ARRIVED, resume)
         else:
             waits_for.add_done_callback(QuickCallback(partial(self.soon, resume)))

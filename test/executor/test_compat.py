@@ -270,7 +270,7 @@ def test_what_a_coroutine_waits_for_is_found():
 
     coroutine = waits_for_something_else()
     coroutine.send(None)
-    assert compat.awaited(coroutine) is compat.UNKNOWN
+    assert compat.awaited(coroutine) is compat.NEXT_TURN
     coroutine.close()
 
 

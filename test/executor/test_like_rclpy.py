@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+import threading
 import time
 
 from mddag_executor.executor.compat import TASKS_NEWEST_FIRST
@@ -49,6 +50,33 @@ def test_a_coroutine_goes_on_in_the_step_after_its_future_is_done(make_executor)
     future.set_result(None)
     executor.spin_once(timeout_sec=1)
     assert task.done() and task.result() == 'done'
+
+
+def test_other_callbacks_of_an_awaited_future_run_where_rclpy_runs_them(
+        make_executor, ros_context):
+    """Since rclpy 7.1.9 in the executor, before that in the thread that completes the future."""
+    here = []
+    for executor in make_executor(), SingleThreadedExecutor(context=ros_context):
+        future: Future = Future()
+        threads: list[int] = []
+
+        async def wait(future: Future = future) -> None:
+            await future
+
+        task = executor.create_task(wait)
+        executor.spin_once(timeout_sec=0)
+        future.add_done_callback(
+            lambda _, threads=threads: threads.append(threading.get_ident()))
+        completing = threading.Thread(target=future.set_result, args=(None,))
+        completing.start()
+        completing.join()
+        for _ in range(20):
+            if task.done() and threads:
+                break
+            executor.spin_once(timeout_sec=0.1)
+        here.append(threads == [threading.get_ident()])
+        executor.shutdown()
+    assert here[0] == here[1]
 
 
 @pytest.mark.parametrize('mine', [True, False], ids=['own', 'free'])

@@ -261,6 +261,49 @@ def test_a_wake_up_that_another_worker_hears_is_not_the_last_one(make_executor, 
         assert wait_for(task.done, 5.0)
 
 
+def test_a_callback_has_ended_when_the_future_that_it_completes_is_waited_for(
+        make_executor, make_node):
+    """As with one thread: rclpy's own tests count on it."""
+    node, executor = make_node(), make_executor()
+    executor.add_node(node)
+    begun, ended = [], []
+
+    def complete() -> None:
+        begun.append(1)
+        future.set_result(None)
+        ended.append(1)
+
+    future: Future = Future()
+    node.create_timer(0.001, lambda: None if future.done() else complete())
+    for count in range(1, 201):
+        executor.spin_until_future_complete(future, 15.0)
+        assert len(begun) == len(ended) == count
+        future = Future()
+
+
+def test_a_future_may_be_polled_without_waiting(make_executor, make_node):
+    node, executor = make_node(), make_executor()
+    executor.add_node(node)
+    future: Future = Future()
+    node.create_timer(0.01, lambda: future.done() or future.set_result(None))
+
+    def polled() -> bool:
+        executor.spin_until_future_complete(future, 0)
+        return future.done()
+
+    assert wait_for(polled)
+
+
+def test_what_is_triggered_runs_in_a_step_that_does_not_wait(make_executor, make_node):
+    node, executor, calls = make_node(), make_executor(), []
+    executor.add_node(node)
+    guard = node.create_guard_condition(lambda: calls.append(1))
+    for count in range(1, 51):
+        guard.trigger()
+        executor.spin_once(0)
+        assert len(calls) == count
+
+
 def test_spinning_twice_is_an_error(make_executor):
     executor = make_executor()
     assert not executor.is_spinning

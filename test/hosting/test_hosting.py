@@ -19,6 +19,7 @@ import time
 from typing import Any
 import weakref
 
+from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.hosting.host import Host
 from mddag_executor.hosting.loading import Program
 from mddag_executor.trace import TraceError, TraceReader
@@ -295,6 +296,18 @@ def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host: Host, kind
     spinning.join(2.0)
     assert not spinning.is_alive()
     assert host.executor.get_nodes() == []
+
+
+@pytest.mark.parametrize('kind', [SingleThreadedExecutor, MultiDeadlineExecutor])
+def test_an_executor_of_a_program_knows_whether_it_spins(host: Host, kind: Any) -> None:
+    other = kind()
+    spinning = threading.Thread(target=other.spin)
+    assert not other.is_spinning
+    spinning.start()
+    assert wait_for(lambda: other.is_spinning, 15.0)
+    other.shutdown()
+    spinning.join(15.0)
+    assert not spinning.is_alive() and not other.is_spinning
 
 
 def test_a_class_of_executors_of_a_program_keeps_what_it_overrides(host: Host) -> None:

@@ -171,9 +171,9 @@ def coroutines_not_resumed() -> None:
     replace(Engine, 'resume', lambda resume: lambda self, work: None)
 
 
-@mutation("A coroutine never goes on that awaits something other than one of rclpy's futures.")
+@mutation("A coroutine never goes on that yields without awaiting one of rclpy's futures.")
 def unknown_waits_not_resumed() -> None:
-    workers.POLL_NS = 10 ** 18
+    workers.YIELD_STEP_NS = workers.MOST_YIELD_NS = 10 ** 18
     replace(WorkerPool, '_resume_of_last_step', lambda resume: lambda self: None)
 
 
