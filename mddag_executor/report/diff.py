@@ -20,7 +20,8 @@ from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
 
 _KEYS = ('min', 'median', 'p99', 'max')
-_HEADER = ('sink', 'due A', 'due B', 'in time A', 'in time B', 'median A', 'B', 'p99 A', 'B', '')
+_HEADER = ('sink', 'due A', 'due B', 'in time A', 'in time B', 'median A', 'median B', 'p99 A',
+           'p99 B', 'p99 B-A', '')
 
 _COUNTS: tuple[Callable[[Mapping[str, Any]], Cell], ...] = (
     lambda side: side['due'], lambda side: percent(side['in_time'], side['due']))
@@ -108,31 +109,30 @@ def _callback(use: Mapping[str, int] | None) -> dict[str, Any] | None:
 
 
 def sinks_table(difference: Mapping[str, Any]) -> str:
-    """Return the table of sinks: the figures of run A, and those of run B or how they changed."""
-    dags = difference['dags']
-    short = short_names(name for dag in dags.values() for name in dag['sinks'])
+    """Return the table of sinks: both runs' figures, those first that are worse in run B."""
+    sinks = [(name, sink) for dag in difference['dags'].values()
+             for name, sink in dag['sinks'].items()]
+    short = short_names(name for name, _ in sinks)
+    sinks.sort(key=lambda item: _order(item[1]))
     rows: list[list[Cell]] = []
-    for dag in dags.values():
-        for name, sink in dag['sinks'].items():
-            row: list[Cell] = [short[name]]
-            for cell in _COUNTS:
-                row.extend(None if side is None else cell(side)
-                           for side in (sink['a'], sink['b']))
-            for key in ('median', 'p99'):
-                row.extend(_response(sink, key))
-            rows.append([*row, _remark(sink)])
-    return table(_HEADER, rows, marked=[
-        sink['worse'] for dag in dags.values() for sink in dag['sinks'].values()])
+    for name, sink in sinks:
+        sides = (sink['a'], sink['b'])
+        row: list[Cell] = [short[name]]
+        for cell in _COUNTS:
+            row.extend(None if side is None else cell(side) for side in sides)
+        for key in ('median', 'p99'):
+            row.extend(None if side is None or side['response_ns'] is None
+                       else format_ns(side['response_ns'][key], 3) for side in sides)
+        share = None if sink['change'] is None else sink['change']['p99']
+        rows.append([*row, None if share is None else f'{100 * share:+.1f} %', _remark(sink)])
+    return table(_HEADER, rows, marked=[sink['worse'] for _, sink in sinks])
 
 
-def _response(sink: Mapping[str, Any], key: str) -> list[Cell]:
-    side = sink['a']
-    value = None if side is None or side['response_ns'] is None \
-        else format_ns(side['response_ns'][key], 3)
-    if sink['change'] is None:
-        return [value, None]
-    share = sink['change'][key]
-    return [value, '-' if share is None else f'{100 * share:+.1f} %']
+def _order(sink: Mapping[str, Any]) -> tuple[bool, float]:
+    """Return the key for the order of sinks: what got worse, then what missed most in B."""
+    b = sink['b']
+    missed = 0 if b is None else (b['due'] - b['in_time']) / max(1, b['due'])
+    return not sink['worse'], -missed
 
 
 def _remark(sink: Mapping[str, Any]) -> str:
@@ -152,15 +152,16 @@ def _remark(sink: Mapping[str, Any]) -> str:
 def callbacks_table(difference: Mapping[str, Any]) -> str:
     """Return a table of the callbacks' executions and times in both runs."""
     rows: list[list[Cell]] = []
+    short = short_names(difference['callbacks'])
     for key, sides in difference['callbacks'].items():
-        row: list[Cell] = [key]
+        row: list[Cell] = [short[key]]
         for what in ('executions', 'mean_ns', 'longest_ns', 'mean_wait_ns'):
             for side in (sides['a'], sides['b']):
                 value = None if side is None else side[what]
-                row.append(value if value is None or what == 'executions' else format_ns(value))
+                row.append(value if value is None or what == 'executions' else format_ns(value, 3))
         rows.append(row)
-    return table(('callback', 'executions A', 'B', 'mean A', 'B', 'longest A', 'B',
-                  'mean wait A', 'B'), rows)
+    return table(('callback', 'ran A', 'ran B', 'mean A', 'mean B', 'longest A', 'longest B',
+                  'wait A', 'wait B'), rows)
 
 
 def lines(difference: Mapping[str, Any], callbacks: bool) -> Iterator[str]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from mddag_executor.replay.causes import REMEDIES
 from mddag_executor.report.tables import percent, short_names
-from mddag_executor.report.text import Cell, format_ns, table
+from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
 
 MOST_STALLS = 10
@@ -48,10 +48,10 @@ def sinks_table(mostly: Sequence[Mapping[str, Any]]) -> str:
     for each, before in zip(mostly, [None, *mostly]):
         same = before is not None and before['sink'] == each['sink']
         rows.append([
-            '' if same else each['dag'], '' if same else names[each['sink']], each['cause'],
+            '' if same else names[each['sink']], each['cause'],
             each['missed'], format_ns(each['ns'], 3) if each['ns'] else None,
             *(None if each[key] is None else names[each[key]] for key in ('vertex', 'behind'))])
-    return table(('DAG', 'sink', 'cause', 'misses', 'mean', 'mostly at', 'mostly behind'), rows)
+    return table(('sink', 'cause', 'misses', 'mean', 'mostly at', 'mostly behind'), rows)
 
 
 def stalls_table(stalls: Sequence[Mapping[str, int]], start: int) -> str:
@@ -66,11 +66,11 @@ def job_lines(job: Mapping[str, Any]) -> Iterator[str]:
     """Yield what became of a job, and where its time went."""
     late = job['verdict'] if job['late_ns'] is None else f'late by {format_ns(job["late_ns"], 3)}'
     allowed = job['deadline_ns'] - job['release_ns']
-    yield (f'Job {job["job"]} of {job["sink"]}: {late} (deadline {format_ns(allowed)} after its '
-           f'release): {job["cause"]}')
     parts = job['parts']
-    names = short_names({part['vertex'] for part in parts} | {
+    names = short_names({job['sink']} | {part['vertex'] for part in parts} | {
         each['callback'] for part in parts for each in part['behind']})
+    yield (f'Job {job["job"]} of {printable(names[job["sink"]])}: {late} (deadline '
+           f'{format_ns(allowed)} after its release): {job["cause"]}')
     yield table(('callback', 'what', 'time', 'behind'), [
         [names[part['vertex']], part['cause'], format_ns(part['ns'], 3),
          ', '.join(f'{names[each["callback"]]} {format_ns(each["ns"], 3)}'

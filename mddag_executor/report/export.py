@@ -98,9 +98,6 @@ def _releases(replay: Replay, rows: Ints) -> tuple[Ints, Ints, Mask]:
         release[some] = jobs_of.release[row[some]]
     return row, release, row >= 0
 
-    def abandon(self) -> None:
-        """Write nothing more, after an error."""
-
 
 def jobs(replay: Replay) -> list[Column]:
     """Return the columns of the verdicts about jobs at sinks."""
@@ -122,10 +119,6 @@ def jobs(replay: Replay) -> list[Column]:
 
 def _seconds(recording: Recording, times: Ints) -> Any:
     return (times - (recording.start or 0)) / 1e9
-
-    def abandon(self) -> None:
-        """Write nothing more, after an error."""
-        self._target.abandon()
 
 
 # --- formats -------------------------------------------------------------------------------------
@@ -162,10 +155,6 @@ def _cells(column: Column, begin: int) -> Iterator[Any]:
 def _harmless(name: str) -> str:
     text = printable(name)
     return f"'{text}" if text[:1] in ('=', '+', '-', '@') else text
-
-    def abandon(self) -> None:
-        """Write nothing more, after an error."""
-        self._writer.abandon()
 
 
 def arrow_table(columns: Sequence[Column]) -> Any:

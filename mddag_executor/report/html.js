@@ -2,11 +2,58 @@
 'use strict';
 (() => {
   const NARROW = 700;                   // pixels, as in html.css
+  const DARK = window.matchMedia('(prefers-color-scheme: dark)').matches;
   const MISSES = new Set(['late', 'expired', 'failed', 'aborted']);
   const element = (id) => document.getElementById(id);
   const meta = JSON.parse(element('mddag-meta').textContent);
-  const missed = meta.missed.map(
-    ([release, deadline, shown, text]) => ({release, deadline, shown, text}));
+
+  // The texts about jobs and executions, from the tables of the page.
+  function time(ns) {
+    let found = '';
+    for (const [scale, unit] of [[1, 'ns'], [1e3, 'us'], [1e6, 'ms'], [1e9, 's']]) {
+      const value = Number((ns / scale).toPrecision(4));
+      found = `${value} ${unit}`;
+      if (Math.abs(value) < 1000) break;
+    }
+    return found;
+  }
+
+  function jobText(place) {
+    if (place < 0) return 'declared by no DAG';
+    const [dag, job, release] = meta.jobs[place];
+    const text = `job ${job} of ${meta.dags[dag]}`;
+    return release === null ? text : `${text}, released at ${release.toFixed(6)} s`;
+  }
+
+  function verdictText(place) {
+    const [sink, , deadline, response, verdict] = meta.verdicts[place];
+    const name = meta.short[sink], due = `(deadline ${time(deadline)})`;
+    if (response === null) return `MISSED at ${name}: ${verdict} ${due}`;
+    const slack = deadline - response;
+    const how = slack < 0 ? `${time(-slack)} late` : `${time(slack)} of slack`;
+    return `${slack < 0 ? 'MISSED' : 'in time'} at ${name}: response ${time(response)}, ${how} ${due}`;
+  }
+
+  function fillTexts(bars, marks) {     // a to d: the lines of a tool tip
+    const d = bars.data, all = (column, text) => Array.from(column, text);
+    d.a = all(d.name, (name) => meta.names[name]);
+    d.b = all(d.job, jobText);
+    d.c = all(d.worker, (worker, i) => {
+      const where = worker < 0 ? 'a spare thread' : meta.workers[worker] || `worker ${worker}`;
+      return `started ${d.left[i].toFixed(6)} s on ${where}, waited ` +
+        `${time(Math.round(d.waited[i] * 1e9))}, ran ${time(Math.round((d.right[i] - d.left[i]) * 1e9))}`;
+    });
+    d.d = all(d.verdict, (verdict, i) => verdict >= 0 ? verdictText(verdict)
+      : d.name[i] < meta.declared ? 'no verdict known' : '');
+    const m = marks.data;
+    m.a = all(m.verdict, (verdict) => meta.names[meta.verdicts[verdict][0]]);
+    m.b = all(m.verdict, (verdict) => jobText(meta.verdicts[verdict][1]));
+    m.c = all(m.verdict, verdictText);
+    m.d = all(m.verdict, () => '');
+  }
+
+  const missed = meta.missed.map(([verdict, release, deadline, shown]) => ({
+    release, deadline, shown, text: `${jobText(meta.verdicts[verdict][1])}: ${verdictText(verdict)}`}));
 
   // The table of sinks: search, sort, and the rows that are not in the page at first.
   function sinks() {
@@ -31,7 +78,7 @@
           const bar = cell.querySelector('i');
           bar.style.width = `${100 * Math.min(1, reached)}%`;
           bar.style.background = reached > 1 ? '#d7191c' : reached > 0.9 ? '#fd8d3c' : '#3182bd';
-          cell.lastChild.textContent = `${Math.round(100 * reached)} %`;
+          cell.querySelector('b').textContent = `${Math.round(100 * reached)} %`;
         });
         body.append(row);
       }
@@ -88,8 +135,26 @@
     for (const name of ['overview', 'workers', 'callbacks']) model(name).min_border_left = 110;
   }
 
+  function darken(doc) {                // the pictures, where the reader prefers dark pages
+    for (const {model} of Bokeh.index) {
+      model.setv({background_fill_color: '#202022', border_fill_color: '#1b1b1d',
+                  outline_line_color: '#555'});
+      if (model.title) model.title.text_color = '#ddd';
+      for (const axis of [...model.below, ...model.left]) {
+        axis.setv({major_label_text_color: '#bbb', axis_label_text_color: '#bbb',
+                   axis_line_color: '#777', major_tick_line_color: '#777'});
+      }
+      for (const part of model.center) {
+        if ('grid_line_color' in part && part.grid_line_color) part.grid_line_color = '#3a3a3d';
+        if (part.fill_color === '#eeeeee') part.fill_color = '#333336';
+      }
+    }
+  }
+
   function start(doc) {
     const model = (name) => doc.get_model_by_name(name);
+    fillTexts(model('executions'), model('marks'));
+    if (DARK) darken(doc);
     fit(model);
     const range = model('timeline_range');
     const boxes = (kind) => ['workers', 'callbacks'].map((name) => model(`${name}_${kind}`));

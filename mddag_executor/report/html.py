@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from html import escape
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
 from mddag_executor import __version__
@@ -20,12 +20,11 @@ from mddag_executor.replay import Replay, Reschedule
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.html_data import (
-    CLASSES,
+    COLOURS,
     json_for_html,
     prepare,
     Prepared,
     ReportData,
-    UNKNOWN,
 )
 from mddag_executor.report.html_tables import (
     callbacks_html,
@@ -129,7 +128,8 @@ def _page(
     data: ReportData, prepared: Prepared, library: str, script: str, divisions: list[str]
 ) -> Iterator[str]:
     plots = [f'<div class="mddag-plot">{division}</div>' for division in divisions]
-    title = escape(printable(f'{data.title}: {data.task_set.file or data.facts[0][1]}'))
+    title = escape(printable(
+        f'{data.title}: {PurePath(data.task_set.file or data.facts[0][1]).name}'))
     yield (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n<title>{title}</title>'
            '\n<meta name="viewport" content="width=device-width">\n'
            '<link rel="icon" href="data:,">\n'
@@ -142,9 +142,8 @@ def _page(
         yield f'<h2>Sinks</h2>\n{sinks_html(data)}\n'
     else:
         yield '<p class="note">No DAG is declared: give a GRAPH to judge deadlines.</p>\n'
-    colours = (*(colour for _, colour in CLASSES), UNKNOWN)
     legend = ''.join(f'<span><i style="background:{colour}"></i>{text}</span>'
-                     for colour, text in zip(colours, _LEGEND))
+                     for colour, text in zip(COLOURS, _LEGEND))
     yield (f'<h2 id="mddag-timeline">Timeline</h2>\n<p class="legend">{legend}'
            '<span><b class="miss">&#9660;</b>where a deadline was missed</span></p>\n')
     yield ('<p class="note">Times count from the beginning of the run. Drag the window of the '
@@ -154,7 +153,11 @@ def _page(
            '<button id="mddag-next">next miss &#9654;</button> '
            '<button id="mddag-whole">whole run</button> <span id="mddag-status"></span></p>\n')
     yield f'{plots[0]}\n<p class="note">{_BARS}</p>\n'
-    yield f'<h3>By worker</h3>\n{plots[1]}\n<h3>By callback</h3>\n{plots[2]}\n'
+    yield f'<h3>By worker</h3>\n{plots[1]}\n<h3>By callback</h3>\n'
+    if prepared.n_hidden:
+        yield ('<p class="note">Only the DAGs that missed the largest share of their deadlines; '
+               f'{prepared.n_hidden} of {len(data.task_set.dags)} are left out.</p>\n')
+    yield f'{plots[2]}\n'
     if data.paths:
         yield ('<h2>End to end</h2>\n<p class="note">From the first publication to the start of '
                f'the last callback.</p>\n{paths_html(data)}\n')
@@ -167,7 +170,7 @@ def _page(
     yield f'<h2>Callbacks</h2>\n{callbacks_html(data)}\n'
     yield f'<footer>mddag_executor {escape(__version__)}</footer>\n'
     yield ('<script id="mddag-meta" type="application/json">'
-           f'{json_for_html({"duration": data.duration_ns / 1e9, "missed": prepared.steps})}'
+           f'{json_for_html(prepared.meta)}'
            f'</script>\n{script}\n<script>{_SCRIPT.read_text(encoding="utf-8")}</script>\n')
     yield '</body></html>\n'
 
@@ -180,12 +183,10 @@ def _head(data: ReportData) -> Iterator[str]:
         for word, text in data.facts) + '</p>\n'
     if data.task_set.dags:
         good = every.due and not every.missed
-        yield f'<p class="verdict {"good" if good else "bad"}">{verdicts_line(dags)}</p>\n'
-        worst = worst_line(data)
-        if worst is not None:
-            yield f'<p>{escape(printable(worst))}</p>\n'
-        if data.misses is not None:
-            yield from (f'<p>{line}</p>\n' for line in causes_line(data.misses))
+        lines = [line for line in (worst_line(data), *(
+            () if data.misses is None else causes_line(data.misses))) if line is not None]
+        yield (f'<div class="verdict {"good" if good else "bad"}"><b>{verdicts_line(dags)}</b>'
+               + ''.join(f'<p>{escape(printable(line))}</p>' for line in lines) + '</div>\n')
     for warning in [*never_due_lines(dags), *data.warnings]:
         yield f'<p class="warning">{escape(printable(warning))}</p>\n'
     timeline = data.timeline

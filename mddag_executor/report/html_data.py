@@ -1,11 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The data of an HTML report: what its pictures are drawn from in the browser.
+The data of an HTML report: what its script draws the timeline and its texts from.
 
-The executions that the timeline kept go into the file, as columns of the pictures: those around
-missed deadlines, and some of all other times (``timeline``).  Times are seconds since the first
-instant.  A name is only ever JSON here, text in HTML or text on a canvas, never markup or code.
+The page has the executions that ``timeline`` selects, as columns of numbers. They refer to tables
+of names, jobs and verdicts, from which the script makes the texts of tool tips. So a page stays
+small. Times are seconds since the first instant. A name is only ever JSON here, text in HTML or
+text on a canvas, never markup or code.
 """
 
 from __future__ import annotations
@@ -15,36 +16,24 @@ import json
 from typing import Any, NamedTuple
 
 from mddag_executor.core import Tables, Tally
-from mddag_executor.recording.tables import Ints
+from mddag_executor.core.tally import counts, VERDICTS
 from mddag_executor.replay.usage import Usage
-from mddag_executor.report.tables import short_names
-from mddag_executor.report.text import format_ns, printable
-from mddag_executor.report.timeline import (
-    ABORTED,
-    DONE,
-    END,
-    EXPIRED,
-    FAILED,
-    JOB,
-    OVERDUE,
-    READY,
-    ROW,
-    START,
-    Timeline,
-    WORKER,
-)
-from msg_graph import TaskSet
+from mddag_executor.report.tables import missed_share, short_names
+from mddag_executor.report.text import format_ns, printable, shortened
+from mddag_executor.report.timeline import Shown, Timeline
+from msg_graph import Dag, TaskSet
 import numpy as np
 
 MOST_MISSES = 200
+MOST_LINES = 150
+"""So many lines the timeline by callback has, more only for a single DAG."""
 LONGEST_LABEL = 40
-KINDS = {
-    DONE: 'late', OVERDUE: 'not completed at the end', EXPIRED: 'expired', ABORTED: 'aborted',
-    FAILED: 'failed'}
 UNKNOWN = '#969696'
-CLASSES = ((0.0, '#d7191c'), (0.1, '#fd8d3c'), (0.25, '#fec44f'), (0.5, '#9ecae1'),
-           (float('inf'), '#3182bd'))
-"""The colour of an execution whose slack is less than such a share of the deadline."""
+COLOURS = ('#d7191c', '#fd8d3c', '#fec44f', '#9ecae1', '#3182bd', UNKNOWN)
+"""The colours of executions, from the least slack to the most, and without a verdict."""
+_SHARES = (0.0, 0.1, 0.25, 0.5)
+"""Between the colours: slack as a share of the deadline."""
+_HIDDEN = -10       # the place of a callback whose line is left out
 
 
 class ReportData(NamedTuple):
@@ -52,13 +41,13 @@ class ReportData(NamedTuple):
     What a report is about.
 
     :ivar breakdown: by sink where the times of its jobs went, as in the result of a replay.
-    :ivar facts: what stands below the title: pairs of a word and a text.
+    :ivar facts: below the title: pairs of a word and a text.
     :ivar duration_ns: from the first release to the end of the run.
     :ivar paths: end-to-end times of the declared paths, as in the result of a replay.
     :ivar recorded: the callbacks of an imported recording, as in the result of a replay.
     :ivar misses: why deadlines were missed, as in the result of a replay.
     :ivar causes: the cause of each miss, by global vertex of the sink and job.
-    :ivar worker_names: what workers are called, where that is more than a number.
+    :ivar worker_names: the names of workers, if they have more than a number.
     """
 
     title: str
@@ -79,8 +68,11 @@ class ReportData(NamedTuple):
     worker_names: Sequence[str] = ()
 
 
+NumberedJobs = dict[tuple[int, int], tuple[int, float | None]]
+
+
 class Line(NamedTuple):
-    """A line of the picture by callback: its label, its place from the bottom, whether a DAG."""
+    """A line of a timeline: its label, its place from the bottom, whether it is a DAG's title."""
 
     label: str
     y: int
@@ -89,16 +81,19 @@ class Line(NamedTuple):
 
 class SinkJob(NamedTuple):
     """
-    What came of a job at a sink; ``sink`` is its global vertex.
+    The verdict about a job at a sink (a global vertex).
 
-    Times are ns since the origin; ``completed`` is None where it never was.
+    Times are ns since the origin; ``completed`` is None if it never was. ``place`` is that in the
+    page's table of verdicts.
     """
 
     sink: int
     job: int
+    release: int
     deadline: int
     completed: int | None
-    kind: int
+    verdict: str
+    place: int
 
     @property
     def missed(self) -> bool:
@@ -110,190 +105,208 @@ class SinkJob(NamedTuple):
         """Return when it is marked in the pictures."""
         return self.deadline if self.completed is None else self.completed
 
+    @property
+    def slack_share(self) -> float:
+        """Return the slack as a share of the deadline; below zero if that was missed."""
+        if self.completed is None:
+            return float('-inf')
+        return (self.deadline - self.completed) / max(1, self.deadline - self.release)
+
 
 class Prepared(NamedTuple):
     """
     A report's data, ready to be drawn.
 
     :ivar executions: the columns of the executions; ``marks`` those of the missed deadlines.
-    :ivar misses: in the order of ``SinkJob.shown``.
-    :ivar worst: of these the worst ones, in the order of their releases.
-    :ivar steps: for the page's script: start, deadline and end of each miss (s), and its text.
+    :ivar lines: of the timeline by callback; ``n_hidden`` is the number of DAGs that have none.
+    :ivar misses: the worst misses, in the order of their releases.
+    :ivar meta: for the page's script.
     """
 
     executions: dict[str, Any]
     marks: dict[str, Any]
     lines: list[Line]
+    n_hidden: int
     worker_lines: list[int]
     gaps: list[tuple[float, float]]
     origin: int
     misses: list[SinkJob]
-    worst: list[int]
-    steps: list[tuple[float, float, float, str]]
+    meta: dict[str, Any]
 
 
 def prepare(data: ReportData) -> Prepared:
     """Return what the pictures of a report are drawn from."""
-    columns = data.timeline.columns()
-    origin = _origin(columns.releases, columns.executions)
-    lines, ys = _lines(data.task_set, data.timeline.undeclared_names())
-    verdicts = {
-        (v, job): SinkJob(v, job, deadline - origin, None if done < 0 else done - origin, kind)
-        for v, job, deadline, done, kind in columns.verdicts.T.tolist()}
-    misses = sorted((each for each in verdicts.values() if each.missed),
+    shown = data.timeline.shown()
+    starts = np.concatenate([shown.releases['release'], shown.executions['ready']])
+    origin = int(starts.min()) if len(starts) else 0
+    verdicts = _verdicts(shown, origin)
+    missed = sorted((each for each in verdicts.values() if each.missed),
                     key=lambda miss: miss.shown)
-    releases = [miss.deadline - data.tables.sink_deadline[miss.sink] for miss in misses]
-    worst = sorted(range(len(misses)), key=lambda i: _badness(misses[i]))[:MOST_MISSES]
-    worst.sort(key=lambda i: (releases[i], misses[i].sink))
-    words = _Words(data, verdicts, {
-        (dag, job): release - origin for dag, job, release in columns.releases.T.tolist()})
-    steps = [(release / 1e9, miss.deadline / 1e9, miss.shown / 1e9,
-              f'{words.job(miss.sink, miss.job)}: {words.verdict(miss)}')
-             for release, miss in zip(releases, misses)]
+    worst = sorted(missed, key=_badness)[:MOST_MISSES]
+    worst.sort(key=lambda miss: (miss.release, miss.sink))
+    lines, ys, n_hidden = _lines(data)
+    worker_lines = _worker_lines(data)
+    jobs = _numbered_jobs(data, shown, verdicts, origin)
+    marks = {
+        'x': [miss.shown / 1e9 for miss in missed], 'workers': [0] * len(missed),
+        'callbacks': [ys[miss.sink] for miss in missed],
+        'verdict': np.array([miss.place for miss in missed], dtype=np.int32)}
     return Prepared(
-        words.executions(columns.executions, origin, ys), words.marks(misses, ys), lines,
-        words.worker_lines, [((a - origin) / 1e9, (b - origin) / 1e9)
-                             for a, b in data.timeline.gaps()], origin, misses, worst, steps)
+        _executions(data, shown, origin, verdicts, jobs, ys, worker_lines), marks, lines, n_hidden,
+        worker_lines, [((a - origin) / 1e9, (b - origin) / 1e9)
+                       for a, b in data.timeline.gaps()], origin, worst,
+        _meta(data, verdicts, jobs, worst))
 
 
 def _badness(miss: SinkJob) -> tuple[int, int, int]:
-    """Return what misses are ordered by: first those that never completed, then the latest."""
+    """Return the key for the order of misses: first what never completed, then the latest."""
     if miss.completed is None:
         return 0, 0, miss.deadline
     return 1, miss.deadline - miss.completed, miss.deadline
 
 
-class _Words:
-    """What is known of executions and jobs, in words."""
-
-    def __init__(
-        self, data: ReportData, verdicts: Mapping[tuple[int, int], SinkJob],
-        releases: Mapping[tuple[int, int], int],
-    ) -> None:
-        self._data = data
-        self._verdicts = verdicts
-        self._releases = releases
-        self._names = [vertex.name for vertex in data.task_set.vertices]
-        self._short = short_names(self._names)
-        self._leads_to = list(_leads_to(data))
-        self.worker_lines = _worker_lines(data)
-
-    def executions(self, executions: Ints, origin: int, ys: list[int]) -> dict[str, Any]:
-        """Return the columns of executions; ``a`` to ``d`` are the lines about them."""
-        undeclared = self._data.timeline.undeclared_names()
-        n_declared = len(self._names)
-        rows = np.where(executions[ROW] >= 0, executions[ROW], n_declared - 1 - executions[ROW])
-        names = [printable(name) for name in (*self._names, *undeclared)]
-        texts: list[tuple[str, str, str, str]] = []
-        colours = []
-        for row, job, worker, ready, start, end in zip(
-                rows.tolist(), *executions[[JOB, WORKER, READY, START, END]].tolist()):
-            least = self._least(row, job) if row < n_declared else None
-            verdict = '' if row >= n_declared else 'no verdict known'
-            if least is not None:
-                verdict = self.verdict(least)
-            colours.append(self._colour(least))
-            texts.append((
-                names[row], 'declared by no DAG' if row >= n_declared else self.job(row, job),
-                f'started {_instant(start - origin)} {self._worker(worker)}, waited '
-                f'{format_ns(start - ready)}, ran {format_ns(end - start)}', verdict))
-        lines = [self.worker_lines[w if 0 <= w < self._data.workers else -1]
-                 for w in executions[WORKER].tolist()]
-        return {
-            'left': (executions[START] - origin) / 1e9, 'right': (executions[END] - origin) / 1e9,
-            'workers': np.array(lines, dtype=np.int32),
-            'callbacks': np.array(ys, dtype=np.int32)[rows], 'colour': colours, **_lines_of(texts)}
-
-    def marks(self, misses: list[SinkJob], ys: list[int]) -> dict[str, Any]:
-        """Return the columns of missed deadlines."""
-        return {
-            'x': [miss.shown / 1e9 for miss in misses], 'workers': [0] * len(misses),
-            'callbacks': [ys[miss.sink] for miss in misses], **_lines_of([
-                (printable(self._names[miss.sink]), self.job(miss.sink, miss.job),
-                 self.verdict(miss), '') for miss in misses])}
-
-    def job(self, vertex: int, job: int) -> str:
-        """Return which job it is, and when it was released."""
-        dag = self._data.tables.dag_of[vertex]
-        release = self._releases.get((dag, job))
-        text = f'job {job} of {printable(self._data.task_set.dags[dag].name)}'
-        return text if release is None else f'{text}, released at {_instant(release)}'
-
-    def verdict(self, miss: SinkJob) -> str:
-        """Return what came of a job at a sink."""
-        relative = self._data.tables.sink_deadline[miss.sink]
-        name, due = printable(self._short[self._names[miss.sink]]), format_ns(relative)
-        if miss.completed is None:
-            return f'MISSED at {name}: {KINDS[miss.kind]} (deadline {due})'
-        slack = miss.deadline - miss.completed
-        how = f'{format_ns(-slack)} late' if slack < 0 else f'{format_ns(slack)} of slack'
-        return (f'{"MISSED" if slack < 0 else "in time"} at {name}: response '
-                f'{format_ns(relative - slack)}, {how} (deadline {due})')
-
-    def _least(self, row: int, job: int) -> SinkJob | None:
-        """Return the verdict with the least slack of those that an execution leads to."""
-        found = [verdict for sink in self._leads_to[row]
-                 if (verdict := self._verdicts.get((sink, job))) is not None]
-        return min(found, key=_slack, default=None)
-
-    def _colour(self, verdict: SinkJob | None) -> str:
-        if verdict is None:
-            return UNKNOWN
-        share = _slack(verdict) / max(1, self._data.tables.sink_deadline[verdict.sink])
-        return next(colour for limit, colour in CLASSES if share < limit)
-
-    def _worker(self, worker: int) -> str:
-        if worker < 0:
-            return 'on a spare thread'
-        names = self._data.worker_names
-        return f'on {printable(names[worker]) if worker < len(names) else f"worker {worker}"}'
+def _verdicts(shown: Shown, origin: int) -> dict[tuple[int, int], SinkJob]:
+    table = shown.verdicts
+    rows = zip(*(table[name].tolist() for name in (
+        'sink', 'job', 'release', 'deadline', 'completed', 'kind')))
+    return {
+        (sink, job): SinkJob(
+            sink, job, release - origin, deadline - origin,
+            None if completed < 0 else completed - origin, VERDICTS[kind], place)
+        for place, (sink, job, release, deadline, completed, kind) in enumerate(rows)}
 
 
-def _slack(verdict: SinkJob) -> float:
-    return float('-inf') if verdict.completed is None else verdict.deadline - verdict.completed
+def _numbered_jobs(
+    data: ReportData, shown: Shown, verdicts: Mapping[tuple[int, int], SinkJob], origin: int
+) -> NumberedJobs:
+    """Return by DAG and number of each job its place in the page's table and its release (s)."""
+    jobs: NumberedJobs = {}
+
+    def add(dag: int, job: int, release: float | None) -> None:
+        if (dag, job) not in jobs:
+            jobs[dag, job] = len(jobs), release
+
+    for dag, job, release in zip(*(
+            shown.releases[name].tolist() for name in ('dag', 'job', 'release'))):
+        add(dag, job, (release - origin) / 1e9)
+    for each in verdicts.values():
+        add(data.tables.dag_of[each.sink], each.job, each.release / 1e9)
+    declared = shown.executions[shown.row >= 0]
+    for dag, job in zip(declared['dag'].tolist(), declared['job'].tolist()):
+        add(dag, job, None)
+    return jobs
 
 
-def _instant(ns: int) -> str:
-    return f'{ns / 1e9:.6f} s'
+def _executions(
+    data: ReportData, shown: Shown, origin: int, verdicts: Mapping[tuple[int, int], SinkJob],
+    jobs: NumberedJobs, ys: list[int],
+    worker_lines: list[int],
+) -> dict[str, Any]:
+    """Return the columns of executions: times, lines, and places in the page's tables."""
+    table, n_declared = shown.executions, len(data.task_set.vertices)
+    names = np.where(shown.row >= 0, shown.row, n_declared - 1 - shown.row)
+    leads_to = list(_leads_to(data))
+    place, job_place, colour = (np.full(len(table), -1, dtype=np.int32) for _ in range(3))
+    colour[:] = len(COLOURS) - 1
+    for i, (row, dag, job) in enumerate(zip(
+            shown.row.tolist(), table['dag'].tolist(), table['job'].tolist())):
+        if row < 0:
+            continue
+        job_place[i] = jobs[dag, job][0]
+        found = [verdicts[sink, job] for sink in leads_to[row] if (sink, job) in verdicts]
+        if found:
+            least = min(found, key=lambda each: each.slack_share)
+            place[i] = least.place
+            colour[i] = int(np.searchsorted(_SHARES, least.slack_share, 'right'))
+    workers = np.array(worker_lines, dtype=np.int32)
+    on = table['worker'].astype(np.int32)
+    return {
+        'left': (table['start'] - origin) / 1e9, 'right': (table['end'] - origin) / 1e9,
+        'waited': (table['start'] - table['ready']) / 1e9, 'worker': on,
+        'workers': workers[np.where((on >= 0) & (on < data.workers), on, -1)],
+        'callbacks': np.array(ys, dtype=np.int32)[names], 'name': names.astype(np.int32),
+        'job': job_place, 'verdict': place, 'class': colour}
 
 
-def _lines_of(texts: list[tuple[str, str, str, str]]) -> dict[str, list[str]]:
-    """Return the columns of the four lines that are shown about a place."""
-    return {key: [text[i] for text in texts] for i, key in enumerate('abcd')}
+def _meta(
+    data: ReportData, verdicts: Mapping[tuple[int, int], SinkJob],
+    jobs: NumberedJobs, worst: list[SinkJob],
+) -> dict[str, Any]:
+    """Return the tables that the page's script makes texts from; times in ns but releases."""
+    names = [vertex.name for vertex in data.task_set.vertices]
+    short = short_names(names)
+    return {
+        'duration': data.duration_ns / 1e9, 'declared': len(names),
+        'names': [printable(n) for n in (*names, *data.timeline.undeclared_names())],
+        'short': [printable(short[name]) for name in names],
+        'dags': [printable(dag.name) for dag in data.task_set.dags],
+        'workers': [printable(name) for name in data.worker_names],
+        'jobs': [[dag, job, release] for (dag, job), (_, release) in jobs.items()],
+        'verdicts': [
+            [each.sink, jobs[data.tables.dag_of[each.sink], each.job][0],
+             each.deadline - each.release,
+             None if each.completed is None else each.completed - each.release, each.verdict]
+            for each in verdicts.values()],
+        'missed': [[miss.place, miss.release / 1e9, miss.deadline / 1e9, miss.shown / 1e9]
+                   for miss in worst]}
 
 
 def json_for_html(value: Any) -> str:
-    """Return JSON that can stand in a script element whatever it holds."""
+    """Return JSON that can be in a script element whatever it contains."""
     text = json.dumps(value, ensure_ascii=True, separators=(',', ':'), allow_nan=False)
     return text.replace('<', '\\u003c').replace('>', '\\u003e').replace('&', '\\u0026')
 
 
 def label(text: str, longest: int = LONGEST_LABEL) -> str:
-    """Return a name as it stands at an axis: harmless, and shortened in its middle."""
-    text = printable(text)
-    if len(text) <= longest:
-        return text
-    half = (longest - 1) // 2
-    return f'{text[:longest - 1 - half]}…{text[-half:]}'
+    """Return a name for an axis: harmless, and shortened in its middle."""
+    return shortened(printable(text), longest)
 
 
-def _origin(releases: Ints, executions: Ints) -> int:
-    starts = [int(column.min()) for column in (releases[2], executions[READY]) if len(column)]
-    return min(starts, default=0)
+def _lines(data: ReportData) -> tuple[list[Line], list[int], int]:
+    """
+    Return the lines of the timeline by callback, from the top.
 
-
-def _lines(task_set: TaskSet, undeclared: list[str]) -> tuple[list[Line], list[int]]:
-    """Return the lines of the picture by callback, from the top, and the place of each row."""
+    Also return the place of each row, and how many DAGs are left out.
+    """
+    task_set, undeclared = data.task_set, data.timeline.undeclared_names()
+    chosen = _chosen_dags(data)
     short = short_names(vertex.name for vertex in task_set.vertices)
     texts: list[tuple[str, bool]] = []
+    rows: list[int] = []
     for dag in task_set.dags:
+        if dag.index not in chosen:
+            rows += [-1] * len(dag.vertices)
+            continue
         texts.append((label(f'{dag.name}, every {format_ns(dag.period_ns)}'), True))
-        texts.extend((label(short[vertex.name]), False) for vertex in dag.vertices)
+        for vertex in dag.vertices:
+            rows.append(len(texts))
+            texts.append((label(short[vertex.name]), False))
     if undeclared:
         texts.append(('undeclared', True))
-        texts.extend((label(name), False) for name in undeclared)
+        for name in undeclared:
+            rows.append(len(texts))
+            texts.append((label(name), False))
     lines = [Line(text, len(texts) - 1 - i, heading) for i, (text, heading) in enumerate(texts)]
-    return lines, [line.y for line in lines if not line.heading]
+    ys = [_HIDDEN if row < 0 else lines[row].y for row in rows]
+    return lines, ys, len(task_set.dags) - len(chosen)
+
+
+def _chosen_dags(data: ReportData) -> set[int]:
+    """Return the DAGs that the timeline by callback has lines for: those that missed most."""
+    results = data.tally.result()['dags']
+
+    def badness(dag: Dag) -> float:
+        return -max((missed_share(counts(sink))
+                     for sink in results[dag.name]['sinks'].values()), default=0.0)
+
+    chosen: set[int] = set()
+    room = MOST_LINES
+    for dag in sorted(data.task_set.dags, key=badness):
+        room -= 1 + len(dag.vertices)
+        if room < 0 and chosen:
+            break
+        chosen.add(dag.index)
+    return chosen
 
 
 def _worker_lines(data: ReportData) -> list[int]:

@@ -8,6 +8,7 @@ The page's script ``html.js`` moves the timelines to a missed deadline.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from bokeh.colors import RGB
@@ -17,6 +18,7 @@ from bokeh.models import (
     CustomJSTickFormatter,
     FixedTicker,
     HoverTool,
+    LinearColorMapper,
     Range1d,
     RangeTool,
     WheelZoomTool,
@@ -24,7 +26,7 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 from mddag_executor.replay.usage import PoolUse
-from mddag_executor.report.html_data import label, Line, Prepared, ReportData
+from mddag_executor.report.html_data import COLOURS, label, Line, Prepared, ReportData
 from mddag_executor.report.tables import short_names
 from mddag_executor.report.text import format_ns, printable
 import numpy as np
@@ -35,7 +37,9 @@ _LINE = 16              # height of a line of a timeline, pixels
 _TOOLTIP = ('<div style="max-width:46em"><b>@a</b><br>@b<br>@c<br>@d</div>')
 _FONT = '11px'
 _ZOOM = 'xpan,xbox_zoom,xzoom_in,xzoom_out,reset,save'
-_RED, _BLUE, _GREY = '#d7191c', '#3182bd', '#969696'
+_RED, _BLUE = '#d7191c', '#3182bd'
+_EDGES = tuple(RGB.from_hex_string(colour).darken(0.1).to_hex() for colour in COLOURS)
+_RIGHT = 24             # room for half of the last label of the time axis
 
 
 class Figures(NamedTuple):
@@ -57,10 +61,7 @@ def figures(data: ReportData, prepared: Prepared) -> Figures:
     workers = [Line('spare threads' if w == data.workers else names[w], y, False)
                for w, y in enumerate(prepared.worker_lines) if y]
     workers.append(Line('missed deadlines', 0, False))
-    edges = {colour: RGB.from_hex_string(colour).darken(0.1).to_hex()
-             for colour in set(prepared.executions['colour'])}
-    executions = ColumnDataSource({**prepared.executions, 'edge': [
-        edges[colour] for colour in prepared.executions['colour']]}, name='executions')
+    executions = ColumnDataSource(prepared.executions, name='executions')
     marks = ColumnDataSource(prepared.marks, name='marks')
     return Figures(
         _overview(data, prepared, time),
@@ -71,6 +72,7 @@ def figures(data: ReportData, prepared: Prepared) -> Figures:
 
 def _style(plot: Any, grid: bool = True) -> None:
     plot.toolbar.logo = None
+    plot.min_border_right = _RIGHT
     plot.outline_line_color = '#bbbbbb'
     for axis in (*plot.xaxis, *plot.yaxis):
         axis.axis_label_text_font_style = 'normal'
@@ -152,7 +154,7 @@ def _timeline(
             level='underlay', visible=False, name=f'{name}_{kind}'))
     _wheel(plot)
     bars = plot.hbar(y=name, left='left', right='right', height=0.8, source=executions,
-                     fill_color='colour', line_color='edge', line_width=0.5)
+                     fill_color=_by_class(COLOURS), line_color=_by_class(_EDGES), line_width=0.5)
     plot.add_tools(HoverTool(renderers=[bars], tooltips=_TOOLTIP, point_policy='follow_mouse'))
     marked = plot.scatter('x', name, source=marks, marker='inverted_triangle', size=9,
                           fill_color=_RED, line_color='#ffffff')
@@ -162,6 +164,11 @@ def _timeline(
     plot.xaxis.formatter = CustomJSTickFormatter(code=_TICKS, args={'range': time})
     _style(plot, grid=False)
     return plot
+
+
+def _by_class(palette: Sequence[str]) -> Any:
+    return {'field': 'class', 'transform': LinearColorMapper(
+        palette=list(palette), low=-0.5, high=len(palette) - 0.5)}
 
 
 def _wheel(plot: Any) -> None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from mddag_executor.core.tally import counts, total
 from mddag_executor.replay.chains import Breakdown
-from mddag_executor.report.html_data import json_for_html, KINDS, Prepared, ReportData
+from mddag_executor.report.html_data import json_for_html, Prepared, ReportData
 from mddag_executor.report.replays import (
     CALLBACKS_HEADER,
     callbacks_rows,
@@ -146,7 +146,7 @@ def _reached(share: float) -> Html:
     """Return a bar from 0 to the deadline, red beyond it."""
     colour = '#d7191c' if share > 1 else '#fd8d3c' if share > 0.9 else '#3182bd'
     return Html(f'<span class="reached"><i style="width:{100 * min(1.0, share):.1f}%;'
-                f'background:{colour}"></i></span>{100 * share:.0f} %')
+                f'background:{colour}"></i></span><b>{100 * share:.0f} %</b>')
 
 
 def misses_html(data: ReportData, prepared: Prepared) -> str:
@@ -157,22 +157,21 @@ def misses_html(data: ReportData, prepared: Prepared) -> str:
                 '<p class="note">No job was due at any sink: nothing is proven.</p>\n')
     short = short_names(vertex.name for vertex in data.task_set.vertices)
     rows = []
-    for miss in (prepared.misses[i] for i in prepared.worst):
+    for miss in prepared.misses:
         vertex = data.task_set.vertices[miss.sink]
         dag = data.task_set.dags[vertex.dag]
-        release = miss.deadline - data.tables.sink_deadline[miss.sink]
         late = None if miss.completed is None else format_ns(miss.completed - miss.deadline)
-        response = None if miss.completed is None else format_ns(miss.completed - release)
+        response = None if miss.completed is None else format_ns(miss.completed - miss.release)
         cause = [data.causes.get((miss.sink, miss.job))] if data.causes else []
-        rows.append((dag.name, short[vertex.name], KINDS[miss.kind], *cause, miss.job,
-                     f'{release / 1e9:.6f} s', response, late))
-    header = ('DAG', 'sink', 'what', *(['cause'] if data.causes else []), 'job', 'released at',
+        rows.append((dag.name, short[vertex.name], miss.verdict, *cause, miss.job,
+                     f'{miss.release / 1e9:.6f} s', response, late))
+    header = ('DAG', 'sink', 'verdict', *(['cause'] if data.causes else []), 'job', 'released at',
               'response', 'late by')
-    shown = len(prepared.worst)
+    shown = len(prepared.misses)
     what = f'The {shown} worst of {data.timeline.n_missed}' if shown < data.timeline.n_missed \
         else 'All'
     what += ' in the order of time'
-    attributes = (f'data-miss="{i}"' for i in prepared.worst)
+    attributes = (f'data-miss="{i}"' for i in range(shown))
     return (f'<h2>Missed deadlines</h2>\n<p class="note">{what}; click on one to see it in the '
             f'timeline.</p>\n<div class="scroll">'
             f'{html_table(header, rows, 3 + bool(data.causes), attributes=attributes)}</div>\n')

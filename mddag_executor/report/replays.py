@@ -9,7 +9,13 @@ from typing import Any
 
 from mddag_executor.core.tally import counts
 from mddag_executor.report.explained import causes_line
-from mddag_executor.report.tables import each_sink, never_due_lines, percent, verdicts_line
+from mddag_executor.report.tables import (
+    never_due_lines,
+    percent,
+    short_names,
+    verdicts_line,
+    worst_first,
+)
 from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
 
@@ -30,7 +36,7 @@ def times_tables(dags: Mapping[str, Any]) -> Iterator[str]:
     for title, which in (('Where the response times went, on average:', 'mean'),
                          ('The same of the worst job of each sink:', 'worst')):
         found = [(sink.shown_name, None if sink.result['breakdown'] is None
-                  else sink.result['breakdown'][which]) for sink in each_sink(dags)]
+                  else sink.result['breakdown'][which]) for sink in worst_first(dags)]
         # most programs have neither groups that wait nor coroutines
         parts = [name for name, key in _PARTS.items() if name not in ('for group', 'suspended')
                  or any(of is not None and of[key] for _, of in found)]
@@ -48,10 +54,11 @@ def _time(nanoseconds: int) -> str:
 
 def callbacks_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[Cell]]:
     """Yield the rows of the table of callbacks."""
+    short = short_names(callbacks)
     for key, use in callbacks.items():
         n = use['executions']
         yield [
-            key, n, _time(use['busy_ns']), _time(use['busy_ns'] // n) if n else None,
+            short[key], n, _time(use['busy_ns']), _time(use['busy_ns'] // n) if n else None,
             _time(use['longest_ns']), _time(use['waiting_ns'] // n) if n else None,
             _time(use['longest_wait_ns']), *_computed(use)]
 
@@ -120,9 +127,9 @@ def paths_rows(paths: Mapping[str, Any]) -> Iterator[list[Cell]]:
 
 
 def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> str:
-    """Return a table of rescheduled sinks, each figure beside the recorded one."""
+    """Return a table of rescheduled sinks, each figure next to the recorded one."""
     rows: list[list[Cell]] = []
-    for sink in each_sink(dags):
+    for sink in worst_first(dags):
         sides = (sink.result, recorded[sink.dag]['sinks'][sink.name])
         row: list[Cell] = [
             sink.shown_name, format_ns(sink.result['relative_deadline_ns']),

@@ -25,13 +25,13 @@ def lines(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the tables of callbacks, the tightest first, and of sinks, and the lines below."""
     short = _short(result)
     yield from _load_lines(result)
-    yield '\nHow many times as long each callback may take, alone:'
+    yield '\nHow many times as long each callback may take, if the others take as long as now:'
     yield table(('callback', 'may take', 'then misses'), [
         [short[name], _times(one['factor']), short[one['breaks']]]
         for name, one in _tightest(result)])
-    yield 'How much before their deadlines the sinks complete as things are:'
+    yield 'How long before their deadlines the sinks complete now:'
     yield table(('sink', 'deadline', 'least margin', 'of it', '99 % have', 'median'), [
-        [short[name], *_margins(sink)] for name, sink in result['sinks'].items()])
+        [short[name], *_margins(sink)] for name, sink in _least_first(result)])
     yield from _summary(result)
 
 
@@ -114,7 +114,7 @@ def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
     yield '<h2>Margins of the sinks</h2>\n'
     yield html_table(('sink', 'least margin', 'deadline', 'least', 'of it', '99 % have', 'median'),
                      [(short[name], _margin_bar(sink), *_margins(sink))
-                      for name, sink in result['sinks'].items()], 2)
+                      for name, sink in _least_first(result)], 2)
     yield '</body></html>\n'
 
 
@@ -125,6 +125,15 @@ def _short(result: Mapping[str, Any]) -> dict[str, str]:
 def _tightest(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return sorted(((name, one) for name, one in result['callbacks'].items()
                    if one['factor'] is not None), key=lambda item: item[1]['factor'])
+
+
+def _least_first(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Return the sinks, that with the least margin first, as a share of its deadline."""
+    def share(item: tuple[str, Any]) -> float:
+        margin = item[1]['margin_ns']
+        return float('-inf') if margin is None else margin['min'] / item[1]['relative_deadline_ns']
+
+    return sorted(result['sinks'].items(), key=share)
 
 
 def _times(factor: float) -> str:

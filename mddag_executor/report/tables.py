@@ -73,8 +73,7 @@ def sink_table(dags: Mapping[str, Any]) -> str:
     weakly_hard = [column for column in ('tolerates', 'worst') if any(
         'tolerate' in sink for dag in dags.values() for sink in dag['sinks'].values())]
     rare = [name for name in ('expired', 'failed', 'aborted') if getattr(every, name)]
-    found = [(sink, counts(sink.result)) for sink in each_sink(dags)]
-    found.sort(key=lambda each: -missed_share(each[1]))
+    found = [(sink, counts(sink.result)) for sink in worst_first(dags)]
     rows: list[list[Cell]] = []
     above = None
     for sink, verdicts in found:
@@ -96,6 +95,11 @@ def _tolerate_cells(sink: Mapping[str, Any]) -> list[Cell]:
     if tolerate is None:
         return ['', '']
     return [f'{tolerate["misses"]} of {tolerate["of"]}', tolerate['worst']]
+
+
+def worst_first(dags: Mapping[str, Any]) -> list[Sink]:
+    """Return the sinks, those that missed the largest share of their deadlines first."""
+    return sorted(each_sink(dags), key=lambda sink: -missed_share(counts(sink.result)))
 
 
 def missed_share(verdicts: Counts) -> float:

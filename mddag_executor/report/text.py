@@ -14,7 +14,10 @@ from mddag_executor.text import listed as listed_plainly
 
 Cell = str | int | float | None
 
+WIDTH = 120
+"""No table is wider, as long as the names in it can be shortened."""
 _LONGEST_LIST = 10
+_SHORTEST_NAME = 20
 _NUMBER = re.compile(r'[-+]?[\d,]+(\.\d+)?( ?(%|ns|us|ms|s|min|h|MB|KB))?|-|')
 _RED, _PLAIN = '\x1b[31m', '\x1b[0m'
 _UNITS = ((1, 'ns'), (1_000, 'us'), (1_000_000, 'ms'), (1_000_000_000, 's'))
@@ -62,6 +65,14 @@ def format_ns(nanoseconds: int, digits: int = 4) -> str:
     return f'{sign}{text} {unit}'
 
 
+def shortened(text: str, longest: int) -> str:
+    """Return a text of at most so many characters, with an ellipsis in place of its middle."""
+    if len(text) <= longest:
+        return text
+    half = (longest - 1) // 2
+    return f'{text[:longest - 1 - half]}…{text[len(text) - half:]}'
+
+
 def is_coloured(stream: TextIO | None = None) -> bool:
     """Return whether a stream (standard output) shows colours (see no-color.org)."""
     return (stream or sys.stdout).isatty() and not os.environ.get('NO_COLOR') and os.environ.get(
@@ -73,6 +84,8 @@ def table(
 ) -> str:
     """
     Return an aligned table; columns of numbers (also with a unit) are right-aligned.
+
+    Long names are shortened in their middle, so that the table is at most ``WIDTH`` columns wide.
 
     :param header: the titles of the columns
     :param rows: their cells; None is printed as `-`, a float with two decimals
@@ -86,7 +99,8 @@ def table(
     right = [bool(column) and all(_NUMBER.fullmatch(cell) for cell in column)
              for column in columns]
     lines = [[printable(title) for title in header], *body]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    widths = _fitting([max(len(line[i]) for line in lines) for i in range(len(header))], right)
+    lines = [[shortened(cell, width) for cell, width in zip(line, widths)] for line in lines]
     texts = ['  '.join(
         cell.rjust(width) if is_right else cell.ljust(width)
         for cell, width, is_right in zip(line, widths, right)).rstrip() for line in lines]
@@ -94,6 +108,19 @@ def table(
         texts[1:] = [f'{_RED}{text}{_PLAIN}' if red else text
                      for text, red in zip(texts[1:], marked)]
     return ''.join(text + '\n' for text in texts)
+
+
+def _fitting(widths: list[int], right: Sequence[bool]) -> list[int]:
+    """Return widths of columns that fit together: the widest columns of text lose most."""
+    too_many = sum(widths) + 2 * (len(widths) - 1) - WIDTH
+    texts = [i for i, is_right in enumerate(right) if not is_right]
+    while too_many > 0 and texts:
+        widest = max(texts, key=lambda i: widths[i])
+        if widths[widest] <= _SHORTEST_NAME:
+            break
+        widths[widest] -= 1
+        too_many -= 1
+    return widths
 
 
 def _cell(cell: Cell) -> str:

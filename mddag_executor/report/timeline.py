@@ -5,61 +5,44 @@ What ran when, for pictures: executions around missed deadlines, and some of all
 
 Theory of operation
 -------------------
-Executions are in blocks of ``BLOCK``, in the order in which they ended.  If there are more than
+Executions are in blocks of ``BLOCK``, in the order in which they ended. If there are more than
 ``most`` executions, the blocks with the most missed deadlines are shown, and of the others every
-second, fourth, eighth …: so the misses are there, and what is there of the rest is spread over the
-run.
+second, fourth, eighth, and so on: the misses are shown, and the rest is spread over the run.
 
-A *row* says which line of a picture an execution belongs to: the global vertex of the declaration,
-or -1-k for the k-th undeclared callback.
+A *row* is the line of a picture that an execution belongs to: the global vertex of the
+declaration, or -1-k for the k-th undeclared callback.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from mddag_executor.core.state import (
-    SINK_ABORTED,
-    SINK_EXPIRED,
-    SINK_FAILED,
-    SINK_IN_TIME,
-    SINK_LATE,
-    SINK_MISSED,
-)
-from mddag_executor.recording.tables import Ints, Recording
+from mddag_executor.recording.tables import Ints, Recording, Table
 from mddag_executor.replay.deadlines import Judged
 from mddag_executor.replay.usage import PoolUse, ran
 import numpy as np
 
-MOST_EXECUTIONS = 30_000
+MOST_EXECUTIONS = 20_000
 BLOCK = 512
 MOST_UNDECLARED = 200
 OTHERS = 'other undeclared callbacks'
 
-# What came of a sink's job, as the pictures and exports call it.
-DONE, OVERDUE, EXPIRED, ABORTED, FAILED = range(5)
-_KINDS = {
-    SINK_IN_TIME: DONE, SINK_LATE: DONE, SINK_MISSED: OVERDUE, SINK_EXPIRED: EXPIRED,
-    SINK_ABORTED: ABORTED, SINK_FAILED: FAILED}
-
 _FIRST_STEP = 1 << 16       # of the sums, ns
 
 
-class Columns(NamedTuple):
+class Shown(NamedTuple):
     """
     What is shown; times in ns on the recording's clock.
 
-    ``executions`` has the rows ROW, JOB, WORKER, READY, START, END (indices below), in order of
-    start; ``releases`` DAG, job, release; ``verdicts`` global vertex, job, deadline, completion
-    (-1: never), kind.
+    :ivar executions: rows of the recording's table, in order of start; ``row`` the row of each.
+    :ivar releases: rows of the recording's table.
+    :ivar verdicts: rows of ``Judged.verdicts``.
     """
 
-    executions: Ints
-    releases: Ints
-    verdicts: Ints
-
-
-ROW, JOB, WORKER, READY, START, END = range(6)
+    executions: Table
+    row: Ints
+    releases: Table
+    verdicts: Table
 
 
 class Timeline:
@@ -68,7 +51,7 @@ class Timeline:
 
     :param most: how many executions are shown at most.
     :ivar n_executions: how many there are; ``n_missed`` the deadlines missed.
-    :ivar busy_over_time: how busy the workers were over time, without the threads beside them; in
+    :ivar busy_over_time: how busy the workers were over time, without spare threads; in
         ``missed_over_time`` each missed deadline is one nanosecond.
     """
 
@@ -140,23 +123,14 @@ class Timeline:
                             max(0, self.n_executions - 1) // self._block)
         return np.flatnonzero(np.isin(number, self._blocks))
 
-    def columns(self) -> Columns:
+    def shown(self) -> Shown:
         """Return what is shown."""
-        shown = self._shown()
-        table = self._recording.executions[self._rows[shown]]
-        row = self._row[shown]
-        job = np.where(row < 0, -1, table['job'])
-        executions = np.stack((row, job, *(
-            table[name].astype(np.int64) for name in ('worker', 'ready', 'start', 'end'))))
+        chosen = self._shown()
+        table, row = self._recording.executions[self._rows[chosen]], self._row[chosen]
+        order = np.argsort(table['start'], kind='stable')
         releases, verdicts = self._recording.releases, self._judged.verdicts
-        releases = releases[self._shows(releases['noticed'])]
-        verdicts = verdicts[self._shows(verdicts['until'])]
-        kinds = np.array([_KINDS[kind] for kind in range(len(_KINDS))])
-        return Columns(
-            executions[:, np.argsort(executions[START], kind='stable')],
-            np.stack([releases[name].astype(np.int64) for name in ('dag', 'job', 'release')]),
-            np.stack((verdicts['sink'].astype(np.int64), verdicts['job'], verdicts['deadline'],
-                      verdicts['completed'], kinds[verdicts['kind']])))
+        return Shown(table[order], row[order], releases[self._shows(releases['noticed'])],
+                     verdicts[self._shows(verdicts['until'])])
 
     def gaps(self) -> list[tuple[int, int]]:
         """Return the stretches of time (ns) that are not shown: between blocks that are."""

@@ -255,7 +255,7 @@ def test_what_people_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert out.splitlines()[-1] == '119 misses: 119 waited'
     assert program.main(['explain', path, '--sink', '/victim:use', '--job', '9']) == 0
     out = capsys.readouterr().out
-    assert out.startswith('Job 9 of /victim:use: late by ')
+    assert out.startswith('Job 9 of victim:use: late by ')
     assert 'heavy:first' in out
     assert program.main(['explain', path, '--job', '8']) == 0
     assert capsys.readouterr().out == 'no such job missed its deadline\n'
@@ -404,5 +404,5 @@ def test_the_mean_of_a_cause_is_that_of_its_parts(
     mean = sum(part['ns'] for part in parts if part['cause'] in counted) // result['missed']
     assert program.main(['explain', str(path)]) == 0
     row, = (line for line in capsys.readouterr().out.splitlines()
-            if line.split()[1:4] == ['x:late', 'ran', 'long'])
+            if line.split()[:3] == ['x:late', 'ran', 'long'])
     assert f' {format_ns(mean, 3)} ' in row

@@ -17,14 +17,7 @@ from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.deadlines import Judged
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.report import html
-from mddag_executor.report.timeline import (
-    END,
-    JOB,
-    MOST_UNDECLARED,
-    OTHERS,
-    START,
-    Timeline,
-)
+from mddag_executor.report.timeline import MOST_UNDECLARED, OTHERS, Timeline
 from mddag_executor.simulate import periodic_load, Settings, simulate
 import msg_graph
 import numpy as np
@@ -46,9 +39,14 @@ def test_a_schedule_is_told_as_its_trace_says(
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     read = html.of_outcome(replay(tmp_path / 'run.mcap'))
     assert seen.tally.result() == read.tally.result() == run.tally.result()
-    assert seen.timeline.n_executions == len(seen.timeline.columns().executions[0]) > 100
-    for ours, theirs in zip(seen.timeline.columns(), read.timeline.columns()):
-        assert sorted(ours.T.tolist()) == sorted(theirs.T.tolist())
+    ours, theirs = seen.timeline.shown(), read.timeline.shown()
+    assert seen.timeline.n_executions == len(ours.executions) > 100
+    for one, other, columns in (
+            (ours.executions, theirs.executions,
+             ['vertex', 'job', 'worker', 'ready', 'start', 'end']),
+            (ours.releases, theirs.releases, ['dag', 'job', 'release']),
+            (ours.verdicts, theirs.verdicts, ['sink', 'job', 'deadline', 'completed', 'kind'])):
+        assert sorted(one[columns].tolist()) == sorted(other[columns].tolist())
     assert seen.timeline.busy_over_time.result() == read.timeline.busy_over_time.result()
     assert seen.usage.callbacks() == read.usage.callbacks()
     assert seen.breakdown == read.breakdown
@@ -118,8 +116,8 @@ def test_a_rescheduled_run_has_the_verdicts_of_its_report(workers: int) -> None:
     outcome = reschedule(runs.CONFIG.parent / 'bags' / 'demo_short.mcap', workers=workers)
     data = html.of_outcome(outcome)
     assert data.tally.result()['dags'] == outcome.tally.result()['dags']
-    executions = data.timeline.columns().executions
-    busy = [int((executions[END] - executions[START])[executions[2] == w].sum())
+    executions = data.timeline.shown().executions
+    busy = [int((executions['end'] - executions['start'])[executions['worker'] == w].sum())
             for w in range(workers)]
     for ours, theirs in zip(busy, outcome.busy):
         assert 0 <= theirs - ours < 200 * runs.MS   # what still ran at the end is no execution yet
@@ -142,7 +140,7 @@ def test_what_is_aborted_and_stopped_is_told() -> None:
     assert run.ended_ns < 300 * runs.MS
     data = html.of_run(task_set, load, run)
     assert data.timeline.n_missed >= 1
-    assert data.timeline.columns().executions[END].max() <= run.ended_ns
+    assert data.timeline.shown().executions['end'].max() <= run.ended_ns
 
 
 ONE = """\
@@ -175,16 +173,17 @@ def test_detail_is_bounded_and_keeps_the_misses() -> None:
     us = 1000
     timeline = ran(*((1, 0, i, 100 * us * i, 100 * us * i + (70 if i in (333, 777) else 50) * us)
                      for i in range(1000)))
-    columns = timeline.columns()
+    shown = timeline.shown()
+    executions = shown.executions
     assert timeline.n_executions == 1000 and timeline.n_missed == 2
-    assert timeline.kept == len(columns.executions[0]) <= 100
-    assert {333, 777} <= set(columns.executions[JOB].tolist())
-    assert {333, 777} <= set(columns.verdicts[1].tolist())
-    jobs = columns.executions[JOB]
+    assert timeline.kept == len(executions) <= 100
+    assert {333, 777} <= set(executions['job'].tolist())
+    assert {333, 777} <= set(shown.verdicts['job'].tolist())
+    jobs = executions['job']
     assert jobs[0] == 0 and jobs[-1] >= 960
     assert int(np.diff(jobs).max()) <= 330      # what is shown is spread over the run
     for left, right in timeline.gaps():
-        inside = (columns.executions[START] > left) & (columns.executions[END] < right)
+        inside = (executions['start'] > left) & (executions['end'] < right)
         assert not inside.any() and left < right
     assert len(timeline.gaps()) >= 3
     assert sum(timeline.busy_over_time.result()['busy_ns']) == (998 * 50 + 2 * 70) * us
@@ -197,12 +196,11 @@ def test_undeclared_callbacks_have_names_and_a_bound() -> None:
     names = timeline.undeclared_names()
     assert names[:2] == ['spin_some', 'a callback whose start is not recorded']
     assert len(names) == MOST_UNDECLARED + 1 and names[-1] == OTHERS
-    rows = timeline._row
-    assert int(rows.min()) == -len(names)
-    assert set(timeline.columns().executions[JOB].tolist()) == {-1}
+    assert int(timeline.shown().row.min()) == -len(names)
 
 
 def test_never_completed_counts_at_its_deadline() -> None:
     timeline = ran((1, 0, 0, 0, -1))
     assert timeline.n_missed == 1
-    assert timeline.columns().verdicts.T.tolist() == [[0, 0, 60_000, -1, 1]]
+    verdicts = timeline.shown().verdicts
+    assert verdicts[['sink', 'job', 'deadline', 'completed']].tolist() == [(0, 0, 60_000, -1)]
