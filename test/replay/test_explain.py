@@ -403,6 +403,6 @@ def test_the_mean_of_a_cause_is_that_of_its_parts(
     counted = ['ran long'] if usual else ['ran long', 'ran']
     mean = sum(part['ns'] for part in parts if part['cause'] in counted) // result['missed']
     assert program.main(['explain', str(path)]) == 0
-    row, = (line for line in capsys.readouterr().out.splitlines()
-            if line.split()[:3] == ['x:late', 'ran', 'long'])
+    row = next(line for line in capsys.readouterr().out.splitlines()
+               if line.split()[:3] == ['x:late', 'ran', 'long'])
     assert f' {format_ns(mean, 3)} ' in row
