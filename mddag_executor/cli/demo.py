@@ -7,16 +7,12 @@ Each step runs in a process of its own, without the threads, caches or nodes of 
 `mddag run --synthetic sleep`, which records; two times `mddag replay`; and rclpy's own
 MultiThreadedExecutor with the same nodes, seed and number of threads.  The nodes measure both
 executors in the same way (`mddag_executor.hosting.measure`).
-
-With `--processes N` callbacks compute in Python, in N processes.  The steps are `graph place`;
-`run --synthetic spin` of what that wrote, which records; `replay` of all traces; and rclpy's
-EventsExecutor in the same processes, and both executors in one process.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from io import StringIO
 import json
@@ -37,19 +33,15 @@ from mddag_executor.report.tables import (
     percent,
     response_cells,
     sink_table,
-    verdicts_line,
 )
 from mddag_executor.resources import find
 from mddag_executor.text import counted
 
 EXAMPLE = """\
-mddag demo --duration 20s
-mddag demo --processes 2"""
+mddag demo --duration 20s"""
 
 WORKERS = defaults.WORKERS
 UTILISATION = 0.6
-UTILISATION_EACH = 0.1
-"""Of seven workers, with `--processes`: 0.7 of a core for each."""
 SEED = 0
 """The first seed; at utilisation 0.6 its draw is feasible (`ExecutionPlan.infeasible`)."""
 
@@ -63,10 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--duration', type=options.duration, default=20 * 10 ** 9, metavar='TIME',
         help="how long to measure this executor (default: 20s), and half of it rclpy's")
-    options.add(parser, '--utilisation', otherwise='0.6, with --processes 0.1 for each')
-    add('--processes', type=options.positive_int, metavar='N',
-        help='callbacks compute in Python: place the nodes in N processes, run them, and replay '
-        'their recordings as one run')
+    add('--utilisation', type=options.positive_float, default=UTILISATION, metavar='U',
+        help='normalised utilisation that execution times are scaled to (default: %(default)s)')
     add('-o', '--output', default='build/demo', metavar='DIR',
         help='where trace and results are written (default: build/demo)')
     options.add(parser, '--json')
@@ -79,16 +69,6 @@ def main(args: argparse.Namespace) -> int:
     graph = find('config/autoware.yaml')
     # at once, also into a pipe: the next step takes long
     say = partial(print, flush=True, file=None if common.wants_tables(args) else StringIO())
-    run = _in_one_process if args.processes is None else _in_several
-    common.write_result(args, run(args, graph, output, say))
-    return 0
-
-
-def _in_one_process(
-    args: argparse.Namespace, graph: Path, output: Path, say: Callable[[str], None]
-) -> dict[str, Any]:
-    """Run the steps, say what each found, and return all of it."""
-    args.utilisation = args.utilisation or UTILISATION
     for line in _introduction(args, graph):
         say(line)
     live = run_live(args, graph, output)
@@ -97,67 +77,18 @@ def _in_one_process(
         say(line)
     recorded, rescheduled = run_replays(graph, output)
     say('\n== The recording, replayed ==')
-    say(beside(('p99',), live=live['dags'], recorded=recorded['dags'],
-               rescheduled=rescheduled['dags']))
+    say(results_table(live=live['dags'], recorded=recorded['dags'],
+                      rescheduled=rescheduled['dags']))
     say(agreement(live, recorded))
     for line in causes_line(recorded['misses']):
         say(f'{line} (mddag explain {output / "demo.mcap"})')
-    say(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), "
-        f'{_half(args):g} s ==')
-    baseline = _peer(args, graph, 'multi', args.utilisation)
+    say(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), {_half(args):g} s ==")
+    baseline = _baseline(args, graph)
     say(side_by_side(live['measured'], baseline))
-    return {'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': baseline,
-            'trace': str((output / 'demo.mcap').absolute())}
-
-
-def _in_several(
-    args: argparse.Namespace, graph: Path, output: Path, say: Callable[[str], None]
-) -> dict[str, Any]:
-    """Run the steps of `--processes`, say what each found, and return all of it."""
-    utilisation = args.utilisation or UTILISATION_EACH * args.processes
-    load = ['--utilisation', str(utilisation), '--seed', str(SEED),
-            '--workers', str(WORKERS)]
-    placed = output / 'placed.yaml'
-    say(f'{graph}: callbacks compute in Python, {utilisation * WORKERS:.2f} cores in all')
-    say(f'\n== Placed in {counted(args.processes, "process", "processes")} ==')
-    placement = json_of(mddag(
-        'graph', 'place', str(graph), '--processes', str(args.processes), *load,
-        '-o', str(placed), '--json', '-'), 'placing')
-    for process, share in zip(placement['processes'], placement['loads']):
-        say(f'{process["name"]}: {counted(len(process["nodes"]), "node")}, {share:.2f} of a core')
-    say(f'predicted: {verdicts_line(placement["predicted"])}')
-    say(f'predicted of one process: {verdicts_line(placement["one_process"])}')
-    say(f'\n== Under MultiDeadlineExecutor({WORKERS}) each, recording, '
-        f'{args.duration / 1e9:g} s ==')
-    live = json_of(mddag(
-        'run', str(placed), '--synthetic', 'spin', *load, '--duration', f'{args.duration}ns',
-        '--trace', str(output / 'demo.mcap'), '--overwrite', '--json', '-'), 'running',
-        args.duration / 1e9 + 3)
-    say(sink_table(live['dags']))
-    for line in summary(live):
-        say(line)
-    traces = [process['trace']['path'] for process in live['processes']]
-    say('\n== The recordings of all processes, replayed as one run ==')
-    recorded = json_of(mddag('replay', *traces, '--json', '-'), 'replaying')
-    say(beside(('median', 'p99'), predicted=placement['predicted'], live=live['dags'],
-               replayed=recorded['dags']))
-    say(f'mddag replay {" ".join(traces)} --report {output / "demo.html"}')
-    say(f'\n== Side by side, {_half(args):g} s each ==')
-    runs = []
-    for what, path in ((f'{args.processes} processes', placed), ('one process', graph)):
-        ours = json_of(mddag(
-            'run', str(path), '--synthetic', 'spin', *load, '--duration',
-            f'{_half(args):.3f}s', '--diagnostics', 'off', '--json', '-'),
-            'measuring', _half(args) + 3, quiet=True)
-        runs += [(what, 'rad', measured(ours)),
-                 (what, 'events', _peer(args, path, 'events', utilisation))]
-    say(table(['', 'executor', 'due', 'in time', 'share'], [
-        [what, 'this' if executor == 'rad' else 'EventsExecutor', run['sink_jobs_due'],
-         run['on_time'], percent(run['on_time'], run['sink_jobs_due'])]
-        for what, executor, run in runs]))
-    return {'placement': placement, 'live': live, 'recorded': recorded, 'traces': traces,
-            'measured': [{'what': what, 'executor': executor, **run}
-                         for what, executor, run in runs]}
+    common.write_result(args, {
+        'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': baseline,
+        'trace': str((output / 'demo.mcap').absolute())})
+    return 0
 
 
 def _half(args: argparse.Namespace) -> float:
@@ -166,16 +97,13 @@ def _half(args: argparse.Namespace) -> float:
     return seconds
 
 
-def _peer(
-    args: argparse.Namespace, graph: Path, executor: str, utilisation: float
-) -> dict[str, Any]:
-    """Run the same nodes on an executor of rclpy; return what they measured."""
+def _baseline(args: argparse.Namespace, graph: Path) -> dict[str, Any]:
+    """Run the same nodes on rclpy's executor; return what they measured."""
     from mddag_executor.hosting.peers import measure_peer
     with Progress('measuring', _half(args) + 3) as progress:
         return measure_peer(
-            executor, str(graph), WORKERS, seconds=_half(args), seed=SEED,
-            utilisation=utilisation, mode='sleep' if args.processes is None else 'spin',
-            tick=progress.update)
+            'multi', str(graph), WORKERS, seconds=_half(args), seed=SEED,
+            utilisation=args.utilisation, mode='sleep', tick=progress.update)
 
 
 def _introduction(args: argparse.Namespace, graph: Path) -> Iterator[str]:
@@ -207,16 +135,9 @@ def run_live(args: argparse.Namespace, graph: Path, output: Path) -> dict[str, A
         '--seed', str(SEED), '--workers', str(WORKERS), '--duration', f'{args.duration}ns',
         '--trace', str(output / 'demo.mcap'), '--overwrite', '--json', '-']
     result = json_of(mddag(*command), 'running', args.duration / 1e9 + 3)
-    measured(result)
-    return result
-
-
-def measured(result: dict[str, Any]) -> dict[str, Any]:
-    """Return what the nodes of a run measured."""
-    found: dict[str, Any] | None = result['measured']
-    if found is None:
+    if result['measured'] is None:
         raise DemoError('mddag run: it ended before it measured anything: run the demo again')
-    return found
+    return result
 
 
 def run_replays(graph: Path, output: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -234,14 +155,8 @@ def mddag(*arguments: str) -> list[str]:
     return [sys.executable, '-m', 'mddag_executor', *arguments]
 
 
-def json_of(
-    command: list[str], what: str, seconds: float | None = None, quiet: bool = False
-) -> dict[str, Any]:
-    """
-    Run a program that prints JSON, with progress on a terminal meanwhile.
-
-    :param quiet: leave out its warnings.
-    """
+def json_of(command: list[str], what: str, seconds: float | None = None) -> dict[str, Any]:
+    """Run a program that prints JSON, with progress on a terminal meanwhile."""
     # Of this machine only: the demo must not find another one's nodes, nor be found by them.
     done = run_program(command, what, seconds, environment={
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ})
@@ -250,33 +165,26 @@ def json_of(
         lines = errors.strip().splitlines() or [f'it ended with status {done.returncode}']
         name = ' '.join(command[2:4]).replace('mddag_executor ', 'mddag ')
         raise DemoError(f'{name}: {lines[-1].removeprefix("error: ")}')
-    if not quiet:
-        sys.stderr.write(errors)
+    sys.stderr.write(errors)
     result: dict[str, Any] = json.loads(done.stdout)
     return result
 
 
-def beside(which: Sequence[str], **several: dict[str, Any]) -> str:
-    """
-    Return a table with a row for each sink: what each of several results says of it.
-
-    :param which: of the response times' `median` and `p99`.
-    """
+def results_table(**several: dict[str, Any]) -> str:
+    """Return a table with a row for each sink: the verdicts and times of several results."""
     rows: list[list[Cell]] = []
     for sink in each_sink(next(iter(several.values()))):
         results = [dags[sink.dag]['sinks'][sink.name] for dags in several.values()]
-        times = [dict(zip(('median', 'p99'), response_cells(r['response_ns']))) for r in results]
         verdicts = [counts(result) for result in results]
         rows.append([
             sink.shown_dag, sink.shown_name, *(f'{v.in_time} of {v.due}' for v in verdicts),
-            *(cells[what] for what in which for cells in times),
+            *(response_cells(result['response_ns'])[1] for result in results),
             format_ns(results[0]['relative_deadline_ns'])])
     totals = [total(dags) for dags in several.values()]
     rows.append(['all', '', *(percent(v.in_time, v.due) for v in totals),
-                 *[''] * (len(which) * len(several) + 1)])
-    return table(
-        ['DAG', 'sink', *(f'{name} in time' for name in several),
-         *(f'{name} {what}' for what in which for name in several), 'deadline'], rows)
+                 *[''] * (len(several) + 1)])
+    return table(['DAG', 'sink', *(f'{name} in time' for name in several),
+                  *(f'{name} p99' for name in several), 'deadline'], rows)
 
 
 def agreement(live: dict[str, Any], recorded: dict[str, Any]) -> str:

@@ -9,8 +9,7 @@ from pathlib import Path
 import subprocess
 from typing import Any
 
-from mddag_executor.cli.demo import agreement, beside, side_by_side
-from msg_graph import load
+from mddag_executor.cli.demo import agreement, results_table, side_by_side
 import pytest
 
 
@@ -28,7 +27,7 @@ def test_the_demo_says_where_recording_and_live_differ() -> None:
     assert agreement(live, other) == (
         'The replay counts otherwise for 1 of 2 sinks: /b:y (live 20 completed, 2 late; '
         'recorded 20, 3)')
-    table = beside(('p99',), **{name: each['dags'] for name, each in (
+    table = results_table(**{name: each['dags'] for name, each in (
         ('live', live), ('recorded', same), ('rescheduled', other))}).splitlines()
     assert table[2].split()[:10] == [
         'b:y', '18', 'of', '20', '18', 'of', '20', '17', 'of', '20']
@@ -91,24 +90,3 @@ def test_a_step_that_fails_is_one_line(
     assert process.returncode == 2
     assert process.stderr == (
         f'error: mddag run: {tmp_path}/demo.mcap: this is a directory: name a file\n')
-
-
-@pytest.mark.slow
-def test_the_main_job_in_two_processes(
-    tmp_path: Path, mddag: Callable[..., subprocess.CompletedProcess[str]]
-) -> None:
-    process = mddag(
-        'demo', '--processes', '2', '--duration', '1s', '--utilisation', '0.05',
-        '--output', tmp_path / 'made', '--json', tmp_path / 'result.json', timeout=180.0)
-    assert process.returncode == 0, process.stderr
-    result = json.loads((tmp_path / 'result.json').read_text())
-    assert [p['name'] for p in result['live']['processes']] == ['p1', 'p2']
-    assert result['live']['measured']['attribution']['wrong'] == 0
-    sinks = [{name for dag in result[of]['dags'].values() for name in dag['sinks']}
-             for of in ('live', 'recorded')]
-    assert sinks[0] == sinks[1] and len(sinks[0]) == 18
-    assert len(load(tmp_path / 'made' / 'placed.yaml').processes) == 2
-    assert [(run['what'], run['executor']) for run in result['measured']] == [
-        (what, executor) for what in ('2 processes', 'one process')
-        for executor in ('rad', 'events')]
-    assert 'predicted in time' in process.stdout and 'demo.p2.mcap' in process.stdout
