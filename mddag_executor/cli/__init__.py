@@ -3,18 +3,17 @@
 """
 The command line program `mddag`: one module for each verb.
 
-A verb's module has these names, and is imported only when its verb is run:
+A verb's module is imported only when its verb is run, and has these names:
 
 | name | meaning |
 | --- | --- |
-| `EXAMPLE` | a command line, or several lines of them, shown by `--help` |
+| `EXAMPLE` | one command line or more, shown by `--help` |
+| `DESCRIPTION` | what `--help` begins with, if that is more than the verb's line in `main.py` |
 | `add_arguments(parser)` | declares the arguments |
-| `main(args) -> int` | does it and returns the exit status (0, or 1 for `--fail-on-miss`) |
-
-Its one-line help is in the table of `main.py`. The module of a verb of a verb (`graph_…`) has its
-own in `HELP`, and what its `--help` begins with in `DESCRIPTION`.
+| `main(args) -> int` | does the work and returns the exit status (0, or 1 for `--fail-on-miss`) |
 
 A verb reports bad input by raising an error of `mddag_executor.errors` or `msg_graph`;
-`main.py` turns it into the one line on standard error and exit status 2. What the verbs share is
-in `options.py` (arguments), `common.py` (files) and `text.py` (tables, warnings, progress).
+`main.py` turns it into one line on standard error and exit status 2. What the verbs share is in
+`options.py` (arguments), `common.py` (files), `recorded.py` (recordings) and `text.py` (tables,
+warnings, progress).
 """

@@ -124,27 +124,6 @@ def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | T
     return Traces(paths, dict(offsets))
 
 
-def two_runs(
-    first: str, second: str, offsets: Sequence[tuple[str, int]]
-) -> list[str | Traces]:
-    """
-    Return the recordings of two runs, each with the offsets of the processes that it has.
-
-    :raises mddag_executor.errors.UsageError: where they cannot be taken
-    """
-    if not offsets:
-        return [one_run([first], ()), one_run([second], ())]
-    from mddag_executor.replay.joining import names_of
-    runs = [_traces_in(path) for path in (first, second)]
-    names = [names_of(paths) if len(paths) > 1 else set() for paths in runs]
-    for name, _ in offsets:
-        if name not in set.union(*names):
-            raise UsageError(f'--offset: neither run has several traces and one of {name}: name '
-                             'a process, or its trace')
-    return [one_run(paths, [each for each in offsets if each[0] in known])
-            for paths, known in zip(runs, names)]
-
-
 def _traces_in(path: str) -> Sequence[str]:
     if os.path.isdir(path):
         from mddag_executor.replay.bags import is_ordinary

@@ -54,14 +54,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--tolerance', type=_share, metavar='SHARE',
         help='with --fail-on-worse and in the tables: how much the p99 response time of a sink '
         'may grow, as 10%% (default: by any amount)')
-    options.add(parser, '--skip', '--offset', '--json')
+    options.add(parser, '--skip', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Compare two runs."""
     from mddag_executor.report import diff
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    runs = common.two_runs(args.first, args.second, args.offset)
+    runs = [common.one_run([path], ()) for path in (args.first, args.second)]
     with ExitStack() as files:
         first, second = (files.enter_context(common.input_recording(run)) for run in runs)
         before, after = _results(args, first, second, task_set)

@@ -62,27 +62,6 @@ def test_a_file_of_each_form(
     assert out.read_bytes().startswith(start)
 
 
-def test_csv_to_standard_output_and_a_trace_from_standard_input(
-    trace: Path, capfdbinary: pytest.CaptureFixture[bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, 'stdin', io.TextIOWrapper(io.BytesIO(trace.read_bytes())))
-    assert program.main(['export', '-', '-o', '-', '--rows', 'jobs']) == 0
-    lines = capfdbinary.readouterr().out.decode().splitlines()
-    assert lines[0].startswith('dag,job,sink,release_s') and len(lines) == 11
-    assert lines[1].endswith(',6000000,-1000000,late')
-
-
-def test_another_graph_judges(
-    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    wide = tmp_path / 'wide.yaml'
-    wide.write_text(GRAPH.replace('5ms', '9ms') % '4ms')
-    out = tmp_path / 'out.csv'
-    assert call(capsys, 'export', trace, wide, '-o', out, '--rows', 'jobs')[0] == 0
-    lines = out.read_text().splitlines()
-    assert all(line.endswith('in_time') for line in lines[1:])
-
-
 def test_a_report_of_each_kind(
     graph: Path, trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

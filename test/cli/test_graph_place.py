@@ -25,23 +25,6 @@ nodes:
 """
 
 
-def test_a_placement_is_written_and_predicted(graph: Path, call: Mddag) -> None:
-    run = call('graph', 'place', 'graph.yaml', '--processes', '2', '--cpus', '2',
-               '-o', 'placed.yaml', '--json', 'out.json')
-    assert run.returncode == 0, run.stderr
-    placed = load('placed.yaml')
-    assert Path('placed.yaml').read_text().startswith(GRAPH)
-    assert len(placed.processes) == 2 and placed.process_of('/a') != placed.process_of('/b')
-    for text in ('predicted with 2 CPUs: 90 sink jobs due, 90 in time', 'in one process: 90 sink'):
-        assert text in run.stdout, run.stdout
-    result = json.loads(Path('out.json').read_text())
-    assert [p['name'] for p in result['processes']] == ['p1', 'p2']
-    assert sorted(result['loads'], reverse=True)[0] == pytest.approx(0.4, abs=0.02)
-    again = call('graph', 'place', 'placed.yaml', '--processes', '1', '-o', '-')
-    assert again.stdout == GRAPH + 'processes:\n  p1: [/a, /b, /c]\n'
-    assert 'The deadlines do not hold' in again.stderr
-
-
 def test_rules_of_the_user(graph: Path, call: Mddag) -> None:
     place = ['graph', 'place', 'graph.yaml', '--processes', '2', '-o', 'placed.yaml']
     assert call(*place, '--together', '/a, /b').returncode == 0

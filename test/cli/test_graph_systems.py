@@ -11,7 +11,7 @@ import re
 import subprocess
 import sys
 
-from mddag_executor.report.tables import drift_lines, MOST_LINES
+from mddag_executor.report.tables import MOST_LINES
 import msg_graph
 import pytest
 
@@ -254,18 +254,6 @@ def test_a_coroutine_is_one_execution_however_often_it_is_resumed(
     assert counts == {'ask': str(asked + 1), 'inner': str(2 * asked), 'outer': str(asked)}
 
 
-def test_from_trace_of_something_else(call: Mddag, tmp_path: Path) -> None:
-    (tmp_path / 'x').write_text('no trace')
-    (tmp_path / 'empty').mkdir()
-    done = call('graph', 'from-trace', 'empty', '-o', 'g.yaml', cwd=tmp_path)
-    assert done.stderr == 'error: empty: is an empty folder: give a trace, an .mcap file\n'
-    for name in ('x', 'none', str(tmp_path)):
-        done = call('graph', 'from-trace', name, '-o', 'g.yaml', cwd=tmp_path)
-        assert (done.returncode, done.stdout) == (2, '')
-        assert done.stderr.startswith(f'error: {name}: ') and done.stderr.count('\n') == 1
-    assert not (tmp_path / 'g.yaml').exists()
-
-
 def test_from_caret_with_a_trace(call: Mddag, tmp_path: Path) -> None:
     (tmp_path / 'a.yaml').write_text(ARCHITECTURE)
     done = call('graph', 'from-caret', 'a.yaml', '--trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
@@ -302,14 +290,6 @@ def test_replay_tells_of_drift(call: Mddag, tmp_path: Path) -> None:
     assert {each['kind'] for each in found} == {'rate'}
     assert done.stdout.splitlines()[-1 - min(len(found), MOST_LINES)].startswith(
         f'{len(found)} difference')
-
-
-def test_drift_lines() -> None:
-    assert list(drift_lines([])) == []
-    assert list(drift_lines([{'text': 'a\x1b'}])) == [
-        '1 difference between the run and the declaration:', '  a\\x1b']
-    many = list(drift_lines([{'text': str(i)} for i in range(MOST_LINES + 3)]))
-    assert (len(many), many[-1]) == (MOST_LINES + 2, '  … (3 more)')
 
 
 def test_includes(call: Mddag, tmp_path: Path) -> None:

@@ -75,20 +75,6 @@ def test_bad_input_is_one_line(verb, capsys: pytest.CaptureFixture[str],
     assert capsys.readouterr() == ('', line + '\n')
 
 
-def test_errors_of_the_neighbours_are_known(verb, capsys: pytest.CaptureFixture[str]) -> None:
-    import msg_graph
-
-    def action(args: argparse.Namespace) -> int:
-        msg_graph.loads('', name='empty.yaml')
-        return 0
-
-    verb(action)
-    assert program.main(['probe']) == 2
-    out, err = capsys.readouterr()
-    assert out == ''
-    assert err.startswith('error: empty.yaml') and err.count('\n') == 1
-
-
 @pytest.mark.parametrize('error', [
     ZeroDivisionError('a defect'), OSError('a defect'),
     ModuleNotFoundError('a defect', name='somebodys_module')])
@@ -177,16 +163,6 @@ def test_a_declaration_may_follow_an_option(
     traces = ['a.mcap', 'b.mcap'] if verb == 'diff' else ['a.mcap']
     assert program.main([verb, *traces, *options, 'gone.yaml']) == 2
     assert capsys.readouterr().err.startswith('error: gone.yaml: the file cannot be read')
-
-
-def test_help_has_an_example(verb, capsys: pytest.CaptureFixture[str]) -> None:
-    verb(lambda args: 0)
-    with pytest.raises(SystemExit) as stop:
-        program.main(['probe', '--help'])
-    assert stop.value.code == 0
-    out = capsys.readouterr().out
-    assert 'Try things.' in out
-    assert 'example:\n  mddag probe graph.yaml' in out
 
 
 @pytest.mark.parametrize('verb', sorted(program.VERBS))

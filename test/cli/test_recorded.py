@@ -113,16 +113,6 @@ def test_export(
         assert '/detect:detect' in names
 
 
-def test_executions_of_an_imported_recording_need_no_graph(
-    files: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / 'out.csv'
-    assert call(capsys, 'export', files['imported.mcap'], '-o', str(out))[0] == 0
-    with out.open(newline='') as stream:
-        names = [row['vertex'] for row in csv.DictReader(stream)]
-    assert names == ['/camera timer 100ms', '/detect subscription /image'] * 4
-
-
 @pytest.mark.parametrize(('arguments', 'medians', 'due'), [
     (['own.mcap', 'imported.mcap'], (6, 5), (10, 4)),       # judged by the own one's declaration
     (['imported.mcap', 'own.mcap'], (5, 6), (4, 10)),

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable
 import json
 from pathlib import Path
-import re
 import subprocess
 from typing import Any
 
@@ -26,32 +25,6 @@ call = caller('replay')
 def trace(tmp_path: Path) -> Path:
     """Give a trace of three jobs; the third is 2 ms late, its first vertex took 6 ms."""
     return by_hand(tmp_path / 'run.mcap', undeclared=False)
-
-
-def test_the_tables(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = call(capsys, trace)
-    assert (status, err) == (0, '')
-    lines = [line.split() for line in out.splitlines()]
-    assert ['/driver', 'filter:run', '3', '66.67', '%', '1', '6', 'ms', '10', 'ms', '10', 'ms',
-            '8', 'ms'] in lines
-    at = out.splitlines().index('Where the response times went, on average:')
-    assert lines[at + 2] == ['filter:run', '0', 'ns', '1', 'ms', '6', 'ms', '0', 'ns']
-    at = out.splitlines().index('The same of the worst job of each sink:')
-    assert lines[at + 2] == ['filter:run', '2', '0', 'ns', '1', 'ms', '9', 'ms', '0', 'ns']
-    assert '3 sink jobs due, 2 in time (66.67 %), 1 late, 0 expired' in out
-    assert 'policy rad, 2 workers, 40 ms, utilisation 0.225 (all callbacks: 0.225)' in out
-    assert 'first miss: /filter:run, job 2, 2 ms late' in out
-    assert '/driver:tick' not in out
-
-
-def test_the_table_of_callbacks(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _, out, _ = call(capsys, trace, '--callbacks')
-    lines = [line.split() for line in out.splitlines()]
-    # nobody knows what they computed
-    assert ['driver:tick', '3', '9', 'ms', '3', 'ms', '6', 'ms', '0', 'ns', '0', 'ns', '-',
-            '-'] in lines
-    assert ['filter:run', '3', '9', 'ms', '3', 'ms', '3', 'ms', '1', 'ms', '1', 'ms', '-',
-            '-'] in lines
 
 
 def test_the_result_for_machines(
@@ -127,16 +100,6 @@ def test_reschedule(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
         sink = result['dags']['/driver']['sinks']['/filter:run']
         assert sink['response_ns']['max'] == longest
         assert result['overheads']['dispatch_median_ns'] == 0
-
-
-def test_utilisation_is_what_is_asked_for_beside_how_busy_workers_were(
-    capsys: pytest.CaptureFixture[str]
-) -> None:
-    status, out, _ = call(capsys, DEMO, '--reschedule', '--workers', 3)
-    line, = (line for line in out.splitlines() if ', utilisation ' in line)
-    figures = re.fullmatch(r'.*, utilisation ([0-9.]+), workers busy ([0-9.]+) %', line)
-    assert status == 0 and figures is not None
-    assert float(figures[1]) > 1 and float(figures[2]) <= 100
 
 
 def test_a_run_without_jobs_proves_nothing(

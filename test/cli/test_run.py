@@ -17,7 +17,7 @@ from typing import Any
 
 from mddag_executor.cli import run
 from mddag_executor.core.tally import counts, total
-from mddag_executor.report.tables import percent, short_names, sink_table
+from mddag_executor.report.tables import percent, sink_table
 from mddag_executor.trace import read_events, TraceError, TraceReader
 from msg_graph import load
 import pytest
@@ -192,12 +192,6 @@ def test_spinning_takes_cpu_which_is_not_overhead(graph: Path, mddag: Mddag) -> 
     assert measured['callbacks'] > 0
     assert measured['callbacks_per_s'] == pytest.approx(
         measured['callbacks'] * 1e9 / measured['window_ns'], rel=0.01)
-
-
-def test_a_warning_when_spinning_can_not_work(graph: Path, mddag: Mddag) -> None:
-    process = mddag(
-        'run', graph, '--synthetic', 'spin', '--utilisation', '0.6', '--duration', '0.1s')
-    assert 'share the interpreter lock' in process.stderr
 
 
 @contextmanager
@@ -378,17 +372,6 @@ def sink(completed: int, late: int = 0, **more: Any) -> dict[str, Any]:
         'response_ns': {'min': 1, 'median': 2_000_000, 'p99': 3_000_000, 'max': 4_000_000}, **more}
 
 
-def test_verdicts_add_up() -> None:
-    # 100 completed, 3 of them late; 2 were overdue at the end; 4 expired, 1 aborted, 6 failed.
-    found = counts(sink(100, 5, overdue=2, expired=4, aborted=1, failed=6))
-    assert found == (113, 97, 5, 4, 1, 6)
-    assert found.missed == found.late + found.expired + found.aborted + found.failed
-    sinks = {'/x:a': sink(100, 5, overdue=2), '/x:b': sink(10)}
-    dags: dict[str, Any] = {'a': {'sinks': sinks}, 'b': {'sinks': {}}}
-    assert total(dags) == (112, 107, 5, 0, 0, 0)
-    assert total({}) == (0, 0, 0, 0, 0, 0)
-
-
 def test_the_table_has_a_row_for_each_sink() -> None:
     text = sink_table({
         'one': {'sinks': {'/long/way/node:a': sink(10), '/other/node:a': sink(10)}},
@@ -421,11 +404,6 @@ def test_what_missed_most_comes_first_and_is_red_on_a_terminal(
         with monkeypatch.context() as here:
             here.setenv(name, value)
             assert sink_table(dags) == plain
-
-
-def test_names_are_short_where_that_is_enough() -> None:
-    assert short_names(['/a/b:x', '/c/b:x', '/c/d:x']) == {
-        '/a/b:x': '/a/b:x', '/c/b:x': '/c/b:x', '/c/d:x': 'd:x'}
 
 
 @pytest.mark.parametrize(('part', 'whole', 'text'), [

@@ -88,14 +88,6 @@ def test_execution_times_from_a_file(
     assert result['dags']['lidar']['sinks']['/filter:far']['response_ns']['max'] == 2_001_000
 
 
-def test_utilisation_scales_either(
-    capsys: pytest.CaptureFixture[str], graph: Path, times: Path
-) -> None:
-    for source in ([], ['--execution-times', times]):
-        result = result_of(capsys, graph, '--utilisation', '0.3', *source)
-        assert result['utilisation'] == pytest.approx(0.3, rel=1e-5)
-
-
 def test_what_is_asked_for_is_done(
     capsys: pytest.CaptureFixture[str], graph: Path
 ) -> None:
@@ -120,20 +112,6 @@ def test_what_is_asked_for_is_done(
     stopped = result_of(capsys, graph, '--workers', 1, '--stop-at-first-miss')
     assert stopped['ended_ns'] == stopped['first_miss']['completed_ns'] == 33_000_000
     assert stopped['deadline_missed'] is True
-
-
-def test_the_paper_workload(capsys: pytest.CaptureFixture[str]) -> None:
-    result = result_of(
-        capsys, AUTOWARE, '--policy', 'rad', '--workers', 7, '--duration', '3s', '--preemptive',
-        '--seed', 1, '--judge', 'completions')
-    again = result_of(
-        capsys, AUTOWARE, '--policy', 'rad', '--workers', 7, '--duration', '3s', '--preemptive',
-        '--seed', 1, '--judge', 'completions')
-    assert result == again
-    assert len(result['dags']) == 11
-    assert result['workers'] == 7
-    assert result['dags']['control']['jobs'] == 100
-    assert result != result_of(capsys, AUTOWARE, '--preemptive', '--seed', 2)
 
 
 @pytest.mark.parametrize(('workers', 'status'), [(1, 1), (2, 0)])

@@ -8,7 +8,6 @@ import io
 
 from hypothesis import given, strategies
 from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table, warn
-from mddag_executor.progress import report
 from msg_graph import errors
 import pytest
 
@@ -47,12 +46,6 @@ def test_no_control_character_reaches_the_terminal(text: str) -> None:
         assert line.isprintable()
     if text.isprintable():
         assert printable(text) == text
-
-
-def test_escapes_can_be_recognised() -> None:
-    assert printable('/node\x1b]0;title\x07\n') == '/node\\x1b]0;title\\x07\\n'
-    assert printable('\u202eevil\udcff') == '\\u202eevil\\udcff'
-    assert printable('/küche/ロボット') == '/küche/ロボット'
 
 
 def test_tables_align_names_left_and_numbers_right() -> None:
@@ -102,28 +95,6 @@ def test_progress_is_quiet_where_nobody_looks() -> None:
         clock.now += 10
         progress.update(3)
     assert stream.getvalue() == ''
-
-
-def test_progress_of_what_nobody_asked_for() -> None:
-    stream, clock = Terminal(), Clock()
-    with Progress('replaying', stream=stream, clock=clock) as progress:
-        report('the core is being compiled, once')
-        assert stream.getvalue() == ''
-        clock.now += 3
-        report('the core is being compiled, once')
-        assert '\rreplaying: the core is being compiled, once' in stream.getvalue()
-        clock.now += 3
-        progress.update(1500)
-    report('nobody hears it')
-    assert 'nobody' not in stream.getvalue()
-
-
-def test_progress_of_unknown_length() -> None:
-    stream, clock = Terminal(), Clock()
-    with Progress('reading', stream=stream, clock=clock) as progress:
-        clock.now += 3
-        progress.update(1500)
-    assert '\rreading: 1500' in stream.getvalue()
 
 
 def test_a_warning_is_one_harmless_line(capsys: pytest.CaptureFixture[str]) -> None:

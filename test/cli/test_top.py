@@ -56,12 +56,6 @@ def test_the_newest_status_of_each_process_is_shown():
     assert re.search(r'a/1 +mddag +OK +25 % +- +5 .* +12.5 ', text)
 
 
-def test_statuses_of_others_are_left_out():
-    board = Board()
-    board.take(array(('disk', 'smartd: sda', 2, {'temperature': '80'}), ('', 'x', 77, {})))
-    assert board.statuses() == []
-
-
 def test_a_process_that_says_nothing_any_more_is_gone():
     now = [0.0]
     board = Board(lambda: now[0])
@@ -202,17 +196,6 @@ def test_nobody_to_hear(call: Mddag):
     board = Board()
     list(_ticks(spent.append, board, 3600.0, 0.05))     # gives up long before an hour
     assert spent
-
-
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['--duration', '3'], 'has no unit'),
-    (['--once', '--json', 'no/such/dir/x.json'], 'no directory'),
-])
-def test_bad_input(call: Mddag, arguments: list[str], message: str):
-    done = call('top', *arguments)
-    assert done.returncode == 2 and done.stdout == ''
-    assert done.stderr.startswith('error: ') and message in done.stderr
-    assert done.stderr.count('\n') == 1
 
 
 def test_run_takes_no_strange_period(call: Mddag, tmp_path: Path):

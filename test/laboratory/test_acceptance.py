@@ -23,10 +23,6 @@ def test_wide_bins(utilisation: float, centre: float) -> None:
     assert WIDE_BINS[bins_of(np.array([utilisation]), WIDE_BINS)[0]] == centre
 
 
-def test_bins_are_the_paper_s() -> None:
-    assert BINS == (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0)
-
-
 @pytest.mark.parametrize(('accepted', 'runs', 'low', 'high'), [
     # Figures of R's binom.confint(method = 'wilson').
     (0, 10, 0.0, 0.2775328), (5, 10, 0.2365931, 0.7634069), (10, 10, 0.7224672, 1.0),
@@ -50,8 +46,3 @@ def test_acceptance() -> None:
     assert found.ratio[10] == 0.0
     assert found.interval[1] is None and found.interval[2] == wilson(1, 3)
     assert found.total == 0.5
-
-
-def test_no_runs() -> None:
-    found = Acceptance(np.array([], dtype=np.int64), np.array([], dtype=np.bool_))
-    assert found.total is None and set(found.ratio) == {None}

@@ -91,13 +91,6 @@ def test_a_path_that_is_too_long() -> None:
     assert all(v.verdict == NOTHING for v in found.values() if v.kind == 'sufficient')
 
 
-def test_too_much_work() -> None:
-    found = verdicts(timers('10ms 20ms 9ms', '10ms 20ms 2ms'), 1)
-    assert found['longest path'].verdict == HOLDS
-    assert found['utilisation'].verdict == FAILS
-    assert found['utilisation'].figure == '1.100 of 1 worker'
-
-
 def test_demand() -> None:
     found = verdicts(timers('10ms 1ms 1ms', '10ms 1ms 1ms'), 1)
     assert found['utilisation'].verdict == HOLDS
@@ -217,17 +210,3 @@ def test_urgent_work() -> None:
     assert own_urgent(task, 25 * MS) == 12 * MS
     assert own_urgent(task, 35 * MS) == 16 * MS
     assert own_urgent(task, 24 * MS) == 8 * MS
-
-
-@pytest.mark.parametrize('budget', ['max', 'mean'])
-def test_all_that_is_missing_is_counted(budget: str) -> None:
-    text = WIDE.replace(', execution_time: 3ms', '').replace(', execution_time: 5ms', '')
-    with pytest.raises(AnalysisError, match=r'g:6: /n:x \(and 1 more callback\) declares no'):
-        analyse(loads(text, 'g'), 2, budget)
-
-
-def test_words_and_assumptions() -> None:
-    for verdict in analyse(loads(WIDE), 2).verdicts:
-        assert verdict.verdict in (HOLDS, FAILS, NOTHING)
-        assert verdict.kind == 'necessary' or verdict.verdict != FAILS
-        assert verdict.name and verdict.assumption and verdict.figure and verdict.reason

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.errors import InputError, UsageError
+from mddag_executor.errors import InputError
 from mddag_executor.laboratory.draws import Draws, feasible, read_samples, utilisations
 from msg_graph import ExecutionTime, loads, TaskSet
 import numpy as np
@@ -138,17 +138,6 @@ def test_damaged_values(task_set: TaskSet, tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match='are damaged or no numbers'):
         read_samples(task_set, path, 'samples.npz')
-
-
-def test_no_execution_time() -> None:
-    with pytest.raises(InputError, match=r'^graph.yaml:6: /n:b declares no execution_time: '):
-        Draws(loads(GRAPH.replace(', execution_time: 2ms', ''), 'graph.yaml'), 0)
-
-
-@pytest.mark.parametrize('seed', [-1, 2 ** 64])
-def test_seed_out_of_range(task_set: TaskSet, seed: int) -> None:
-    with pytest.raises(UsageError, match='seed'):
-        Draws(task_set, seed)
 
 
 def test_utilisation_and_bound(task_set: TaskSet) -> None:

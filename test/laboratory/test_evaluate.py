@@ -14,8 +14,8 @@ from dataclasses import replace
 import math
 from pathlib import Path
 
-from mddag_executor.core import POLICIES, PolicyError
-from mddag_executor.laboratory.acceptance import BINS, Evaluation, WIDE_BINS
+from mddag_executor.core import POLICIES
+from mddag_executor.laboratory.acceptance import Evaluation, WIDE_BINS
 from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.evaluate import evaluate
 from mddag_executor.laboratory.experiment import Experiment
@@ -198,17 +198,6 @@ def test_modes_and_overhead(small: TaskSet) -> None:
     assert not evaluate(replace(base, overhead_ns=3_000_000), 20).accepted.any()
 
 
-def test_judging_what_is_open(small: TaskSet) -> None:
-    """A sink that never completes is late only for the judge who looks at the horizon."""
-    task_set = loads(
-        SMALL.replace('deadline: 20ms', 'deadline: 1s').replace('[10000, 10000, 16000, 16000]',
-                                                                '[2000000]')
-        .replace(', percent: [0, 50, 50.01, 100]', ''), 'small.yaml')
-    experiment = Experiment(task_set, ('rad',), workers=1, duration_ns=1_500_000_000)
-    assert evaluate(experiment, 1).accepted.all()
-    assert not evaluate(replace(experiment, judge='horizon'), 1).accepted.any()
-
-
 def same(first: Evaluation, second: Evaluation) -> bool:
     return all((getattr(first, name) == getattr(second, name)).all()
                for name in ('done', 'accepted', 'possible', 'utilisation'))
@@ -273,17 +262,6 @@ def test_interrupted(small: TaskSet) -> None:
     assert sum(result['counts']) == outcome.runs
 
 
-def test_result(small: TaskSet) -> None:
-    result = evaluate(Experiment(small, ('rad', 'wc'), workers=1), 30).result()
-    assert result['runs'] == 30 == sum(result['counts'])
-    assert result['bins'] == list(BINS)
-    assert list(result['acceptance']) == ['rad', 'wc'] == list(result['policies'])
-    for ratios in (*result['acceptance'].values(), result['bound']):
-        assert [ratio is None for ratio in ratios] == [count == 0 for count in result['counts']]
-    assert result['acceptance']['rad'][5] == 1.0 and result['acceptance']['rad'][10] == 0.0
-    assert result['policies']['rad']['total'] == result['counts'][5] / 30
-
-
 @pytest.mark.parametrize(('runs', 'options', 'problem'), [
     (0, {}, 'runs: 0 is too few'),
     (10 ** 12, {}, 'runs: 1000000000000 is too many: give at most 10000000, and evaluate more'),
@@ -296,15 +274,6 @@ def test_bad_input(
     with pytest.raises(SimulationError) as caught:
         evaluate(Experiment(small), runs, **options)  # type: ignore[arg-type]
     assert str(caught.value).startswith(problem)
-
-
-def test_bad_experiments(small: TaskSet) -> None:
-    with pytest.raises(PolicyError, match="policy 'edf': there is no such policy"):
-        evaluate(Experiment(small, ('rad', 'edf')), 1)
-    with pytest.raises(SimulationError, match='workers: 0 is out of range: give 1 to 4096'):
-        evaluate(Experiment(small, workers=0), 1)
-    with pytest.raises(SimulationError, match='overhead'):
-        evaluate(Experiment(small, overhead_ns=-1), 1)
 
 
 def test_without_numba(small: TaskSet, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -110,17 +110,6 @@ def test_joins() -> None:
     assert sum(len(dag.vertices) for dag in apart.dags) > len(apart.callbacks)
 
 
-def test_several_deadlines_of_a_dag() -> None:
-    task_set = loads(generate(Options(sinks=(4, 4), vertices=(10, 15), tightness=(0.2, 1.0))))
-    assert all(len({dag.vertices[sink].deadline_ns for sink in dag.sinks}) > 1
-               for dag in task_set.dags)
-
-
-def test_seed_and_number_count() -> None:
-    texts = {generate(Options(seed=seed), number) for seed in range(4) for number in range(4)}
-    assert len(texts) == 16
-
-
 @pytest.mark.parametrize(('change', 'problem'), [
     ({'sinks': (9, 9), 'vertices': (9, 9)}, '--sinks 9: a DAG of 9 vertices has at most 8: '),
     ({'sinks': (2, 2), 'vertices': (1, 9)}, '--sinks 2: a DAG of 1 vertex has at most 1: '),

@@ -16,7 +16,6 @@ from mddag_executor.laboratory.prediction import (
 from mddag_executor.simulate.intakes import Costs
 from mddag_executor.simulate.machine import SWITCH_NS
 from msg_graph import loads, Process, TaskSet
-import pytest
 
 MS = 1_000_000
 TWO = """
@@ -123,11 +122,3 @@ def test_a_few_tries_are_enough_to_stop() -> None:
     _, tried = improve(
         placing, placing.place(), lambda p: cost_of(predictor.predict(p, times)), most=5)
     assert tried == 5
-
-
-@pytest.mark.parametrize('policy', ['rad', 'fifo'])
-def test_rules_are_those_of_the_policy(policy: str) -> None:
-    task_set, times = several(20, 10, 30)
-    tally = Predictor(task_set, 7, 2, policy, 1000 * MS).predict(
-        (Process('all', ('/n0', '/n1', '/n2')),), times)
-    assert not tally.missed

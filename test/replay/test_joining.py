@@ -445,24 +445,6 @@ def test_a_process_that_was_started_again_has_its_name(tmp_path: Path) -> None:
             'up', 'up', 'up.2', 'up.2', '2', 'drive']
 
 
-def test_diff_takes_offsets(tmp_path: Path, mddag: Any) -> None:
-    folders = tmp_path / 'before', tmp_path / 'after'
-    for folder in folders:
-        folder.mkdir()
-        two_machines(folder, 2 * MS)
-    for name, longest in (
-            ('up', [10 * MS, 10 * MS]), (f'{folders[1]}/run.up.mcap', [9_900_000, 10 * MS])):
-        run = mddag('diff', *folders, '--offset', f'{name}=2ms', '--json', '-')
-        assert run.returncode == 0, run.stderr
-        sides = json.loads(run.stdout)['dags']['chain']['sinks']['/b:take']
-        assert [sides[side]['response_ns']['max'] for side in 'ab'] == longest
-    for arguments in ((*folders, '--offset', 'left=2ms'),
-                      (*folders[0].iterdir(), '--offset', 'up=2ms')):
-        run = mddag('diff', *arguments)
-        assert (run.returncode, run.stderr.count('\n')) == (2, 1)
-        assert '--offset: neither run has several traces and one of ' in run.stderr
-
-
 def test_the_command_takes_several_traces(tmp_path: Path, mddag: Any) -> None:
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
     up.runs(0, MS)

@@ -9,7 +9,6 @@ from dataclasses import replace
 import json
 from typing import Any
 
-from mddag_executor.core import NEVER
 from mddag_executor.simulate import (
     draw_execution_times,
     Load,
@@ -91,15 +90,6 @@ def test_a_bound_for_all_dags_and_one_of_its_own() -> None:
     assert ends == {'a': 10 - 3, 'b': 0}
 
 
-def test_progress_is_told_the_virtual_time() -> None:
-    told: list[int] = []
-    simulate(two_dags(), periodic_load(two_dags(), [[1, 1], [1, 1]], 9 * US),
-             Settings(workers=4, duration_ns=9 * US), progress=told.append)
-    assert told == sorted(told)
-    assert told[0] == 0
-    assert told[-1] == 8 * US + 2
-
-
 # --- settings ------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(('setting', 'says'), [
@@ -149,12 +139,6 @@ def test_utilisation_and_its_scaling() -> None:
         scale_execution_times(two_dags(), [[0, 0], [0, 0]], 2, 0.5)
 
 
-def test_times_can_not_be_drawn_where_none_is_declared() -> None:
-    bare = declaration([{'node': '/n', 'name': 's', 'timer': '10us', 'deadline': '9us'}])
-    with pytest.raises(SimulationError, match=r'random.yaml:1: /n:s declares no execution_time: '):
-        draw_execution_times(bare, 0)
-
-
 GOOD = {'a': {'/n:s': 2, '/n:x@a': 3.5}, 'b': {'/n:t': 0.0001, '/n:x': 86_399_999_999}}
 
 
@@ -171,36 +155,3 @@ def changed(change: Callable[[dict[str, Any]], Any]) -> str:
 
 NO_TIMES: tuple[Any, ...] = (
     0, -1, -0.5, 86_400_000_000, '3', True, [1], {}, float('nan'), float('inf'), 10 ** 400)
-
-
-def with_time(value: Any) -> str:
-    return changed(lambda data: data['a'].update({'/n:s': value}))
-
-
-@pytest.mark.parametrize(('text', 'says'), [
-    ('', 'times.json:1: not JSON'),
-    ('{"a": {\n"x" 1}}', 'times.json:2: not JSON'),
-    ('[' * 100_000, 'not usable JSON'),
-    ('{"a": {"/n:s": ' + '9' * 5_000 + '}}', 'JSON|below one day'),
-    ('[]', 'not an object of objects'), ('null', 'not an object of objects'),
-    ('{"a": 3}', 'not an object of objects'),
-    ('{}', 'no execution time for /n:s of DAG a: add it'),
-    (changed(lambda d: d.pop('b')), 'no execution time for /n:t of DAG b|/n:x of DAG b'),
-    (changed(lambda d: d['a'].update({'/n:s': None})), 'no execution time for /n:s of DAG a'),
-    (changed(lambda d: d['a'].pop('/n:x@a')), 'no execution time for /n:x of DAG a: add it'),
-    (changed(lambda d: d.update(c={})), "DAG 'c' is not in random.yaml: its DAGs are a, b"),
-    (changed(lambda d: d['a'].update({'/n:t': 1})), "'/n:t' is not a vertex of DAG a"),
-    *((with_time(value), 'execution time of /n:s of DAG a') for value in NO_TIMES),
-])
-def test_a_wrong_file_of_times_is_one_line(text: str, says: str) -> None:
-    with pytest.raises(SimulationError, match=says) as error:
-        read_execution_times(two_dags(), text, FILE)
-    line = str(error.value)
-    assert '\n' not in line
-    assert line.startswith(FILE)
-    assert len(line) < 300
-
-
-def test_never_is_later_than_any_clock() -> None:
-    assert NEVER > 2 * 1_800_000_000 * 10 ** 9
-    assert NEVER + 86_400 * 10 ** 9 < 2 ** 63, 'deadlines can be added to it in 64 bits'
