@@ -26,8 +26,7 @@ can keep them; where a sufficient test holds, its scheduler does, as long as no 
 longer than its budget. A sufficient test that does not hold says nothing. Overheads of dispatching
 are not part of any test, nor are callback groups and Python's lock."""
 
-_HEADER = ('test', 'kind', 'verdict', 'figure', 'why')
-_ABOUT = ('test', 'source', 'scheduler', 'assumption')
+_HEADER = ('test', 'kind', 'verdict', 'figure')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Analyse."""
-    from mddag_executor.laboratory.analyse import analyse
+    from mddag_executor.laboratory.analyse import analyse, HOLDS
     task_set = common.load_graph(args.graph)
     with Progress('analysing') as line:
         analysis = analyse(
@@ -51,8 +50,8 @@ def main(args: argparse.Namespace) -> int:
             lambda tests: line.update(tests, 'tests'))
     found = analysis.verdicts
     common.show(args, analysis.result(), (
-        table(_HEADER, ((v.name, v.kind, v.verdict, v.figure, v.reason) for v in found)),
-        table(_ABOUT, ((v.name, v.source, v.scheduler, v.assumption) for v in found)),
+        table(_HEADER, ((v.name, v.kind, v.verdict, v.figure) for v in found)),
+        *(f'{v.name} {v.verdict}: {v.reason}' for v in found if v.verdict != HOLDS),
         _summary(analysis)))
     return int(args.fail_on_unschedulable and _is_impossible(analysis))
 
