@@ -106,8 +106,8 @@ def _fix_hashes() -> None:
 
 def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
     from mddag_executor.rerun import compare, programs
+    from mddag_executor.rerun.inputs import open_input
     from mddag_executor.rerun.run import Rerun, Settings
-    from mddag_executor.rerun.sources import open_source
     task_set = common.load_graph(args.graph)
     if task_set.processes:
         warn(f'{task_set.file}: processes: all nodes run in one here, with its workers and its '
@@ -118,7 +118,7 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
         args.all_clocks, ros_args=tuple(args.ros_args))
     with ExitStack() as files:
         path, name = files.enter_context(common.input_recording(args.recording))
-        source = open_source(path, task_set, args.times, args.seed, name)
+        source = open_input(path, task_set, args.times, args.seed, name)
         output: BinaryIO | None = None
         if args.output is not None:
             output = files.enter_context(common.output_file(args.output))

@@ -25,9 +25,9 @@ from mddag_executor.hosting.loading import Program, resolve, ros_arguments
 from mddag_executor.output_rules import check_distinct, check_replaced
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
+from mddag_executor.rerun.inputs import MessageBag, open_input
 from mddag_executor.rerun.outputs import Output
 from mddag_executor.rerun.run import PATIENCE_S, Rerun, Result, Settings
-from mddag_executor.rerun.sources import open_source, Recording
 from msg_graph import load, TaskSet
 
 __all__ = [
@@ -62,7 +62,7 @@ def rerun(
     :param recording: a bag, or a trace of this executor.
     :param graph: the declaration: a file, or a task set.
     :param nodes: as for ``mddag run --node``; or classes of nodes, or functions that return nodes.
-    :param times: ``recorded``, ``declared``, or a file (see ``sources.open_source``).
+    :param times: ``recorded``, ``declared``, or a file (see ``sources.open_input``).
     :param output: a file that gets the outputs as a bag; ``trace``: one that gets the run.
     :param overwrite: whether ``output`` and ``trace`` may replace files that are there.
     :param patience_s: a callback or thread that waits for this long, and not in virtual time, ends
@@ -81,7 +81,7 @@ def rerun(
     settings = Settings(
         defaults.workers(workers, task_set), cpus, policy, seed, all_clocks, patience_s,
         tuple(ros_args))
-    source = open_source(
+    source = open_input(
         os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)
     where = None if trace is None else os.fspath(trace)
     with ExitStack() as files:
@@ -105,7 +105,7 @@ def compare(
 
     :raises mddag_executor.errors.MddagError: when the bag cannot be read.
     """
-    recording = Recording(os.fspath(expected))
+    recording = MessageBag(os.fspath(expected))
     try:
         recording.load(recording.topics)
         return differences(

@@ -3,9 +3,9 @@
 """
 Actions between nodes of the run: goals, results, feedback and status without a middleware.
 
-rclpy's action clients and servers do all by themselves but for sending and taking.  What they send
+rclpy's action clients and servers do all by themselves but for sending and taking. What they send
 (methods of their handles) is kept, and goes, when the callback that sends it ends or waits, to the
-other side as what it would have taken.  Goals are known by the middleware's own bookkeeping, which
+other side as what it would have taken. Goals are known by the middleware's own bookkeeping, which
 stays in use; results do not expire.
 """
 
@@ -116,7 +116,7 @@ class Actions:
             else:
                 self._take(server, {kind: ((client, number), asked)})
 
-        self._loop.later(leave)
+        self._loop.call_at_end(leave)
         return number
 
     # --- what servers send -----------------------------------------------------------------------
@@ -124,7 +124,7 @@ class Actions:
     def _answer(self, kind: str, handle: Any, header: Header, response: Any) -> None:
         client, number = header
         answered = copy.deepcopy(response)
-        self._loop.later(lambda: self._take(client, {kind: (number, answered)}))
+        self._loop.call_at_end(lambda: self._take(client, {kind: (number, answered)}))
 
     def _clients_of(self, handle: Any) -> list[Any]:
         name, _ = self._servers[id(handle)]
@@ -139,7 +139,7 @@ class Actions:
                 if callback is not None:
                     self._ready(client, callback, copy.deepcopy(sent))
 
-        self._loop.later(leave)
+        self._loop.call_at_end(leave)
 
     def _status(self, handle: Any) -> None:
         from action_msgs.msg import GoalStatus, GoalStatusArray
@@ -151,7 +151,7 @@ class Actions:
             for client in self._clients_of(handle):
                 self._take(client, {'status': message})
 
-        self._loop.later(leave)
+        self._loop.call_at_end(leave)
 
     # --- what arrives ----------------------------------------------------------------------------
 

@@ -1,25 +1,25 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What gives the time, or waits for it, uses virtual time while a run lasts.
+Functions that return the time, or wait for it, use virtual time during a run.
 
 Theory of operation
 -------------------
-====================================  =============================================================
-a node's clock (ROS time)             is virtual; but where the recording has ``/clock`` and the
-                                      node uses simulated time, it tells what that said last
-steady and system clocks, ``time``    virtual if asked for; else what they always say, and the
-                                      first use of each by code of a node is warned of
-``Clock.sleep_until``                 waits in virtual time, of a virtual clock
-``Condition.wait``                    waits in virtual time in a strand; all that Python builds on
-                                      it does, too: events, queues, rates, futures
-``Thread.start``, ``Thread.join``     threads that strands start are strands; to wait for their end
-                                      is to wait in virtual time
-``uuid.uuid4``                        is drawn with the seed: goals of actions are called so
+====================================  ============================================================
+a node's clock (ROS time)             is virtual; but if the recording has ``/clock`` and the node
+                                      uses simulated time, it has the last recorded time
+steady and system clocks, ``time``    virtual on request; else real, and a warning names the first
+                                      use of each by code of a node
+``Clock.sleep_until``                 waits in virtual time for a virtual clock
+``Condition.wait``                    waits in virtual time in a run thread, and so does all that
+                                      Python builds on it: events, queues, rates, futures
+``Thread.start``, ``Thread.join``     threads that a run thread starts are run threads; waiting
+                                      for their end takes virtual time
+``uuid.uuid4``                        is drawn with the seed: goals of actions are named by it
 ``random``, ``numpy.random``          generators that nodes make without a seed get one
-====================================  =============================================================
+====================================  ============================================================
 
-Threads that are no strands get what they always do, except from a node's clock.
+In other threads everything is as always, except a node's clock.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ import uuid
 import weakref
 
 from mddag_executor.rerun.loop import Loop
-from mddag_executor.rerun.strands import is_library, Strand
+from mddag_executor.rerun.run_threads import is_library, RunThread
 from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
 from rclpy.time import Time
@@ -44,9 +44,9 @@ from rclpy.time import Time
 _READS = ('time', 'time_ns', 'monotonic', 'monotonic_ns', 'perf_counter', 'perf_counter_ns')
 
 
-class _Asked:
+class _Replaced:
     """
-    Functions that stand in the place of those of ``time`` and of ``uuid4``, and whom they ask.
+    The functions that replace those of ``time`` and ``uuid4``, and the run that they call.
 
     They are made once: a module that imports one keeps it for later runs.
     """
@@ -55,15 +55,15 @@ class _Asked:
     functions: ClassVar[dict[str, Callable[..., Any]]] = {}
 
 
-def _asking(original: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what asks the run that is under way, in place of a function."""
-    function = _Asked.functions.get(original.__name__)
+def _replaced(original: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that calls the current run instead of the original."""
+    function = _Replaced.functions.get(original.__name__)
     if function is None:
         def function(*args: Any) -> Any:
-            run = _Asked.run
-            return original(*args) if run is None else run.asked(original, args)
+            run = _Replaced.run
+            return original(*args) if run is None else run.call(original, args)
 
-        _Asked.functions[original.__name__] = function
+        _Replaced.functions[original.__name__] = function
     return function
 
 
@@ -84,7 +84,7 @@ class VirtualTime:
         self._simulated = simulated
         self._warn = warn
         self._random = random.Random(seed)
-        self._threads: weakref.WeakKeyDictionary[threading.Thread, Strand] = (
+        self._threads: weakref.WeakKeyDictionary[threading.Thread, RunThread] = (
             weakref.WeakKeyDictionary())
 
     def install(self, replace: Callable[[Any, str, Callable[[Any], Any]], None]) -> None:
@@ -96,7 +96,7 @@ class VirtualTime:
         replace(threading.Thread, 'join', self._thread_join)
         # The one in C waits without asking anybody; pools of threads are built on it.
         replace(queue, 'SimpleQueue', lambda original: vars(queue)['_PySimpleQueue'])
-        replace(uuid, 'uuid4', _asking)
+        replace(uuid, 'uuid4', _replaced)
         replace(random.Random, 'seed', self._seed)
         # that of the module is a method of a generator, bound before
         replace(random, 'seed', lambda original: partial(random.Random.seed, original.__self__))
@@ -107,12 +107,12 @@ class VirtualTime:
         else:  # what all of numpy's generators begin with that get no seed
             replace(bit_generator, 'randbits', self._randbits)
         for name in (*_READS, 'sleep'):
-            replace(time, name, _asking)
-        _Asked.run = self
+            replace(time, name, _replaced)
+        _Replaced.run = self
 
     def uninstall(self) -> None:
         """Have the functions of ``time`` give real time again."""
-        _Asked.run = None
+        _Replaced.run = None
 
     # --- clocks ----------------------------------------------------------------------------------
 
@@ -127,11 +127,11 @@ class VirtualTime:
         def now(clock: Clock) -> Time:
             kind = clock.clock_type
             if kind is ros_time and not self._simulated or self._is_virtual(clock):
-                if loop.strands.mine() is not None:
-                    loop.looked()
+                if loop.run_threads.current() is not None:
+                    loop.note_poll()
                 return Time(nanoseconds=loop.now, clock_type=kind)
             if kind is not ros_time:
-                self._look(f'a clock of {kind.name}', 2)
+                self._warn_of(f'a clock of {kind.name}', 2)
             return original(clock)
 
         return now
@@ -139,7 +139,7 @@ class VirtualTime:
     def _sleep_until(self, original: Callable[..., bool]) -> Callable[..., bool]:
         def sleep_until(clock: Clock, until: Time, context: Any = None) -> bool:
             loop = self._loop
-            if loop.strands.mine() is None or not (
+            if loop.run_threads.current() is None or not (
                     self._is_virtual(clock) or clock.clock_type == ClockType.ROS_TIME):
                 return original(clock, until, context)
             if until.clock_type != clock.clock_type:
@@ -154,18 +154,18 @@ class VirtualTime:
 
     # --- Python's time ---------------------------------------------------------------------------
 
-    def asked(self, original: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    def call(self, original: Callable[..., Any], args: tuple[Any, ...]) -> Any:
         """Do what a function of ``time`` does, or ``uuid4``."""
         loop, name = self._loop, original.__name__
-        if loop.strands.mine() is None:
+        if loop.run_threads.current() is None:
             return original(*args)
         if name == 'uuid4':
             return uuid.UUID(int=self._random.getrandbits(128), version=4)
         if not self._all:
-            self._look(f'time.{name}()', 3)
+            self._warn_of(f'time.{name}()', 3)
             return original(*args)
         if name in _READS:
-            loop.looked()
+            loop.note_poll()
             return loop.now if name.endswith('_ns') else loop.now / 1e9
         seconds, = args
         if seconds < 0:
@@ -173,9 +173,9 @@ class VirtualTime:
         loop.wait(None, loop.now + round(seconds * 1e9), 'time.sleep')
         return None
 
-    def _look(self, what: str, depth: int) -> None:
-        """Warn of something that code of a node asks for, which is so many calls further up."""
-        if self._loop.strands.mine() is None:
+    def _warn_of(self, what: str, depth: int) -> None:
+        """Warn of a function that code of a node calls, which is so many calls further up."""
+        if self._loop.run_threads.current() is None:
             return
         caller = sys._getframe(depth)
         if is_library(caller.f_globals.get('__name__', '')):
@@ -206,7 +206,7 @@ class VirtualTime:
         caller = sys._getframe(2)
         while caller.f_back is not None and caller.f_globals.get('__name__') == 'random':
             caller = caller.f_back
-        return self._loop.strands.mine() is not None and not is_library(
+        return self._loop.run_threads.current() is not None and not is_library(
             caller.f_globals.get('__name__', ''))
 
     # --- waiting and threads ---------------------------------------------------------------------
@@ -214,7 +214,7 @@ class VirtualTime:
     def _condition_wait(self, original: Callable[..., bool]) -> Callable[..., bool]:
         def wait(condition: Any, timeout: float | None = None) -> bool:
             loop = self._loop
-            if loop.strands.mine() is None or loop.strands.over:
+            if loop.run_threads.current() is None or loop.run_threads.over:
                 return original(condition, timeout)
             deadline = loop.deadline_after(timeout)
             return _wait_for_notify(
@@ -224,26 +224,26 @@ class VirtualTime:
 
     def _thread_start(self, original: Callable[[Any], None]) -> Callable[[Any], None]:
         def start(thread: threading.Thread) -> None:
-            strands = self._loop.strands
-            if strands.mine() is None or strands.over:
+            run_threads = self._loop.run_threads
+            if run_threads.current() is None or run_threads.over:
                 original(thread)
                 return
-            strand = self._threads[thread] = strands.make(f'thread {thread.name}')
+            run_thread = self._threads[thread] = run_threads.make(f'thread {thread.name}')
             thread.daemon = True  # one that does not end keeps no process from ending
             run = thread.run
-            thread.run = lambda: strands.run_as(strand, run)  # type: ignore[method-assign]
-            with strands.set_aside():  # it waits until the thread is there
+            thread.run = lambda: run_threads.run_as(run_thread, run)  # type: ignore[method-assign]
+            with run_threads.left_run():  # it waits until the thread is there
                 original(thread)
 
         return start
 
     def _thread_join(self, original: Callable[..., None]) -> Callable[..., None]:
         def join(thread: threading.Thread, timeout: float | None = None) -> None:
-            loop, strand = self._loop, self._threads.get(thread)
-            if strand is None or loop.strands.mine() is None or loop.strands.over:
+            loop, run_thread = self._loop, self._threads.get(thread)
+            if run_thread is None or loop.run_threads.current() is None or loop.run_threads.over:
                 original(thread, timeout)
                 return
-            loop.wait(lambda: strand.ended, loop.deadline_after(timeout),
+            loop.wait(lambda: run_thread.ended, loop.deadline_after(timeout),
                       f'for thread {thread.name}')
 
         return join

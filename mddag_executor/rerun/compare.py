@@ -5,12 +5,12 @@ Whether two runs have published the same: message by message, field by field.
 
 Theory of operation
 -------------------
-The messages of a topic are compared one by one, in their order.  What is reported of a topic is
+The messages of a topic are compared one by one, in their order. What is reported of a topic is
 where it differs first, and whether only in *timing*: the same messages, but at other times, or
 with other stamps in them (fields of type ``builtin_interfaces/Time``).
 
 Numbers with a point are equal within a tolerance ``x``: where their difference is at most ``x``,
-or ``x`` times the larger one.  What is not a number equals itself.
+or ``x`` times the larger one. What is not a number equals itself.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from collections.abc import Iterable, Iterator, Sequence
 import math
 from typing import Any, NamedTuple
 
+from mddag_executor.rerun.inputs import RecordedMessage
+from mddag_executor.rerun.message_types import type_name
 from mddag_executor.rerun.outputs import Output
-from mddag_executor.rerun.sources import Recorded
-from mddag_executor.rerun.types import type_name
 from rclpy.serialization import deserialize_message
 
 CONTENT, TIMING, MISSING = 'content', 'timing', 'missing'
@@ -62,7 +62,8 @@ class Difference(NamedTuple):
 
 
 def differences(
-    outputs: Iterable[Output], expected: Iterable[Recorded], start: int, tolerance: float = 0.0,
+    outputs: Iterable[Output], expected: Iterable[RecordedMessage], start: int,
+    tolerance: float = 0.0,
 ) -> list[Difference]:
     """
     Compare what was published with what is expected, topic by topic.
@@ -72,7 +73,7 @@ def differences(
     found: dict[str, list[Output]] = {}
     for output in outputs:
         found.setdefault(output.topic, []).append(output)
-    wanted: dict[str, list[Recorded]] = {}
+    wanted: dict[str, list[RecordedMessage]] = {}
     for message in expected:
         wanted.setdefault(message.topic, []).append(message)
     results = []
@@ -93,7 +94,7 @@ class _Topic:
         self._tolerance = tolerance
 
     def compare(
-        self, found: Sequence[Output], expected: Sequence[Recorded]
+        self, found: Sequence[Output], expected: Sequence[RecordedMessage]
     ) -> Difference | None:
         counts = len(found), len(expected)
         timing: Difference | None = None
@@ -124,7 +125,7 @@ class _Topic:
             self._topic, MISSING, number, time - self._start, 'it', *sides, *counts)
 
     def _fields(
-        self, one: Output, other: Recorded
+        self, one: Output, other: RecordedMessage
     ) -> Iterator[tuple[str, Any, Any, bool]]:
         if one.data == other.data:
             return

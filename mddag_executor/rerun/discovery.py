@@ -3,7 +3,7 @@
 """
 Who is there, for nodes that ask: the nodes of the run, and what is recorded.
 
-The middleware finds out in a time of its own.  Here everybody is known at once.  What is asked for
+The middleware finds out in a time of its own. Here everybody is known at once. What is asked for
 beyond this is answered by the middleware, and a warning says that it is not the same in each run.
 """
 
@@ -15,8 +15,8 @@ from typing import Any
 from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.executor import NodeHolder
 from mddag_executor.rerun.loop import Loop
+from mddag_executor.rerun.message_types import type_name
 from mddag_executor.rerun.messages import Messages
-from mddag_executor.rerun.types import type_name
 from rclpy.node import Node
 
 _OTHERS = (

@@ -63,7 +63,7 @@ class NodeHolder(BareExecutor):
         task, work = make_task(
             self.task_entity, self, self._resume, self._unclaimed, callback, args, kwargs)
         assert self.loop is not None
-        self.loop.soon(partial(self._ready, work))
+        self.loop.call_in_run(partial(self._ready, work))
         return task
 
     def on_callback_ended(self, listener: Callable[[Any, BaseException | None], bool]) -> None:
@@ -77,11 +77,11 @@ class NodeHolder(BareExecutor):
 
     def _resume(self, work: Work) -> None:
         assert self.loop is not None
-        self.loop.soon(partial(self.loop.engine.resume, work))
+        self.loop.call_in_run(partial(self.loop.engine.resume, work))
 
 
 class RerunHost(Host):
-    """Runs programs as strands: their waiting takes virtual time."""
+    """Runs programs as run threads: their waiting takes virtual time."""
 
     def __init__(self, loop: Loop) -> None:
         super().__init__()
@@ -93,7 +93,7 @@ class RerunHost(Host):
 
     def _wait_settled(self, guest: Guest) -> None:
         loop = self._loop
-        loop.wait(lambda: guest.settled or loop.strands.has_waiting(guest.thread), None,
+        loop.wait(lambda: guest.settled or loop.run_threads.has_waiting(guest.thread), None,
                   'for a program to start')
 
     def wait(
@@ -102,7 +102,7 @@ class RerunHost(Host):
     ) -> None:
         """Wait in virtual time for something, the end of the run or the program, or a time."""
         loop = self._loop
-        if loop.strands.mine() is None:
+        if loop.run_threads.current() is None:
             super().wait(changed, until, timeout_s, guest)
             return
         deadline = None

@@ -5,25 +5,25 @@ The run in virtual time: what happens next, and which callback runs.
 
 Theory of operation
 -------------------
-Time jumps from event to event.  At one instant first executions end, workers in ascending order;
+Time jumps from event to event. At one instant first executions end, workers in ascending order;
 then messages arrive, in the order in which they were sent; then come the recorded messages, in
-their order, and the timers that are due; then strands go on whose time is over (``strands``); then
-the core dispatches until it has nothing left to do.  All that this causes at the same instant is
-done before time goes on.
+their order, and the timers that are due; then run threads go on whose time is over (``run
+threads``); then the core dispatches until it has nothing left to do. All that this causes at the
+same instant is done before time goes on.
 
-A callback runs, for real and at once, when the core dispatches it.  In virtual time it takes as
-long as ``times`` says, or as long as it has waited, if that is more.  What it sends is *held*
-until its virtual end, or until it begins to wait, for others may have to answer it.  A message
+A callback runs, for real and at once, when the core dispatches it. In virtual time it takes as
+long as ``times`` says, or as long as it has waited, if that is more. What it sends is *held*
+until its virtual end, or until it begins to wait, for others may have to answer it. A message
 whose recorded transport time is negative left before the end, and does so here, too.
 
 What threads of others send has no virtual time: it is taken as of when it comes, and a warning
 says so.
 
-A recording may have pauses: the recorder was stopped, or the machine's clock set forward.  No
-timer fires in a pause, and what has begun is completed, for ``DRAIN_NS`` at most.  What else would
+A recording may have pauses: the recorder was stopped, or the machine's clock set forward. No
+timer fires in a pause, and what has begun is completed, for ``DRAIN_NS`` at most. What else would
 happen in it happens at its end, a timer once.
 
-The run is over when nothing is left to happen, or at ``end``.  Then, too, no timer fires any more,
+The run is over when nothing is left to happen, or at ``end``. Then, too, no timer fires any more,
 and what has begun is completed.
 """
 
@@ -46,10 +46,10 @@ from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.groups import Refused
 from mddag_executor.executor.jobs import Origin
 from mddag_executor.executor.work import Destroyed, QuickCallback, Work
-from mddag_executor.rerun.computing import Computing
+from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
-from mddag_executor.rerun.strands import Strands
-from mddag_executor.rerun.times import Times
+from mddag_executor.rerun.run_threads import RunThreads
+from mddag_executor.rerun.shared_cpus import SharedCpus
 
 DRAIN_NS = 10_000_000_000
 """What has begun may go on this long after the end of the recording, and in a pause of it."""
@@ -67,7 +67,7 @@ ENDED, ARRIVED, RECORDED, TIMER = range(4)
 
 
 @dataclass
-class Held:
+class Sent:
     """
     Something that an execution has sent.
 
@@ -86,12 +86,12 @@ class Held:
 class Execution:
     """A callback that runs, or has run for real and not ended in virtual time."""
 
-    __slots__ = ('work', 'start', 'held', 'worker', 'thread', 'waits_for', 'origin', 'release')
+    __slots__ = ('work', 'start', 'sent', 'worker', 'thread', 'waits_for', 'origin', 'release')
 
     def __init__(self, work: Work, start: int, release: int) -> None:
         self.work = work
         self.start = start
-        self.held: list[Held] = []
+        self.sent: list[Sent] = []
         self.worker = work.worker
         self.thread = work.worker + 1
         self.waits_for: Any = None
@@ -107,8 +107,8 @@ class Loop:
     :param end: when the recording ends.
     :param pauses: from when to when it has no messages.
     :param refresh: brings up to date which entities there are.
-    :param begin: is called once, in the first strand: it starts the programs; ``over``: at the
-        end, before the strands end that still wait.
+    :param begin: is called once, in the first run thread: it starts the programs; ``over``: at the
+        end, before the run threads end that still wait.
     :ivar now: the virtual time.
     :ivar callbacks: how many callbacks have run.
     :ivar computing: shares CPUs and the interpreter, where these are few.
@@ -117,7 +117,7 @@ class Loop:
     """
 
     def __init__(
-        self, engine: Engine, times: Times, start: int, end: int,
+        self, engine: Engine, times: Durations, start: int, end: int,
         pauses: Sequence[tuple[int, int]], refresh: Callable[[], None],
         begin: Callable[[], None], over: Callable[[], None],
     ) -> None:
@@ -127,9 +127,9 @@ class Loop:
         self._pauses = pauses
         self.callbacks = 0
         self.changed = True
-        self.computing: Computing | None = None
+        self.computing: SharedCpus | None = None
         self.on_ended: Callable[[Any], object] = lambda entity: None
-        self.strands = Strands(self._step, over)
+        self.run_threads = RunThreads(self._step, over)
         self._times = times
         self._refresh = refresh
         self._begin: Callable[[], None] | None = begin
@@ -154,9 +154,9 @@ class Loop:
         place = bisect_left(self._pauses, (time - drain_ns,)) - 1
         return time if place < 0 else max(time, self._pauses[place][1])
 
-    def soon(self, function: Callable[[], None]) -> None:
+    def call_in_run(self, function: Callable[[], None]) -> None:
         """Do something at once, or, where a thread of others calls, as soon as possible."""
-        if self.strands.mine() is not None:
+        if self.run_threads.current() is not None:
             function()
         else:
             self._foreign.append(function)
@@ -168,14 +168,14 @@ class Loop:
     @property
     def current(self) -> Execution | None:
         """Return the execution whose callback runs in the calling thread; None for no callback."""
-        return self._current if self.strands.mine() is not None else None
+        return self._current if self.run_threads.current() is not None else None
 
     def here(self) -> str:
         """Return what runs, for messages."""
         if self._current is not None:
             return self._current.work.entity.name
-        strand = self.strands.owner
-        return 'the run' if strand is None else strand.name
+        run_thread = self.run_threads.owner
+        return 'the run' if run_thread is None else run_thread.name
 
     # --- the steps -------------------------------------------------------------------------------
 
@@ -197,9 +197,9 @@ class Loop:
             _, _, _, function, args = heappop(events)
             function(*args)
             return True
-        deadline = self.strands.next_deadline() if self.strands.waiting else None
+        deadline = self.run_threads.next_deadline() if self.run_threads.waiting else None
         if deadline is not None and deadline <= now:
-            self.strands.expire(now)
+            self.run_threads.expire(now)
             return True
         engine = self.engine
         work = engine.dispatch(0, now)
@@ -217,7 +217,7 @@ class Loop:
 
     def refresh_now(self) -> None:
         """Bring up to date which entities there are, if any may have come or gone."""
-        if self.changed and self.strands.mine() is not None:
+        if self.changed and self.run_threads.current() is not None:
             self.changed = False
             self._refresh()
 
@@ -295,22 +295,22 @@ class Loop:
             self._current = None
         return True
 
-    def _take_early(self, execution: Execution, takes: int) -> list[tuple[int, Held]]:
+    def _take_early(self, execution: Execution, takes: int) -> list[tuple[int, Sent]]:
         """Take from what an execution has sent what left before its end in the recording."""
         origin = execution.origin
         if origin is None or not takes:
             return []
         found, kept = [], []
-        for held in execution.held:
+        for held in execution.sent:
             early = held.early(origin, execution.release)
             if early < 0:
                 found.append((early, held))
             else:
                 kept.append(held)
-        execution.held = kept
+        execution.sent = kept
         return found
 
-    def _leave(self, held: Held, execution: Execution, early: int) -> None:
+    def _leave(self, held: Sent, execution: Execution, early: int) -> None:
         """Let something leave before its execution ends."""
         held.record(execution.thread)
         held.leave(execution.origin, execution.release, self.now - early)
@@ -338,7 +338,7 @@ class Loop:
         work, engine, worker = execution.work, self.engine, execution.worker
         start, waits_for = execution.start, execution.waits_for
         work.entity.busy_ns += now - start
-        held = execution.held
+        held = execution.sent
         for each in held:
             each.record(execution.thread)  # before its callback's end
         if waits_for is None:
@@ -358,19 +358,19 @@ class Loop:
         if waits_for is NEXT_TURN or not hasattr(waits_for, 'add_done_callback'):
             self.at(self.now + POLL_NS, ARRIVED, resume)
         else:
-            waits_for.add_done_callback(QuickCallback(partial(self.soon, resume)))
+            waits_for.add_done_callback(QuickCallback(partial(self.call_in_run, resume)))
 
-    def send(self, held: Held) -> None:
+    def send(self, held: Sent) -> None:
         """Send something: when the callback that runs ends, or else at once."""
         execution = self.current
         if execution is not None:
-            execution.held.append(held)
+            execution.sent.append(held)
         else:
-            self.soon(partial(held.leave, None, 0, self.now))
+            self.call_in_run(partial(held.leave, None, 0, self.now))
 
-    def later(self, function: Callable[[], None]) -> None:
+    def call_at_end(self, function: Callable[[], None]) -> None:
         """Do something when the callback that runs ends, or else at once."""
-        self.send(Held(lambda *_: function()))
+        self.send(Sent(lambda *_: function()))
 
     # --- waiting ---------------------------------------------------------------------------------
 
@@ -385,7 +385,7 @@ class Loop:
         lends: bool = False,
     ) -> bool:
         """
-        Wait in virtual time, in the strand that calls; return whether it came true.
+        Wait in virtual time, in the run thread that calls; return whether it came true.
 
         :param deadline: when not to wait any longer; None: never.
         :param lends: whether its worker may run something else meanwhile.
@@ -394,12 +394,12 @@ class Loop:
             return True
         if deadline is not None:
             if deadline <= self.now:
-                self.looked()
+                self.note_poll()
                 return until is not None and until()
             deadline = self.after_pause(deadline, DRAIN_NS)
         execution = self._current
         if execution is not None:
-            held, execution.held = execution.held, []
+            held, execution.sent = execution.sent, []
             for each in held:
                 each.record(execution.thread)
                 each.leave(execution.origin, execution.release, self.now)
@@ -407,19 +407,19 @@ class Loop:
                 self.engine.lend(execution.work)
                 execution.worker = -1
                 execution.thread = _LENT + next(self._order)
-        strand = self.strands.mine()
-        assert strand is not None
-        strand.execution, self._current = execution, None
+        run_thread = self.run_threads.current()
+        assert run_thread is not None
+        run_thread.execution, self._current = execution, None
         try:
-            return self.strands.wait(until, deadline, place)
+            return self.run_threads.wait(until, deadline, place)
         finally:
-            self._current, strand.execution = strand.execution, None
+            self._current, run_thread.execution = run_thread.execution, None
 
-    def looked(self) -> None:
+    def note_poll(self) -> None:
         """
-        Note that the calling strand has looked at the time, or whether something has come.
+        Note that the calling run thread has looked at the time, or whether something has come.
 
-        A strand that looks all the time waits for time to pass: so time passes.
+        A run thread that looks all the time waits for time to pass: so time passes.
         """
         if self._looked_at != self.now:
             self._looked_at, self._looks = self.now, 0
@@ -431,9 +431,9 @@ class Loop:
     def blocked(self) -> list[str]:
         """Return which callbacks wait for something that has not come."""
         return [
-            f'{strand.execution.work.entity.name}: it still waits ({strand.place})'
-            for strand in self.strands.waiting
-            if strand.execution is not None and strand.deadline is None]
+            f'{run_thread.execution.work.entity.name}: it still waits ({run_thread.place})'
+            for run_thread in self.run_threads.waiting
+            if run_thread.execution is not None and run_thread.deadline is None]
 
 
 def _nothing() -> None:

@@ -6,14 +6,14 @@ Messages from publishers to subscriptions, without a middleware.
 Theory of operation
 -------------------
 ``publish`` serialises the message, so that nothing changes it any more, and hands it to the loop,
-which lets it *leave* later.  Then it is an output of the run, and goes to all subscriptions of its
+which lets it *leave* later. Then it is an output of the run, and goes to all subscriptions of its
 topic whose QoS fits: each gets a message of its own, after the transport time.
 
 A recorded message goes to the subscriptions of its topic at its recorded time, unless a node of
 the run publishes on the topic: then the node's messages count.
 
-Which job does a message belong to?  That of the execution that has sent it.  A recorded one starts
-a job where it is its DAG's source.  Elsewhere its publisher is not here, and it enters the job
+Which job does a message belong to?  That of the execution that has sent it. A recorded one starts
+a job where it is its DAG's source. Elsewhere its publisher is not here, and it enters the job
 that its header's stamp names, or one of its own (see ``executor.other_processes``).
 """
 
@@ -30,11 +30,11 @@ from mddag_executor.executor.jobs import header_stamp, Origin
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.snapshot import alive
 from mddag_executor.executor.work import Work
+from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError
-from mddag_executor.rerun.loop import ARRIVED, Held, Loop
+from mddag_executor.rerun.loop import ARRIVED, Loop, Sent
+from mddag_executor.rerun.message_types import canonical, type_name
 from mddag_executor.rerun.outputs import Outputs
-from mddag_executor.rerun.times import Times
-from mddag_executor.rerun.types import canonical, type_name
 from mddag_executor.trace.groups import PUBLICATION
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
@@ -95,7 +95,7 @@ class Messages:
     """
 
     def __init__(
-        self, loop: Loop, times: Times, outputs: Outputs, task_set: TaskSet,
+        self, loop: Loop, times: Durations, outputs: Outputs, task_set: TaskSet,
         recorder: Recorder | None, warn: Callable[[str], None],
     ) -> None:
         self._loop = loop
@@ -185,14 +185,14 @@ class Messages:
             data = msg
         else:
             raise TypeError(f'Expected {publisher.msg_type}, got {type(msg)}')
-        if self._loop.strands.mine() is None:
+        if self._loop.run_threads.current() is None:
             self._warn(
                 f'{outlet.topic}: a thread publishes on it that is not of the run: when '
                 'that happens depends on the machine')
         current = self._loop.current
         if current is not None:
             current.work.entity.publishes.add(outlet.topic)
-        self._loop.send(Held(
+        self._loop.send(Sent(
             partial(self._leave, outlet, data), partial(self._record, outlet),
             partial(self._earliest, outlet)))
 

@@ -16,7 +16,7 @@ import os
 import struct
 from typing import Any, BinaryIO, NamedTuple
 
-from mddag_executor.rerun.types import definition, type_name
+from mddag_executor.rerun.message_types import definition, type_name
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.trace_file import TraceFile
 

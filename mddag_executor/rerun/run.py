@@ -5,7 +5,7 @@ A rerun: real nodes, a recording, virtual time.
 
 ``rerun`` puts the parts together: what is recorded (``recording``), the engine of live runs, the
 loop that drives it (``loop``), what carries messages (``messages``, ``services``), and what nodes
-see of time (``clocks``, ``timers``).  The nodes are rclpy's own, in a context of their own that
+see of time (``clocks``, ``timers``). The nodes are rclpy's own, in a context of their own that
 discovers nobody: for the middleware they do nothing at all.
 """
 
@@ -39,19 +39,19 @@ from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.actions import Actions
 from mddag_executor.rerun.clocks import VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
-from mddag_executor.rerun.computing import Computing
 from mddag_executor.rerun.discovery import Discovery
+from mddag_executor.rerun.durations import RecordedDurations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.executor import NodeHolder, RerunHost
+from mddag_executor.rerun.inputs import RerunInput
 from mddag_executor.rerun.loop import ENDED, Loop
 from mddag_executor.rerun.messages import Messages
 from mddag_executor.rerun.outputs import Output, Outputs, VirtualTraceWriter
-from mddag_executor.rerun.playing import CLOCK, Playing
+from mddag_executor.rerun.player import CLOCK, Player
+from mddag_executor.rerun.run_threads import Stalled
 from mddag_executor.rerun.services import Services
-from mddag_executor.rerun.sources import Source
-from mddag_executor.rerun.strands import Stuck
+from mddag_executor.rerun.shared_cpus import SharedCpus
 from mddag_executor.rerun.timers import Timers
-from mddag_executor.rerun.times import AsRecorded
 from mddag_executor.text import counted
 from msg_graph import TaskSet
 import rclpy
@@ -140,7 +140,7 @@ class Rerun:
     """
 
     def __init__(
-        self, source: Source, task_set: TaskSet, settings: Settings,
+        self, source: RerunInput, task_set: TaskSet, settings: Settings,
         output: BinaryIO | None = None, trace: str | None = None, keep: bool = True,
     ) -> None:
         self._source = source
@@ -178,13 +178,13 @@ class Rerun:
         clock.loop = self._holder.loop = loop
         self._holders = self._held()
         if settings.cpus is not None or self._holders:
-            python = isinstance(source.times, AsRecorded) and source.times.python
-            loop.computing = Computing(
+            python = isinstance(source.times, RecordedDurations) and source.times.python
+            loop.computing = SharedCpus(
                 self._engine, settings.cpus, python, loop.start, loop.ended)
         self._registry = Registry(task_set, self._engine, self._engine.leave_group)
         self._messages = Messages(
             loop, source.times, self._outputs, task_set, self._recorder, self._warn)
-        self._playing = Playing(loop, self._messages, source.messages)
+        self._player = Player(loop, self._messages, source.messages)
         self._services = Services(loop, self._holder, self._warn)
         self._actions = Actions(
             loop, self._holder, lambda: self._registry.by_id, self._warn)
@@ -233,11 +233,11 @@ class Rerun:
                 self._install()
                 with self._host:
                     self._seed()
-                    loop.strands.run(
+                    loop.run_threads.run(
                         self._settings.patience_s,
                         lambda: (loop.now, loop.callbacks, len(self._host.guests)),
                         lambda: tick(loop.now - loop.start) if tick is not None else None)
-            except Stuck as stuck:
+            except Stalled as stuck:
                 raise self._blocked(stuck) from None
             finally:
                 self._virtual.uninstall()
@@ -275,7 +275,7 @@ class Rerun:
             entity = self._registry.by_id.get(id(guard))
             if entity is not None and guard.callback is not None:
                 work = Work(entity, guard.callback)
-                self._loop.soon(lambda: self._engine.ready(work, self._loop.now))
+                self._loop.call_in_run(lambda: self._engine.ready(work, self._loop.now))
 
         return trigger
 
@@ -305,7 +305,7 @@ class Rerun:
             self._warn(f'{self._source.name}: timers do not fire in '
                        f'{counted(len(self._source.pauses), "pause")} of over a minute without '
                        'any message')
-        self._playing.begin()
+        self._player.begin()
 
     def _none_hosted(self) -> str:
         return (f'{self._task_set.file}: none of its callbacks is in the nodes that run: give the '
@@ -345,7 +345,7 @@ class Rerun:
         if self._recorder is not None:
             self._recorder.entities(nodes, added)
         self._messages.refresh(nodes, registry.subscriptions())
-        self._playing.refresh()
+        self._player.refresh()
 
     # --- the end ---------------------------------------------------------------------------------
 
@@ -356,7 +356,7 @@ class Rerun:
         self._engine.finish(self._loop.now)
         self._host.shut_down()
 
-    def _blocked(self, stuck: Stuck) -> RerunError:
+    def _blocked(self, stuck: Stalled) -> RerunError:
         at = (self._loop.now - self._loop.start) / 1e9
         return RerunError(
             f'{self._loop.here()}: {stuck}, at {at:.6f} s of the run: let it wait with rclpy or '

@@ -4,7 +4,7 @@
 Services between nodes of the run: requests and responses without a middleware.
 
 A request goes to the service of its name when the callback that sends it ends or waits; its
-response goes back when the service's callback ends.  Both are copied, as if they had been sent.
+response goes back when the service's callback ends. Both are copied, as if they had been sent.
 A request to a service that no node of the run offers is never answered, and a warning says so.
 """
 
@@ -77,7 +77,7 @@ class Services:
             pass
         number = next(self._numbers)
         future = new_request(client, number)
-        self._loop.later(partial(self._ask, client, number, copy.deepcopy(request)))
+        self._loop.call_at_end(partial(self._ask, client, number, copy.deepcopy(request)))
         return future
 
     def call(
@@ -114,7 +114,7 @@ class Services:
         """Send a response."""
         if not isinstance(response, service.srv_type.Response):
             raise TypeError()
-        self._loop.later(partial(self._answer, *header, copy.deepcopy(response)))
+        self._loop.call_at_end(partial(self._answer, *header, copy.deepcopy(response)))
 
     def _answer(self, client: Client, number: int, response: Any) -> None:
         try:

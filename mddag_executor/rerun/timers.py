@@ -5,11 +5,11 @@ Timers, whatever their clock, fire at their virtual due times.
 
 Theory of operation
 -------------------
-What rcl knows of a timer's time is not asked for; only whether it is cancelled.  A timer is due a
-period after it was made or reset, and each period after that.  Where a recorded run has jobs of
+What rcl knows of a timer's time is not asked for; only whether it is cancelled. A timer is due a
+period after it was made or reset, and each period after that. Where a recorded run has jobs of
 the timer's DAG, it is due first when the first of these was released, so that it keeps their
 phase.
-After a pause of the recording (see ``loop``) it keeps its phase.  No timer is due any more when
+After a pause of the recording (see ``loop``) it keeps its phase. No timer is due any more when
 the recording ends.
 """
 
@@ -28,7 +28,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.timer import Timer
 
 
-class _Known:
+class _TimerState:
     """What is kept for a timer: when it is due next (-1: never), and was last."""
 
     __slots__ = ('entity', 'due', 'last')
@@ -49,7 +49,7 @@ class Timers:
     def __init__(self, loop: Loop, first_release: Callable[[int], int | None]) -> None:
         self._loop = loop
         self._first_release = first_release
-        self._known: dict[int, _Known] = {}
+        self._known: dict[int, _TimerState] = {}
 
     def install(self, replacements: Replacements) -> None:
         """Have what nodes do with their timers count in virtual time."""
@@ -77,8 +77,8 @@ class Timers:
         for entity in entities:
             known = before.get(id(entity.rclpy))
             if known is None or known.entity.rclpy is not entity.rclpy:
-                known = _Known(entity, now)
-                self._aim(known, self._first_due(entity))
+                known = _TimerState(entity, now)
+                self._schedule(known, self._first_due(entity))
             known.entity = entity
             self._known[id(entity.rclpy)] = known
 
@@ -91,7 +91,7 @@ class Timers:
             return now + period
         return first if first >= now else now + (first - now) % period
 
-    def _aim(self, known: _Known, due: int) -> None:
+    def _schedule(self, known: _TimerState, due: int) -> None:
         """Have a timer fire at a time, unless it is cancelled."""
         try:
             known.due = -1 if known.entity.rclpy.is_canceled() else due
@@ -100,13 +100,13 @@ class Timers:
         if 0 <= known.due < self._loop.end:
             self._loop.at(self._loop.after_pause(due), TIMER, self._fire, known, due)
 
-    def _fire(self, known: _Known, due: int) -> None:
+    def _fire(self, known: _TimerState, due: int) -> None:
         timer, engine, now = known.entity.rclpy, self._loop.engine, self._loop.now
         if known.due != due or self._known.get(id(timer)) is not known:
             return  # it was reset or cancelled meanwhile, or is gone
         try:
             period = _period(timer)
-            self._aim(known, due + ((now - due) // period + 1) * period)
+            self._schedule(known, due + ((now - due) // period + 1) * period)
         except InvalidHandle:
             return
         if known.due < 0:
@@ -129,7 +129,7 @@ class Timers:
         known = self._known.get(id(timer))
         if known is not None:
             known.last = self._loop.now
-            self._aim(known, self._loop.now + _period(timer))
+            self._schedule(known, self._loop.now + _period(timer))
 
     def cancelled(self, timer: Timer) -> None:
         """Note that a timer was cancelled."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mcap.writer import Writer
-from mddag_executor.rerun.types import definition, type_name
+from mddag_executor.rerun.message_types import definition, type_name
 from rclpy.serialization import serialize_message
 
 START = 1_700_000_000_000_000_000

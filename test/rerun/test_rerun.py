@@ -21,9 +21,9 @@ from mddag_executor.rerun import (
     RerunError,
     Result,
 )
+from mddag_executor.rerun.inputs import MessageBag, RerunInput
+from mddag_executor.rerun.message_types import canonical
 from mddag_executor.rerun.run import Rerun, Settings
-from mddag_executor.rerun.sources import Recording, Source
-from mddag_executor.rerun.types import canonical
 from msg_graph import load
 import numpy
 import pytest
@@ -157,9 +157,9 @@ class Early:
 
 @pytest.mark.parametrize('cpus', [None, 2])
 def test_what_was_published_early_leaves_early(bag: str, graph: Path, cpus: int | None) -> None:
-    recording = Recording(bag)
+    recording = MessageBag(bag)
     assert recording.start is not None and recording.end is not None
-    source = Source('bag', recording.start, recording.end, recording, Early())
+    source = RerunInput('bag', recording.start, recording.end, recording, Early())
     result = Rerun(source, load(str(graph)), Settings(workers=2, cpus=cpus)).run(
         lambda: programs([Filter, Sink]))
     assert [time for time, _ in published(result, '/filtered')][:2] == [6, 106]

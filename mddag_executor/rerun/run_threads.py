@@ -5,24 +5,21 @@ Threads of which one runs at a time, in an order that does not depend on the mac
 
 Theory of operation
 -------------------
-A callback that waits (for a service, a rate, a time) needs a thread of its own for as long: others
-run meanwhile, and may end before or after it.  So do a program's ``main`` and the threads that
-nodes start.  All of these are *strands*.  One of them has its *turn*; the others wait for theirs,
-each at a lock of its own, and so the operating system has nothing to choose.
-
-Whoever has the turn either runs code of a node, or drives the run: it does the next thing in
-virtual time (``step``), over and over.  When code of a node waits, its strand gives the turn to
-another thread that drives (an idle one, or a new one).  That gives the turn back as soon as what
-the strand waits for has come true, or its time is over.  A callback that does not wait runs in the
-thread that drives, and no thread is switched.
-
-Threads that do not belong to the run (the middleware's) are no strands: what they call does what
-it always does.
-
-A strand that waits for something else than this (a socket, a lock that another strand has) keeps
-its turn, and virtual time stands still.  The thread that has started the run watches for that:
-where no virtual time passes and no callback ends, a strand that waits for ``patience_s`` is
-*stuck*, and so is one that computes for ``_COMPUTES`` times as long.
+1. A callback that waits (for a service, a rate, a time) needs its own thread meanwhile: other
+   callbacks run, and may end before or after it. So do a program's ``main`` and the threads that
+   nodes start. All of these are *run threads*. One of them has the *turn*. Each of the others
+   waits at its own lock, so the operating system has nothing to choose.
+2. The thread with the turn either runs code of a node, or drives the run: it calls ``step``, which
+   does the next thing in virtual time. When code of a node waits, its thread passes the turn to a
+   driving thread (an idle one, or a new one). That passes the turn back as soon as the condition
+   is true or the deadline has passed. A callback that does not wait runs in the driving thread,
+   without a switch of threads.
+3. Threads that do not belong to the run (the middleware's) are not run threads: the functions that
+   they call do what they always do.
+4. A run thread that waits for something else (a socket, a lock that another run thread has) keeps
+   the turn, and virtual time does not advance. The thread that started the run checks for that: if
+   no virtual time passes and no callback ends, a run thread that waits for ``patience_s`` has
+   *stalled*, and so has one that computes for ``_COMPUTES`` times as long.
 """
 
 from __future__ import annotations
@@ -41,10 +38,10 @@ _LONGEST_LOOK_S = 1.0
 """More time between two looks is that of a process that was stopped."""
 _COMPUTES = 10
 _END_S = 2.0
-"""Strands have this much real time to end when the run is over."""
+"""RunThreads have this much real time to end when the run is over."""
 
 
-class Strand:
+class RunThread:
     """
     A thread of the run, and what it waits for.
 
@@ -73,30 +70,30 @@ class Strand:
         self.ended = False
 
 
-class Stuck(Exception):
-    """A strand in which no virtual time passes."""
+class Stalled(Exception):
+    """A run thread in which no virtual time passes."""
 
-    def __init__(self, strand: Strand, what: str, seconds: float) -> None:
+    def __init__(self, run_thread: RunThread, what: str, seconds: float) -> None:
         super().__init__(
-            f'it has been {what} at {place_of(strand.ident)} for {seconds:g} s')
+            f'it has been {what} at {code_position(run_thread.ident)} for {seconds:g} s')
 
 
-class Strands:
+class RunThreads:
     """
-    The strands of a run.
+    The run threads of a run.
 
     :param step: does the next thing in virtual time; False: the run is over.
-    :param at_end: called then, before the strands end that still wait.
-    :ivar owner: the strand that has the turn.
+    :param at_end: called then, before the run threads end that still wait.
+    :ivar owner: the run thread that has the turn.
     """
 
     def __init__(self, step: Callable[[], bool], at_end: Callable[[], None]) -> None:
         self._step = step
         self._at_end = at_end
-        self.owner: Strand | None = None
-        self._idle: list[Strand] = []
-        self._ready: deque[Strand] = deque()
-        self.waiting: list[Strand] = []
+        self.owner: RunThread | None = None
+        self._idle: list[RunThread] = []
+        self._ready: deque[RunThread] = deque()
+        self.waiting: list[RunThread] = []
         self._here = threading.local()
         self._done = threading.Lock()
         self._done.acquire()
@@ -105,45 +102,45 @@ class Strands:
 
     # --- who has the turn ------------------------------------------------------------------------
 
-    def mine(self) -> Strand | None:
-        """Return the strand that calls, if it has the turn; None for threads of others."""
-        strand: Strand | None = getattr(self._here, 'strand', None)
-        return strand if strand is not None and strand is self.owner else None
+    def current(self) -> RunThread | None:
+        """Return the run thread that calls, if it has the turn; None for threads of others."""
+        run_thread: RunThread | None = getattr(self._here, 'run_thread', None)
+        return run_thread if run_thread is not None and run_thread is self.owner else None
 
     @contextmanager
-    def set_aside(self) -> Iterator[None]:
-        """Let the calling strand wait for something real, of Python's own, while entered."""
-        strand, self._here.strand = self._here.strand, None
+    def left_run(self) -> Iterator[None]:
+        """Let the calling run thread wait for something real, of Python's own, while entered."""
+        run_thread, self._here.run_thread = self._here.run_thread, None
         try:
             yield
         finally:
-            self._here.strand = strand
+            self._here.run_thread = run_thread
 
-    def _give(self, strand: Strand) -> None:
-        self.owner = strand
-        strand.lock.release()
+    def _give(self, run_thread: RunThread) -> None:
+        self.owner = run_thread
+        run_thread.lock.release()
 
     def _pass_on(self) -> None:
         """Give the turn to a thread that drives."""
         if self._idle:
             self._give(self._idle.pop())
             return
-        driver = Strand('driver')
+        driver = RunThread('driver')
         self.owner = driver
         driver.lock.release()
         threading.Thread(
             target=self._run_driver, args=(driver,), daemon=True, name='mddag-rerun').start()
 
-    def _begin(self, strand: Strand) -> None:
-        self._here.strand = strand
-        strand.ident = threading.get_ident()
-        strand.folder = Path(f'/proc/self/task/{threading.get_native_id()}')
-        strand.clock = time.pthread_getcpuclockid(strand.ident)
-        strand.lock.acquire()
+    def _begin(self, run_thread: RunThread) -> None:
+        self._here.run_thread = run_thread
+        run_thread.ident = threading.get_ident()
+        run_thread.folder = Path(f'/proc/self/task/{threading.get_native_id()}')
+        run_thread.clock = time.pthread_getcpuclockid(run_thread.ident)
+        run_thread.lock.acquire()
 
     # --- driving ---------------------------------------------------------------------------------
 
-    def _run_driver(self, me: Strand) -> None:
+    def _run_driver(self, me: RunThread) -> None:
         self._begin(me)
         try:
             self._drive(me)
@@ -160,31 +157,31 @@ class Strands:
                 self.error = self.error or error
             self.over = True
 
-    def _drive(self, me: Strand) -> None:
+    def _drive(self, me: RunThread) -> None:
         while not me.leaves:
-            strand = self._next()
-            if strand is not None:
+            run_thread = self._next()
+            if run_thread is not None:
                 self._idle.append(me)
-                self._give(strand)
+                self._give(run_thread)
                 me.lock.acquire()
             elif self.over:
                 self._finish(me)
             elif not self._step():
                 self._end()
 
-    def _next(self) -> Strand | None:
-        """Return a strand that goes on now."""
+    def _next(self) -> RunThread | None:
+        """Return a run thread that goes on now."""
         if self._ready:
             return self._ready.popleft()
-        for place, strand in enumerate(self.waiting):
-            if self.over or strand.until is not None and strand.until():
+        for place, run_thread in enumerate(self.waiting):
+            if self.over or run_thread.until is not None and run_thread.until():
                 del self.waiting[place]
-                strand.came_true = not self.over
-                return strand
+                run_thread.came_true = not self.over
+                return run_thread
         return None
 
-    def _finish(self, me: Strand) -> None:
-        """Let all threads that drive end: no strand waits any more."""
+    def _finish(self, me: RunThread) -> None:
+        """Let all threads that drive end: no run thread waits any more."""
         me.leaves = True
         for each in self._idle:
             each.leaves = True
@@ -193,59 +190,59 @@ class Strands:
         self.owner = None
         self._done.release()
 
-    # --- what strands do -------------------------------------------------------------------------
+    # --- what run threads do ---------------------------------------------------------------------
 
-    def make(self, name: str) -> Strand:
-        """Make a strand; its thread is to call ``run_as``, and has its turn after the others."""
-        strand = Strand(name)
-        self._ready.append(strand)
-        return strand
+    def make(self, name: str) -> RunThread:
+        """Make a run thread, which has the turn after the others; it must call ``run_as``."""
+        run_thread = RunThread(name)
+        self._ready.append(run_thread)
+        return run_thread
 
-    def run_as(self, strand: Strand, function: Callable[[], Any]) -> None:
-        """Run a function as a strand, in a thread of its own."""
-        self._begin(strand)
+    def run_as(self, run_thread: RunThread, function: Callable[[], Any]) -> None:
+        """Run a function as a run thread, in a thread of its own."""
+        self._begin(run_thread)
         try:
             function()
         finally:
-            self._here.strand = None
-            strand.ended = True
-            if not self.over or self.owner is strand:
+            self._here.run_thread = None
+            run_thread.ended = True
+            if not self.over or self.owner is run_thread:
                 self._pass_on()
 
     def wait(self, until: Callable[[], bool] | None, deadline: int | None, place: str) -> bool:
         """
-        Wait in the calling strand, which has the turn; return whether what it waits for is true.
+        Wait in the calling run thread, which has the turn; return whether ``until`` came true.
 
         :param deadline: the virtual time at which it waits no longer; None: there is none.
         :param place: says what it waits for.
         """
-        strand = self.mine()
-        assert strand is not None
+        run_thread = self.current()
+        assert run_thread is not None
         if until is not None and until():
             return True
         if self.over:
             return False
-        strand.until, strand.deadline, strand.place = until, deadline, place
-        strand.came_true = False
-        self.waiting.append(strand)
+        run_thread.until, run_thread.deadline, run_thread.place = until, deadline, place
+        run_thread.came_true = False
+        self.waiting.append(run_thread)
         self._pass_on()
-        strand.lock.acquire()
-        return strand.came_true
+        run_thread.lock.acquire()
+        return run_thread.came_true
 
     def has_waiting(self, thread: threading.Thread | None) -> bool:
-        """Return whether a thread is a strand that waits."""
+        """Return whether a thread is a run thread that waits."""
         return thread is not None and any(s.ident == thread.ident for s in self.waiting)
 
     def next_deadline(self) -> int | None:
-        """Return the earliest time at which a strand waits no longer."""
+        """Return the earliest time at which a run thread waits no longer."""
         return min((s.deadline for s in self.waiting if s.deadline is not None), default=None)
 
     def expire(self, now: int) -> None:
-        """Let strands go on whose time is over."""
+        """Let run threads go on whose time is over."""
         late = [s for s in self.waiting if s.deadline is not None and s.deadline <= now]
-        for strand in sorted(late, key=lambda s: s.deadline or 0):
-            self.waiting.remove(strand)
-            self._ready.append(strand)
+        for run_thread in sorted(late, key=lambda s: s.deadline or 0):
+            self.waiting.remove(run_thread)
+            self._ready.append(run_thread)
 
     # --- from outside ----------------------------------------------------------------------------
 
@@ -253,16 +250,16 @@ class Strands:
         self, patience_s: float, progress: Callable[[], object], tick: Callable[[], None]
     ) -> None:
         """
-        Run all until the run is over, watched by the calling thread, which is no strand.
+        Run all until the run is over, watched by the calling thread, which is no run_thread.
 
-        :param patience_s: a strand that waits for this long is stuck.
+        :param patience_s: a run thread that waits for this long is stuck.
         :param progress: what it returns changes as long as the run goes on.
         :param tick: called now and then.
-        :raises Stuck: where one is; its thread is left behind.
+        :raises Stalled: where one is; its thread is left behind.
         :raises BaseException: what ended the run.
         """
         self._pass_on()
-        watch = _Watch(self, progress, patience_s)
+        watch = _StallWatch(self, progress, patience_s)
         ending_at = 0.0
         try:
             while not self._done.acquire(timeout=_LOOK_S):
@@ -279,21 +276,21 @@ class Strands:
             raise self.error
 
 
-class _Watch:
+class _StallWatch:
     """
-    Finds out whether virtual time stands still since a strand waits, or computes, for too long.
+    Finds out whether a run thread keeps virtual time from advancing for too long.
 
-    Only the time in which the strand waits counts, or that of its CPU: the machine may be busy.
+    Only the time counts in which the run thread waits, or that of its CPU: the machine may be busy.
     """
 
     def __init__(
-        self, strands: Strands, progress: Callable[[], object], patience_s: float
+        self, run_threads: RunThreads, progress: Callable[[], object], patience_s: float
     ) -> None:
-        self._strands = strands
+        self._strands = run_threads
         self._progress = progress
         self._patience_s = patience_s
         self._seen: object = None
-        self._owner: Strand | None = None
+        self._owner: RunThread | None = None
         self._looked_at = time.monotonic()
         self._cpu_s = self._waited_s = self._computed_s = 0.0
 
@@ -317,9 +314,9 @@ class _Watch:
             if not is_runnable(owner.folder):
                 self._waited_s += max(0.0, passed_s - computed_s)
             if self._waited_s > self._patience_s:
-                raise Stuck(owner, 'blocking', self._patience_s)
+                raise Stalled(owner, 'blocking', self._patience_s)
             if self._computed_s > _COMPUTES * self._patience_s:
-                raise Stuck(owner, 'computing', _COMPUTES * self._patience_s)
+                raise Stalled(owner, 'computing', _COMPUTES * self._patience_s)
 
 
 def is_runnable(folder: Path) -> bool:
@@ -330,7 +327,7 @@ def is_runnable(folder: Path) -> bool:
         return False
 
 
-def place_of(ident: int) -> str:
+def code_position(ident: int) -> str:
     """Return where a thread is: file and line of the innermost code that is no library's."""
     frame = sys._current_frames().get(ident)
     found = ''

@@ -1,16 +1,14 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What a rerun takes from recordings: the messages of a bag, and how long everything takes.
+What a rerun reads from recordings: messages, and how long callbacks and messages take.
 
-A bag is read twice: first for which topics it has and how long it is, then, when the nodes are
-there, for the messages that they need.  These are kept in a temporary file, in memory while they
-are few.
+A bag is read twice: first for its topics and its length, then, when the nodes are there, for the
+messages that they need. These are in a temporary file, which is in memory while they are few.
 """
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Collection, Iterator
 from itertools import pairwise
 import os
@@ -22,8 +20,8 @@ from mddag_executor.errors import UsageError
 from mddag_executor.replay.bags import Bag, is_ordinary
 from mddag_executor.replay.load import LoadBuilder
 from mddag_executor.replay.run import open_recording
+from mddag_executor.rerun.durations import Durations, FixedDurations, RecordedDurations
 from mddag_executor.rerun.errors import RerunError
-from mddag_executor.rerun.times import AsRecorded, SameInEachJob, Times
 from mddag_executor.simulate import draw_execution_times, read_execution_times
 from mddag_executor.trace.channels import Topic
 from msg_graph import TaskSet
@@ -32,7 +30,7 @@ RECORDED, DECLARED = 'recorded', 'declared'
 _IN_MEMORY = 256 << 20
 
 
-class Recorded(NamedTuple):
+class RecordedMessage(NamedTuple):
     """
     A recorded message: when it came, when it was published, its topic with its type.
 
@@ -47,7 +45,7 @@ class Recorded(NamedTuple):
     place: int
 
 
-class Recording:
+class MessageBag:
     """
     A bag.
 
@@ -69,11 +67,8 @@ class Recording:
         self.warnings = list(bag.warnings)
         self.kinds: dict[str, str] = {}
         self._file = tempfile.SpooledTemporaryFile(max_size=_IN_MEMORY, prefix='mddag-')
-        self._times, self._published = array('q'), array('q')
-        self._places, self._sizes = array('q'), array('q')
-        self._topics: list[Topic] = []
         self._loaded: set[str] = set()
-        self._order: list[int] = []
+        self._index: list[_Stored] = []
 
     def close(self) -> None:
         """Let go of the messages."""
@@ -86,7 +81,7 @@ class Recording:
             return False
         self._loaded |= wanted
         Bag(self.path, sorted(wanted), self.name, self._keep)
-        self._order = sorted(range(len(self._times)), key=lambda i: self._times[i])
+        self._index.sort(key=lambda stored: stored.time)
         return True
 
     def _keep(self, topic: Topic, time: int, published: int, data: bytes) -> None:
@@ -97,28 +92,30 @@ class Recording:
         if self.start is None or self.end is None or not self.start <= time <= self.end:
             return  # of damage
         self.kinds[topic.name] = topic.message_type
-        self._times.append(time)
-        self._published.append(published if published >= 0 else time)
-        self._places.append(self._file.seek(0, 2))
-        self._sizes.append(len(data))
-        self._topics.append(topic)
+        self._index.append(_Stored(
+            time, published if published >= 0 else time, topic, self._file.seek(0, 2), len(data)))
         self._file.write(data)
 
-    def messages(self, since: int = 0) -> Iterator[Recorded]:
+    def messages(self, since: int = 0) -> Iterator[RecordedMessage]:
         """Yield what has been loaded, in order of time; of equal times in the order of the bag."""
-        for i in self._order:
-            if self._times[i] >= since:
-                yield self._message(i)
-
-    def _message(self, i: int) -> Recorded:
-        self._file.seek(self._places[i])
-        topic = self._topics[i]
-        return Recorded(
-            self._times[i], self._published[i], topic.name, topic.message_type,
-            self._file.read(self._sizes[i]), i)
+        for time, published, topic, place, size in self._index[:]:
+            if time >= since:
+                self._file.seek(place)
+                yield RecordedMessage(
+                    time, published, topic.name, topic.message_type, self._file.read(size), place)
 
 
-class Source(NamedTuple):
+class _Stored(NamedTuple):
+    """A message in the temporary file: its times, its topic, where it is and how long."""
+
+    time: int
+    published: int
+    topic: Topic
+    place: int
+    size: int
+
+
+class RerunInput(NamedTuple):
     """
     What a run takes from recordings.
 
@@ -129,12 +126,12 @@ class Source(NamedTuple):
     name: str
     start: int
     end: int
-    messages: Recording | None
-    times: Times
+    messages: MessageBag | None
+    times: Durations
 
     def first_release(self, dag: int) -> int | None:
         """Return when the first job of a DAG was released in the recorded run; None: unknown."""
-        return self.times.first_release(dag) if isinstance(self.times, AsRecorded) else None
+        return self.times.first_release(dag) if isinstance(self.times, RecordedDurations) else None
 
     @property
     def pauses(self) -> list[tuple[int, int]]:
@@ -147,9 +144,9 @@ class Source(NamedTuple):
         return frozenset() if self.messages is None else self.messages.topics
 
 
-def open_source(
+def open_input(
     path: str, task_set: TaskSet, times: str | None = None, seed: int = 0, name: str | None = None,
-) -> Source:
+) -> RerunInput:
     """
     Open what a rerun begins with.
 
@@ -169,25 +166,25 @@ def open_source(
             '--times declared, or a trace or a file of execution times')
     run = None if bag else _recorded(path, task_set, name)
     if times == DECLARED:
-        taken: Times = SameInEachJob(draw_execution_times(task_set, seed, undeclared=0))
+        taken: Durations = FixedDurations(draw_execution_times(task_set, seed, undeclared=0))
     elif times == RECORDED and run is not None:
         taken = run.times
     elif os.path.isdir(times) or _begins_as_mcap(times):
         taken = _recorded(times, task_set, times).times
     else:
         with open(times, encoding='utf-8') as file:
-            taken = SameInEachJob(read_execution_times(task_set, file.read(), times))
+            taken = FixedDurations(read_execution_times(task_set, file.read(), times))
     messages = _messages(path, name)
     if messages is not None and messages.start is not None and messages.end is not None:
-        return Source(name, messages.start, messages.end, messages, taken)
+        return RerunInput(name, messages.start, messages.end, messages, taken)
     if run is None:
         raise UsageError(f'{name}: no message is recorded in it: record it with ros2 bag record')
     return run._replace(times=taken)
 
 
-def _messages(path: str, name: str) -> Recording | None:
+def _messages(path: str, name: str) -> MessageBag | None:
     """Return the messages of nodes that a recording has; None where it is a mere trace."""
-    recording = Recording(path, name)
+    recording = MessageBag(path, name)
     if all(topic.startswith('/trace/') for topic in recording.topics):
         recording.close()
         return None
@@ -199,12 +196,13 @@ def _begins_as_mcap(path: str) -> bool:
         return file.read(5) == b'\x89MCAP'
 
 
-def _recorded(path: str, task_set: TaskSet, name: str) -> Source:
+def _recorded(path: str, task_set: TaskSet, name: str) -> RerunInput:
     """Return what a recorded run has: from when to when it was, and its times."""
     run = open_recording(path, task_set, name)
     tables = Tables.build(task_set, max_active_jobs=NEVER)
     head = run.head
     builder = LoadBuilder(run, tables, head.workers, max(0, head.cpus))
     start = run.end if run.start is None else run.start
-    return Source(
-        name, min(start, head.time or start), run.end, None, AsRecorded(tables, builder.build()))
+    return RerunInput(
+        name, min(start, head.time or start), run.end, None,
+        RecordedDurations(tables, builder.build()))

@@ -1,13 +1,14 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The recorded messages arrive at their recorded times.
+Recorded messages arrive at their recorded times.
 
-What nodes subscribe to is loaded from the recording, and what they publish, to be compared.  A
-topic to which a node subscribes later is loaded then, and its messages come from then on.
+The messages of the topics that nodes subscribe to are loaded from the recording, and those of the
+topics that they publish, to be compared. If a node subscribes to another topic later, its messages
+are loaded then and arrive from then on.
 
-Where somebody subscribes to ``/clock``, and it is neither recorded nor published by a node, it
-gives virtual time.
+If a node subscribes to ``/clock``, and it is neither recorded nor published by a node, it gives
+virtual time.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 
 from mddag_executor.rerun.errors import RerunError
+from mddag_executor.rerun.inputs import MessageBag, RecordedMessage
 from mddag_executor.rerun.loop import Loop, RECORDED
+from mddag_executor.rerun.message_types import type_name
 from mddag_executor.rerun.messages import Messages
-from mddag_executor.rerun.sources import Recorded, Recording
-from mddag_executor.rerun.types import type_name
 from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
@@ -28,18 +29,18 @@ CLOCK_EVERY_NS = 10_000_000
 """How often ``/clock`` gives the time."""
 
 
-class Playing:
+class Player:
     """
     Delivers what is recorded.
 
     :param recording: None: there are no messages.
     """
 
-    def __init__(self, loop: Loop, messages: Messages, recording: Recording | None) -> None:
+    def __init__(self, loop: Loop, messages: Messages, recording: MessageBag | None) -> None:
         self._loop = loop
         self._messages = messages
         self._recording = recording
-        self._playing: Iterator[Recorded] | None = None
+        self._player: Iterator[RecordedMessage] | None = None
         # which messages of this instant have been delivered
         self._instant = -1
         self._delivered: set[int] = set()
@@ -60,7 +61,7 @@ class Playing:
                 CLOCK not in self._topics and CLOCK not in self._messages.offered):
             self._clocked = True
             self._publish_time()
-        if self._playing is not None and self._load():
+        if self._player is not None and self._load():
             self._play()
 
     def _load(self) -> bool:
@@ -81,16 +82,16 @@ class Playing:
 
     def _play(self) -> None:
         if self._recording is not None:
-            self._playing = self._recording.messages(self._loop.now)
-            self._next(self._playing)
+            self._player = self._recording.messages(self._loop.now)
+            self._next(self._player)
 
-    def _next(self, playing: Iterator[Recorded]) -> None:
+    def _next(self, playing: Iterator[RecordedMessage]) -> None:
         message = next(playing, None)
         if message is not None:
             self._loop.at(message.time, RECORDED, self._deliver, playing, message)
 
-    def _deliver(self, playing: Iterator[Recorded], message: Recorded) -> None:
-        if playing is not self._playing:
+    def _deliver(self, playing: Iterator[RecordedMessage], message: RecordedMessage) -> None:
+        if playing is not self._player:
             return  # it has begun anew, with more topics
         if self._instant != message.time:
             self._instant = message.time

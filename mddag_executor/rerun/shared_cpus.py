@@ -3,8 +3,9 @@
 """
 When executions end that share CPUs and the interpreter.
 
-The machine is the simulator's (``simulate.machine``): it says which one stands still.  What an
-execution has sent before its end leaves when it is as far as it was then in the recording.
+The machine is the simulator's (``simulate.machine``): it decides which execution pauses. A message
+that an execution sent before its end leaves when the execution is as far as it was in the
+recording.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from mddag_executor.executor.work import Work
 from mddag_executor.simulate.machine import begins, new_machine, NEXT_TIME, settle, share
 
 
-class Computing:
+class SharedCpus:
     """
     What runs on workers, and how far it is.
 

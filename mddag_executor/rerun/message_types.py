@@ -1,14 +1,14 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What a message type looks like: its definition for a bag, and its bytes without chance in them.
+Message types: their definitions for a bag, and serialised messages without random bytes.
 
 Theory of operation
 -------------------
-The middleware leaves what lies between two fields, to align the second one, and what follows the
-last one, as it was in memory.  So equal messages have unequal bytes.  ``canonical`` walks through
-a message (CDR, little endian) and sets these bytes to zero.  How to walk is found out once for
-each type, from what its Python class says of its fields.
+The middleware does not initialise the bytes between two fields that align the second one, nor
+those after the last field. So equal messages have unequal bytes. ``canonical`` walks through a
+message (CDR, little endian) and sets these bytes to zero. The walk of a type is made once, from
+the fields of its Python class.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def type_name(kind: Any) -> str:
 
 def canonical(data: bytes, kind: Any) -> bytes:
     """Return a serialised message with nothing in it that is not of its fields."""
-    if data[1:2] != b'\x01':  # big endian: of somebody who serialised it himself
+    if data[1:2] != b'\x01':  # big endian: not serialised by rclpy
         return data
     filled = bytearray(data)
     end = _walk_of(kind)(filled, HEAD)
@@ -58,10 +58,7 @@ def canonical(data: bytes, kind: Any) -> bytes:
 
 @cache
 def _walk_of(kind: Any) -> Walk:
-    walks = [_walk(slot) for slot in kind.SLOT_TYPES] or [_Numbers(1, 1)]
-    walks = _merged(walks)
-    if len(walks) == 1:
-        return walks[0]
+    walks = [_walk(slot) for slot in kind.SLOT_TYPES] or [_numbers_of(1, 1)]
 
     def walk(data: bytearray, at: int) -> int:
         for each in walks:
@@ -71,29 +68,12 @@ def _walk_of(kind: Any) -> Walk:
     return walk
 
 
-class _Numbers:
-    """Walks over ``count`` numbers of one width."""
+def _numbers_of(width: int, count: int) -> Walk:
+    """Return the walk over so many numbers of one width."""
+    def walk(data: bytearray, at: int) -> int:
+        return _align(data, at, width) + width * count
 
-    def __init__(self, width: int, count: int) -> None:
-        self.width = width
-        self.count = count
-
-    def __call__(self, data: bytearray, at: int) -> int:
-        start = _align(data, at, self.width)
-        return start + self.width * self.count
-
-
-def _merged(walks: list[Walk]) -> list[Walk]:
-    """Return the same with numbers of one width that follow one another as one."""
-    found: list[Walk] = []
-    for walk in walks:
-        last = found[-1] if found else None
-        if (isinstance(walk, _Numbers) and isinstance(last, _Numbers)
-                and walk.width == last.width):
-            found[-1] = _Numbers(walk.width, walk.count + last.count)
-        else:
-            found.append(walk)
-    return found
+    return walk
 
 
 def _align(data: bytearray, at: int, width: int) -> int:
@@ -105,7 +85,7 @@ def _align(data: bytearray, at: int, width: int) -> int:
 
 def _walk(slot: Any) -> Walk:
     if isinstance(slot, BasicType):
-        return _Numbers(_WIDTHS[slot.typename], 1)
+        return _numbers_of(_WIDTHS[slot.typename], 1)
     if isinstance(slot, (AbstractString, AbstractWString)):
         return _string(4 if isinstance(slot, AbstractWString) else 1)
     if isinstance(slot, NamespacedType):
@@ -114,7 +94,7 @@ def _walk(slot: Any) -> Walk:
     inner = slot.value_type
     if isinstance(slot, Array):
         if isinstance(inner, BasicType):
-            return _Numbers(_WIDTHS[inner.typename], slot.size)
+            return _numbers_of(_WIDTHS[inner.typename], slot.size)
         return _repeated(_walk(inner), slot.size)
     if isinstance(inner, BasicType):
         return _numbers(_WIDTHS[inner.typename])

@@ -5,14 +5,14 @@ How long callbacks and messages take in virtual time.
 
 Theory of operation
 -------------------
-*Declared* (or drawn, or from a file of execution times): each vertex takes the same time in every
-job, its messages leave at its end and arrive at once.
+*Fixed* (declared, drawn, or from a file of execution times): each vertex takes the same time in
+every job. Its messages leave at its end and arrive at once.
 
-*Recorded*: the k-th job of the rerun is not always the k-th of the recording.  So a job takes the
-times of that recorded job of its DAG whose release is nearest, if it is no further away than half
-a period.  Where there is none, each vertex takes the median of its recorded times.  The time from
-a vertex's end to the arrival of its message is the recorded one, too; it is negative where the
-callback published before its end.
+*Recorded*: the k-th job of the rerun is not always the k-th of the recording. A job takes the
+times of the recorded job of its DAG with the nearest release, at most half a period away. If there
+is none, each vertex takes the median of its recorded times. The time from a vertex's end to the
+arrival of its message is the recorded one, too; it is negative if the callback published before
+its end.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mddag_executor.replay.load import RecordedLoad
 from mddag_executor.simulate.load import as_lists, edge_numbers, needs_python
 
 
-class SameInEachJob:
+class FixedDurations:
     """
     The same time in every job; all times are in ns, vertices are global.
 
@@ -55,7 +55,7 @@ class SameInEachJob:
         return False
 
 
-class AsRecorded:
+class RecordedDurations:
     """The times of the job of a recording that was released at about the same time."""
 
     at_once = False
@@ -138,4 +138,4 @@ class AsRecorded:
         return job if abs(at - release) * 2 <= self._tables.period[dag] else -1
 
 
-Times = SameInEachJob | AsRecorded
+Durations = FixedDurations | RecordedDurations
