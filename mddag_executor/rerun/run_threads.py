@@ -280,13 +280,14 @@ class _StallWatch:
     """
     Finds out whether a run thread keeps virtual time from advancing for too long.
 
-    Only the time counts in which the run thread waits, or that of its CPU: the machine may be busy.
+    Only the time counts in which the run thread waits, or that of its CPU: the machine may be
+    busy.
     """
 
     def __init__(
         self, run_threads: RunThreads, progress: Callable[[], object], patience_s: float
     ) -> None:
-        self._strands = run_threads
+        self._run_threads = run_threads
         self._progress = progress
         self._patience_s = patience_s
         self._seen: object = None
@@ -295,7 +296,7 @@ class _StallWatch:
         self._cpu_s = self._waited_s = self._computed_s = 0.0
 
     def look(self) -> None:
-        before, owner = self._owner, self._strands.owner
+        before, owner = self._owner, self._run_threads.owner
         now = time.monotonic()
         passed_s, self._looked_at = min(now - self._looked_at, _LONGEST_LOOK_S), now
         self._owner = None
