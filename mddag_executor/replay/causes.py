@@ -9,7 +9,8 @@ The time of a job, from its release to its completion at the sink (or until it w
 along its critical chain (see ``chains``).  Each piece of it is split:
 
 * what overlaps a recorded stop of the machine is the *machine*'s;
-* before the source is ready the job is *released late*;
+* before the source is ready the job is *released late*, but as far as all workers were busy, so
+  that none noticed the timer or the message, it *waited*;
 * a callback that is ready waits: for its *group*, as far as another of the group ran; else it
   *waited* as far as all workers were busy; else, with a free worker, for the *interpreter* as far
   as something else ran; and where nothing ran though a worker was free, for the *machine*;
@@ -175,12 +176,17 @@ def find(
     times[:, MACHINE] = stood
     for kind, part in ((_LAG, RELEASED_LATE), (_TRANSPORT, TRANSPORT), (_BEFORE, UNKNOWN)):
         times[kinds == kind, part] = left[kinds == kind]
+    lags = kinds == _LAG
+    if pool.knows_workers:
+        times[lags, WAITED] = np.minimum(
+            left[lags], pool.full.within(spans['begin'][lags], spans['end'][lags]))
+        times[lags, RELEASED_LATE] -= times[lags, WAITED]
     runs = kinds == _RUN
     normal = usual.runs[spans['vertex']]
     usually = np.where(left <= normal + (normal >> _ABOUT_BITS), left, normal)
     times[runs, RAN_USUALLY] = usually[runs]
     times[runs] += _ran_long(spans[runs], (left - usually)[runs], usual, pool)
-    _pending(rows, spans, times, left, never, pool)
+    _pending(rows, spans, times, left, never, pool, is_source)
     waits = kinds == _WAIT
     if waits.any():
         times[waits] += _waits(spans[waits], left[waits], pool)
@@ -272,9 +278,13 @@ def _waits(spans: Table, left: Ints, pool: Pool) -> Ints:
 
 
 def _pending(
-    rows: Table, spans: Table, times: Ints, left: Ints, never: Never, pool: Pool
+    rows: Table, spans: Table, times: Ints, left: Ints, never: Never, pool: Pool, is_source: Any
 ) -> None:
-    """Find out what became of the callbacks that never ran; they wait or are lost."""
+    """
+    Find out what became of the callbacks that never ran; they wait or are lost.
+
+    A timer's release that was skipped waited if all workers were busy for most of that time.
+    """
     open_ones = np.flatnonzero(spans['kind'] == _PENDING).tolist()
     started = never.started if open_ones else never.started[:0]
     ready = dict(zip(zip(started['vertex'].tolist(), started['job'].tolist()),
@@ -283,7 +293,8 @@ def _pending(
         miss, vertex, _, begin, end, _ = spans[i].item()
         key = vertex, int(rows['job'][miss])
         waits = never.dropped.get(key) == 'aborted' or ready.get(key, end) < end
-        if not waits and key not in never.dropped and rows['kind'][miss] != SINK_EXPIRED:
+        if not waits and key not in never.dropped and (
+                rows['kind'][miss] != SINK_EXPIRED or is_source[vertex]):
             full, = pool.full.within(*(np.array([each]) for each in (begin, end)))
             waits = pool.knows_workers and 2 * int(full) >= end - begin
         if waits:

@@ -406,3 +406,25 @@ def test_the_mean_of_a_cause_is_that_of_its_parts(
     row = next(line for line in capsys.readouterr().out.splitlines()
                if line.split()[:3] == ['x:late', 'ran', 'long'])
     assert f' {format_ns(mean, 3)} ' in row
+
+
+@pytest.mark.parametrize(('workers', 'cause'), [(1, 'waited'), (2, 'released late')])
+def test_a_timer_that_no_worker_could_notice_has_waited(
+    workers: int, cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Something undeclared runs while the timer becomes due, at every second release."""
+    path = tmp_path / 'run.mcap'
+    declaration = LENT.replace('50ms', '15ms')
+    with begin_trace(path, declaration, workers=workers) as file:
+        for job in range(0, 20, 2):
+            due = START_TIME + (job + 1) * 1_000 * MS
+            for late, number in ((20, job), (0, job + 1)):
+                release = due + number % 2 * 1_000 * MS
+                file.add('job_release', release + late * MS, 1, 1, 1, number, release)
+                if late:
+                    add_execution(file, release - MS, release + late * MS, -1, -1, -1, address=6)
+                start = release + late * MS
+                add_execution(file, start, start + MS, 1, 0, number, address=8)
+        end_trace(file, START_TIME + 21_000 * MS)
+    result = explain(capsys, str(path))
+    assert result['causes'][cause] == result['missed'] == 10
