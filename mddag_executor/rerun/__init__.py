@@ -109,7 +109,7 @@ def compare(
     try:
         recording.load(recording.topics)
         return differences(
-            result.outputs, recording.messages(), result.start_ns, tolerance)
+            result.outputs, recording.messages(recording.topics), result.start_ns, tolerance)
     finally:
         recording.close()
 

@@ -31,18 +31,13 @@ _IN_MEMORY = 256 << 20
 
 
 class RecordedMessage(NamedTuple):
-    """
-    A recorded message: when it came, when it was published, its topic with its type.
-
-    :ivar place: identifies it.
-    """
+    """A recorded message: when it came, when it was published, its topic with its type."""
 
     time: int
     published: int
     topic: str
     kind: str
     data: bytes
-    place: int
 
 
 class MessageBag:
@@ -74,15 +69,15 @@ class MessageBag:
         """Let go of the messages."""
         self._file.close()
 
-    def load(self, topics: Collection[str]) -> bool:
-        """Load the messages of topics, unless that was done; return whether there were more."""
+    def load(self, topics: Collection[str]) -> frozenset[str]:
+        """Load the messages of topics, unless that was done; return the topics that are new."""
         wanted = self.topics.intersection(topics) - self._loaded
         if not wanted:
-            return False
+            return wanted
         self._loaded |= wanted
         Bag(self.path, sorted(wanted), self.name, self._keep)
         self._index.sort(key=lambda stored: stored.time)
-        return True
+        return wanted
 
     def _keep(self, topic: Topic, time: int, published: int, data: bytes) -> None:
         if topic.encoding != 'cdr':
@@ -96,13 +91,13 @@ class MessageBag:
             time, published if published >= 0 else time, topic, self._file.seek(0, 2), len(data)))
         self._file.write(data)
 
-    def messages(self, since: int = 0) -> Iterator[RecordedMessage]:
-        """Yield what has been loaded, in order of time; of equal times in the order of the bag."""
+    def messages(self, topics: Collection[str], since: int = 0) -> Iterator[RecordedMessage]:
+        """Yield what is loaded of topics, in order of time; at equal times in the bag's order."""
         for time, published, topic, place, size in self._index[:]:
-            if time >= since:
+            if time >= since and topic.name in topics:
                 self._file.seek(place)
                 yield RecordedMessage(
-                    time, published, topic.name, topic.message_type, self._file.read(size), place)
+                    time, published, topic.name, topic.message_type, self._file.read(size))
 
 
 class _Stored(NamedTuple):

@@ -40,11 +40,7 @@ class Player:
         self._loop = loop
         self._messages = messages
         self._recording = recording
-        self._player: Iterator[RecordedMessage] | None = None
-        # which messages of this instant have been delivered
-        self._instant = -1
-        self._delivered: set[int] = set()
-        self._clocked = False
+        self._has_begun = self._gives_clock = False
 
     @property
     def _topics(self) -> Collection[str]:
@@ -52,54 +48,43 @@ class Player:
 
     def begin(self) -> None:
         """Deliver from now on."""
+        self._has_begun = True
         self._load()
-        self._play()
 
     def refresh(self) -> None:
         """Note which topics nodes subscribe to now."""
-        if not self._clocked and self._messages.inlets(CLOCK) and (
+        if not self._gives_clock and self._messages.inlets(CLOCK) and (
                 CLOCK not in self._topics and CLOCK not in self._messages.offered):
-            self._clocked = True
+            self._gives_clock = True
             self._publish_time()
-        if self._player is not None and self._load():
-            self._play()
+        if self._has_begun:
+            self._load()
 
-    def _load(self) -> bool:
-        """Load what nodes need; return whether that is more than before."""
+    def _load(self) -> None:
+        """Load the messages that nodes need by now, and begin to deliver them."""
         recording = self._recording
         if recording is None:
-            return False
+            return
         topics = self._messages.topics()
-        more = recording.load({*topics, *self._messages.offered})
+        new = recording.load({*topics, *self._messages.offered})
         for topic, kind in topics.items():
             recorded = recording.kinds.get(topic)
             if recorded is not None and topic not in self._messages.offered and (
                     recorded != type_name(kind)):
                 raise RerunError(
                     f'{recording.name}: {topic} was recorded as {recorded}, and the node '
-                    f'subscribes to it as {type_name(kind)}: record it anew, or correct the node')
-        return more
+                    f'subscribes to it as {type_name(kind)}: record it again, or correct the node')
+        if new:
+            self._schedule_next(recording.messages(new, self._loop.now))
 
-    def _play(self) -> None:
-        if self._recording is not None:
-            self._player = self._recording.messages(self._loop.now)
-            self._next(self._player)
-
-    def _next(self, playing: Iterator[RecordedMessage]) -> None:
-        message = next(playing, None)
+    def _schedule_next(self, coming: Iterator[RecordedMessage]) -> None:
+        message = next(coming, None)
         if message is not None:
-            self._loop.at(message.time, RECORDED, self._deliver, playing, message)
+            self._loop.at(message.time, RECORDED, self._deliver, coming, message)
 
-    def _deliver(self, playing: Iterator[RecordedMessage], message: RecordedMessage) -> None:
-        if playing is not self._player:
-            return  # it has begun anew, with more topics
-        if self._instant != message.time:
-            self._instant = message.time
-            self._delivered.clear()
-        if message.place not in self._delivered:
-            self._delivered.add(message.place)
-            self._messages.recorded(message.topic, message.data, message.published)
-        self._next(playing)
+    def _deliver(self, coming: Iterator[RecordedMessage], message: RecordedMessage) -> None:
+        self._messages.recorded(message.topic, message.data, message.published)
+        self._schedule_next(coming)
 
     def _publish_time(self) -> None:
         now = self._loop.now

@@ -382,7 +382,7 @@ class Rerun:
             both = set(recording.topics & self._outputs.counts.keys() - _OF_ALL_NODES)
             recorded = differences(
                 [each for each in self._outputs.messages if each.topic in both],
-                (each for each in recording.messages() if each.topic in both), loop.start)
+                recording.messages(both), loop.start)
             recording.close()
             self.warnings = [*recording.warnings, *self.warnings]
         verdicts = {

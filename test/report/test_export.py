@@ -31,30 +31,6 @@ def read_csv(data: bytes) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(data.decode(), newline='')))
 
 
-def test_executions_as_csv(tmp_path: Path) -> None:
-    rows = read_csv(exported(runs.by_hand(tmp_path / 'run.mcap'), 'csv'))
-    assert len(rows) == 7
-    start = runs.START
-    assert rows[5] == {
-        'dag': '/driver', 'job': '2', 'vertex': '/filter:run', 'worker': '1', 'first': 'true',
-        'start_s': '0.027000000', 'release_ns': str(start + 30 * MS),
-        'ready_ns': str(start + 36 * MS), 'start_ns': str(start + 37 * MS),
-        'end_ns': str(start + 40 * MS), 'waiting_ns': str(MS), 'executing_ns': str(3 * MS),
-        'reference_deadline_ns': str(start + 38 * MS), 'slack_ns': str(-2 * MS)}
-    assert rows[6]['vertex'] == 'extra'
-    assert [rows[6][key] for key in ('dag', 'job', 'release_ns', 'slack_ns')] == [''] * 4
-
-
-def test_jobs_as_csv(tmp_path: Path) -> None:
-    rows = read_csv(exported(runs.by_hand(tmp_path / 'run.mcap'), 'csv', jobs=True))
-    assert [row['verdict'] for row in rows] == ['in_time', 'in_time', 'late']
-    assert rows[2] == {
-        'dag': '/driver', 'job': '2', 'sink': '/filter:run', 'release_s': '0.020000000',
-        'release_ns': str(runs.START + 30 * MS), 'deadline_ns': str(runs.START + 38 * MS),
-        'completed_ns': str(runs.START + 40 * MS), 'response_ns': str(10 * MS),
-        'slack_ns': str(-2 * MS), 'verdict': 'late'}
-
-
 def test_rows_come_in_the_order_of_their_releases(tmp_path: Path) -> None:
     task_set = runs.autoware()
     load, run = runs.simulated(task_set, ms=500, utilisation=1.2, preemptive=True)

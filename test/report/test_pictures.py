@@ -1,6 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of task sets: what is in them, and that no name can break out of its label."""
+"""
+Pictures of task sets: what is in them, and that no name can break out of its label.
+
+``test_golden`` has the DOT and Mermaid texts of ``GRAPH``.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.report import dot, mermaid
 from mddag_executor.report.dot import to_dot
-from mddag_executor.report.mermaid import to_mermaid
 from mddag_executor.report.picture import Picture, picture
 from mddag_executor.report.text import printable
 import msg_graph
@@ -78,20 +81,6 @@ def test_a_long_legend_keeps_its_ends() -> None:
     assert (len(legend), legend[0][1], legend[-1][1]) == (12, '1 ms', '40 ms')
 
 
-def test_dot() -> None:
-    text = to_dot(drawn())
-    assert re.search(r'"d0v0" \[label="/n\\nt\\ntimer 10 ms\\n", shape=ellipse', text)
-    assert re.search(
-        r'"d0v3" \[label="/m\\nz\\nsync of 2\\ndeadline 50 ms\\n", shape=hexagon', text)
-    assert re.search(r'"d0v3" .*peripheries=2', text)
-    assert not re.search(r'"d0v1" .*peripheries', text)
-    assert '"d0v1" -> "d0v3" [tooltip="/b", label="/b\\n"]' in text
-    dotted = [line.split(' [')[0].strip() for line in text.splitlines() if 'dotted,' in line]
-    assert dotted == ['"d1v0q0" -> "d1v0"', '"d0v2q0" -> "d0v2"']
-    assert '"d1v0q0" [label="/c\\nfrom n:y\\n"' in text
-    assert '"d0v2q0" [label="member variable\\nfrom n:x\\n"' in text
-
-
 def laid_out(text: str) -> dict[str, list[float]]:
     """Return where Graphviz puts each DAG: left, low, right and high."""
     done = subprocess.run(['dot', '-Tjson0'], input=text, text=True, check=True,
@@ -128,17 +117,6 @@ def test_many_small_dags_are_in_a_grid() -> None:
         assert row == sorted(row)
     for above, below in zip(rows, rows[1:]):
         assert min(frame[1] for frame in above) > max(frame[3] for frame in below)
-
-
-def test_mermaid() -> None:
-    lines = [line.strip() for line in to_mermaid(drawn()).splitlines()]
-    assert lines[0] == 'flowchart LR'
-    assert 'd0v0(["/n<br>t<br>timer 10 ms"])' in lines
-    assert 'd0v3{{"/m<br>z<br>sync of 2<br>deadline 50 ms"}}' in lines
-    assert 'd1v0[/"/m<br>s<br>service /serve<br>deadline 1 s"/]' in lines
-    assert 'd0v1 -->|"/b"| d0v3' in lines and 'd0v2 -.-> d1v0' in lines
-    assert 'class d0v3,d0v4,d1v0 sink' in lines
-    assert lines.count('end') == sum(line.startswith('subgraph') for line in lines) == 2
 
 
 @given(st.one_of(st.sampled_from(HOSTILE), st.text()))
