@@ -3,8 +3,8 @@
 """
 Arguments of the verbs: their kinds, and the options that several verbs have.
 
-An option that means the same in two verbs is declared here, so that its name, its default and its
-help are the same, too. Like the verbs' modules this one imports nothing heavy.
+An option of several verbs is declared here, so that its name, its default and its help are the
+same. Like the verbs' modules this one imports nothing heavy.
 """
 
 from __future__ import annotations
@@ -32,53 +32,35 @@ def duration(text: str) -> int:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def positive_int(text: str) -> int:
-    """Return a whole number from 1 up."""
-    return _parsed(text, int, lambda value: value >= 1, 'whole number from 1 up')
+def _number(
+    kind: Callable[[str], T], fits: Callable[[T], bool], what: str
+) -> Callable[[str], T]:
+    """Return the kind of argument that is a number which fits."""
+    def parse(text: str) -> T:
+        try:
+            value = kind(text)
+            if fits(value):
+                return value
+        except ValueError:
+            pass
+        raise argparse.ArgumentTypeError(f'{text!r} is not {what}')
+
+    return parse
 
 
 def workers(text: str) -> int:
     """Return a number of workers."""
     from msg_graph.model import MOST_WORKERS
-    return _parsed(text, int, lambda value: 1 <= value <= MOST_WORKERS,
-                   f'whole number from 1 to {MOST_WORKERS}')
+    return _number(int, lambda value: 1 <= value <= MOST_WORKERS,
+                   f'an integer from 1 to {MOST_WORKERS}')(text)
 
 
-def seed(text: str) -> int:
-    """Return a whole number from 0 to 2**64 - 1."""
-    return _parsed(
-        text, int, lambda value: 0 <= value < 2 ** 64, 'whole number from 0 to 2**64 - 1')
-
-
-def number(text: str) -> float:
-    """Return a finite number."""
-    return _parsed(text, float, math.isfinite, 'number')
-
-
-def positive_float(text: str) -> float:
-    """Return a finite number above zero."""
-    return _parsed(
-        text, float, lambda value: value > 0 and math.isfinite(value), 'number above zero')
-
-
-def not_negative(text: str) -> float:
-    """Return a finite number from 0 up."""
-    return _parsed(text, float, lambda value: 0 <= value < math.inf, 'number from 0 up')
-
-
-def ratio(text: str) -> float:
-    """Return a number from 0 to 1."""
-    return _parsed(text, float, lambda value: 0 <= value <= 1, 'number from 0 to 1')
-
-
-def _parsed(text: str, kind: Callable[[str], T], fits: Callable[[T], bool], what: str) -> T:
-    try:
-        value = kind(text)
-        if fits(value):
-            return value
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f'{text!r} is no {what}')
+positive_int = _number(int, lambda value: value >= 1, 'an integer from 1 up')
+seed = _number(int, lambda value: 0 <= value < 2 ** 64, 'an integer from 0 to 2**64 - 1')
+number = _number(float, math.isfinite, 'a number')
+positive_float = _number(float, lambda value: 0 < value < math.inf, 'a number above zero')
+not_negative = _number(float, lambda value: 0 <= value < math.inf, 'a number from 0 up')
+ratio = _number(float, lambda value: 0 <= value <= 1, 'a number from 0 to 1')
 
 
 def or_zero(kind: Callable[[str], int]) -> Callable[[str], int]:
@@ -107,7 +89,7 @@ def _offset(text: str) -> tuple[str, int]:
     import msg_graph
     name, _, time = text.rpartition('=')
     if not name:
-        raise argparse.ArgumentTypeError(f'{text!r} is not NAME=TIME, as control=2.5ms')
+        raise argparse.ArgumentTypeError(f'{text!r} is not NAME=TIME, such as control=2.5ms')
     try:
         ahead = msg_graph.parse_duration(
             time.removeprefix('-'), minimum_ns=0, maximum_ns=_MOST_OFFSET)

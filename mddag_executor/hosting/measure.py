@@ -96,7 +96,7 @@ class ExecutionPlan:
         if utilisation is not None:
             if not (utilisation > 0 and math.isfinite(utilisation)):
                 raise PlanError(
-                    f'utilisation {utilisation}: this is no number above zero: give one as 0.6')
+                    f'utilisation {utilisation}: this is not a number above zero: give one as 0.6')
             before = normalised(task_set, drawn, workers)
             if before == 0:
                 raise PlanError(

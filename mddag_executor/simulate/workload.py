@@ -119,11 +119,12 @@ def scale_execution_times(
     """
     Return the execution times scaled by one factor to a normalised utilisation, ns.
 
-    :raises SimulationError: when the target is no number above zero, or there is nothing to scale.
+    :raises SimulationError: the target is not a number above zero, or there is nothing to scale.
     """
     now = utilisation(task_set, times, workers)
     if not (target > 0 and math.isfinite(target)):
-        raise SimulationError(f'utilisation {target}: no number above zero: give one as 0.6')
+        raise SimulationError(
+            f'utilisation {target}: it is not a number above zero: give one, as 0.6')
     if now == 0:
         raise SimulationError('utilisation: all execution times are 0: give times to scale')
     factor = target / now

@@ -126,7 +126,7 @@ def test_the_demo_draw_is_feasible(autoware: TaskSet) -> None:
 
 @pytest.mark.parametrize('utilisation', [0.0, -1.0, math.nan, math.inf])
 def test_an_absurd_utilisation_is_refused(autoware: TaskSet, utilisation: float) -> None:
-    with pytest.raises(PlanError, match='no number above zero'):
+    with pytest.raises(PlanError, match='not a number above zero'):
         ExecutionPlan(autoware, 0, utilisation)
 
 

@@ -340,9 +340,9 @@ def test_a_run_in_which_nothing_was_due_is_no_better(
 
 
 @pytest.mark.parametrize(('options', 'says'), [
-    (['--tolerate-ratio', '1.5', '--fail-on-miss'], "'1.5' is no number from 0 to 1"),
-    (['--tolerate-ratio', 'nan', '--fail-on-miss'], "'nan' is no number from 0 to 1"),
-    (['--tolerate-burst', '-1', '--fail-on-miss'], "'-1' is no whole number from 1 up"),
+    (['--tolerate-ratio', '1.5', '--fail-on-miss'], "'1.5' is not a number from 0 to 1"),
+    (['--tolerate-ratio', 'nan', '--fail-on-miss'], "'nan' is not a number from 0 to 1"),
+    (['--tolerate-burst', '-1', '--fail-on-miss'], "'-1' is not an integer from 1 up"),
     (['--tolerate-burst', '2'], 'it decides about --fail-on-miss, --junit and --github: add'),
     (['--junit', '/gone/out.xml'], 'there is no directory /gone'),
     (['--junit', '-', '--json', '-'], 'can be only one of junit and json'),
