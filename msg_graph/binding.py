@@ -9,12 +9,12 @@ A declaration names callbacks as their authors count them; a running or recorded
 with periods, subscriptions with topics and services with names.
 
 1. They are matched by node and by what starts them.
-2. Several callbacks of one node that are started alike (two subscriptions of one topic) are handed
-   out in the order of their declaration: nodes make their entities in the order in which tools
-   count the callbacks.
+2. Several callbacks of one node that are started alike (two subscriptions of one topic) are bound
+   in the order of their declaration: nodes make their entities in the order in which tools count
+   the callbacks.
 3. A sync callback has one entity for each of its topics, its *legs*.
-4. What no declared callback is left for is not declared. It is called by its node, its function
-   and what it is, as in `/camera: on_image (subscription /image)`.
+4. An entity without a remaining declared callback is undeclared. Its name is made of its node, its
+   function and what it is, as in `/camera: on_image (subscription /image)`.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Entity(NamedTuple):
 
 
 def entities_of(callback: Callback) -> list[Entity]:
-    """Return the entities that a declared callback stands for."""
+    """Return the entities of a declared callback."""
     if callback.kind == 'timer':
         return [Entity(callback.node, 'timer', '', callback.timer_period_ns)]
     if callback.service is not None:
@@ -65,7 +65,7 @@ def entities_of(callback: Callback) -> list[Entity]:
 
 
 class Binder:
-    """Hands out the declared callbacks of a task set to the entities that start them."""
+    """Binds the declared callbacks of a task set to the entities that start them."""
 
     def __init__(self, task_set: TaskSet) -> None:
         self._callbacks = task_set.callbacks
@@ -83,8 +83,8 @@ class Binder:
         """
         Return the callback of an entity; of a sync callback's leg, the sync callback.
 
-        None where nothing (more) is declared that fits, so the entity's callback is an undeclared
-        one. The period of a timer may differ by 0.2 %; of several the nearest one is meant.
+        None: no (further) declared callback fits, so the entity's callback is undeclared. The
+        period of a timer may differ by 0.2 %; of several timers the nearest one is bound.
 
         :param entity: with the full names of its node and of its topic or service.
         """
@@ -102,13 +102,13 @@ class Binder:
         return self._callbacks[place]
 
     def unbound(self) -> list[Callback]:
-        """Return the callbacks that no entity is bound to, or of a sync not one for each leg."""
+        """Return the callbacks without an entity, or of a sync without one for each leg."""
         places = {place for free in list(self._free.values()) for place in free}
         return [self._callbacks[place] for place in sorted(places)]
 
     def release(self, callback: Callback, topic: str | None = None) -> None:
         """
-        Take a binding back, as its entity is gone; the callback can be bound anew.
+        Undo a binding, as its entity is gone; the callback can be bound again.
 
         :param topic: the leg of a sync callback; None for all that are bound.
         :raises KeyError: the callback, or that leg of it, is not bound.
@@ -130,11 +130,11 @@ def is_period(period_ns: int, declared_ns: int) -> bool:
 
 def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
     """
-    Return which entity a declared callback that nothing stands for probably means, as a question.
+    Return which entity a declared callback without an entity probably means, as a question.
 
-    That is one of another node or topic whose name has a namespace more or less, a timer of its
-    node with another period, or one of a node or topic whose name is similar.  Of a node with
-    another name it may also be the only one that is started alike.
+    That is an entity of another node or topic whose name has one namespace more or less, a timer
+    of its node with another period, or an entity of a node or topic with a similar name.  It may
+    also be the only one that is started alike.
     """
     undeclared = list(undeclared)
     timers = []
@@ -178,7 +178,7 @@ def _same_below(name: str, other: str) -> bool:
 
 def function_of(symbol: str) -> str | None:
     """
-    Return the name of the function that a recorded symbol stands for, None where it has none.
+    Return the name of the function of a recorded symbol, None if it has none.
 
     :param symbol: `package.module.Class.function`, or what rclcpp records.
     """
@@ -188,7 +188,7 @@ def function_of(symbol: str) -> str | None:
 
 def entity_name(node: str, symbol: str, what: str) -> str:
     """
-    Return what a callback is called that is not declared.
+    Return the name of an undeclared callback.
 
     :param symbol: that of its function; empty where there is none.
     :param what: its kind and what starts it, as `timer 100ms`.
@@ -201,10 +201,9 @@ def entity_name(node: str, symbol: str, what: str) -> str:
 
 def is_background(name: str, node: str) -> bool:
     """
-    Return whether a node has a topic or service as every node has, or is an action's inner one.
+    Return whether a topic or service belongs to the client library or to an action.
 
-    So it is with what every lifecycle node has. A declaration is about what a system is there for,
-    not about what the client library adds.
+    Every node or lifecycle node has some of them; a declaration is about the others.
     """
     before, _, word = name.rpartition('/')
     return (name in _BACKGROUND_TOPICS or '/_action/' in name or word in _BACKGROUND_SERVICES

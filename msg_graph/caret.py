@@ -7,11 +7,11 @@ Theory of operation
 -------------------
 An architecture file (caret_analyze's ``Architecture.export``) lists for each node its callbacks
 with what starts them, its callback groups, the topics that it publishes and subscribes, with the
-callbacks that do, its ``variable_passings`` and its ``message_contexts``. ``UNDEFINED`` stands for
-what CARET could not find out and nobody filled in.
+callbacks that do, its ``variable_passings`` and its ``message_contexts``. ``UNDEFINED`` means that
+CARET could not find it out, and that it was not filled in.
 
-1. A topic's publisher is the callback that the file names; where it names none, the only callback
-   of the node; else it is not known.
+1. A topic's publisher is the callback that the file names; if it names none, the only callback of
+   the node; else it is unknown.
 2. A variable passing is a queue edge: the reading callback reads the writing one's variable.
 3. A message context ``use_latest_message`` from a subscribed to a published topic says that the
    publisher's callback uses the latest message: nothing new if it is that message's own callback,
@@ -20,7 +20,7 @@ what CARET could not find out and nobody filled in.
 4. A mutually exclusive callback group counts where it has several callbacks.
 5. In 2021 files had ``type`` for ``callback_type``, one ``callback_name`` for each topic that is
    published, and paths that list callbacks (``path_name_aliases``).
-6. Keys that are not used here are not looked at: the format grows.
+6. Other keys are ignored: the format grows.
 """
 
 from __future__ import annotations

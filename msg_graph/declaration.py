@@ -6,8 +6,7 @@ Declarations: from YAML, of one file or several, to callbacks, paths and process
 Theory of operation
 -------------------
 Entries do not depend on each other, so the first error of each is collected and all are raised
-together. What needs more than one entry to judge (publishers, cycles, sinks, sources, …) is
-``derive``'s.
+together. ``derive`` checks the rules about several entries (publishers, cycles, sinks, …).
 
 A declaration may be put together from several files:
 
@@ -15,16 +14,15 @@ A declaration may be put together from several files:
    order, each time that the file is listed. ``workers:`` and ``processes:`` of an included file do
    not count: they are about the whole system.
 2. ``arguments:`` names the arguments of a file, with default values (none: it must be given).
-   ``set:`` of an include gives it, and ``$(name)`` in any value of the file stands for it.
+   ``set:`` of an include gives its value, which replaces ``$(name)`` in all values of the file.
 3. Names in an included file (nodes, topics, services, DAGs and, with dots, paths) are put below
-   the ``namespace:`` of the include. A name that ``remap:`` lists, as it stands in the included
-   file, becomes the other name instead, which the including file knows.
-4. So an included file is worked from the inside out: its own includes, its arguments, then the
-   names, as the file that includes it wants them. The result is a tree like that of one file, and
-   every part of it knows its file and line.
-5. A file is looked for beside the one that includes it, and nowhere outside of the folder of the
-   first file, not by way of symbolic links either. Files that include each other in a cycle are
-   an error, and so is too much of anything: files, depth, entries.
+   the ``namespace:`` of the include. A name that ``remap:`` lists becomes the other name instead,
+   which the including file uses.
+4. An included file is processed from the inside out: its own includes, its arguments, then its
+   names. The result is a tree like that of one file, and every part of it knows its file and line.
+5. The path of a file is relative to the file that includes it. It must be in the folder of the
+   first file or below, also by way of symbolic links. Files that include each other in a cycle are
+   an error, and so are too many files, levels or entries.
 """
 
 from __future__ import annotations
@@ -74,10 +72,10 @@ Part = tuple[Tree, str]
 @dataclass(frozen=True, slots=True)
 class Declaration:
     """
-    A declaration as it stands in its files; callbacks in the order of the file.
+    A declaration as written in its files; callbacks in the order of the file.
 
     :ivar text: all of it in one text, which needs no other file.
-    :ivar entries: what declares each callback, by its key, and so each path, by its name; they
+    :ivar entries: the entry of each callback, by its key, and of each path, by its name; they
         know the lines.
     """
 
@@ -94,7 +92,7 @@ def parse_declaration(text: str, file: str, path: str | None = None) -> Declarat
     """
     Return the declaration that a YAML text holds, with all that it includes.
 
-    :param path: the file that it was read from, if it was; beside it others are looked for.
+    :param path: the file that it was read from; None: it can include nothing.
     """
     tree, top = top_of(text, file)
     found = Collector()
@@ -230,7 +228,7 @@ def _callback(entry: Entry, node: str, top: str) -> Callback:
 
 
 def _period(entry: Entry, timer_period: int | None) -> int | None:
-    """Return the declared period, or the timer's; where both stand they must agree."""
+    """Return the declared period, or the timer's; both must agree."""
     period: int | None = entry.get('period')
     if timer_period is None or period is None:
         return timer_period if period is None else period
@@ -287,8 +285,7 @@ class Assembler:
     """
     Puts a declaration together.
 
-    :ivar path: of the first file; None where it was read from elsewhere, so that there is nothing
-        to include from.
+    :ivar path: of the first file; None: it was not read from a file, and can include nothing.
     """
 
     path: str | None
@@ -420,7 +417,7 @@ def _substituted(tree: Tree, file: str, values: dict[str, str]) -> Tree:
         def value(found: re.Match[str]) -> str:
             if found[1] not in values:
                 raise GraphError(
-                    file, old.line, f'{shown(found[0])} stands for no argument of this file',
+                    file, old.line, f'{shown(found[0])} is no argument of this file',
                     did_you_mean(found[1], values, f"add it to 'arguments:' ({listed(values)})"
                                  if values else "add it to 'arguments:'"))
             return values[found[1]]
@@ -435,7 +432,7 @@ def _substituted(tree: Tree, file: str, values: dict[str, str]) -> Tree:
 
 
 def _changed(tree: Tree, change: Callable[[Scalar], str]) -> Tree:
-    """Return a tree with every text changed; nesting is bounded, so this may recurse."""
+    """Return a tree with every text changed; its nesting is bounded."""
     if isinstance(tree, Scalar):
         text = change(tree)
         return tree if text == tree.text else Scalar(tree.line, text, tree.plain)
@@ -447,7 +444,7 @@ def _changed(tree: Tree, change: Callable[[Scalar], str]) -> Tree:
 
 class _Renaming:
     """
-    Gives names of an included file those that the including one knows (rule 3).
+    Changes names of an included file to those that the including one uses (rule 3).
 
     :param entry: of ``include:``.
     """
@@ -460,7 +457,7 @@ class _Renaming:
         self._seen: set[str] = set()
 
     def check(self) -> None:
-        """Raise where a name is remapped that the included file does not have."""
+        """Raise if a name is remapped that the included file does not have."""
         for name, line in self._lines.items():
             if name not in self._seen:
                 raise GraphError(

@@ -11,8 +11,8 @@ Source: Yano and Azumi, "Multi-Deadline DAG Scheduling Model for Autonomous Driv
 Rules 1, 2, 3 and 6 concern callbacks (``Links``), the others make vertices.
 
 1. *Trigger edges* come from topics: from each callback that publishes a topic to each subscription
-   or sync callback that the topic starts. *Queue edges* (``reads``) start nothing; they are kept
-   for end-to-end analysis and take no part in what follows.
+   or sync callback that the topic starts. *Queue edges* (``reads``) start nothing; they only serve
+   end-to-end analysis.
 2. A *source* is a timer, or a subscription or service with a ``period:``, whose messages come from
    outside of the graph. Every topic that starts any other callback must be published in the graph.
    Only a source has a period, a DAG's name and what else concerns a whole DAG.
@@ -33,8 +33,8 @@ Rules 1, 2, 3 and 6 concern callbacks (``Links``), the others make vertices.
    start them, that is of the publishers. The edges of a vertex are listed in the order of the
    topics that it publishes, those of one topic by index.  A DAG is called by ``dag:``, else after
    its source's node, or, if several sources of the node have no ``dag:``, ``/node/callback``.
-8. Errors are collected in stages, as far as none is a consequence of another: who starts whom and
-   who reads what; then cycles, deadlines and paths; then what the vertices show.
+8. Errors are collected in stages, so that none is a consequence of another: trigger and queue
+   edges; then cycles, deadlines and paths; then the vertices.
 9. The number of vertices and edges is bounded before they are made, as rule 4 multiplies.
 """
 
@@ -87,9 +87,8 @@ def loads(
 
     :param text: the YAML; bytes must be UTF-8.
     :param name: what errors call it.
-    :param path: the file that it comes from, if it is to include others that lie beside it.
-    :param without_deadline: takes the keys of the sinks that have no deadline; None: they are
-        errors.
+    :param path: the file that it comes from, if it may include others from its folder.
+    :param without_deadline: gets the keys of the sinks without a deadline; None: they are errors.
     :raises GraphError: it is not YAML, or breaks a rule of the language or of the model.
     """
     text = decode(text, name) if isinstance(text, bytes) else text
@@ -105,10 +104,10 @@ def loads(
 @contextmanager
 def no_garbage() -> Iterator[None]:
     """
-    Hold the cyclic garbage collector off.
+    Switch the cyclic garbage collector off.
 
-    Hundreds of thousands of objects come to be and none of them dies; looking for garbage among
-    them again and again takes a quarter of the time that it takes to read a declaration.
+    Reading a declaration makes hundreds of thousands of objects and no garbage; searching them for
+    garbage takes a quarter of the time.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -125,8 +124,7 @@ def derive_task_set(
     """
     Return the task set of a declaration.
 
-    :param without_deadline: takes the keys of the sinks that have no deadline; None: they are
-        errors.
+    :param without_deadline: gets the keys of the sinks without a deadline; None: they are errors.
     """
     links = Links(declaration)
     found = Collector()
@@ -161,7 +159,7 @@ def derive_task_set(
 
 
 class Links:
-    """Who publishes what, and whom it starts; callbacks by their places in the file."""
+    """Publishers and subscribers by topic; callbacks by their places in the file."""
 
     def __init__(self, declaration: Declaration) -> None:
         self.entries = declaration.entries
@@ -203,7 +201,7 @@ class Links:
         if callback.kind == 'sync':
             raise self.entries[callback.key].error(
                 'period', 'a sync callback joins topics, so it cannot be a source',
-                "remove 'period:' and declare who publishes its topics")
+                "remove 'period:' and declare the publishers of its topics")
         for topic in callback.topics:
             if topic in self.publishers:
                 publisher = self.callbacks[self.publishers[topic][0]].key
@@ -224,7 +222,7 @@ class Links:
                 if callback.kind == 'subscription':
                     remedy += ", or add 'period:' if it comes from outside of the graph"
                 raise self.entries[callback.key].error(
-                    callback.kind, f'nobody publishes {shown(topic)}',
+                    callback.kind, f'no callback publishes {shown(topic)}',
                     did_you_mean(topic, self.publishers, remedy), item=topic)
 
     def _only_source(self, callback: Callback, key: str) -> GraphError:
@@ -288,7 +286,7 @@ class Links:
                 yield places[places.index(place):][::-1]
 
     def check_deadlines(self, without: list[str] | None) -> None:
-        """Check that sinks, and nothing else, have deadlines (rule 6); or collect who has none."""
+        """Check that sinks, and nothing else, have deadlines (rule 6); or collect the others."""
         for_each(self.callbacks, lambda each: self._check_deadline(each, without))
 
     def _check_deadline(self, callback: Callback, without: list[str] | None) -> None:
@@ -334,7 +332,7 @@ class Links:
             writers = tuple(self.callbacks[p].key for p in self.publishers.get(read, ()))
             if not writers:
                 raise self.entries[callback.key].error(
-                    'reads', f'it reads {shown(read)}, which nobody publishes',
+                    'reads', f'it reads {shown(read)}, which no callback publishes',
                     did_you_mean(read, self.publishers, "add it to a 'publishes:'"), item=read)
             return QueueEdge(callback.key, read, writers)
         writer = f'{callback.node}:{read}'

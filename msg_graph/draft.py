@@ -5,26 +5,26 @@ Drafts of declarations: a system as far as a file, a trace or the system itself 
 
 Theory of operation
 -------------------
-Drafts come from CARET architecture files (``caret``), from traces and from running systems. Names
-in a draft are valid: whoever makes one checks them. ``declaration_of`` writes one as a declaration
-to fill in.
+Drafts come from CARET architecture files (``caret``), from traces and from running systems. The
+code that makes a draft checks the names in it. ``declaration_of`` writes it as a declaration to
+fill in.
 
-What is known becomes entries. What is not stands as a comment that is an entry once its first
-``# `` is gone, with ``FILL IN`` and a proposal, so that ``mddag graph check`` names what is still
-open (``open_blanks``), all of it at once, instead of the errors that come of it:
+What is known becomes entries. What is unknown becomes a comment with ``FILL IN`` and a proposal,
+which is an entry once its first ``# `` is removed. ``mddag graph check`` lists all blanks that are
+still open (``open_blanks``) instead of the errors that follow from them:
 
 1. *deadline* of a sink: the shortest period of the sources that lead to it.
-2. *period* of a subscription whose topic nobody publishes, and of a service: the measured time
-   between two of its executions, where there is one.
+2. *period* of a subscription whose topic no callback publishes, and of a service: the measured
+   time between two of its executions, if there is one.
 3. *publishes*, where it is not known which of a node's callbacks publishes a topic: on each that
    may.
 4. *timers* that are only supposed, as nothing else seems to start what their node publishes.
 
-``accept`` decides instead of asking, by what was recorded: measured periods and proposed deadlines
-become entries, nothing is published that was not seen to be, and a source whose rate is not known
-is left out (``leave_out_sources``).
+``accept`` decides by the recording instead of asking: measured periods and proposed deadlines
+become entries, only recorded publications count, and a source with an unknown rate is left out
+(``leave_out_sources``).
 
-A named path becomes an entry where each of its nodes has just one callback that fits.
+A named path becomes an entry if each of its nodes has exactly one callback that fits.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ class Draft:
 
 def leave_out_sources(draft: Draft, reason: Callable[[DraftCallback], str]) -> None:
     """
-    Leave out sources, and sources that come of it as nobody publishes their topics any more.
+    Leave out sources, and callbacks that become sources as their topics have no publisher then.
 
     :param reason: says why a source is left out; an empty text keeps it.
     """
@@ -291,7 +291,7 @@ class _Writer:
                         'the node but its name; remove it if it has no callbacks')
             if callback.guessed and callback.interval_ns is None:
                 return (f'        # timer: 100ms  # {MARK}: what starts it? No message came while '
-                        'it was looked at')
+                        'the system was probed')
             if callback.guessed:
                 return (f'        timer: {_rounded(callback.interval_ns or 0)}  # {MARK}: is this '
                         f'a timer? Proposed: the measured {_measured(callback)}')
@@ -328,7 +328,7 @@ class _Writer:
 
     def _period_line(self, callback: DraftCallback) -> str:
         what = ('the time between two requests' if callback.kind == 'service' else
-                'nobody here publishes the topic; the time between two messages')
+                'no callback here publishes the topic; the time between two messages')
         if callback.interval_ns is not None:
             return self._proposal(f'period: {_rounded(callback.interval_ns)}', what,
                                   f'the measured {_measured(callback)}')

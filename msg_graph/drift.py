@@ -5,23 +5,23 @@ Drift: where a system that ran and its declaration disagree.
 
 Theory of operation
 -------------------
-The rules, for live runs and for recordings alike. What was seen comes as counts by callback.
+The rules are the same for live runs and recordings. Observations are counts by callback.
 
-1. *publishes*: a callback published a topic that it does not declare. What every node publishes
-   anyway does not count.
+1. *publishes*: a callback published a topic that it does not declare. Topics of the client library
+   do not count.
 2. *rate* of a source: the mean time between two releases is not the declared period, by more than
    ``TOLERANCE`` of it. It takes ``LEAST`` releases to say so.
 3. *rate* of a subscription: it got messages more or less often than the jobs of its DAGs were
    released, by more than ``TOLERANCE``. It takes ``LEAST`` expected ones. Dropped messages count
-   as got: losing them is no fault of the declaration. A sync is not judged by this rule, as how
-   its messages come together is not declared.
-4. *never ran*: a callback never ran, while it should have done so at least twice. Where something
-   undeclared ran that may be meant (``binding.meant``), that is asked.
-5. Where all DAGs of a callback may span processes (``release_from: header_stamp``), or the
-   declaration has ``processes:``, and its node was not seen here, it may well run elsewhere, and
-   nothing is said of it.
+   as received: their loss is no fault of the declaration. A sync is not judged by this rule, as
+   the declaration does not say how its messages are joined.
+4. *never ran*: a callback never ran, while it should have done so at least twice. The report asks
+   about an undeclared entity that may be meant (``binding.meant``).
+5. A callback may run in another process if all its DAGs may span processes (``release_from:
+   header_stamp``) or the declaration has ``processes:``, and its node was not seen here. Then it
+   is not reported.
 6. Of callbacks that follow each other only the first that disagrees by rule 2, 3 or 4 is
-   reported: what comes after it has no messages because of it.
+   reported: those after it have no messages because of it.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Deadlines of sinks and ``processes:`` given anew: in the text of a declaration, and its task set.
+New deadlines of sinks and new ``processes:``, in the text of a declaration and in its task set.
 
 Theory of operation
 -------------------
 1. Deadlines belong to callbacks: where a callback is several vertices, all have its deadline.
-2. In the text only the values of ``deadline:`` change, in their places; a callback that has none
-   gets a line of its own, or an entry in its braces.  ``processes:`` is the last entry where it is
-   written anew.  Comments outside of it, order, layout and all else stay.
-3. The new text must give the task set with just that changed; else it is refused.
-   (It can, where a value is an alias of one that stands elsewhere.)
+2. In the text only the values of ``deadline:`` change, in their places; a callback without one
+   gets a new line, or a new entry in its braces.  New ``processes:`` are the last entry.  Comments
+   outside of it, order, layout and everything else stay.
+3. The new text must give the task set with only that changed; otherwise it is refused.  (A value
+   may be an alias of another one.)
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 def checked(text: str, wanted: TaskSet) -> str:
-    """Return a text that was written anew; refuse it if it does not give the task set wanted."""
+    """Return a changed text; raise if it does not give the wanted task set."""
     try:
         same = without_lines(loads(text, wanted.file)) == without_lines(wanted)
     except GraphError:

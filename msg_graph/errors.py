@@ -25,7 +25,7 @@ class GraphError(Exception):
     ``str()`` gives one line, ``FILE[:LINE]: what is wrong: what to do``.
 
     :ivar file: the file's name as it was given to ``load`` or ``loads``.
-    :ivar line: line of the offending entry, counted from 1; None where no line can be blamed.
+    :ivar line: line of the offending entry, counted from 1; None: of no single line.
     :ivar problem: what is wrong, naming the entry.
     :ivar remedy: what to do about it.
     :ivar errors: all errors that were found together, this one first.
@@ -53,7 +53,7 @@ class GraphErrors(GraphError):
     """
     Several independent errors of one declaration.
 
-    To those who know of one error only it is the first; ``str()`` is still one line.
+    Used as a ``GraphError`` it is the first one; ``str()`` is one line.
     """
 
     def __init__(self, errors: tuple[GraphError, ...]) -> None:
@@ -76,9 +76,9 @@ class Collector:
     """
     Collects errors that do not depend on each other.
 
-    As a context manager it holds an error back, as often as it is entered; ``check`` raises what
-    was held back. With ``MOST_ERRORS`` it raises at once: nobody reads more, and to look for the
-    word that was meant takes its time.
+    As a context manager it keeps an error, as often as it is entered; ``check`` raises the kept
+    ones. It raises at once when it has ``MOST_ERRORS``: more are not read, and the search for
+    similar words takes time.
     """
 
     def __init__(self) -> None:

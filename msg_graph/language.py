@@ -7,14 +7,13 @@ Theory of operation
 -------------------
 An *entry* is a mapping of the declaration. A table says which keys it may have, and of what *kind*
 the value of each is. A kind reads a value, with errors that name file, line and entry, and has its
-part of the JSON Schema. So what a file may hold stands in one place, the tables below; the parser
-goes by them, and the JSON Schema is made from them.
+part of the JSON Schema. So the tables below are the only description of a file: the parser uses
+them, and the JSON Schema is made from them.
 
 A *name* of a node, topic, callback, … is a text that is valid for what it names.
 
-The schema is that of draft 7, which the language servers for YAML know best. It says what one
-entry may look like; what takes more than one entry to judge (publishers, cycles, sinks) only
-``load`` can say.
+The schema is that of draft 7, which the language servers for YAML know best. It describes single
+entries; only ``load`` checks the rules about several (publishers, cycles, sinks).
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ Schema = dict[str, Any]
 
 ARGUMENT = re.compile(r'[A-Za-z_][A-Za-z0-9_]*')
 ARGUMENT_USE = rf'\$\({ARGUMENT.pattern}\)'
-"""How an argument of the file stands in a value; the JSON Schema allows it in any."""
+"""An argument of the file in a value; the JSON Schema allows it in all values."""
 
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _OF = re.compile(r'[ \t]*([0-9]{1,6})[ \t]+of[ \t]+([0-9]{1,6})[ \t]*')
@@ -46,7 +45,7 @@ _ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
 _WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
 
 Check = Callable[[str], 'tuple[str, str] | None']
-"""Looks at a text; returns what is wrong with it and what to do, or None."""
+"""Checks a text; returns what is wrong with it and what to do, or None."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ class Kind:
 
     :ivar read: returns what a value at a key of an entry says, or raises a ``GraphError``.
     :ivar schema: its JSON Schema.
-    :ivar missing: what stands for it where its key is missing.
+    :ivar missing: its value if the key is missing.
     """
 
     read: Callable[[Entry, str, Tree], Any]
@@ -144,7 +143,7 @@ class Entry:
     One mapping of the declaration.
 
     :ivar file: the file's name.
-    :ivar name: how errors call the mapping; may be set anew when that is known.
+    :ivar name: how errors call the mapping; it may be set later.
     """
 
     def __init__(self, tree: Tree, file: str, name: str, keys: Table[str, Key]) -> None:
@@ -171,11 +170,11 @@ class Entry:
         return self._tree.line
 
     def has(self, key: str) -> bool:
-        """Whether the key stands there."""
+        """Whether the mapping has the key."""
         return key in self._tree.entries
 
     def get(self, key: str) -> Any:
-        """Return the value of a key; what the kind has for a missing one, where it is missing."""
+        """Return the value of a key, or the kind's value for a missing key."""
         value = self._tree.entries.get(key)
         described = self._keys[key]
         if value is None:
@@ -187,7 +186,7 @@ class Entry:
         return described.kind.read(self, key, value)
 
     def one_of(self, keys: Table[str, Any], what: str) -> str:
-        """Return the one key of several that stands there."""
+        """Return the one key of several that the mapping has."""
         found = [key for key in keys if self.has(key)]
         if not found:
             raise self.error(None, f'nothing says {what}', f'add one of {", ".join(keys)}')

@@ -1,9 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The derived task set: what the rest of the program knows about a message graph.
+The derived task set, all that the rest of a program needs to know about a message graph.
 
-With it come figures of a DAG: topological order, longest path, load. Everything is immutable. All
+It includes figures of a DAG: topological order, longest path, load. Everything is immutable. All
 times are integers in nanoseconds.
 """
 
@@ -109,7 +109,7 @@ class Callback:
         the run does by default.
     :ivar max_active_jobs: bound on the open jobs of the DAG that it is the source of, or None.
     :ivar holds_interpreter: whether it computes in Python (True), or waits, or computes with the
-        interpreter's lock released (False); None where nobody says.
+        interpreter's lock released (False); None: not declared.
     :ivar keep: of a source or sink: ``newest`` if an execution that has not started is dropped
         when the next job's is ready.
     :ivar importance: of a sink, in an overload.
@@ -248,7 +248,7 @@ class TaskSet:
     :ivar workers: declared number of workers, or None.
     :ivar file: name of the file that this was read from.
     :ivar text: the declaration as it was read; put together to one where it includes others.
-    :ivar processes: those that the nodes run in, each declared node in one; none: nobody says.
+    :ivar processes: those that the nodes run in, each declared node in one; none: not declared.
     :ivar vertices: the vertices of all DAGs, DAG by DAG.
     """
 
@@ -274,7 +274,7 @@ class TaskSet:
         object.__setattr__(self, '_callback', {c.key: c for c in self.callbacks})
 
     def process_of(self, node: str) -> str | None:
-        """Return the name of the process that a node runs in; None: nobody says."""
+        """Return the name of the process that a node runs in; None: not declared."""
         return next((p.name for p in self.processes if node in p.nodes),
                     self.processes[0].name if self.processes else None)
 
@@ -367,4 +367,4 @@ def load_of(dag: Dag) -> float | None:
 
 
 NO_GRAPH = TaskSet((), (), (), (), None, '', '')
-"""Stands for a declaration where there is none."""
+"""The task set without a declaration."""

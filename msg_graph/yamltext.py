@@ -8,8 +8,8 @@ Theory of operation
 The tree is built from the parser's events, not by PyYAML's composer or constructor:
 
 1. Nesting beyond ``MAX_DEPTH`` ends it, so none can overflow the stack.
-2. Scalars stay text. What a text means is decided by the key it stands at, so that ``on``, ``1e3``
-   or ``2026-01-01`` are never turned into something that nobody wrote.
+2. Scalars stay text. Their key decides what they mean, so that ``on``, ``1e3`` or ``2026-01-01``
+   never become something else.
 3. An alias shares the tree of its anchor. Every tree knows its size with all aliases written out;
    beyond ``MAX_SIZE`` the file is refused, so that nested aliases cannot explode. An alias inside
    of its own anchor is refused.
@@ -38,7 +38,7 @@ _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
 
 
 class Scalar:
-    """A text; ``plain`` if it stands there without quotes."""
+    """A text; ``plain`` if it is written without quotes."""
 
     __slots__ = ('line', 'text', 'plain')
     size = 1
@@ -50,7 +50,7 @@ class Scalar:
 
     @property
     def is_null(self) -> bool:
-        """Whether nothing stands here."""
+        """Whether there is no value."""
         return self.plain and self.text in ('', '~', 'null')
 
 
@@ -108,7 +108,7 @@ def decode(data: bytes, file: str) -> str:
 
 
 def plain_scalar(text: str) -> str:
-    """Return a name (without quotes in it) that stands for itself, quoted where it would not."""
+    """Return a name (without quotes in it), quoted if YAML would read it as something else."""
     return text if _PLAIN.fullmatch(text) and text.lower() not in _WORDS else f"'{text}'"
 
 
@@ -158,7 +158,7 @@ def parse_yaml(text: str, file: str) -> Tree | None:
 
 
 class _Builder:
-    """Builds the tree from the parser's events; nesting is bounded, so this may recurse."""
+    """Builds the tree from the parser's events; its nesting is bounded."""
 
     def __init__(self, text: str, file: str) -> None:
         self._events: Any = yaml.parse(text, Loader=_LOADER)
@@ -214,11 +214,11 @@ class _Builder:
                 event, f'the alias {name} has no anchor', 'define the anchor before it')
         if any(tree is each for each in self._open):
             raise self._error(
-                event, f'the alias {name} stands inside of its own anchor', 'write the value out')
+                event, f'the alias {name} is inside of its own anchor', 'write the value out')
         return tree
 
     def _fill(self, tree: Sequence | Mapping) -> None:
-        """Take in what stands in a list or mapping, and count it, with aliases written out."""
+        """Read the entries of a list or mapping, and count them, with aliases written out."""
         key: str | None = None
         while type(event := next(self._events)) not in _ENDS:
             each = self._tree(event)
@@ -241,7 +241,7 @@ class _Builder:
             raise self._error(event, 'a key is a list or a mapping', 'write a plain word as key')
         if tree.text in parent.entries:
             raise self._error(
-                event, f'the key {shown(tree.text)} stands here twice',
+                event, f'the key {shown(tree.text)} is given twice',
                 f'remove one of them (the first is in line {parent.key_lines[tree.text]})')
         parent.key_lines[tree.text] = event.start_mark.line + 1
         return tree.text

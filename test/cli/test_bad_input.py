@@ -89,7 +89,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('graph check wrong.yaml',
      "wrong.yaml:6: callback 1 of node '/n': unknown key 'tmer': did you mean 'timer'?"),
     ('graph check unpublished.yaml',
-     "unpublished.yaml:7: callback '/n:x': nobody publishes '/b': add it to a "),
+     "unpublished.yaml:7: callback '/n:x': no callback publishes '/b': add it to a "),
     ('simulate no_times.yaml', 'no_times.yaml:6: /n:t declares no execution_time: add one, or gi'),
     ('graph analyse no_times.yaml',
      'no_times.yaml:6: /n:t (and 2 more callbacks) declares no execution_time: add one'),

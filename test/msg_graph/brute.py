@@ -54,12 +54,12 @@ def violations(specs: list[Spec]) -> set[str]:
     published = {topic for spec in specs for topic in spec.publishes}
     for spec in specs:
         if spec.start in ('subscription', 'sync') and not published.issuperset(spec.topics):
-            found.add('nobody publishes')
+            found.add('no callback publishes')
         if spec.start == 'outside' and published.intersection(spec.topics):
             found.add('only a source has a period')
         for read in spec.reads:
             if read.startswith('/') and read not in published:
-                found.add('which nobody publishes')
+                found.add('which no callback publishes')
             if not read.startswith('/') and not any(
                     other.node == spec.node and other.name == read for other in specs):
                 found.add('unknown callback')
@@ -84,7 +84,7 @@ def violations(specs: list[Spec]) -> set[str]:
 def all_violations(specs: list[Spec]) -> set[str]:
     """Return which rules the declared callbacks or the vertices made of them break."""
     found = violations(specs)
-    if found.isdisjoint({'in a cycle', 'nobody publishes', 'only a source has a period'}):
+    if found.isdisjoint({'in a cycle', 'no callback publishes', 'only a source has a period'}):
         parts = components(expand(specs))
         if any(sum(not vertex[1] for vertex in part) != 1 for part in parts):
             found.add('joins two sources')

@@ -67,7 +67,7 @@ def found(text: str) -> GraphErrors:
     (ENTRIES, [(2, "'workers' is 'none'"), (6, "'10' has no unit"), (7, "unknown key 'deadine'"),
                (9, 'taken in line 8'), (10, 'not an absolute node name'),
                (13, 'a path of one callback'), (14, "'y' names no callback")]),
-    (LINKS, [(6, "nobody publishes '/c'"), (7, "nobody publishes '/d'"),
+    (LINKS, [(6, "no callback publishes '/c'"), (7, "no callback publishes '/d'"),
              (9, "'dag:' is for the source"), (8, "unknown callback 'w'"),
              (8, "it reads '/e', which nobody")]),
     (GRAPH, [(7, 'in a cycle'), (5, 'deadline but is no sink'), (6, 'has no deadline'),

@@ -140,10 +140,10 @@ def test_includes_within_includes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(('wrong', 'right', 'place', 'problem'), [
     ('timer: $(period)', 'timer: $(perod)', 'parts/sensor.yaml:9',
-     "'$(perod)' stands for no argument of this file: did you mean 'period'?"),
+     "'$(perod)' is no argument of this file: did you mean 'period'?"),
     ('deadline: $(late)', 'deadline: 5', 'parts/sensor.yaml:13', 'has no unit'),
     ('subscription: /raw', 'subscription: /rawe', 'parts/sensor.yaml:13',
-     "nobody publishes '/front/left/rawe': did you mean '/front/left/raw'?"),
+     "no callback publishes '/front/left/rawe': did you mean '/front/left/raw'?"),
     ('set: {late: 80ms}', 'set: {}', 'parts/sensor.yaml:5', "'late' has no value"),
     ('set: {late: 80ms}', 'set: {lat: 80ms, late: 1s}', 'parts/sensor.yaml:3',
      "sets 'lat', which is no argument of this file: did you mean 'late'?"),

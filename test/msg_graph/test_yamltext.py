@@ -66,7 +66,7 @@ def test_bytes() -> None:
 
 
 @pytest.mark.parametrize('text, says', [
-    (f'mddag: 1\nmddag: 1 {MARK}\n', "'mddag' stands here twice"),
+    (f'mddag: 1\nmddag: 1 {MARK}\n', "'mddag' is given twice"),
     (f'mddag: 1\nnodes:\n- node: /a\n  node: /b {MARK}\n', 'line 3'),
     (f'mddag: 1\nnodes: !!python/object/apply:os.system [ls] {MARK}\n', 'python'),
     (f'mddag: !!int 1 {MARK}\n', 'tag'),

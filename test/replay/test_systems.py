@@ -109,7 +109,7 @@ def test_from_a_trace(recorded: Path) -> None:
     assert task_set.callbacks[0].group == task_set.callbacks[1].group == 'callback_group_0'
     assert task_set.callbacks[1].publishes == ('/x', '/unseen')
     assert task_set.callbacks[3].period_ns == 5 * MS
-    assert 'nobody here publishes the topic; the time between two messages; proposed' in text
+    assert 'no callback here publishes the topic; the time between two messages; proposed' in text
     time = task_set.callbacks[1].execution_time
     assert time is not None
     assert time.quantiles_ns == (
