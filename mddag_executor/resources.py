@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Find the files that ship with the package, and the package itself: in another process, too.
+Find the files that ship with the package.
 
 Theory of operation: the files that belong to the code that runs come first. A checkout (also one
 that is installed with `pip install -e`) has them next to the package, and an installation under a
@@ -21,12 +21,6 @@ import sys
 from mddag_executor.errors import InputError
 
 _NAME = 'mddag_executor'
-
-
-def import_environment() -> dict[str, str]:
-    """Return an environment in which another Python imports from where this one does."""
-    path = os.pathsep.join(each or os.getcwd() for each in sys.path)
-    return {**os.environ, 'PYTHONPATH': path}
 
 
 def roots() -> Iterator[Path]:
