@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import signal
 import subprocess
@@ -80,12 +80,16 @@ def interrupted(program: str, *arguments: str) -> tuple[int, str, str]:
 
 @pytest.fixture
 def make_executor(ros_context: Any) -> Iterator[Callable[..., Any]]:
-    """Give a function that makes executors; they are shut down afterwards."""
+    """Give a function that makes executors with nodes; they are shut down afterwards."""
     with contextlib.ExitStack() as stack:
-        def make(*args: Any, **kwargs: Any) -> MultiDeadlineExecutor:
+        def make(
+            *args: Any, nodes: Sequence[Node] = (), **kwargs: Any
+        ) -> MultiDeadlineExecutor:
             kwargs.setdefault('context', ros_context)
             executor = MultiDeadlineExecutor(*args, **kwargs)
             stack.callback(executor.shutdown, 5.0)
+            for node in nodes:
+                executor.add_node(node)
             return executor
         yield make
 

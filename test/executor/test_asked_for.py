@@ -61,9 +61,7 @@ nodes:
     modest.create_subscription(Header, '/topic', note('message'), 10, callback_group=group)
     modest.create_timer(0.005, lambda: publisher.publish(Header()), group)
     modest.create_timer(0.01, note('timer'), group)
-    executor = make_executor(graph, num_workers=1)
-    executor.add_node(greedy)
-    executor.add_node(modest)
+    executor = make_executor(graph, num_workers=1, nodes=[greedy, modest])
 
     def again() -> None:  # and one that makes itself ready again and again
         runs['task'] += 1
@@ -98,8 +96,7 @@ def test_all_of_one_group_get_their_turn(make_executor, make_node):
             publisher.publish(Header())
 
     node.create_timer(0.002, publish, others)
-    executor = make_executor(num_workers=3)
-    executor.add_node(node)
+    executor = make_executor(num_workers=3, nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: min(runs[n] for n in range(5)) >= 20, 10.0), runs
         counts = [runs[number] for number in range(5)]
@@ -129,8 +126,7 @@ def test_a_slow_timer_does_not_monopolise_a_loop_of_spin_once(make_executor, mak
     """One callback at a time, and none for ever the same (rclcpp#2402)."""
     node = make_node()
     runs = slow_and_quick(node)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
 
     def ran() -> bool:
         executor.spin_once(0.1)
@@ -160,8 +156,7 @@ nodes:
             time.sleep(0.13)
 
     node.create_timer(0.02, tick)
-    executor = make_executor(graph, num_workers=2)
-    executor.add_node(node)
+    executor = make_executor(graph, num_workers=2, nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(releases) >= 10)
     # (the first may have been due before the executor began to look after the timer)
@@ -201,8 +196,7 @@ def test_every_worker_may_sleep_on_the_simulated_clock(make_executor, make_node,
     """They would wait for a clock that waits for them (rclpy#792)."""
     simulation = Simulation(make_node)
     node = simulation.node
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     clock = node.get_clock()
     ends: list[bool] = []
 
@@ -228,8 +222,7 @@ def test_every_worker_may_sleep_on_the_simulated_clock(make_executor, make_node,
 def test_every_worker_may_sleep_with_a_rate(make_executor, make_node):
     """The timer that ends their sleep needs no worker (the same for ``create_rate``)."""
     node = make_node()
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     together = threading.Barrier(7)
     rates = [node.create_rate(100) for _ in range(7)]
 

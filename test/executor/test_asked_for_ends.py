@@ -92,8 +92,7 @@ def test_an_exception_that_nobody_handles_ends_the_spin(make_executor, kept):
 def test_shutdown_from_inside_a_callback(make_executor, make_node, ros_context, what):
     """It hangs in rclpy: rclpy#944, and #1646 of an executor's own shutdown."""
     node = make_node()
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     calls: list[int] = []
 
     def end() -> None:
@@ -115,8 +114,7 @@ def test_shutdown_from_inside_a_callback(make_executor, make_node, ros_context, 
 def test_nothing_starts_after_the_context_has_ended(make_executor, make_node, ros_context):
     """What was ready by then neither: a worker is quicker than the thread that spins."""
     node = make_node()
-    executor = make_executor(num_workers=1)
-    executor.add_node(node)
+    executor = make_executor(num_workers=1, nodes=[node])
     calls: list[int] = []
 
     def end() -> None:
@@ -138,8 +136,7 @@ def test_shutdown_while_spin_dispatches(make_executor, make_node):
     timers = [node.create_timer(0.001, lambda: None, ReentrantCallbackGroup()) for _ in range(5)]
     assert timers
     for turn in range(15):
-        executor = make_executor(num_workers=3)
-        executor.add_node(node)
+        executor = make_executor(num_workers=3, nodes=[node])
         stop = threading.Event()
 
         def feed(executor: Any = executor, stop: threading.Event = stop) -> None:

@@ -119,8 +119,7 @@ def test_a_timer_gives_its_info_to_who_asks_for_it(make_executor, make_node):
     tick.__annotations__['call'] = compat.TimerInfo
     node.create_timer(0.02, tick)
     node.create_timer(0.02, lambda: plain.append(1))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor) as spinning:
         assert wait_for(lambda: len(seen) >= 10 and len(plain) >= 10)
     assert spinning.error is None
@@ -220,8 +219,7 @@ def test_a_waitable_that_takes_nothing_is_executed(make_executor, make_node):
     node = make_node()
     waitable = Always(node)
     node.add_waitable(waitable)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: waitable.guard.trigger() or len(waitable.got) >= 3)
     assert set(waitable.got) == {None}

@@ -104,8 +104,7 @@ def test_what_the_callback_raises_that_shuts_down_comes_out(make_executor, make_
         raise SystemExit('done')
 
     node.create_timer(0.01, end)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with pytest.raises(SystemExit, match='done'):
         executor.spin()
 

@@ -20,7 +20,7 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import LivelinessPolicy, QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from std_msgs.msg import Header, String
@@ -67,9 +67,7 @@ def test_a_lifecycle_node_goes_through_its_transitions(make_executor, make_node,
     state = other.create_client(GetState, '/managed/get_state')
     heard: list[Header] = []
     other.create_subscription(Header, '/managed', heard.append, 10)
-    executor = make_executor()
-    executor.add_node(managed)
-    executor.add_node(other)
+    executor = make_executor(nodes=[managed, other])
 
     async def go(transition: int) -> str:
         request = ChangeState.Request(transition=Transition(id=transition))
@@ -111,8 +109,7 @@ def test_qos_events_reach_their_callbacks(make_executor, make_node):
     publisher = node.create_publisher(
         Header, '/topic', qos, event_callbacks=PublisherEventCallbacks(
             deadline=got['offered'].append, liveliness=got['lost'].append))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor) as spinning:
         assert wait_for(lambda: publisher.get_subscription_count() == 1)
         publisher.publish(Header())
@@ -124,25 +121,6 @@ def test_qos_events_reach_their_callbacks(make_executor, make_node):
     assert got['lost'][0].total_count >= 1 and got['requested'][0].total_count >= 1
 
 
-def test_incompatible_qos_is_told_on_both_sides(make_executor, make_node):
-    node = make_node()
-    requested: list[Any] = []
-    offered: list[Any] = []
-    executor = make_executor()
-    executor.add_node(node)
-    with Spinning(executor) as spinning:
-        node.create_subscription(
-            Header, '/topic', lambda m: None,
-            QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE),
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=requested.append))
-        node.create_publisher(
-            Header, '/topic', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
-            event_callbacks=PublisherEventCallbacks(incompatible_qos=offered.append))
-        assert wait_for(lambda: requested and offered)
-    assert spinning.error is None
-    assert requested[0].total_count == offered[0].total_count == 1
-
-
 def test_parameters_through_another_node_of_the_same_executor(make_executor, make_node):
     node, other = make_node('server', start_parameter_services=True), make_node('asker')
     node.declare_parameter('speed', 3)
@@ -150,9 +128,7 @@ def test_parameters_through_another_node_of_the_same_executor(make_executor, mak
     told: list[str] = []
     node.add_post_set_parameters_callback(lambda given: told.extend(p.name for p in given))
     client = AsyncParameterClient(other, 'server', callback_group=ReentrantCallbackGroup())
-    executor = make_executor()
-    executor.add_node(node)
-    executor.add_node(other)
+    executor = make_executor(nodes=[node, other])
 
     async def ask() -> tuple[Any, ...]:
         given = await client.set_parameters([Parameter('speed', value=5)])
@@ -182,8 +158,7 @@ def test_entities_that_a_callback_makes_run(make_executor, make_node):
     node = make_node()
     ran: dict[str, list[Any]] = {name: [] for name in (
         'timer', 'message', 'request', 'response', 'guard', 'result', 'node')}
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     kept: list[Any] = []
     group = ReentrantCallbackGroup()
 
@@ -253,8 +228,7 @@ def test_what_is_made_while_the_executor_looks_is_not_lost(make_executor, make_n
             return super().waitables
 
     node = Listed('listed', context=make_node().context, enable_rosout=False)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         executor.create_task(node.make)
         assert wait_for(lambda: len(calls) == 2), (made, calls)
@@ -291,8 +265,7 @@ class LateSender:
 
 def test_an_action_that_answers_before_the_request_is_noted(make_executor, make_node):
     node, group = make_node(), ReentrantCallbackGroup()
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
 
     def execute(goal: Any) -> Any:
         goal.succeed()
@@ -334,8 +307,7 @@ def test_a_cancelled_goal_request_does_not_block_its_callback_group(
         callback_group=ReentrantCallbackGroup())
     client = ActionClient(node, Fibonacci, '/cancelled')
     node.create_timer(0.002, lambda: ticks.append(1))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor) as spinning:
         assert client.wait_for_server(15.0)
         client.send_goal_async(Fibonacci.Goal()).cancel()
@@ -356,8 +328,7 @@ def test_a_content_filter_may_be_set_while_it_spins(make_executor, make_node):
     subscription = node.create_subscription(String, '/filtered', lambda msg: got.append(msg.data),
                                             10)
     publisher = node.create_publisher(String, '/filtered', 10)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
 
     def publish_until(found: str) -> bool:
         got.clear()
@@ -384,8 +355,7 @@ def test_a_content_filter_may_be_set_while_it_spins(make_executor, make_node):
 def test_a_timer_that_its_callback_cancels_runs_once(make_executor, make_node, stepwise):
     """Even where the next period begins before it gets to that."""
     node, calls = make_node(), []
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
 
     def once() -> None:
         calls.append(1)
@@ -441,8 +411,7 @@ def test_a_callback_may_destroy_what_it_belongs_to(make_executor, make_node):
 def test_publishers_are_destroyed_while_another_thread_publishes(make_executor, make_node):
     """The publishing thread is told, the executor goes on (rclpy#1206 for subscriptions)."""
     node, got = make_node(), []
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     node.create_subscription(Header, '/topic', got.append, 10)
     current: list[Any] = []
     stop = threading.Event()
@@ -473,35 +442,3 @@ def test_publishers_are_destroyed_while_another_thread_publishes(make_executor, 
             stop.set()
             thread.join()
     assert spinning.error is None and errors == []
-
-
-def test_a_result_does_not_overtake_the_feedback_before_it(make_executor, make_node):
-    """All that was published before the result, though its client forgets whom to tell then."""
-    node, feedback = make_node(), []
-    group = ReentrantCallbackGroup()
-
-    def execute(goal: Any) -> Any:
-        for number in range(8):
-            goal.publish_feedback(Fibonacci.Feedback(sequence=[number]))
-        goal.succeed()
-        return Fibonacci.Result()
-
-    server = ActionServer(node, Fibonacci, '/counted', execute, callback_group=group)
-    client = ActionClient(node, Fibonacci, '/counted', callback_group=group)
-    executor = make_executor()
-    executor.add_node(node)
-
-    async def run() -> None:
-        goal = await client.send_goal_async(Fibonacci.Goal(), feedback_callback=feedback.append)
-        await goal.get_result_async()
-
-    with Spinning(executor) as spinning:
-        assert client.wait_for_server(5.0)
-        assert wait_for(lambda: node.count_subscribers('/counted/_action/feedback') == 1)
-        for turn in range(1, 11):
-            task = executor.create_task(run)
-            assert wait_for(task.done)
-            assert wait_for(lambda n=turn: len(feedback) == 8 * n), (turn, len(feedback))
-    assert spinning.error is None
-    server.destroy()
-    client.destroy()

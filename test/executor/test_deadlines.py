@@ -194,8 +194,7 @@ def test_messages_of_another_process_in_the_same_microseconds_are_told_apart(
     timer = node.create_timer(
         0.005, lambda: publisher.publish(Header()), group, autostart=False)
     node.create_subscription(Header, '/a', sink, 1000, callback_group=group)
-    executor = make_executor(loads(SHARED), num_workers=2)
-    executor.add_node(node)
+    executor = make_executor(loads(SHARED), num_workers=2, nodes=[node])
     foreign = subprocess.Popen([sys.executable, '-c', FOREIGN])
     try:
         with Spinning(executor):
@@ -318,9 +317,7 @@ def test_ready_callbacks_run_in_the_policys_order(make_executor, make_node, poli
     for name in 'cab':
         racer.create_subscription(
             Header, f'/{name}', lambda m, n=name: ran.append(n), 10, callback_group=group)
-    executor = make_executor(loads(ORDER), num_workers=1, policy=policy)
-    executor.add_node(source)
-    executor.add_node(racer)
+    executor = make_executor(loads(ORDER), num_workers=1, policy=policy, nodes=[source, racer])
     with Spinning(executor):
         assert wait_for(lambda: all(p.get_subscription_count() == 1 for p in publishers))
         timer.timer_period_ns = 10_000_000_000

@@ -133,8 +133,7 @@ def test_without_the_variable_there_is_a_plain_lock(monkeypatch):
 def test_a_broken_invariant_ends_the_spin(make_executor, make_node):
     node, ticks = make_node(), []
     node.create_timer(0.01, lambda: ticks.append(None))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor) as spinning:
         assert wait_for(lambda: ticks)
         count(executor._engine, N_STALE)

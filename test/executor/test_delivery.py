@@ -48,8 +48,7 @@ def test_the_publishing_thread_takes(make_executor, make_node):
     node, got, go_on = make_node(), [], threading.Event()
     node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 10)
     publisher = node.create_publisher(Header, '/a', 10)
-    executor = make_executor(num_workers=1)
-    executor.add_node(node)
+    executor = make_executor(num_workers=1, nodes=[node])
     publisher.publish(Header(frame_id='before'))
     with Spinning(executor):
         assert wait_for(lambda: got == ['before'])
@@ -88,8 +87,7 @@ def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
     node, got = make_node('here'), []
     node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 1000)
     publisher = node.create_publisher(Header, '/a', 1000)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert sees_all(publisher)
         with subprocess.Popen([sys.executable, '-c', FOREIGN]) as foreign:
@@ -112,8 +110,7 @@ def test_nothing_is_lost_while_publishers_come_and_go(make_executor, make_node):
     got: list[int] = []
     node.create_subscription(Header, '/a', lambda m: got.append(int(m.frame_id)), 5000)
     publisher = node.create_publisher(Header, '/a', 5000)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     done = threading.Event()
 
     def come_and_go() -> None:
@@ -143,8 +140,7 @@ def test_several_threads_publish_and_each_ones_order_is_kept(make_executor, make
     node, got = make_node(), []
     node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), qos)
     publishers = [node.create_publisher(Header, '/a', qos) for _ in range(4)]
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
 
     def publish(publisher: Any, name: int) -> None:
         for number in range(200):
@@ -209,8 +205,7 @@ def test_a_message_from_before_the_subscription_comes_first(make_executor, make_
     publisher = node.create_publisher(Header, '/late', late)
     publisher.publish(Header(frame_id='early'))
     node.create_subscription(Header, '/late', lambda m: got.append(m.frame_id), late)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: got == ['early'])
         publisher.publish(Header(frame_id='now'))
@@ -222,8 +217,7 @@ def test_a_destroyed_subscription_is_no_harm(make_executor, make_node):
     first = node.create_subscription(Header, '/a', lambda m: got.append('first'), 10)
     node.create_subscription(Header, '/a', lambda m: got.append('second'), 10)
     publisher = node.create_publisher(Header, '/a', 10)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor) as spinning:
         publisher.publish(Header())
         assert wait_for(lambda: len(got) == 2)
@@ -257,8 +251,7 @@ def test_work_does_not_wait_for_a_callback_that_goes_on_after_publishing(
 
     node.create_timer(0.005, tick)
     node.create_subscription(Header, '/one', lambda m: heard.set(), 10, callback_group=group)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(waited) >= 10, 40.0)
     assert all(waited)
@@ -275,8 +268,7 @@ def test_counts_are_the_same_with_and_without(make_executor, make_node, monkeypa
     node.create_timer(0.02, lambda: one.publish(Header()))
     node.create_subscription(Header, '/one', lambda m: two.publish(Header()), 10)
     node.create_subscription(Header, '/two', lambda m: got.append(1), 10)
-    executor = make_executor(loads(CHAIN, 'chain.yaml'))
-    executor.add_node(node)
+    executor = make_executor(loads(CHAIN, 'chain.yaml'), nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(got) >= 20)
     statistics = executor.statistics()
@@ -333,8 +325,7 @@ def test_a_message_of_a_publisher_that_was_there_for_a_moment_does_not_wait(
 ):
     node, other, got = make_node('here'), make_node('elsewhere'), []
     node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 10)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         foreign = other.create_publisher(Header, '/a', 10)
         assert sees_all(foreign)

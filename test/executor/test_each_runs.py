@@ -99,8 +99,7 @@ def one_by_one(
     of_tasks, of_coroutines, of_subscriptions, of_services, of_guards, of_waitables])
 def test_each_of_many_runs_once(make_executor, make_node, start):
     node = make_node()
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     calls: list[int] = []
     with Spinning(executor) as spinning:
         start(executor, node, calls.append)
@@ -113,8 +112,7 @@ def test_each_time_that_a_timer_is_due_counts(make_executor, make_node):
     """Where this machine is busy it skips periods, and says so."""
     node, calls = make_node(), []
     timer = node.create_timer(0.005, lambda: calls.append(1))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(calls) >= MANY)
         timer.cancel()

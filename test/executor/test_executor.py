@@ -43,8 +43,7 @@ def test_subscriptions_of_each_kind(make_executor, make_node):
     node.create_subscription(Header, '/raw', got['raw'].append, 10, raw=True)
     node.create_subscription(Header, '/async', coroutine, 10)
     publishers = {name: node.create_publisher(Header, f'/{name}', 10) for name in got}
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         for publisher in publishers.values():
             publish_when_matched(publisher, Header(frame_id='x'))
@@ -70,8 +69,7 @@ def test_service_and_client_from_a_coroutine(make_executor, make_node):
         answers.append((await client.call_async(Trigger.Request())).message)
 
     timer = node.create_timer(0.01, ask, group)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(answers) >= 3)
         timer.cancel()
@@ -88,8 +86,7 @@ def test_a_callback_that_waits_may_lend_its_worker(make_executor, make_node):
 
     waiting = node.create_timer(0.01, wait, ReentrantCallbackGroup())
     node.create_timer(0.02, event.set, ReentrantCallbackGroup())
-    executor = make_executor(num_workers=1)
-    executor.add_node(node)
+    executor = make_executor(num_workers=1, nodes=[node])
     with executor.lend():  # elsewhere it does nothing
         pass
     with Spinning(executor):
@@ -109,8 +106,7 @@ def test_synchronous_calls_from_all_workers_at_once(make_executor, make_node):
         together.wait(5.0)
         answers.append(client.call(Trigger.Request(), timeout_sec=5.0))
 
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     assert client.wait_for_service(5.0)
     with Spinning(executor) as spinning:
         for _ in range(7):
@@ -131,8 +127,7 @@ def test_two_synchronous_calls_in_one_callback_inside_spin_once(make_executor, m
         for _ in range(2):
             answers.append(client.call(Trigger.Request(), timeout_sec=5.0))
 
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     assert client.wait_for_service(5.0)
     executor.create_task(ask_twice)
     executor.spin_once(1.0)
@@ -152,8 +147,7 @@ def test_shutdown_does_not_wait_for_the_second_call_of_a_callback(make_executor,
         nobody.call(Trigger.Request())
         done.set()
 
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     assert client.wait_for_service(5.0)
     executor.create_task(ask_twice)
     try:
@@ -192,8 +186,7 @@ def test_a_task_made_before_spin_runs_before_messages_that_wait(make_executor, m
     node, ran = make_node(), []
     node.create_subscription(Header, '/topic', lambda _: ran.append('message'), 10)
     publisher = node.create_publisher(Header, '/topic', 10)
-    executor = make_executor(num_workers=1)
-    executor.add_node(node)
+    executor = make_executor(num_workers=1, nodes=[node])
     publish_when_matched(publisher, Header())
     time.sleep(0.1)
     executor.create_task(ran.append, 'task')
@@ -235,8 +228,7 @@ def stays(calls: list[Any]) -> bool:
 def test_entities_created_and_destroyed_while_it_spins(make_executor, make_node):
     """What is destroyed meanwhile neither runs nor fails (rclpy#1206)."""
     node, calls = make_node(), []
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     publisher = node.create_publisher(Header, '/topic', 10)
     with Spinning(executor) as spinning:
         for _ in range(8):
@@ -285,8 +277,7 @@ def test_mutually_exclusive_group_is_kept(make_executor, make_node):
     for _ in range(6):
         node.create_subscription(Header, '/topic', exclusive, 10, callback_group=group)
     publisher = node.create_publisher(Header, '/topic', 10)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: publisher.get_subscription_count() == 6)
         for _ in range(3):
@@ -315,8 +306,7 @@ def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):
 
     node.create_subscription(Header, '/topic', slow, 3, callback_group=group)
     publisher = node.create_publisher(Header, '/topic', 100)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         publish_when_matched(publisher, Header(stamp=Time(sec=0)))
         assert wait_for(lambda: got == [0])
@@ -346,8 +336,7 @@ def test_bad_arguments_say_what_to_do(ros_context, kwargs, says):
 def test_a_destroyed_subscription_does_not_run_what_it_has_queued(make_executor, make_node):
     """Not even when it is just dispatched while the executor takes note; hence the rounds."""
     node, got = make_node(), []
-    executor = make_executor(num_workers=1)
-    executor.add_node(node)
+    executor = make_executor(num_workers=1, nodes=[node])
     publisher = node.create_publisher(Header, '/topic', 10)
     begun, gate = threading.Semaphore(0), threading.Semaphore(0)
 
@@ -393,8 +382,7 @@ def test_executors_that_are_shut_down_leave_no_files(ros_context):
 def test_statistics_while_entities_come_and_go(make_executor, make_node):
     """No exception, and nothing that has been counted is lost."""
     node, errors, counts = make_node(), [], [0]
-    executor = make_executor(num_workers=1)
-    executor.add_node(node)
+    executor = make_executor(num_workers=1, nodes=[node])
     ended = threading.Event()
 
     def ask() -> None:

@@ -183,9 +183,7 @@ def test_a_leg_of_a_sync_that_raises(make_executor, make_node) -> None:
         join.create_subscription(
             Header, topic, lambda message, topic=topic: take(topic), 10,
             callback_group=ReentrantCallbackGroup())
-    executor = make_executor(loads(SYNC))
-    executor.add_node(source)
-    executor.add_node(join)
+    executor = make_executor(loads(SYNC), nodes=[source, join])
     assert wait_for(lambda: all(p.get_subscription_count() == 1 for p in publishers))
     timer.reset()
     spin_until(executor, lambda: sum(job % 2 for job in ran) >= 3)  # periods may be missed
@@ -242,8 +240,7 @@ def test_an_exception_outside_of_callbacks_ends_spin_and_no_worker(
         await Awaitable()
 
     node.create_timer(0.01, tick, ReentrantCallbackGroup())
-    executor = make_executor(num_workers=1)
-    executor.add_node(node)
+    executor = make_executor(num_workers=1, nodes=[node])
     for runs in (1, 2, 3):
         with pytest.raises(Wrong):
             executor.spin()

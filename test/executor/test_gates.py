@@ -79,8 +79,7 @@ def test_a_timer_runs_as_often_as_its_group_lets_it(make_executor, node):
             group.give()
 
     node.create_timer(0.004, tick)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor) as spinning:
         assert wait_for(lambda: len(ticks) > 60)
     assert spinning.error is None
@@ -94,8 +93,7 @@ def test_a_timer_runs_as_often_as_its_group_lets_it(make_executor, node):
 def test_it_is_asked_again_though_no_callback_ends(make_executor, node):
     group, ran = Tokens(), []
     node.create_timer(0.001, lambda: ran.append(1), callback_group=group)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: group.asked > 2)
         assert not ran
@@ -109,8 +107,7 @@ def test_a_group_that_always_refuses_stops_nobody_else(make_executor, node):
     node.create_subscription(Int32, '/shut', refused.append, 5, callback_group=group)
     node.create_timer(0.001, lambda: ran.append(1))
     publisher = node.create_publisher(Int32, '/shut', 5)
-    executor = make_executor(num_workers=1)
-    executor.add_node(node)
+    executor = make_executor(num_workers=1, nodes=[node])
     with Spinning(executor) as spinning:
         assert wait_for(lambda: publisher.get_subscription_count() == 1)
         for i in range(20):
@@ -124,8 +121,7 @@ def test_messages_that_wait_are_as_many_as_the_qos_says_and_keep_their_order(mak
     node.create_subscription(
         Int32, '/gated', lambda m: got.append(m.data), 3, callback_group=group)
     publisher = node.create_publisher(Int32, '/gated', 50)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
 
     def count(what: str) -> int:
         return int(sum(c[what] for name, c in executor.statistics()['callbacks'].items()
@@ -152,8 +148,7 @@ def test_callbacks_of_one_entity_run_at_once_where_the_group_lets_them(make_exec
 
     node.create_subscription(Int32, '/pairs', callback, 20, callback_group=group)
     publisher = node.create_publisher(Int32, '/pairs', 20)
-    executor = make_executor(num_workers=4)
-    executor.add_node(node)
+    executor = make_executor(num_workers=4, nodes=[node])
     with Spinning(executor) as spinning:
         assert wait_for(lambda: publisher.get_subscription_count() == 1)
         for i in range(10):
@@ -169,8 +164,7 @@ def test_the_end_is_told_when_a_callback_raises(make_executor, node):
         raise ValueError('on purpose')
 
     node.create_timer(0.001, callback, callback_group=group)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with pytest.raises(ValueError, match='on purpose'):
         executor.spin()
     assert wait_for(lambda: group.begun == group.ended >= 1)
@@ -188,8 +182,7 @@ def test_what_a_group_raises_comes_out_of_spin(make_executor, node, monkeypatch,
 
     monkeypatch.setattr(group, method, broken)
     node.create_timer(0.001, lambda: None, callback_group=group)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with pytest.raises(ValueError, match='a broken group'):
         executor.spin()
 
@@ -204,8 +197,7 @@ def test_a_coroutine_ends_when_it_has_run_to_its_end(make_executor, node):
 
     node.create_subscription(Int32, '/awaits', callback, 5, callback_group=group)
     publisher = node.create_publisher(Int32, '/awaits', 5)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor) as spinning:
         assert wait_for(lambda: publisher.get_subscription_count() == 1)
         publisher.publish(Int32(data=1))
@@ -220,22 +212,10 @@ def test_a_coroutine_ends_when_it_has_run_to_its_end(make_executor, node):
     assert steps == [('begins', 1), ('ends', 1), ('begins', 2), ('ends', 2)]
 
 
-def test_a_spin_goes_on_with_what_a_step_left(make_executor, node):
-    group, ran = Tokens(), []
-    node.create_timer(0.001, lambda: ran.append(1), callback_group=group)
-    executor = make_executor()
-    executor.add_node(node)
-    assert wait_for(lambda: executor.spin_once(0.01) or group.asked)
-    group.give()
-    with Spinning(executor):
-        assert wait_for(lambda: ran)
-
-
 def test_a_destroyed_entity_that_waits_for_its_group_is_forgotten(make_executor, node):
     group, ran = Tokens(), []
     timer = node.create_timer(0.001, lambda: ran.append(1), callback_group=group)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor) as spinning:
         assert wait_for(lambda: group.asked > 2)
         node.destroy_timer(timer)
@@ -320,8 +300,7 @@ def test_a_group_that_changes_one_of_rclpys_is_asked_and_still_exclusive(make_ex
         running.pop()
 
     timers = [node.create_timer(0.001, callback, callback_group=group) for _ in range(3)]
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor) as spinning:
         assert wait_for(lambda: all(group.ended.count(timer) > 5 for timer in timers))
     assert spinning.error is None and set(most) == {1} and len(group.ended) == len(most)

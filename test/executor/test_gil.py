@@ -88,8 +88,7 @@ def test_as_many_run_at_once_as_the_declaration_says(
         compute(5)
 
     bodies = Bodies(node, body)
-    executor = make_executor(graph(holds))
-    executor.add_node(node)
+    executor = make_executor(graph(holds), nodes=[node])
     with Spinning(executor):
         bodies.publish(*NAMES)
         assert wait_for(lambda: len(bodies.ran) == 4, 20.0)
@@ -107,8 +106,7 @@ def test_what_is_held_back_runs_in_the_order_of_deadlines(make_executor, make_no
                 pass
 
     bodies = Bodies(node, body)
-    executor = make_executor(graph('true', (5_000, 60_000, 20_000, 40_000)))
-    executor.add_node(node)
+    executor = make_executor(graph('true', (5_000, 60_000, 20_000, 40_000)), nodes=[node])
     with Spinning(executor):
         bodies.publish('a')
         assert begun.wait(5.0)
@@ -161,8 +159,7 @@ def test_one_that_waits_for_another_gives_the_interpreter_back(make_executor, ma
             done.set()
 
     bodies = Bodies(node, body)
-    executor = make_executor(graph('true'))
-    executor.add_node(node)
+    executor = make_executor(graph('true'), nodes=[node])
     with Spinning(executor):
         bodies.publish('a')
         assert wait_for(lambda: bodies.ran == ['a'])
@@ -176,8 +173,7 @@ def test_who_computes_is_learnt_and_shown(make_executor, make_node):
     node.create_timer(0.01, lambda: (compute(3), ran.append('computes')))
     node.create_timer(0.011, lambda: (time.sleep(0.003), ran.append('sleeps')),
                       callback_group=ReentrantCallbackGroup())
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
 
     def found() -> dict[str, tuple[bool, float | None]]:
         return {name: (count['holds_interpreter'], count['interpreter_share'])
@@ -197,8 +193,7 @@ def test_who_computes_is_learnt_and_shown(make_executor, make_node):
 def test_the_switch_interval_is_given_back(make_executor, make_node):
     node, seen = make_node(), []
     node.create_timer(0.001, lambda: seen.append(sys.getswitchinterval()))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     before = sys.getswitchinterval()
     with Spinning(executor):
         assert wait_for(lambda: seen)
@@ -230,14 +225,6 @@ def test_two_that_fight_for_the_lock_are_both_found_out():
     assert learnt((20, 10, 10)) == 1
     assert learnt((70, 10, 60)) == 1
     assert learnt((20, 0.2, 15)) == 0  # sleeps while others compute
-
-
-def test_who_sleeps_while_others_always_compute_is_seldom_thought_to_compute():
-    """Others that no executor knows: a thread of a driver, or one that hashes all the time."""
-    habit = GilHabit()
-    assert learnt(*[(10, 0.6, 0)] * 20, habit=habit) == 0
-    found = [learnt((10, 0.6, 10), habit=habit) for _ in range(100)]
-    assert sum(found) < 20  # for one execution now and then, to find out
 
 
 def test_who_starves_is_not_thought_to_wait():
@@ -495,30 +482,3 @@ def test_a_callback_that_releases_the_gil_starts_beside_a_long_one(make_executor
         beside.meanwhile = lambda: 'patient' in beside.ran
         for _ in range(3):
             assert beside.order('patient') == ['begins', 'patient', 'ends']
-
-
-def test_a_timer_that_is_due_beside_a_long_callback_runs_after_it(make_executor, make_node):
-    """And keeps its period: it was due while nobody was to be woken for it."""
-    node, ran = make_node(), []
-    group = ReentrantCallbackGroup()
-
-    def compute_long() -> None:
-        ran.append('begins')
-        compute(30)
-        ran.append('ends')
-
-    node.create_timer(0.1, compute_long, callback_group=group)
-    node.create_timer(0.01, lambda: ran.append('patient'), callback_group=group)
-    executor = make_executor(msg_graph.loads("""
-mddag: 1
-nodes:
-  - node: /node
-    callbacks:
-      - {name: long, timer: 100ms, dag: long, deadline: 5s, holds_interpreter: true}
-      - {name: patient, timer: 10ms, dag: patient, deadline: 20s, holds_interpreter: true}
-""", 'g.yaml'))
-    executor.add_node(node)
-    with Spinning(executor):
-        assert wait_for(lambda: ran.count('ends') >= 5 and ran[-1] == 'patient', 30.0)
-    for before, after in zip(ran, ran[1:]):
-        assert before != 'begins' or after == 'ends', ran

@@ -18,8 +18,7 @@ def test_a_worker_that_fails_where_it_waits_is_replaced(make_executor, make_node
     node, got = make_node(), []
     node.create_subscription(Header, '/a', got.append, 10)
     publisher = node.create_publisher(Header, '/a', 10)
-    executor = make_executor(num_workers=2)
-    executor.add_node(node)
+    executor = make_executor(num_workers=2, nodes=[node])
     loop = executor._pool.loop
     wait, fails = loop.wait, [OSError('no more')]
 

@@ -21,7 +21,6 @@ import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
@@ -211,23 +210,6 @@ def test_a_node_that_went_while_its_callback_ran_is_freed(make_executor, ros_con
             gc.collect()
             return left() is None
         assert wait_for(is_free)
-
-
-def test_a_spin_that_has_ended_holds_no_entities(make_executor, make_node):
-    executor = make_executor()
-    node = make_node()
-    timer = node.create_timer(100.0, print)
-    subscription = node.create_subscription(Header, 'chatter', lambda message: None, 10)
-    executor.add_node(node)
-    with without_collector():
-        executor.spin_until_future_complete(Future(), timeout_sec=0.2)
-        executor.remove_node(node)
-        executor.spin_until_future_complete(Future(), timeout_sec=0.2)
-        left = [weakref.ref(thing) for thing in (timer, subscription)]
-        node.destroy_timer(timer)
-        node.destroy_subscription(subscription)
-        del timer, subscription
-        assert [thing() for thing in left] == [None, None]
 
 
 class Thing:

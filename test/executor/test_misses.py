@@ -268,24 +268,6 @@ def test_a_callback_that_hangs_is_a_miss_once(ros_context, make_node, tmp_path) 
     assert judged(replay(trace).result()['dags']) == judged(dags)
 
 
-def test_what_is_stepped_knows_of_a_miss_with_the_next_step(ros_context, make_node) -> None:
-    misses: list[DeadlineMiss] = []
-    once = Once(make_node, lambda: None, lambda: None)
-    executor = MultiDeadlineExecutor(
-        loads(ONCE), on_deadline_miss=misses.append, context=ros_context)
-    for node in once.nodes:
-        executor.add_node(node)
-    once.go()
-
-    def step() -> bool:
-        executor.spin_once(0.001)
-        return bool(misses)
-
-    assert wait_for(step)
-    executor.shutdown()
-    assert [miss.kind for miss in misses] == ['overdue']
-
-
 def test_what_was_reported_is_what_a_replay_judges(ros_context, make_node, tmp_path) -> None:
     """Callbacks end just before and after their deadlines."""
     generator, group = random.Random(1), ReentrantCallbackGroup()

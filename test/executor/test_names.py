@@ -7,7 +7,6 @@ from __future__ import annotations
 from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.executor.name_check import LEAST_S
 from msg_graph import loads
 import pytest
 from rclpy.action import ActionClient, ActionServer
@@ -17,6 +16,13 @@ from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
 from .conftest import Spinning, wait_for
+
+LEAST_S = 0.3
+
+
+@pytest.fixture(autouse=True)
+def check_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('mddag_executor.executor.name_check.LEAST_S', LEAST_S)
 
 
 def test_undeclared_callbacks_have_names(make_executor: Any, make_node: Any) -> None:

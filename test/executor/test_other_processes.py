@@ -4,12 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-import json
-import os
-from pathlib import Path
-import signal
-import subprocess
-import sys
 import time
 from typing import Any
 
@@ -26,8 +20,6 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.executor import current_job
 from mddag_executor.executor.jobs import header_stamp
-from mddag_executor.replay import replay
-from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
 from std_msgs.msg import Header
@@ -305,101 +297,3 @@ def test_a_stamp_of_the_future_is_no_release_before_now(lone):
     half.publish(stamped(before + 10_000 * MS))
     assert wait_for(lambda: len(nodes.jobs.get('last', ())) == 1)
     assert abs(nodes.jobs['last'][0][0].release_ns - before) < 1000 * MS
-
-
-def test_two_publishers_elsewhere_are_a_doubt(make_executor, make_node):
-    text = CHAIN + """
-  - node: /other
-    callbacks: [{name: tick, timer: 20ms, publishes: [/half], dag: other,
-                 release_from: header_stamp}]
-"""
-    nodes = Nodes(make_node)
-    executor = make_executor(loads(text))
-    executor.add_node(nodes.nodes['second'])
-    half = make_node('elsewhere').create_publisher(Header, '/half', 50)
-    with Spinning(executor):
-        assert wait_for(lambda: half.get_subscription_count() == 1)
-        half.publish(stamped(time.time_ns()))
-        assert wait_for(lambda: len(nodes.jobs.get('second', ())) == 1)
-    assert nodes.jobs['second'][0][0] is None
-    assert executor.statistics()['callbacks']['/second:relay']['unattributed'] == 1
-
-
-# --- two processes -------------------------------------------------------------------------------
-
-GUESTS = Path(__file__).resolve().parents[1] / 'hosting' / 'guests'
-
-
-class Run:
-    """A `mddag run` in a process of its own, until it is left."""
-
-    def __init__(self, folder: Path, name: str, nodes: list[str], **environment: str) -> None:
-        self.result = folder / f'{name}.json'
-        self.trace = folder / f'{name}.mcap'
-        path = os.pathsep.join([str(GUESTS), *filter(None, [os.environ.get('PYTHONPATH')])])
-        self._process = subprocess.Popen(
-            [sys.executable, '-m', 'mddag_executor', 'run', str(folder / 'graph.yaml'),
-             *(arg for node in nodes for arg in ('--node', f'relay:{node}')),
-             '--json', str(self.result), '--trace', str(self.trace)],
-            cwd=folder, env={**os.environ, 'PYTHONPATH': path, **environment},
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-    def end(self) -> dict[str, Any]:
-        self._process.send_signal(signal.SIGINT)
-        _, errors = self._process.communicate(timeout=20)
-        assert self._process.returncode == 0, errors
-        result: dict[str, Any] = json.loads(self.result.read_text())
-        return result
-
-    def kill(self) -> None:
-        self._process.kill()
-        self._process.wait()
-
-
-def test_two_processes_share_a_graph_and_the_sink_judges(tmp_path: Path):
-    (tmp_path / 'graph.yaml').write_text(CHAIN)
-    mark = tmp_path / 'enough'
-    down = Run(tmp_path, 'down', ['second', 'last'], RELAY_TAKES='0.12', RELAY_MARK=str(mark))
-    up = Run(tmp_path, 'up', ['sensor', 'first'])
-    try:
-        assert wait_for(mark.exists, 30.0)
-        upper, lower = up.end(), None
-        time.sleep(0.5)
-        lower = down.end()
-    finally:
-        up.kill()
-        down.kill()
-    assert upper['dags']['chain']['sinks'] == {} and not upper['deadline_missed']
-    due, releases = (
-        [e['release'] for e in read_events(str(run.trace)) if e['_name'] == 'mddag:job_release']
-        for run in (up, down))
-    # apart from releases that a busy machine skipped
-    skipped = len(due) - upper['callbacks']['/sensor:tick']['ran']
-    assert upper['dags']['chain']['ends']['expired'] <= skipped + 5
-    chain = lower['dags']['chain']
-    # the trace also has those that were released before the run began, which are not judged
-    early = len(releases) - chain['jobs']
-    assert 10 < chain['jobs'] <= len(releases) <= len(due)
-    assert lower['unattributed']['doubtful'] == 0 and lower['never_ran'] == []
-    counts = lower['callbacks']
-    assert counts['/second:relay']['unattributed'] == 0
-    sink = chain['sinks']['/last:sink']
-    judged = counts['/last:sink']['ran'] - counts['/last:sink']['unattributed']
-    # what expires while its sink waits, on a busy machine, runs and is not judged
-    assert judged - chain['ends']['expired'] - early - 5 <= sink['completed'] <= judged
-    assert sink['completed'] <= chain['jobs']
-    assert 0.8 * chain['jobs'] <= sink['completed']
-    assert sink['late'] == sink['completed'] and lower['deadline_missed']
-    assert sink['response_ns']['min'] >= 120 * MS
-    # each job here is one of there, a little later: the node's clock was read in its callback
-    after = sorted(min(r - d for d in due if r - d > -2 * MS) for r in releases)
-    assert after[len(after) // 2] < 15 * MS
-    hosted = [e['vertices'] for e in read_events(str(down.trace)) if e['_name'] == 'mddag:hosted']
-    assert hosted[-1] == '2,3'
-    for run, recorded in ((up, upper), (down, lower)):
-        replayed = replay(str(run.trace))
-        assert replayed.warnings == []
-        found = replayed.result()
-        assert found['deadline_missed'] == recorded['deadline_missed']
-        assert found['dags']['chain']['jobs'] == recorded['dags']['chain']['jobs']
-        assert found['dags']['chain']['ends'] == recorded['dags']['chain']['ends']

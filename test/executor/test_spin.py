@@ -27,8 +27,7 @@ from .pulse import Pulse
 def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
     """The only worker ends the spin right after it: who swallows it is found out at once."""
     node = make_node()
-    executor = make_executor(num_workers=1)
-    executor.add_node(node)
+    executor = make_executor(num_workers=1, nodes=[node])
     after: Future = Future(executor=executor)
 
     def fail(*args: Any) -> None:
@@ -71,8 +70,7 @@ def test_what_fails_when_it_is_taken_comes_out_of_spin(make_executor, make_node)
     node = make_node()
     broken = Broken(node, node.default_callback_group)
     node.add_waitable(broken)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     broken.guard.trigger()
     with pytest.raises(ZeroDivisionError, match='taken'):
         executor.spin_until_future_complete(Future(), 2.0)
@@ -142,8 +140,7 @@ def test_spin_once_runs_one_callback_and_has_finished_it(make_executor, make_nod
     node, calls = make_node(), []
     for _ in range(3):
         node.create_timer(0.001, lambda: calls.append(threading.get_ident()))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     time.sleep(0.01)
     for count in range(1, 6):
         executor.spin_once(1.0)
@@ -347,8 +344,7 @@ def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros
     node.create_subscription(Header, '/topic', calls.append, 10)
     node.create_guard_condition(lambda: calls.append(2)).trigger()
     publisher = node.create_publisher(Header, '/topic', 10)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     if end == 'shutdown':
         with Spinning(executor):
             assert wait_for(lambda: publisher.get_subscription_count() and done.done())
@@ -370,8 +366,7 @@ def test_wait_for_message_from_a_callback(make_executor, make_node, ros_context)
     node = make_node()
     publisher = node.create_publisher(Header, '/topic', 10)
     node.create_timer(0.01, lambda: publisher.publish(Header(frame_id='it')))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         found, message = wait_for_message(Header, node, '/topic', time_to_wait=5.0)
     assert found and message.frame_id == 'it'
@@ -394,8 +389,7 @@ def test_what_was_taken_is_not_lost_between_two_spin_once_of_rclpy(make_executor
 
 def test_a_rate_ends_a_spin_once(make_executor, make_node):
     node, slept = make_node(), threading.Event()
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     rate = node.create_rate(100.0)
 
     def sleep() -> None:
@@ -411,8 +405,7 @@ def test_a_rate_ends_a_spin_once(make_executor, make_node):
 
 def test_a_coroutine_that_only_yields_goes_on_in_the_next_spin_once(make_executor, make_node):
     node, steps = make_node(), []
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
 
     async def run() -> None:
         steps.append(1)

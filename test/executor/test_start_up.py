@@ -39,8 +39,7 @@ def test_periods_before_the_spin_are_no_jobs_and_no_misses(make_executor, make_n
         publisher.publish(Header())
 
     node.create_timer(0.01, tick)
-    executor = make_executor(loads(GRAPH))
-    executor.add_node(node)
+    executor = make_executor(loads(GRAPH), nodes=[node])
     releases: list[int] = []
     executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
     time.sleep(0.3)
@@ -71,8 +70,7 @@ nodes:
     publisher = node.create_publisher(Header, '/topic', 10)
     node.create_subscription(Header, '/topic', got.append, 10)
     assert wait_for(publisher.get_subscription_count)
-    executor = make_executor(graph)
-    executor.add_node(node)
+    executor = make_executor(graph, nodes=[node])
     releases: list[int] = []
     executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
     publisher.publish(Header(stamp=node.get_clock().now().to_msg()))

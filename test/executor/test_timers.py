@@ -45,8 +45,7 @@ def waits_for_no_timer(executor: Any) -> bool:
 def test_a_timer_that_was_cancelled_runs_when_it_is_reset(make_executor, make_node, spinning):
     node, ran = make_node(), []
     timer = node.create_timer(0.01, lambda: ran.append(1), autostart=False)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with spinning(executor):
         for _ in range(5):
             assert wait_for(lambda: waits_for_no_timer(executor))
@@ -70,8 +69,7 @@ def test_a_callback_may_reset_another_timer_and_its_own(make_executor, make_node
         timers[0].reset()
 
     timers = [node.create_timer(0.005, first), node.create_timer(0.005, second, autostart=False)]
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with spinning(executor):
         assert wait_for(lambda: len(ran) >= 12)
     assert ran[:12] == ['first', 'second'] * 6
@@ -81,8 +79,7 @@ def test_a_shortened_period_counts_from_the_reset_on(make_executor, make_node, s
     node, ran, others = make_node(), [], []
     timer = node.create_timer(FAR_S, lambda: ran.append(1))
     node.create_timer(0.01, lambda: others.append(1))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with spinning(executor):
         assert wait_for(lambda: others)
         timer.timer_period_ns = 5 * MS
@@ -109,8 +106,7 @@ def test_a_timer_that_is_reset_before_it_is_due_never_runs_and_costs_no_memory(
         resets.append(1)
 
     node.create_timer(0.001, feed)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(resets) >= 50)
         assert len(executor._pool.timers._heap) < 50
@@ -122,8 +118,7 @@ def test_a_timer_that_is_reset_before_it_is_due_never_runs_and_costs_no_memory(
 def test_timers_of_each_clock_run(make_executor, make_node, kind):
     node, ran = make_node(), []
     node.create_timer(0.01, lambda: ran.append(1), clock=Clock(clock_type=kind))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(ran) >= 5)
 
@@ -175,40 +170,6 @@ def test_a_timer_runs_by_simulated_time_and_by_nothing_else(make_executor, make_
             simulated.step(1 * MS)
             simulated.until(lambda n=second: len(simulated.ran) == n)
     assert simulated.ran == [start + second * 10**9 for second in range(1, 6)]
-
-
-def test_a_jump_over_several_periods_runs_the_timer_and_keeps_its_phase(
-    make_executor, make_node,
-):
-    simulated = Simulated(make_executor, make_node)
-    with Spinning(simulated.executor):
-        assert simulated.matched()
-        simulated.step(0)
-        simulated.timer(1.0)
-        assert simulated.is_idle()
-        simulated.step(10_500 * MS)
-        simulated.until(lambda: len(simulated.ran) >= 1)
-        assert simulated.is_idle()
-        count = len(simulated.ran)
-        assert count <= 2  # rcl skips the rest
-        simulated.step(499 * MS)
-        assert simulated.is_idle() and len(simulated.ran) == count
-        simulated.step(1 * MS)
-        simulated.until(lambda: len(simulated.ran) == count + 1)
-
-
-def test_a_timer_of_simulated_time_is_reset(make_executor, make_node):
-    simulated = Simulated(make_executor, make_node)
-    with Spinning(simulated.executor):
-        assert simulated.matched()
-        simulated.step(0)
-        timer = simulated.timer(1.0, autostart=False)
-        assert simulated.is_idle()
-        simulated.step(5 * 10**9)
-        assert simulated.is_idle() and not simulated.ran
-        timer.reset()
-        simulated.step(1 * 10**9)
-        simulated.until(lambda: len(simulated.ran) == 1)
 
 
 def test_a_node_may_turn_to_simulated_time_and_back(make_executor, make_node):

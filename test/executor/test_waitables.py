@@ -126,8 +126,7 @@ def test_a_goal_expires_when_its_time_is_over(make_executor, make_node, stepwise
     """The timer is within the server; nothing else happens meanwhile."""
     node = make_node()
     counting = Counting(node, node, result_timeout=0.2)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
 
     def known() -> int:
         return len(counting.server._goal_handles)
@@ -172,8 +171,7 @@ def test_who_comes_and_goes_is_told(make_executor, make_node):
     node.create_subscription(
         Header, '/a', lambda message: None, 10, event_callbacks=SubscriptionEventCallbacks(
             matched=lambda event: matched.append(event.current_count)))
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         for number in range(1, 4):
             publisher = other.create_publisher(Header, '/a', 10)
@@ -246,8 +244,7 @@ def test_what_happened_before_the_executor_came_is_told(make_executor, make_node
             matched=lambda event: matched.append(event.current_count)))
     publisher = node.create_publisher(Header, '/a', 10)
     assert wait_for(lambda: publisher.get_subscription_count() == 1)
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: matched == [1])
 
@@ -276,8 +273,7 @@ class Counted(Pulse):
 def test_each_trigger_of_a_guard_condition_is_noticed(make_executor, make_node, stepwise):
     """While it spins guard conditions come and go."""
     node = make_node()
-    executor = make_executor()
-    executor.add_node(node)
+    executor = make_executor(nodes=[node])
 
     def triggered(guard: Any, done: Any) -> None:
         guard.trigger()
