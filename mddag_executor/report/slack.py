@@ -60,19 +60,18 @@ def _summary(result: Mapping[str, Any]) -> Iterator[str]:
         yield f'never completed, so not judged: {counted(len(never), "sink")}: {listed(never)}'
     if not _is_judged(result):
         if len(never) < len(result['sinks']):
-            yield ('every sink misses every deadline as things are: nothing is left that could '
-                   'break')
+            yield ('every sink misses every deadline already, so nothing is left to find')
         return
     free = sum(one['factor'] is None for one in result['callbacks'].values())
     most = result['most']
     if free:
         yield f'{counted(free, "callback")} may take {most:g} times as long and more'
     if result['left_out']:
-        yield (f'left out, because they miss every deadline as things are: '
+        yield (f'left out, because they miss every deadline already: '
                f'{listed(result["left_out"])}')
     some = {name: n for name, n in result['missed'].items() if name not in result['left_out']}
     if some:
-        yield (f'{counted(sum(some.values()), "deadline")} missed as things are: '
+        yield (f'{counted(sum(some.values()), "deadline")} missed already: '
                + listed([f'{name} ({n})' for name, n in some.items()])
                + '; the factors say when another one is missed')
 
@@ -106,8 +105,8 @@ def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
     for line in (*_load_lines(result), *_summary(result)):
         yield f'<p class="note">{escape(line)}</p>\n'
     short = _short(result)
-    yield ('<h2>How many times as long each callback may take, alone</h2>\n<p class="note">The '
-           f'bars are logarithmic, up to {result["most"]:g} times.</p>\n')
+    yield ('<h2>How many times as long each callback may take</h2>\n<p class="note">If the others '
+           f'take as long as now. The bars are logarithmic, up to {result["most"]:g} times.</p>\n')
     yield '<div class="wide">' + html_table(('callback', 'then misses', 'bar', 'may take'), [
         (short[name], short[one['breaks']], _bar(one['factor'], result['most']),
          _times(one['factor'])) for name, one in _tightest(result)], 3) + '</div>'

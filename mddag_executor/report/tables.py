@@ -24,15 +24,22 @@ HEADER = ('DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', 'median',
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
-    """
-    Return for each vertex its name with only the last part of the node's.
+    """Return for each vertex its name with only the last parts of its node's that are needed."""
+    left = list(dict.fromkeys(names))
+    short: dict[str, str] = {}
+    parts = 1
+    while left:
+        ends = {name: _last_parts(name, parts) for name in left}
+        used = Counter(ends.values())
+        short.update((name, end) for name, end in ends.items() if used[end] == 1 or end == name)
+        left = [name for name in left if name not in short]
+        parts += 1
+    return short
 
-    A name that would then be ambiguous stays whole.
-    """
-    shortened = {name: node.rpartition('/')[2] + colon + rest for name in names
-                 for node, colon, rest in [name.partition(':')]}
-    used = Counter(shortened.values())
-    return {name: short if used[short] == 1 else name for name, short in shortened.items()}
+
+def _last_parts(name: str, parts: int) -> str:
+    node, colon, rest = name.partition(':')
+    return '/'.join(node.split('/')[-parts:]) + colon + rest
 
 
 class Sink(NamedTuple):

@@ -14,10 +14,11 @@ from mddag_executor.text import listed as listed_plainly
 
 Cell = str | int | float | None
 
-WIDTH = 120
-"""No table is wider, as long as the names in it can be shortened."""
+WIDTH, NARROW = 120, 100
+"""No table is wider than 120 columns, or 100 with few rows, if its names can be shortened."""
+_FEW_ROWS = 15
 _LONGEST_LIST = 10
-_SHORTEST_NAME = 20
+_SHORTEST_NAME = 18
 _NUMBER = re.compile(r'[-+]?[\d,]+(\.\d+)?( ?(%|ns|us|ms|s|min|h|MB|KB))?|-|')
 _RED, _PLAIN = '\x1b[31m', '\x1b[0m'
 _UNITS = ((1, 'ns'), (1_000, 'us'), (1_000_000, 'ms'), (1_000_000_000, 's'))
@@ -85,7 +86,8 @@ def table(
     """
     Return an aligned table; columns of numbers (also with a unit) are right-aligned.
 
-    Long names are shortened in their middle, so that the table is at most ``WIDTH`` columns wide.
+    Long names are shortened in their middle, so that the table is at most ``WIDTH`` columns wide,
+    with few rows ``NARROW``.
 
     :param header: the titles of the columns
     :param rows: their cells; None is printed as `-`, a float with two decimals
@@ -99,7 +101,10 @@ def table(
     right = [bool(column) and all(_NUMBER.fullmatch(cell) for cell in column)
              for column in columns]
     lines = [[printable(title) for title in header], *body]
-    widths = _fitting([max(len(line[i]) for line in lines) for i in range(len(header))], right)
+    names = [i for i, column in enumerate(columns)
+             if not right[i] and not any(' ' in cell for cell in column)]
+    widths = _fitting([max(len(line[i]) for line in lines) for i in range(len(header))], names,
+                      NARROW if len(body) <= _FEW_ROWS else WIDTH)
     lines = [[shortened(cell, width) for cell, width in zip(line, widths)] for line in lines]
     texts = ['  '.join(
         cell.rjust(width) if is_right else cell.ljust(width)
@@ -110,12 +115,11 @@ def table(
     return ''.join(text + '\n' for text in texts)
 
 
-def _fitting(widths: list[int], right: Sequence[bool]) -> list[int]:
-    """Return widths of columns that fit together: the widest columns of text lose most."""
-    too_many = sum(widths) + 2 * (len(widths) - 1) - WIDTH
-    texts = [i for i, is_right in enumerate(right) if not is_right]
-    while too_many > 0 and texts:
-        widest = max(texts, key=lambda i: widths[i])
+def _fitting(widths: list[int], names: Sequence[int], most: int) -> list[int]:
+    """Return widths of columns that fit together: the widest columns of names lose most."""
+    too_many = sum(widths) + 2 * (len(widths) - 1) - most
+    while too_many > 0 and names:
+        widest = max(names, key=lambda i: widths[i])
         if widths[widest] <= _SHORTEST_NAME:
             break
         widths[widest] -= 1

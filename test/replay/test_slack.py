@@ -108,8 +108,8 @@ nodes:
     assert result['load']['breaks'] == '/some:run'
     assert program.main(['slack', str(path)]) == 0
     out = capsys.readouterr().out
-    assert '2 deadlines missed as things are: /some:run (2); the factors say when' in out
-    assert 'left out, because they miss every deadline as things are: /every:run' in out
+    assert '2 deadlines missed already: /some:run (2); the factors say when' in out
+    assert 'left out, because they miss every deadline already: /every:run' in out
 
 
 def test_what_is_left_out_and_expires_hides_nothing(
@@ -191,5 +191,5 @@ def test_where_every_sink_misses_nothing_is_told(
         'timer: 100ms, deadline: 100ms', 'timer: 100ms, deadline: 50us'))
     assert program.main(['slack', str(graph)]) == 0
     out = capsys.readouterr().out
-    assert 'every sink misses every deadline as things are' in out
+    assert 'every sink misses every deadline already' in out
     assert 'times' not in out.splitlines()[-1]
