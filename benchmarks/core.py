@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from benchmarks import arguments
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, table
@@ -29,11 +30,12 @@ _LONGEST_NS = 60_000_000_000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    options.add(parser, '--graph', '--workers', '--duration', '--json')
+    arguments.add_graph(parser)
+    options.add(parser, '--workers', '--duration', '--json')
     parser.add_argument(
         '--policies', default=','.join(POLICIES), metavar='P,P…', help='(default: all)')
     options.add_seed(parser, 'seed of the drawn execution times')
-    options.add_repeat(parser, 5)
+    arguments.add_repeat(parser, 5)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -42,7 +44,7 @@ def main(args: argparse.Namespace) -> int:
     if args.duration > _LONGEST_NS:
         raise UsageError('--duration: that is too long: give at most 60s')
     from benchmarks.virtual_time import time_core
-    task_set = common.load_workload(args.graph)
+    task_set = arguments.load_workload(args.graph)
     workers = defaults.workers(args.workers, task_set)
     rows: list[dict[str, Any]] = []
     with Progress('measuring', len(policies)) as line:

@@ -12,6 +12,7 @@ import argparse
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from benchmarks import arguments
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, table
@@ -35,7 +36,8 @@ _VERTEX_JOBS = {'compiled': 200_000, 'plain': 20_000}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    options.add(parser, '--graph', '--json')
+    arguments.add_graph(parser)
+    options.add(parser, '--json')
     add('--runs', type=options.positive_int, default=2000, metavar='N',
         help=f'for each measurement; one in {_PLAIN_SHARE} in plain Python (default: %(default)s)')
     add('--policies', default='rad,rm,wc', metavar='P,P…', help='(default: %(default)s)')
@@ -43,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='runs to simulate at a time (default: 1 and the number of processors)')
     add('--vertices', type=options.list_of(options.positive_int), default=SIZES, metavar='N,N…',
         help='sizes of the random task sets (default: 10,100,1000,10000)')
-    options.add_repeat(parser, 3)
+    arguments.add_repeat(parser, 3)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -55,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
     if max(args.vertices) > 100_000:
         raise UsageError('--vertices: that is too many: give at most 100000')
     cores = CORES if available() else CORES[1:]
-    task_set = common.load_workload(args.graph)
+    task_set = arguments.load_workload(args.graph)
     experiment = Experiment(task_set, policies, workers=defaults.workers(None, task_set))
     jobs = args.jobs or sorted({1, defaults.processors()})
     runs: list[dict[str, Any]] = []

@@ -16,6 +16,7 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
+from benchmarks import arguments
 from benchmarks.campaign import (
     DECLARED,
     EXECUTORS,
@@ -96,9 +97,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_seed(
         parser, 'seed of the drawn execution times and phases, the same for all executors; with '
         'the default every deadline of the Autoware workload can be kept', int,
-        default=defaults.LIVE_SEED)
-    options.add_repeat(parser, 1, 'measure everything R times in turn, and take the medians')
-    options.add(parser, '--graph', '--json')
+        default=arguments.LIVE_SEED)
+    arguments.add_repeat(parser, 1, 'measure everything R times in turn, and take the medians')
+    arguments.add_graph(parser)
+    options.add(parser, '--json')
 
 
 def main(args: argparse.Namespace) -> int:

@@ -18,6 +18,7 @@ import sys
 import tempfile
 from typing import Any, TYPE_CHECKING
 
+from benchmarks import arguments
 from benchmarks.slack import check_slack
 from benchmarks.slack import show as show_slack
 from mddag_executor.cli import common, options
@@ -63,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='how many events the trace is to have (default: %(default)s)')
     add('--others', type=options.positive_int, default=200_000, metavar='N',
         help="messages after which mcap's and rosbags' readers are stopped (default: %(default)s)")
-    options.add_repeat(
+    arguments.add_repeat(
         parser, 3, 'measure R times in turn: the best speed counts, and the median response times')
     add('--accuracy', action='store_true',
         help='record live runs, reschedule them, and compare the response times of each sink')
@@ -83,7 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--workers', type=options.list_of(options.workers), metavar='M[,M…]',
         help='with --accuracy: of the live runs; the runs with further numbers are predicted '
         'from the recording with the first (default: 7 for callbacks that sleep, else 7,1,2)')
-    options.add(parser, '--graph', '--json')
+    arguments.add_graph(parser)
+    options.add(parser, '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -112,7 +114,7 @@ def _slack(args: argparse.Namespace, folder: str) -> dict[str, Any]:
     def record(graph: str, path: str) -> None:
         _record(graph, args, None, args.workers[0], path)
 
-    return check_slack(args, common.load_workload(args.graph), folder, record)
+    return check_slack(args, arguments.load_workload(args.graph), folder, record)
 
 
 # --- speed ---------------------------------------------------------------------------------------
@@ -123,7 +125,7 @@ def _speed(args: argparse.Namespace, folder: str) -> dict[str, Any]:
     path = args.trace
     if path is None:
         path = os.path.join(folder, 'long.mcap')
-        task_set = common.load_workload(args.graph)
+        task_set = arguments.load_workload(args.graph)
         with Progress('writing the trace', args.events) as line:
             write_long_trace(path, task_set, args.events, progress=line.update)
     events = TraceReader(path).message_count

@@ -17,8 +17,6 @@ DURATION_NS = 3_000_000_000
 """Virtual time of a simulated run."""
 BUDGETS = ('max', 'p99', 'mean')
 """Which value of a declared execution time an analysis may count."""
-LIVE_SEED = 2
-"""Of the execution times of live runs: each deadline of the Autoware workload leaves room."""
 
 
 def workers(asked: int | None, task_set: TaskSet | None) -> int:

@@ -28,7 +28,6 @@ from mddag_executor.cli.options import Input, NamedFile, Output, Report
 from mddag_executor.cli.text import is_quiet, Progress
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.output_rules import check_distinct, check_replaced
-from mddag_executor.resources import find
 
 if TYPE_CHECKING:
     from mddag_executor.replay.run import Traces
@@ -70,11 +69,6 @@ def load_graph(path: str) -> TaskSet:
         return msg_graph.load(path)
     name, text = read_text(path)
     return msg_graph.loads(text, name=name)
-
-
-def load_workload(given: str | None) -> TaskSet:
-    """Return the task set of a declaration, of the paper's workload where none is given."""
-    return load_graph(str(find('config/autoware.yaml')) if given is None else given)
 
 
 @contextmanager

@@ -149,10 +149,6 @@ _SHARED: dict[str, dict[str, Any]] = {
     'graph': {
         'metavar': 'GRAPH', 'type': Input,
         'help': "the declaration, a YAML file ('-': standard input)"},
-    '--graph': {
-        'metavar': 'FILE', 'type': Input,
-        'help': "a declaration to take instead of the one that ships with the package ('-': "
-        'standard input)'},
     '--output': {
         'metavar': 'GRAPH', 'type': Output, 'default': '-',
         'help': "the declaration ('-': standard output, the default)"},
@@ -271,13 +267,4 @@ def add_seed(
     :param what: is drawn with it; the help begins with it.
     """
     parser.add_argument('--seed', type=kind, default=default, metavar='N',
-                        help=f'{what} (default: %(default)s)')
-
-
-def add_repeat(
-    parser: argparse.ArgumentParser, default: int,
-    what: str = 'measure everything R times, and take the medians',
-) -> None:
-    """Declare `--repeat` of a benchmark."""
-    parser.add_argument('--repeat', type=positive_int, default=default, metavar='R',
                         help=f'{what} (default: %(default)s)')

@@ -42,7 +42,6 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.defaults import LIVE_SEED
 from mddag_executor.executor import DeadlineMiss
 from mddag_executor.executor.executor import MultiDeadlineExecutor
 from mddag_executor.hosting.measure import ExecutionPlan
@@ -342,7 +341,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--seconds', type=float, default=600.0)
     parser.add_argument('--utilisation', type=float, default=0.8)
     parser.add_argument('--workers', type=int, default=7)
-    parser.add_argument('--seed', type=int, default=LIVE_SEED)
+    parser.add_argument('--seed', type=int, default=2)
     args = parser.parse_args(arguments)
     rclpy.init(args=[])
     try:
