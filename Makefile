@@ -16,13 +16,15 @@ ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: help env demo test test-kilted check-fresh nightly mutations soak stress fuzz lint docs \
-	clean distclean
+.PHONY: help env demo test test-jazzy test-kilted test-public check-fresh nightly mutations soak \
+	stress fuzz lint docs clean distclean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo       run the Autoware workload under the executor, record and replay it'
 	@echo 'make test       run all tests, about $(TEST_TAKES) (PYTEST_ARGS=... for some of them)'
+	@echo 'make test-jazzy RCLPY=DIR  the tests of what runs ROS, with the rclpy in that folder'
+	@echo 'make test-public PUBLIC=DIR  public programs under both executors, from sources in there'
 	@echo 'make test-kilted  the tests of what runs ROS, with ROS 2 Kilted, in $(KILTED)/'
 	@echo 'make check-fresh  make demo and make test in new installations of Debian (CHECK_FRESH=...)'
 	@echo 'make nightly    make mutations, soak, stress and fuzz, and 20 times the random examples'
@@ -51,6 +53,23 @@ test: env
 LIVE_TESTS := test/executor test/hosting test/rerun test/examples test/hardening/test_misuse.py \
 	test/replay/test_live_replay.py \
 	$(addprefix test/cli/test_,$(addsuffix .py,demo graph_systems rerun run top))
+
+# With another rclpy than the index has: RCLPY is a folder with its package rclpy/, the extension
+# compiled against include/ and lib/ of the environment.
+test-jazzy: env
+ifneq ($(wildcard $(RCLPY)/rclpy/__init__.py),)
+	@PYTHONPATH='$(abspath $(RCLPY))' $(BIN)/python -m pytest $(PYTEST_ARGS) $(LIVE_TESTS)
+else
+	@echo 'test-jazzy: skipped: RCLPY=$(RCLPY): no rclpy/ there: set it to that of a compiled rclpy'
+endif
+
+# Public programs under rclpy's executor and under this one; PUBLIC is a folder with their sources.
+test-public: env
+ifneq ($(and $(PUBLIC),$(wildcard $(PUBLIC)/*/.)),)
+	@$(BIN)/python test/endurance/public_programs.py '$(PUBLIC)'
+else
+	@echo 'test-public: skipped: PUBLIC=$(PUBLIC): no sources there: clone demos, diagnostics, … into it'
+endif
 
 test-kilted:
 	@PYTHON='$(PYTHON)' sh .ci/environment $(KILTED) ros-kilted,test-kilted

@@ -1,0 +1,257 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Public programs under rclpy's executor and under this one: what they publish is compared.
+
+    python test/endurance/public_programs.py SOURCES [--seconds 5] [--only NAME]
+
+SOURCES is a folder with the sources of the packages, one folder for each repository.  Programs
+are run from there.  What they import beyond that (interfaces, libraries) must be importable
+already; a program whose imports or sources are missing is skipped with a line that says so.
+
+Each program runs twice with the same inputs, once with its own executor, once as ``mddag run
+--node`` hosts it.  A node of this script counts the messages of every topic for some seconds,
+starting with the first message.  The two runs are the same if
+
+* the same topics were published on, with the same types;
+* each topic had as many messages, give or take a quarter (a slow machine is no difference);
+* the last message of the topics in ``Program.constant`` was the same;
+* both ran until SIGINT, or neither, and the hosted program raised nothing but what it raises by
+  itself.  (``mddag run`` has the exit status 0 after SIGINT, a program often another.)
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from dataclasses import dataclass
+from importlib import import_module
+import os
+from pathlib import Path
+import random
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+from geometry_msgs.msg import Twist, Vector3
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import String
+
+TOLERANCE, FEW = 0.25, 3
+"""Counts that differ by this part, or by so many messages, are the same."""
+START_S, END_S = 10.0, 15.0
+"""How long a program may take to publish first, and to end after SIGINT."""
+IGNORED = ('/rosout', '/parameter_events')
+
+# for subscriptions of either durability
+_KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+URDF = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">
+<parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>"""
+
+
+@dataclass(frozen=True)
+class Program:
+    """
+    A program to compare.
+
+    :ivar spec: its module and function.
+    :ivar folders: where its packages are, in the folder of sources.
+    :ivar inputs: a message for each of some topics, published at 20 Hz while it runs.
+    :ivar constant: the topics whose last message must be the same.
+    """
+
+    name: str
+    spec: str
+    folders: tuple[str, ...]
+    inputs: tuple[tuple[str, Any], ...] = ()
+    constant: tuple[str, ...] = ()
+
+
+_DEMOS = ('demos/demo_nodes_py',)
+_DIAGNOSTICS = ('diagnostics/diagnostic_updater', 'diagnostics/diagnostic_common_diagnostics')
+_ROSBRIDGE = ('rosbridge_suite/rosbridge_library/src', 'rosbridge_suite/rosbridge_server/src',
+              'rosbridge_suite/rosapi/src')
+
+PROGRAMS = (
+    Program('talker', 'demo_nodes_py.topics.talker:main', _DEMOS),
+    Program('listener', 'demo_nodes_py.topics.listener:main', _DEMOS, (
+        ('/chatter', String(data='hello')),)),
+    Program('talker_qos', 'demo_nodes_py.topics.talker_qos:main', _DEMOS),
+    Program('set_parameters', 'demo_nodes_py.parameters.set_parameters_callback:main', _DEMOS),
+    Program('lifecycle_talker', 'lifecycle_py.talker:main', ('demos/lifecycle_py',)),
+    Program('data_publisher', 'topic_monitor.scripts.data_publisher:main',
+            ('demos/topic_monitor',)),
+    Program('obstacle_detection',
+            'turtlebot3_example.turtlebot3_obstacle_detection.turtlebot3_obstacle_detection:main',
+            ('turtlebot3/turtlebot3_example',), (
+                ('/scan', LaserScan(ranges=[1.5] * 360)),
+                ('/cmd_vel_raw', Twist(linear=Vector3(x=0.2)))),
+            ('/cmd_vel',)),
+    Program('joint_state_publisher', 'joint_state_publisher.joint_state_publisher:main',
+            ('joint_state_publisher/joint_state_publisher',), (
+                ('/robot_description', String(data=URDF)),)),
+    Program('cpu_monitor', 'diagnostic_common_diagnostics.cpu_monitor:main', _DIAGNOSTICS),
+    Program('diagnostic_example', 'diagnostic_updater.example:main', _DIAGNOSTICS),
+    Program('rosapi', 'rosapi_node:main', (*_ROSBRIDGE, 'rosbridge_suite/rosapi/scripts')),
+    Program('rosbridge_websocket', 'rosbridge_websocket:main',
+            (*_ROSBRIDGE, 'rosbridge_suite/rosbridge_server/scripts')),
+    Program('tree_watcher', 'py_trees_ros.programs.tree_watcher:main', ('py_trees_ros',)),
+    Program('gym_bridge', 'f1tenth_gym_ros.gym_bridge:main', ('f1tenth_gym_ros',)),
+)
+
+
+class Probe:
+    """A node that publishes a program's inputs and counts what the program publishes."""
+
+    def __init__(self, program: Program) -> None:
+        self.counts: Counter[str] = Counter()
+        self.types: dict[str, str] = {}
+        self.last: dict[str, Any] = {}
+        self.node = Node('public_programs_probe')
+        self._inputs = {topic for topic, _ in program.inputs}
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        for topic, message in program.inputs:
+            publisher = self.node.create_publisher(type(message), topic, _KEPT)
+            self.node.create_timer(0.05, lambda p=publisher, m=message: p.publish(m))
+        self.node.create_timer(0.1, self._look)
+
+    def _look(self) -> None:
+        for topic, types in self.node.get_topic_names_and_types():
+            if topic in self.types or topic in IGNORED or topic in self._inputs:
+                continue
+            if not self.node.get_publishers_info_by_topic(topic):
+                continue
+            self.types[topic] = types[0]
+            package, _, name = types[0].split('/')
+            self.node.create_subscription(
+                getattr(import_module(f'{package}.msg'), name), topic,
+                lambda message, topic=topic: self._count(topic, message),
+                qos_profile_sensor_data)
+
+    def _count(self, topic: str, message: Any) -> None:
+        self.counts[topic] += 1
+        self.last[topic] = message
+
+    def spin_for(self, seconds: float, process: subprocess.Popen[Any], first: bool) -> None:
+        """Spin for some seconds, or until the first message; not longer than a process runs."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and process.poll() is None and not (first and self.counts):
+            self._executor.spin_once(0.05)
+
+    def close(self) -> None:
+        """Destroy the node."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+
+
+@dataclass
+class Run:
+    """What a program did."""
+
+    types: dict[str, str]
+    counts: Counter[str]
+    constant: dict[str, Any]
+    end: str
+    status: int
+    said: str
+
+
+def observe(program: Program, path: list[str], hosted: bool, seconds: float) -> Run:
+    """Run a program under one of the executors; return what it did."""
+    domain = str(random.randrange(1, 100))
+    os.environ['ROS_DOMAIN_ID'] = domain  # of this process's context, too
+    module, function = program.spec.split(':')
+    command = ['-c', f'import sys; sys.argv = [{module!r}]; import {module} as m; m.{function}()']
+    if hosted:
+        command = ['-m', 'mddag_executor', 'run', '--node', program.spec, '--diagnostics', 'off']
+    rclpy.init()
+    probe = Probe(program)
+    with subprocess.Popen(
+        [sys.executable, *command], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(path)},
+    ) as process:
+        try:
+            probe.spin_for(START_S, process, True)
+            probe.counts.clear()
+            probe.spin_for(seconds, process, False)
+            end = 'by SIGINT' if process.poll() is None else 'by itself'
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=END_S)
+        except subprocess.TimeoutExpired:
+            end, said = 'not even by SIGINT', ''
+        finally:
+            process.kill()
+            probe.close()
+            rclpy.shutdown()
+    constant = {topic: probe.last.get(topic) for topic in program.constant}
+    return Run(probe.types, probe.counts, constant, end, process.returncode, said)
+
+
+def differences(theirs: Run, ours: Run) -> list[str]:
+    """Return in what two runs differ."""
+    found = []
+    if theirs.types != ours.types:
+        found.append(f'topics {theirs.types} and {ours.types}')
+    for topic in {*theirs.counts, *ours.counts}:
+        one, other = theirs.counts[topic], ours.counts[topic]
+        if abs(one - other) > max(FEW, TOLERANCE * max(one, other)):
+            found.append(f'{topic}: {one} and {other} messages')
+    if theirs.constant != ours.constant:
+        found.append(f'messages {theirs.constant} and {ours.constant}')
+    if theirs.end != ours.end:
+        found.append(f'ended {theirs.end} and {ours.end}')
+    if ours.status and not theirs.status:
+        found.append(f'exit status {ours.status}: {ours.said.strip()[-500:]}')
+    return found
+
+
+def missing(program: Program, path: list[str]) -> str:
+    """Return why a program cannot run; '' if it can."""
+    if not all(Path(folder).is_dir() for folder in path[:len(program.folders)]):
+        return 'no sources'
+    module = program.spec.split(':')[0]
+    done = subprocess.run(
+        [sys.executable, '-c', f'import {module}'], capture_output=True, text=True, check=False,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(path)}, timeout=60)
+    return done.stderr.strip().splitlines()[-1] if done.returncode else ''
+
+
+def main() -> int:
+    """Compare the programs; return 1 if one differs."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('sources', type=Path)
+    parser.add_argument('--seconds', type=float, default=5.0)
+    parser.add_argument('--only')
+    options = parser.parse_args()
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    before = [os.environ['PYTHONPATH']] if os.environ.get('PYTHONPATH') else []
+    n_different = n_ran = 0
+    for program in PROGRAMS:
+        if options.only not in (None, program.name):
+            continue
+        path = [str((options.sources / each).resolve()) for each in program.folders] + before
+        why = missing(program, path)
+        if why:
+            print(f'{program.name}: skipped: {why}', flush=True)
+            continue
+        theirs, ours = (observe(program, path, hosted, options.seconds)
+                        for hosted in (False, True))
+        found = differences(theirs, ours)
+        n_ran, n_different = n_ran + 1, n_different + bool(found)
+        counts = ', '.join(f'{topic} {theirs.counts[topic]}/{ours.counts[topic]}'
+                           for topic in sorted({*theirs.counts, *ours.counts}))
+        print(f'{program.name}: {"; ".join(found) or "same"} ({counts})', flush=True)
+    print(f'{n_ran} programs compared, {n_different} differ')
+    return 1 if n_different else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
