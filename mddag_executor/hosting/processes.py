@@ -103,9 +103,12 @@ class Run:
 
     @property
     def said(self) -> str:
-        """Return the last line that it wrote to standard error."""
-        lines = (*self._words, *self._errors)
-        return next((line for line in reversed(lines) if line.strip()), '')
+        """Return the last line that it wrote to standard error, or where it was stuck."""
+        lines = [line for line in (*self._words, *self._errors) if line.strip()]
+        threads = [i for i, line in enumerate(lines) if line.endswith('(most recent call first):')]
+        if threads and threads[-1] + 1 < len(lines) and lines[-1].startswith('  File '):
+            return f'stuck: {lines[threads[-1] + 1].strip()}'  # the main thread comes last
+        return lines[-1] if lines else ''
 
     @property
     def how(self) -> str:

@@ -95,6 +95,14 @@ def test_bad_input_of_one_is_the_error_of_all() -> None:
     assert case.err.getvalue() == ''
 
 
+def test_one_that_was_stuck_is_named_with_where() -> None:
+    stuck = ('import faulthandler, os, signal\ndef waits():\n    faulthandler.dump_traceback()\n'
+             '    os.kill(os.getpid(), signal.SIGKILL)\nwaits()')
+    case = Case(a=stuck)
+    case.run()
+    assert [run.said for run in case.died] == ['stuck: File "<string>", line 3 in waits']
+
+
 def test_an_error_line_of_one_that_ends_otherwise_is_printed() -> None:
     case = Case(True, a='import sys; print("error: no", file=sys.stderr)')
     case.run()
