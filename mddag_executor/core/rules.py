@@ -86,7 +86,6 @@ from mddag_executor.core.jobs import (
     fail_job,
     free_slot,
     judge,
-    open_undeclared,
     overdue,
 )
 from mddag_executor.core.policies import KeyFunction
@@ -156,12 +155,29 @@ def ready_undeclared(
     :param job: the job's index; ``group`` and ``holds``: see ``State.x_group``, ``x_holds``.
     :return: the execution.
     """
-    if s.free_slot[t.n_dags] < 0:
-        add_slot(t, s, t.n_dags)
-    x = s.job_base[open_undeclared(s, t.n_dags, job, now)]
+    dag = t.n_dags
+    if s.free_slot[dag] < 0:
+        add_slot(t, s, dag)
+    slot = s.free_slot[dag]
+    s.free_slot[dag] = s.job_next[slot]
+    s.job_index[slot] = job
+    s.job_release[slot] = now
+    s.job_state[slot] = OPEN
+    s.job_active[slot] = 1
+    x = s.job_base[slot]
     s.x_group[x] = group
     s.x_holds[x] = holds
-    make_ready(t, s, key, x, now)
+    s.x_ready[x] = now
+    s.x_started[x] = -1
+    s.scalars[ORDER] += 1
+    k = key(t, t.n_vertices, now, job, s.scalars[ORDER])
+    entry = (k[0], k[1], k[2], k[3], x)
+    s.x_key[x] = entry
+    s.x_state[x] = WAITING
+    if s.scalars[POLLING] == 0:
+        heappush(s.ready, entry)
+    else:
+        wait_for_poll(t, s, entry)
     return x
 
 
@@ -231,8 +247,9 @@ def peek(t: Tables, s: State, now: int) -> int:
                 queue = next_queue(t, s, False)
                 continue
             slot = s.x_slot[x]
-            if (t.on_late[s.job_dag[slot]] == ABORT and s.job_state[slot] == OPEN
-                    and overdue(t, s, slot, now)):
+            if s.job_state[slot] == OPEN:
+                if t.on_late[s.job_dag[slot]] != ABORT or not overdue(t, s, slot, now):
+                    return x
                 abort_job(t, s, slot, now)
             if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
                 return x
@@ -261,7 +278,6 @@ def start_on(s: State, x: int, worker: int, now: int) -> None:
     s.x_worker[x] = worker
     s.scalars[N_HOLDING] += s.x_holds[x]
     s.x_started[x] = now
-    s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
     s.worker_x[worker] = x
     s.scalars[N_IDLE] -= 1
     if s.x_group[x] >= 0:
@@ -276,12 +292,12 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
     """
     if s.scalars[N_IDLE] > 0 and len(s.pool) > 0:
         x = peek(t, s, now)
-        return -1 if x < 0 else take(t, s, idle_worker(t, s, x), now)
+        return -1 if x < 0 else _begin(t, s, idle_worker(t, s, x), now)
     if s.scalars[N_IDLE] > 0:
         worker = 0
         while s.worker_x[worker] >= 0:
             worker += 1
-        return take(t, s, worker, now)
+        return _begin(t, s, worker, now)
     if s.scalars[POLLING] != 0:
         return -1  # only a worker that is free looks, and polls
     x = peek(t, s, now)
@@ -297,8 +313,16 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
         return -1
     victim = s.worker_x[worker]
     _leave_worker(s, victim)
-    x = take(t, s, worker, now)
+    x = _begin(t, s, worker, now)
     _put_back(t, s, key, victim, now)
+    return x
+
+
+def _begin(t: Tables, s: State, worker: int, now: int) -> int:
+    """Dispatch as ``take`` does; the dispatch takes time of its own."""
+    x = take(t, s, worker, now)
+    if x >= 0:
+        s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
     return x
 
 

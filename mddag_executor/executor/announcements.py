@@ -202,7 +202,7 @@ class Announcements:
         self._waiting.append((now + WAIT_NS, work, info))
 
     def _check_later(self) -> None:
-        self._pool.call_at_locked(
+        self._pool.due.call_at(
             time.monotonic_ns() + CHECK_NS, lambda: self._pool.report(self._check))
 
     def _check(self, now: int) -> None:

@@ -33,6 +33,7 @@ from typing import NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import quantile
 from mddag_executor.core.tally import Counts, counts, Tally
+from mddag_executor.executor.bounds import END_S
 from mddag_executor.executor.settings import Thresholds
 from mddag_executor.executor.shutdown import is_over, join, stop_at_exit
 from mddag_executor.text import counted
@@ -51,7 +52,6 @@ TOPIC = '/diagnostics'
 WORKERS = 'workers'
 NODE_NAME = 'mddag_diagnostics'
 OK, WARN, ERROR, STALE = range(4)
-END_TIMEOUT_S = 2.0
 
 
 class Status(NamedTuple):
@@ -275,7 +275,7 @@ class Diagnostics:
         """End publishing; nothing happens when it has never begun."""
         self._ending.set()
         if self._thread is not None:
-            join(self._thread, END_TIMEOUT_S)
+            join(self._thread, END_S)
 
     def _run(self) -> None:
         try:

@@ -95,6 +95,8 @@ class Engine:
         self.refusals = 0
         self.to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
+        self._complete = self.scheduler.complete
+        self._take = self.scheduler.take
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
@@ -168,7 +170,7 @@ class Engine:
         entity = work.entity
         if entity.removed or self._finished:
             return
-        if entity.depth and len(entity.waiting) >= entity.depth:
+        if entity.waiting and 0 < entity.depth <= len(entity.waiting):
             self._replace_oldest(work, now)
         else:
             self._start_undeclared(work, now)
@@ -327,7 +329,7 @@ class Engine:
 
     def remove(self, entity: Entity, now: int) -> None:
         """Forget a destroyed entity: what waits of it never runs."""
-        entity.removed = True
+        entity.removed = entity.may_be_gone = True
         for x in list(entity.waiting):
             self._drop(entity, x, 'destroyed', now)
 
@@ -357,14 +359,15 @@ class Engine:
             worker = state.worker_x.index(-1)
         if self.holders:
             state.overtaking[1] = self._may_be_overtaken(now)
-        x = self.scheduler.take(worker, now)
+        x = self._take(worker, now)
         if state.decisions:
             self._decided(now)
         if x < 0:
             return None
         work = self._work.pop(x)
         entity = work.entity
-        entity.waiting.pop(x, None)
+        if x in entity.waiting:  # else it was suspended
+            del entity.waiting[x]
         work.worker = worker
         if state.x_holds[x]:
             self.holders.append(work)
@@ -490,10 +493,14 @@ class Engine:
         """
         entity = work.entity
         entity.ran += 1
-        entity.failed += failed
         x, work.x = work.x, -1
         if work in self.holders:
             self.holders.remove(work)
+        origin = work.origin
+        if origin is None and self.record is None and not failed:
+            self._complete(x, end)
+            return
+        entity.failed += failed
         if self.verdicts.tally.overdue and work.origin is not None:
             deadline = self.verdicts.tally.overdue.get((work.origin.vertex, work.origin.job), -1)
             if end <= deadline:  # that it was overdue was reported before this was known

@@ -39,8 +39,9 @@ class Entity:
     __slots__ = (
         'kind', 'rclpy', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
-        'busy_ns', 'unattributed', 'removed', 'address', 'handle', 'remote_publishers',
-        'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns', 'publishes', 'at_once',
+        'busy_ns', 'unattributed', 'removed', 'may_be_gone', 'address', 'handle',
+        'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns',
+        'publishes', 'at_once',
         'habit', 'since', 'gate', 'most_waiting', 'collect_more', 'classify', 'is_nested',
         '__weakref__')
 
@@ -82,7 +83,9 @@ class Entity:
         self.incompatible_qos: str | None = None
         # the topics that its callback has published on
         self.publishes: set[str] = set()
+        # whether it was destroyed; whether that, or a timer's end, is to be looked for first
         self.removed = False
+        self.may_be_gone = kind == TIMER
         # whether it holds the interpreter while it runs
         # (one entity stands for all tasks, whatever they do)
         self.habit = GilHabit(

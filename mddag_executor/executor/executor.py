@@ -196,6 +196,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._pool = WorkerPool(
             self._engine, self._trace_clock, inbox, self._fail, self._context_ended, prepare)
         self._at_once = AtOnce(self._engine, self._pool.lock, self._fail)
+        self._at_once.loop.add_own(self._pool.guard)
         self._pool.serve_meanwhile = self._serve_meanwhile
         self._pool.stopped = self._stopped
         self._pool.adopt = lambda future: adopt_awaited(future, self)
@@ -244,9 +245,10 @@ class MultiDeadlineExecutor(BareExecutor):
     def _context_ends(self) -> None:
         """Note whether a callback of this executor ends the context."""
         running = current.running
-        self._ended_by_callback = (
-            running is not None and running.engine is self._engine
-            or self._notifier is not None and self._notifier.is_calling())
+        is_ours = (running is not None and running.work is not None
+                   and running.engine is self._engine)
+        self._ended_by_callback = is_ours or (
+            self._notifier is not None and self._notifier.is_calling())
         self.wake()
 
     # --- nodes -----------------------------------------------------------------------------------
@@ -659,6 +661,7 @@ class MultiDeadlineExecutor(BareExecutor):
                     self._stepping.close()
                 self._pool.loop.close()
                 self._at_once.loop.close()
+                self._pool.guard.close()
 
     def _end_run(self) -> None:
         """Judge what is open and close the trace, once; a second thread waits for that."""

@@ -49,15 +49,13 @@ WAITS = 0.5
 SHORT_NS = 2_000
 """A callback that usually computes for less than half of this is not worth an order."""
 LATELY = 8
-"""An average over about so many executions; the figure of the first ones is their mean."""
+"""An average is over about so many executions; one of so many short ones is measured."""
 UNCLEAR_RUNS = 8
 """After so many executions that said nothing, one runs as if it held the GIL."""
 
 FIRST_CHECK_NS = 2_000_000
 LAST_CHECK_NS = 20_000_000
-"""The time between two checks grows from the first to the last of these."""
-SURE_CHECK_NS = 10_000_000
-"""What has always computed, and never for long, is first checked after this."""
+"""The time between two checks grows from the first to the last; a brief callback begins there."""
 IDLE_SHARE = 0.05
 """A thread that computed for this part of the time since the last check computes."""
 UNCLEAR_CHECKS = 8
@@ -80,47 +78,43 @@ class GilHabit:
     :ivar holds: 1 or 0, for its next execution.
     :ivar mean_ns: for how long its executions compute, lately.
     :ivar is_known: whether ``holds`` is declared, or has been measured.
-    :ivar is_settled: whether nothing but its own time is to be measured: it is declared, or its
-        last executions have all computed.
+    :ivar rests: how many of its next executions need not be measured.
     """
 
-    __slots__ = ('holds', 'mean_ns', 'is_known', 'is_declared', 'is_settled', 'share',
-                 '_unclear', '_runs', '_computing_runs', '_is_trial')
+    __slots__ = ('holds', 'mean_ns', 'is_known', 'is_declared', 'rests', 'share',
+                 '_unclear', '_runs', '_is_trial')
 
     def __init__(self, declared: bool | None = None) -> None:
-        self.is_declared = self.is_known = self.is_settled = declared is not None
+        self.is_declared = self.is_known = declared is not None
         self.holds = int(declared or False)
         self.mean_ns = 0
+        self.rests = 0
         self.share: float | None = None if declared is None else float(declared)
         self._unclear = 0
-        self._runs = self._computing_runs = 0
+        self._runs = 0
         self._is_trial = False
 
-    def ran(self, wall: int, own: int, others: int = -1, starved: bool = False) -> None:
+    def ran(self, wall: int, own: int, others: int, starved: bool = False) -> None:
         """
-        Learn from an execution.
+        Learn from an execution that was measured.
 
         :param wall: how long it took, ns.
         :param own: for how long its thread computed, ns.
-        :param others: for how long all other threads of the process computed meanwhile, ns; -1 if
-            that was not measured.
+        :param others: for how long all other threads of the process computed meanwhile, ns.
         :param starved: whether another thread took the CPU away from it meanwhile.
         """
         runs = self._runs = min(self._runs + 1, LATELY)
         self.mean_ns += (own - self.mean_ns) // runs
-        if self.is_declared:
-            return
-        was_trial, self._is_trial = self._is_trial, False
-        usual = 0 if was_trial else self.holds
+        if not self.is_declared:
+            self._learn(wall, own, others, starved, runs)
+        self.rests = LATELY - 1 if self.is_known and not self._is_trial else 0
+
+    def _learn(self, wall: int, own: int, others: int, starved: bool, runs: int) -> None:
+        usual = 0 if self._is_trial else self.holds
+        self._is_trial = False
         if own >= COMPUTES * wall:
             part = own / max(1, wall)
-            self._computing_runs += 1
-            self.is_settled = self._computing_runs >= LATELY
         else:
-            self._computing_runs, self.is_settled = 0, False
-            if others < 0:
-                self.holds = usual
-                return
             had = max(own, wall - others)
             if own >= SHORT_NS and (starved or own >= WAITS * had):
                 self._unclear += 1

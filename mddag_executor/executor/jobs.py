@@ -28,10 +28,8 @@ import threading
 from time import time_ns
 from typing import Any, NamedTuple
 
+from mddag_executor.executor.bounds import MOST
 from msg_graph import TaskSet
-
-KEEP, KEEP_ANNOUNCED = 64, 256
-"""How many publications of a topic are remembered: of this process, of others."""
 
 ROUNDING_NS = 2
 """DDS stamps are multiples of 2**-32 s: they may lie this far outside of the window."""
@@ -157,8 +155,8 @@ class Topic:
         'publications', 'announced', 'is_announced', 'open', 'to_announce', 'lock', 'on_header')
 
     def __init__(self) -> None:
-        self.publications: deque[Publication] = deque(maxlen=KEEP)
-        self.announced: deque[Publication] = deque(maxlen=KEEP_ANNOUNCED)
+        self.publications: deque[Publication] = deque(maxlen=MOST)
+        self.announced: deque[Publication] = deque(maxlen=4 * MOST)
         self.is_announced = False
         # how many publications have not returned; what is announced once there are none
         self.open = 0

@@ -135,6 +135,11 @@ class EventLoop:
         self._channels[source.fd] = (source,)
         self._epoll.register(source.fd, _EDGE)
 
+    def add_own(self, source: ChannelSource) -> None:
+        """Wait for a source that has a descriptor of its own."""
+        self._channels[source.fd] = (source,)
+        self._epoll.register(source.fd, _EDGE)
+
     def remove(self, source: ChannelSource) -> None:
         """Forget a source whose listener has been cleared."""
         fd, source.fd = source.fd, -1

@@ -13,14 +13,13 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
+from mddag_executor.executor.bounds import LOG_EVERY_S
 from mddag_executor.text import counted
 from msg_graph.errors import printable
 from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
     from mddag_executor.executor.verdicts import Verdicts
-
-LOG_EVERY_S = 10.0
 
 
 class MissLog:

@@ -11,7 +11,7 @@ Theory of operation
     ``statistics()`` and ``/diagnostics``, and a warning in the log names them.
 3.  What the handler raises, also ``SystemExit``, comes out of ``spin``; later misses are reported.
 4.  At the end the waiting misses are still reported, but the handler is called no more after
-    ``REPORT_S``, and not waited for after ``END_S``: it may call a service that is no longer
+    ``END_S``, and not waited for after twice that: it may call a service that is no longer
     answered.
 """
 
@@ -23,6 +23,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
+from mddag_executor.executor.bounds import END_S, LOG_EVERY_S
 from mddag_executor.executor.shutdown import join, stop_at_exit
 from mddag_executor.text import counted
 from rclpy.logging import get_logger
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 
 MOST_WAITING = 256
 """So many misses wait for the handler: at 10 ms each it is 2.5 s late by then."""
-REPORT_S, END_S = 1.0, 2.0
-WARN_EVERY_S = 10.0
 
 
 class MissNotifier:
@@ -88,16 +87,16 @@ class MissNotifier:
 
         Called by the handler itself, it returns at once, and the rest is reported after that.
 
-        :param timeout: seconds to wait for the handler, if that is less than ``END_S``.
+        :param timeout: seconds to wait for the handler, if that is less than twice ``END_S``.
         :return: whether the handler has returned.
         """
         with self._starting:
             if self._ends_at is None:
-                self._ends_at = time.monotonic() + REPORT_S
+                self._ends_at = time.monotonic() + END_S
                 self._queue.put(None)
             if self._thread.ident is None:
                 return True
-        join(self._thread, END_S if timeout is None else min(timeout, END_S))
+        join(self._thread, 2 * END_S if timeout is None else min(timeout, 2 * END_S))
         return not self._thread.is_alive() or self.is_calling()
 
     def _run(self) -> None:
@@ -121,7 +120,7 @@ class MissNotifier:
         new = self.unreported - self._warned
         if new:
             self._warned += new
-            self._warn_at = time.monotonic() + WARN_EVERY_S
+            self._warn_at = time.monotonic() + LOG_EVERY_S
             get_logger('mddag_executor').warning(
                 f'on_deadline_miss: {counted(new, "miss was", "misses were")} not reported, as '
                 'it has not returned in time: have it return sooner')

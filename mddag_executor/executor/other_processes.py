@@ -45,13 +45,11 @@ import threading
 from typing import Any
 
 from mddag_executor.core import Scheduler, Tables
+from mddag_executor.executor.bounds import REMEMBERED
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import Jobs, Origin
 from mddag_executor.executor.verdicts import Record
 from msg_graph import Dag, TaskSet, Vertex
-
-KEEP = 4096
-"""The jobs of so many stamps are remembered."""
 
 
 class OtherProcesses:
@@ -187,7 +185,7 @@ class OtherProcesses:
         key = (origin.dag, name)
         if key not in self._jobs:
             self._kept.append(key)
-            if len(self._kept) > KEEP:
+            if len(self._kept) > REMEMBERED:
                 gone = self._jobs.pop(self._kept.popleft(), None)
                 if gone is not None:
                     self._names.pop((gone.dag, gone.job), None)

@@ -9,6 +9,7 @@ import threading
 from typing import Any
 import weakref
 
+from mddag_executor.executor.bounds import MOST, REMEMBERED
 from mddag_executor.executor.compat import keeps_time, service_name
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import (
@@ -24,7 +25,7 @@ from mddag_executor.executor.entity import (
 )
 from mddag_executor.executor.groups import decides_itself, Gate
 from mddag_executor.executor.snapshot import EntitySet
-from mddag_executor.executor.sources import KEEP_ALL_DEPTH, SERVICE_DEPTH
+from mddag_executor.executor.sources import SERVICE_DEPTH
 from mddag_executor.executor.work import Work
 from msg_graph import binding, Callback, TaskSet
 from msg_graph.duration import exact_duration
@@ -33,7 +34,6 @@ from rclpy.event_handler import EventHandler, QoSSubscriptionEventType
 from rclpy.exceptions import InvalidHandle
 from rclpy.qos import HistoryPolicy, qos_policy_name_from_kind
 
-_MOST_UNDECLARED = 4096
 _INCOMPATIBLE = QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS
 
 KINDS = (TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE)
@@ -255,13 +255,13 @@ class Registry:
         if decides:
             entity.gate = Gate(group, rclpy_entity, self._passed)
         if kind == SUBSCRIPTION and depth == 0:
-            entity.most_waiting = KEEP_ALL_DEPTH
+            entity.most_waiting = MOST
         elif kind == SERVICE:
             entity.most_waiting = SERVICE_DEPTH
         entity.is_own = rclpy_entity in self.own
         entity.at_once = callback is None and kind == SUBSCRIPTION and keeps_time(rclpy_entity)
         if callback is None and kind in (TIMER, SUBSCRIPTION, SERVICE) and not entity.is_own:
-            if len(self._undeclared) < _MOST_UNDECLARED:
+            if len(self._undeclared) < REMEMBERED:
                 self._undeclared[bindable] = None
         if callback is not None:
             assert self._task_set is not None

@@ -18,14 +18,12 @@ import time
 from typing import Any
 import weakref
 
+from mddag_executor.executor.bounds import AGAIN_NS, END_S
 from mddag_executor.executor.compat import on_end
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 
-FIRST_LOOK_NS = 5_000_000
 LAST_LOOK_NS = 500_000_000
-EXIT_PATIENCE_S = 1.0
-"""So long a program that ends waits for callbacks that still run in an executor's threads."""
 _now = time.monotonic_ns
 
 
@@ -90,7 +88,7 @@ def _stop_all() -> None:
     executors = [executor for executor, _ in _living(_executors)]
     for executor in executors:
         executor.halt()
-    end = _now() + int(EXIT_PATIENCE_S * 1e9)
+    end = _now() + int(END_S * 1e9)
     for executor in executors:
         executor.wait_halted(max(0.0, (end - _now()) / 1e9))
     for thing, _ in _living(_started):
@@ -145,7 +143,7 @@ class ContextChecks:
 
     def begin(self) -> None:
         """Look again, in steps that grow from 5 ms to half a second."""
-        self._step = FIRST_LOOK_NS
+        self._step = AGAIN_NS
         self.at = _now() + self._step
 
     def due(self) -> bool:

@@ -9,7 +9,7 @@ taken under the engine's lock, so they stay in order whoever takes them; rclpy k
 it takes, so nothing else could run meanwhile anyway.
 
 What exceeds a bound stays in the middleware: requests beyond ``SERVICE_DEPTH``, and messages
-beyond ``KEEP_ALL_DEPTH`` if the QoS profile keeps all.  They are collected when one of those that
+beyond ``MOST`` if the QoS profile keeps all.  They are collected when one of those that
 wait starts (``Entity.collect_more``).
 """
 
@@ -21,6 +21,7 @@ import os
 from typing import Any, ClassVar, Protocol
 
 from mddag_executor.executor import compat
+from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import Publication
 from mddag_executor.executor.listeners import clear_listener, MANY, set_listener
@@ -29,14 +30,8 @@ from mddag_executor.executor.snapshot import alive
 from mddag_executor.executor.work import Work
 from rclpy.exceptions import InvalidHandle
 
-MOST_AT_ONCE = 64
-"""How many messages are taken from one entity before the others have their turn."""
-
 SERVICE_DEPTH = 10
 """How many requests wait in Python at most: as many as rclpy's default profile for services."""
-
-KEEP_ALL_DEPTH = 64
-"""How many messages of a profile that keeps all wait in Python at most."""
 
 
 class Arrivals(Protocol):
@@ -108,12 +103,12 @@ class Source:
         self._collect(MANY)
 
     def _collect(self, left: int) -> None:
-        """Take so many at most; what is left after ``MOST_AT_ONCE`` is announced again."""
+        """Take so many at most; what is left after ``MOST`` is announced again."""
         entity = self.entity
         if entity.removed:
             return  # another executor may have it now
         try:
-            for _ in range(min(left, MOST_AT_ONCE)):
+            for _ in range(min(left, MOST)):
                 if 0 < entity.most_waiting <= len(entity.waiting):
                     entity.collect_more = self.collect_all
                     return

@@ -286,7 +286,10 @@ class TimerQueue:
             self._push(source, due)
             return None
         work = source.call()
-        after, period = source.next_due(), source.period()
+        period = source.period()
+        after: int | None = due + period
+        if period <= 0 or due + period <= now or period != source.last_period:
+            after = source.next_due()  # rcl leaves out what was missed
         if period != source.last_period:
             source.last_period = period
             self._on_retimed()

@@ -22,6 +22,7 @@ from mddag_executor.executor.compat import (
     is_builtin,
     is_of_wait_for_message,
 )
+from mddag_executor.executor.delivery import LocalDelivery
 from mddag_executor.executor.entity import (
     CLIENT,
     Entity,
@@ -38,7 +39,7 @@ from mddag_executor.executor.snapshot import is_qos_event, snapshot
 from mddag_executor.executor.sources import ClientSource, ServiceSource, SubscriptionSource
 from mddag_executor.executor.timers import TimerSource
 from mddag_executor.executor.waitables import EventsSource, WaitableSource, WaitSetThread
-from mddag_executor.executor.workers import LocalDelivery, WorkerPool
+from mddag_executor.executor.workers import WorkerPool
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 
@@ -190,7 +191,7 @@ class Upkeep:
         if isinstance(source, SubscriptionSource) and source.is_counted:
             before = self._deliveries.get(entity.label)
             self._deliver(entity.label, (*(before.sources if before else ()), source))
-            entity.classify = lambda: pool.classify(source)
+            entity.classify = lambda: pool.muting.classify(source)
 
     def _deliver(self, topic: str, sources: tuple[SubscriptionSource, ...]) -> None:
         """Have publishing threads of this process take for these subscriptions of a topic."""

@@ -23,12 +23,12 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.stops import LEAST_NS, Stops
 from mddag_executor.core.tally import VERDICTS
+from mddag_executor.executor.bounds import REMEMBERED
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import Origin
 from msg_graph import TaskSet
 
 KEEP_RESPONSES = 2_000
-KEEP_ABORTED = 4096
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Verdicts:
     def _ended(self, dag: int, job: int, end: int, now: int) -> None:
         if end == ABORTED:
             self._aborted[(dag, job)] = None
-            if len(self._aborted) > KEEP_ABORTED:
+            if len(self._aborted) > REMEMBERED:
                 del self._aborted[next(iter(self._aborted))]
         if self.record is not None and end in (ABORTED, EXPIRED):
             self.record(

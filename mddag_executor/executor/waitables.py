@@ -28,11 +28,11 @@ from typing import Any
 import weakref
 
 from mddag_executor.executor import compat
+from mddag_executor.executor.bounds import END_S, MOST
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.listeners import clear_listener, ListenerError, NextCall, set_listener
 from mddag_executor.executor.loop import ALWAYS
 from mddag_executor.executor.shutdown import call_at_shutdown, is_over, join, stop_at_exit
-from mddag_executor.executor.sources import MOST_AT_ONCE
 from mddag_executor.executor.waitsets import FilledSet
 from mddag_executor.executor.work import Work
 from rclpy.context import Context
@@ -60,7 +60,7 @@ def executions_of(entity: Entity, executor: Any) -> list[Work]:
     data = waitable.take_data()
     compat.attach_futures(waitable, executor)
     found = [Work(entity, callback, (message,))
-             for callback, message in compat.feedback_taken(waitable, data, MOST_AT_ONCE)]
+             for callback, message in compat.feedback_taken(waitable, data, MOST)]
     if data or not found:
         found.append(Work(entity, waitable.execute, (data,)))
     return found
@@ -148,7 +148,7 @@ class WaitableSource:
         def take(waitable: Waitable) -> None:
             found.extend(executions_of(self._by_id[id(waitable)], self._executor))
 
-        for _ in range(MOST_AT_ONCE):
+        for _ in range(MOST):
             before = len(found)
             self._set.wait(0, take)
             if len(found) == before:
@@ -285,7 +285,7 @@ class WaitSetThread:
         self._ending = True
         self.wake()
         if self._thread is not None:
-            join(self._thread)
+            join(self._thread, END_S)
 
     def _run(self) -> None:
         waiting: FilledSet | None = None

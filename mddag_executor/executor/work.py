@@ -27,6 +27,9 @@ class RunningThread(Protocol):
     def publishes(self, publisher: Any, msg: Any, topic: str) -> None:
         """Note that the callback publishes."""
 
+    def is_brief(self) -> bool:
+        """Return whether a callback runs in it that probably ends soon."""
+
     def lend(self) -> AbstractContextManager[None]:
         """Lend its worker while entered: the callback waits."""
 
@@ -78,15 +81,15 @@ class Work:
     :ivar x: the execution in the core; -1 before it is ready and after it has ended.
     :ivar origin: the vertex and job that it executes; None if no DAG declares it.
     :ivar worker: the worker that runs it, or has run it last.
-    :ivar is_known: whether the executor would know if the entity were destroyed.
+    :ivar must_check: whether the entity may be destroyed, or its timer cancelled, by now.
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar cpu_ns: how long it has computed.
     :ivar yields: how many times in a row its coroutine has yielded without awaiting a future.
     """
 
     __slots__ = (
-        'entity', 'function', 'args', 'then', 'x', 'coroutine', 'origin', 'worker', 'is_known',
-        'ready_ns', 'cpu_ns', 'yields')
+        'entity', 'function', 'args', 'then', 'x', 'coroutine', 'origin', 'worker',
+        'must_check', 'ready_ns', 'cpu_ns', 'yields')
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -99,7 +102,7 @@ class Work:
         self.coroutine: Any = None
         self.origin: Origin | None = None
         self.x = self.worker = -1
-        self.is_known = False
+        self.must_check = True
         self.ready_ns = self.cpu_ns = self.yields = 0
 
     def step(self) -> Any:
@@ -110,15 +113,8 @@ class Work:
         :raises BaseException: whatever the callback raises.
         """
         if self.coroutine is None:
-            handle = self.entity.handle
-            if handle is not None and not (self.is_known and self.entity.kind != TIMER):
-                try:
-                    with handle:
-                        # One more may have become due before it was cancelled in its callback.
-                        if self.entity.kind == TIMER and self.entity.rclpy.is_canceled():
-                            raise Destroyed
-                except InvalidHandle:
-                    raise Destroyed from None
+            if self.must_check:
+                self._check()
             result = self.function(*self.args)
             if type(result) is not types.CoroutineType:
                 if self.then is not None:
@@ -132,6 +128,18 @@ class Work:
                 self.then(stop.value)
             return None
         return yielded if yielded is not None else awaited(self.coroutine)
+
+    def _check(self) -> None:
+        entity = self.entity
+        if entity.handle is None:
+            return
+        try:
+            with entity.handle:
+                # One more may have become due before it was cancelled in its callback.
+                if entity.kind == TIMER and entity.rclpy.is_canceled():
+                    raise Destroyed
+        except InvalidHandle:
+            raise Destroyed from None
 
 
 def _nothing() -> None:

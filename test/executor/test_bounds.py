@@ -9,8 +9,8 @@ import sys
 import threading
 from typing import Any
 
-from mddag_executor.executor.sources import KEEP_ALL_DEPTH, SERVICE_DEPTH
-from mddag_executor.executor.workers import MOST_LENT
+from mddag_executor.executor.bounds import MOST
+from mddag_executor.executor.sources import SERVICE_DEPTH
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import HistoryPolicy, QoSProfile
@@ -152,11 +152,11 @@ def test_few_messages_of_keep_all_wait_in_python_and_none_is_lost(
             message.stamp.sec = number
             publisher.publish(message)
         if from_here:
-            assert wait_for(lambda: waiting(executor) in (KEEP_ALL_DEPTH, KEEP_ALL_DEPTH - 1))
+            assert wait_for(lambda: waiting(executor) in (MOST, MOST - 1))
         go_on.set()
         assert wait_for(lambda: len(got) == 300), len(got)
     assert got == list(range(300))
-    assert max(most) <= KEEP_ALL_DEPTH
+    assert max(most) <= MOST
     assert executor.statistics()['dropped'] == {}
 
 
@@ -179,15 +179,15 @@ def test_blocked_calls_take_a_bounded_number_of_threads(make_executor, make_node
     asking.add_node(node)
     answering.add_node(other)
     assert client.wait_for_service(15.0)
-    count = MOST_LENT + 30
-    most = MOST_LENT + workers
+    count = MOST + 30
+    most = MOST + workers
 
     def ask() -> None:
         answers.append(client.call(Trigger.Request(), 20.0))
 
     with Spinning(asking):
         tasks = [asking.create_task(ask) for _ in range(count)]
-        assert wait_for(lambda: asking.statistics()['lent'] == MOST_LENT, 30.0)
+        assert wait_for(lambda: asking.statistics()['lent'] == MOST, 30.0)
         assert wait_for(lambda: not asking.statistics()['idle_workers'])
         assert worker_threads() <= most
         with Spinning(answering):

@@ -98,7 +98,7 @@ def test_many_goals_at_once(make_executor, make_node, apart):
 
 
 def test_who_takes_as_much_as_may_be_at_once_looks_again(make_executor, make_node, monkeypatch):
-    monkeypatch.setattr(waitables, 'MOST_AT_ONCE', 1)
+    monkeypatch.setattr(waitables, 'MOST', 1)
     nodes = [make_node('server'), make_node('client')]
     counting = Counting(*nodes)
     server, client = make_executor(), make_executor()

@@ -11,13 +11,12 @@ from typing import Any
 
 from mddag_executor.executor import current_job
 from mddag_executor.executor.executor import MultiDeadlineExecutor
+from mddag_executor.hosting.bodies import native, spinner
 from mddag_executor.hosting.measure import BODIES, ExecutionPlan, Ledger, measure, PlanError
 from mddag_executor.hosting.session import Session
 from mddag_executor.hosting.synthetic import (
     JOIN_LIMIT,
-    native,
     Role,
-    spinner,
     SyntheticWorkload,
 )
 from mddag_executor.simulate import draw_execution_times

@@ -27,6 +27,7 @@ from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.inbox import Inbox
 from mddag_executor.executor.jobs import Jobs, Origin, Publication, PublisherState, Topic
 from mddag_executor.executor.loop import EventLoop
+from mddag_executor.executor.muting import Muting
 from mddag_executor.executor.sources import Source
 from mddag_executor.executor.timers import TimerSource
 from mddag_executor.executor.waitables import WaitableSource, WaitSetThread
@@ -127,7 +128,7 @@ def rest_not_collected() -> None:
 def held_subscriptions_not_released() -> None:
     replace(EventLoop, 'release', lambda release: lambda self, sources: None)
     # which would register them again
-    replace(WorkerPool, 'classify', lambda classify: lambda self, source: None)
+    replace(Muting, 'classify', lambda classify: lambda self, source: None)
 
 
 @mutation('A timer that is reset is not looked at.')

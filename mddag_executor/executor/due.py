@@ -1,0 +1,181 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What is to be done at a time: timers, deadlines of open jobs, checks, and calls.
+
+One timerfd (``EventLoop.timer``) is set to the earliest of these times.  While there is something
+to run, it may expire too early, but not too late.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from heapq import heappop, heappush
+from time import monotonic_ns, process_time_ns
+from typing import TYPE_CHECKING
+
+from mddag_executor.core import NEVER
+from mddag_executor.executor.bounds import AGAIN_NS, BRIEF_NS, STOP_NS
+from mddag_executor.executor.gil import FIRST_CHECK_NS, GilCheck, LAST_CHECK_NS
+from mddag_executor.executor.work import Work
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.workers import WorkerPool
+
+
+class DueTimes:
+    """
+    The times at which a worker pool has to do something; all methods under the engine's lock.
+
+    Times are monotonic ns, if nothing else is said.
+
+    :param context_ended: whether the context has ended.
+    """
+
+    def __init__(self, pool: WorkerPool, context_ended: Callable[[], bool]) -> None:
+        self._pool = pool
+        self._engine = pool.engine
+        self._timer = pool.loop.timer
+        self._timers = pool.timers
+        self._offset = pool.clock.offset_ns
+        self._context_ended = context_ended
+        self._check_context_at = 0
+        self._calls: list[tuple[int, int, Callable[[], None]]] = []
+        self._n_calls = 0
+        self._gil_check = GilCheck()
+        # whether the timerfd is set to something that may not have to be done
+        self._may_expire_early = False
+        self._seen = monotonic_ns(), process_time_ns()
+
+    def begin(self, now: int) -> None:
+        """Set the timerfd, as a spin begins."""
+        self._seen = now, process_time_ns()
+        self.arm(now)
+
+    def call_at(self, at: int, function: Callable[[], None]) -> None:
+        """Have a function called at a time, without the lock; the caller arms."""
+        self._n_calls += 1
+        heappush(self._calls, (at, self._n_calls, function))
+
+    def handle(self, now: int, since: int) -> list[Callable[[], None]]:
+        """
+        Handle what is due by now; return what is to be called without the lock.
+
+        :param now: the time on the trace's clock.
+        :param since: since when the calling thread has waited in the epoll, on the trace's clock.
+        """
+        pool, monotonic = self._pool, now - self._offset
+        self._notice_stop(monotonic, since - self._offset)
+        if monotonic > self._check_context_at:  # nothing reports it if it was only destroyed
+            self._check_context_at = monotonic + AGAIN_NS
+            if self._context_ended():
+                pool.context_ended()
+        self._timer.at = 0
+        for fired in self._timers.fire():
+            pool.inbox.timer(fired)
+        if now > self._engine.deadlines.next:
+            self._engine.judge_overdue(now)
+        if 0 < self._gil_check.at <= monotonic:
+            self._check_gil(monotonic)
+        if 0 < pool.muting.until <= now:
+            pool.muting.end(pool.running)
+        calls = []
+        while self._calls and self._calls[0][0] <= monotonic:
+            calls.append(heappop(self._calls)[2])
+        return calls
+
+    def update(self, now: int, has_expired: bool, has_found: bool) -> None:
+        """
+        Set the timerfd if that is necessary, at the end of a turn.
+
+        :param has_expired: the timerfd has expired.
+        :param has_found: there is something to run.
+        """
+        if has_expired or self._may_expire_early and not has_found or self._is_due_earlier(now):
+            self.arm(now)
+
+    def _is_due_earlier(self, now: int) -> bool:
+        """Return whether something may be due before the timerfd expires."""
+        at = self._timer.at or NEVER
+        engine = self._engine
+        deadline = engine.deadlines.next
+        return bool(
+            self._timers.has_new
+            or deadline < NEVER and deadline - self._offset < at
+            or self._calls and self._calls[0][0] < at
+            or engine.holders and engine.has_waiting
+            and at > now + self._check_after(engine.holders[0]) + FIRST_CHECK_NS)
+
+    def arm(self, now: int) -> None:
+        """Set the timerfd to when something is to be done next."""
+        pool = self._pool
+        if not pool.running:
+            self._timer.arm(0)
+            return
+        offset = self._offset
+        self._timers.has_new = False
+        at = [pool.muting.next_timer()]
+        deadline = self._engine.deadlines.next
+        if deadline < NEVER:
+            at.append(deadline - offset + 1)
+        if self._calls:
+            at.append(self._calls[0][0])
+        at.append(pool.muting.until and pool.muting.until - offset)
+        check = self._gil_check
+        if self._engine.holders and self._engine.has_waiting:
+            self._watch_holder(now)
+            at.append(check.at)
+        elif check.at:
+            check.end()
+        first = min(filter(None, at), default=0)
+        self._may_expire_early = first != at[0]
+        if first != self._timer.at:
+            self._timer.arm(first)
+
+    # --- the GIL ---------------------------------------------------------------------------------
+
+    def check_holder(self, now: int) -> None:
+        """Check whether what holds the GIL computes, as something else waits for the GIL."""
+        self._watch_holder(now)
+        at = self._gil_check.at
+        if at and not 0 < self._timer.at <= at:
+            self._may_expire_early = True
+            self._timer.arm(at)
+
+    def _watch_holder(self, now: int) -> None:
+        holder = self._engine.interpreter_holder()
+        if holder is not None:
+            self._gil_check.begin(holder, now, self._check_after(holder))
+
+    @staticmethod
+    def _check_after(holder: Work) -> int:
+        """Return after how long to check first whether what holds the GIL computes, ns."""
+        if holder.entity.wall_ns <= BRIEF_NS:
+            return LAST_CHECK_NS
+        return max(FIRST_CHECK_NS, 2 * holder.entity.habit.mean_ns)
+
+    def _check_gil(self, now: int) -> None:
+        """Take the GIL from an execution that waits for something else."""
+        holder = self._engine.interpreter_holder()
+        thread = None if holder is None else self._pool.thread_of(holder)
+        if holder is None or thread is None:
+            self._gil_check.end()
+        elif self._gil_check.waits(thread.ident, thread.vtid, now):
+            self._gil_check.end()
+            self._engine.stop_holding(holder)
+
+    # --- stops of the machine --------------------------------------------------------------------
+
+    def _notice_stop(self, now: int, since: int) -> None:
+        """
+        Notice that no thread of the process ran since the timerfd was to expire.
+
+        If no thread waited for the timerfd, as all ran callbacks, its being late says nothing.
+        """
+        at, cpu = self._timer.at, process_time_ns()
+        seen, used = self._seen
+        self._seen = now, cpu
+        if at:
+            late = now - max(at, seen, since) - (cpu - used)
+            if late >= STOP_NS:
+                self._pool.stopped(now - late, now)
