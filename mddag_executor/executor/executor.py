@@ -379,8 +379,8 @@ class MultiDeadlineExecutor(BareExecutor):
 
         def note() -> None:
             running = current.running
-            is_mine = running is not None and running.pool is self._pool
-            completed_by.append((running, running.work) if is_mine and running else None)
+            work = None if running is None or running.pool is not self._pool else running.work
+            completed_by.append(None if work is None else (running, work))
             self._at_once.ring()
 
         def is_done() -> bool:

@@ -10,10 +10,10 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.jobs import (
     Announced,
     Jobs,
-    KEEP,
     Origin,
     Publication,
     PublisherNumbers,
@@ -97,7 +97,7 @@ def test_messages_of_a_stranger_in_the_window_are_nobody_s():
 def test_a_long_publication_is_found_behind_many_short_ones():
     bench = Bench()
     bench.published(0, 10 ** 12, 42, publisher=1)
-    for job in range(KEEP - 1):
+    for job in range(MOST - 1):
         bench.published(1_000_000 * job + 1, 1_000_000 * job + 2, job)
     assert bench.job(500) == 42
 
