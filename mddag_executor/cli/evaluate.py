@@ -4,8 +4,8 @@
 The verb `evaluate`: the paper's experiment, acceptance ratio against normalised utilisation.
 
 Each run draws execution times and is simulated under every policy, until the first miss. Several
-declarations (random ones, from `mddag generate`) make one sweep. Ctrl-C ends it early; what is
-done is shown and written, and the exit status is 130.
+declarations (random ones, from `mddag generate`) make one sweep. Ctrl-C ends it early; the
+finished runs are shown and written, and the exit status is 130.
 """
 
 from __future__ import annotations

@@ -21,10 +21,10 @@ mddag graph analyse config/autoware.yaml --workers 4 --json -
 mddag graph analyse graph.yaml --fail-on-unschedulable
 """
 DESCRIPTION = """\
-Test whether the deadlines of a declaration can hold. Where a necessary test fails, no scheduler
-can keep them; where a sufficient test holds, its scheduler does, as long as no execution takes
-longer than its budget. A sufficient test that does not hold says nothing. Overheads of dispatching
-are not part of any test, nor are callback groups and Python's lock."""
+Test whether the deadlines of a declaration can hold. If a necessary test fails, no scheduler can
+keep them; if a sufficient test holds, its scheduler does, as long as no execution takes longer
+than its budget. Otherwise a sufficient test says nothing. No test includes overheads of
+dispatching, callback groups and Python's lock."""
 
 _HEADER = ('test', 'kind', 'verdict', 'figure')
 

@@ -54,7 +54,7 @@ def check_result(task_set: TaskSet) -> dict[str, Any]:
 
     Times are in ns; `rad_offset_ns` is the reference absolute deadline (RAD) minus the release of
     each vertex, in the order of `vertices`. `load` is in cores, `utilisation` is load divided by
-    `workers`. They and `critical_path_ns` are None where an execution time is not declared.
+    `workers`. They and `critical_path_ns` are None if an execution time is not declared.
     """
     from mddag_executor.core import Tables
     workers = defaults.workers(None, task_set)
@@ -96,7 +96,7 @@ def _dag_result(dag: Dag, rad_offsets: list[int], workers: int) -> dict[str, Any
 
 
 def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
-    """Yield what keeps the deadlines from holding, with the mean execution times."""
+    """Yield warnings about deadlines that cannot hold with the mean execution times."""
     from msg_graph.model import mean_execution_times, path_lengths
     for dag in task_set.dags:
         means = mean_execution_times(dag)

@@ -46,7 +46,7 @@ def main(args: argparse.Namespace) -> int:
     name, text = common.read_text(args.architecture)
 
     def measure(draft: Draft) -> None:
-        """Fill in what the recording shows; warn where callbacks did not run."""
+        """Fill in what the recording shows; warn if callbacks did not run."""
         if args.trace is None:
             return
         system = recorded_system(args.trace)

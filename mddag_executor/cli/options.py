@@ -219,8 +219,8 @@ def add(
     """
     Declare some of the arguments that have the same meaning in all verbs.
 
-    :param only: what the help begins with, where an option belongs to another one.
-    :param otherwise: what holds, in words, where an option is left out; its value is None then.
+    :param only: what the help begins with, if an option belongs to another one.
+    :param otherwise: the default in words; the value of the option is None then.
     """
     for name in names:
         kept = dict(_SHARED[name])

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'a YAML file with `processes:` (default: as recorded)')
     options.add_policy(parser, _WITH, 'as recorded')
     options.add(
-        parser, '--preemptive', only=_WITH, otherwise='as recorded, where the policy can')
+        parser, '--preemptive', only=_WITH, otherwise='as recorded, if the policy can')
     add('--overheads', type=_overheads, metavar='WHICH',
         help=f'{_WITH}the time that noticing, dispatch and transport take: recorded (default), '
         'none, or a time for each dispatch (50us); of a bag: none (default) or a time')
@@ -98,7 +98,7 @@ def is_bag(path: Given) -> bool:
 
 
 def check_deadlines(path: Given, name: str) -> None:
-    """Find out whether a recording says which deadlines there are, where no graph is given."""
+    """Check that a recording has deadlines, if no graph is given."""
     if is_bag(path):
         raise _no_graph(name)
     from mddag_executor.replay.run import check_declared

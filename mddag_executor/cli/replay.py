@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Replay a trace and print what came of its deadlines."""
+    """Replay a trace and print the verdicts about its deadlines."""
     from mddag_executor.replay import Replay
     common.recording_and_graph(args)
     verdicts.check(args)

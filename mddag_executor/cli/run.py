@@ -3,10 +3,10 @@
 """
 The verb `run`: real nodes, or nodes made from the declaration, under the executor.
 
-Everything that can be wrong with the command line is found before a node starts: the declaration,
-the names of policy and nodes, whether trace and result can be written.  A run ends after
-`--duration`, with Ctrl-C (or SIGTERM), when a callback calls `rclpy.shutdown`, or when all
-programs have ended; however it ends, its summary is printed.
+The whole command line is checked before a node starts: the declaration, the names of policy and
+nodes, whether trace and result can be written.  A run ends after `--duration`, with Ctrl-C (or
+SIGTERM), when a callback calls `rclpy.shutdown`, or when all programs have ended; its summary is
+always printed.
 
 A run of several processes (`run_processes`) starts this verb once for each of them, with `--part`.
 """
@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "tools; 'off': never (default: 1s)")
     add('--trace', metavar='OUT.mcap', type=options.TraceOfRun,
         help='record the run to this file; of several processes each to OUT.NAME.mcap, or to '
-        'NAME.mcap in OUT where that is a directory')
+        'NAME.mcap in OUT if that is a directory')
     add('--processes', metavar='N|FILE', type=options.Input,
         help='run the nodes in N processes, or in those of a YAML file with `processes:` '
         "(default: those of the declaration); '1': in this process")
@@ -113,7 +113,7 @@ def _or_off(text: str) -> int:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run nodes until the run ends, and print what came of the deadlines."""
+    """Run nodes until the run ends, and print the verdicts about the deadlines."""
     _check_arguments(args)
     if args.part is not None:
         return part(args)
@@ -138,7 +138,7 @@ def status(args: argparse.Namespace, result: dict[str, Any]) -> int:
 
 
 def part(args: argparse.Namespace) -> int:
-    """Run one process of several, and leave what came of it in the folder of the run."""
+    """Run one process of several, and write its result to the folder of the run."""
     from mddag_executor.hosting.processes import belong_to_parent, Part
     the_part = Part.read(args.part)
     belong_to_parent(the_part.parent)
@@ -378,12 +378,12 @@ def _run_programs(
                 executor, programs, ros_arguments(args.ros_args), session.stop,
                 lambda: session.stopped)
             begins: int | None = None
-            if args.process is not None:  # what is lost until then is no job's fault
+            if args.process is not None:  # messages that are lost until then do not count
                 try:
                     begins = _begin(args, task_set)(
                         session, executor.unmatched, _MEET_S if args.part else _ALONE_S)
                 except SessionError as error:
-                    warn(f'{error}; what is lost meanwhile counts as missed')
+                    warn(f'{error}; messages that are lost meanwhile count as missed')
             executor.set_judging(True, begins)
             session.wait(seconds)
     except MddagError:
@@ -404,7 +404,7 @@ class Signals:
 
     A SIGINT that comes a while after the first interrupts the program itself.
 
-    :param limit_s: where that is not 0, the system ends the process so much later.
+    :param limit_s: if it is not 0, the system ends the process so much later.
     """
 
     def __init__(self, limit_s: int = 0) -> None:

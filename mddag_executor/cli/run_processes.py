@@ -1,11 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-`mddag run` over several processes: which node runs where, and their run as if it was one.
+`mddag run` over several processes: the process of each node, and their run as one.
 
-A program says only when it runs which nodes it brings. So each `--node` is started once ahead of
-the run, in a process that ends when the nodes are made, unless it says itself where it is to run:
-`PROCESS=SPEC`.
+The nodes of a program are known only when it runs. So each `--node` is started once before the
+run, in a process that ends when the nodes are made, unless its process is given: `PROCESS=SPEC`.
 """
 
 from __future__ import annotations
@@ -179,7 +178,7 @@ def _probe(
     """Return the names of the nodes that each SPEC brings."""
     from mddag_executor.hosting.loading import ros_arguments
     from mddag_executor.hosting.processes import left, ProcessError
-    # Nobody is to hear of these nodes.
+    # These nodes must not be discovered.
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
     with subprocess.Popen(
         [*_command(args, folder, specs), *ros_arguments(args.ros_args)], stdin=subprocess.DEVNULL,
@@ -238,7 +237,7 @@ def _trace(given: str | None, name: str) -> str | None:
 
 
 def _trace_of_dead(path: str | None) -> dict[str, Any] | None:
-    """Return what there is to say of the trace of a process that has left no result."""
+    """Return the result about the trace of a process that has left no result."""
     if path is None or not Path(path).exists():
         return None
     return {'path': path, 'lost': 0, 'error': 'the process has died'}

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Simulate and print what came of the deadlines."""
+    """Simulate and print the verdicts about the deadlines."""
     from mddag_executor.simulate import periodic_load, Settings, simulate, utilisation
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)

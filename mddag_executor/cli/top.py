@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The verb `top`: what executors report on `/diagnostics`, live in a terminal.
+The verb `top`: the states of executors on `/diagnostics`, live in a terminal.
 
 It only listens, so it watches processes on any machine that ROS reaches, and costs them nothing.
 Statuses of others on the topic are left out. On a terminal the picture is renewed in place (with
@@ -31,7 +31,7 @@ PATIENCE_NS = 10_000_000_000
 
 
 class NothingHeard(MddagError):
-    """Nobody publishes what is to be shown."""
+    """No executor publishes its state."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -87,7 +87,7 @@ def analyse(
     """
     Analyse a task set.
 
-    :param budget: what of each execution time counts: ``max``, ``p99`` or ``mean``.
+    :param budget: which value of each execution time counts: ``max``, ``p99`` or ``mean``.
     :param progress: gets how many tests are done.
     """
     if workers < 1:
@@ -132,7 +132,7 @@ def _utilisation(tasks: Sequence[Task], workers: int) -> Verdict:
         'utilisation', 'necessary', 'Liu and Layland 1973', 'any',
         'releases as often as declared, executions of their budgets', HOLDS if fits else FAILS,
         f'{total / workers:.3f} of {counted(workers, "worker")}',
-        'at most 1' if fits else 'above 1: work piles up without end',
+        'at most 1' if fits else 'above 1: the backlog grows without end',
         {task.dag.name: task.utilisation for task in tasks})
 
 
@@ -141,7 +141,7 @@ def _demand(tasks: Sequence[Task], workers: int) -> Verdict:
     fits = demand.work <= workers * demand.time
     reason = 'no interval asks for more work than there is time'
     if not fits:
-        reason = 'when all first releases come together, more is due than can be done'
+        reason = 'if all first releases come together, more work is due than there is time'
     elif not demand.complete:
         reason += f', in the {counted(demand.points, "instant")} that were checked'
     figure = (f'{format_duration(demand.work)} due within {format_duration(demand.time)}, '

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Deadlines for sinks: in proportion to critical paths, or the tightest that are mostly kept.
+Deadlines for sinks: in proportion to critical paths, or the tightest that reach a target.
 
 Theory of operation
 -------------------
@@ -38,7 +38,7 @@ from msg_graph.duration import whole_us
 from msg_graph.edit import with_deadlines
 
 PRECISION = 0.01
-"""The result is at most by this part larger than a scale that is not good."""
+"""The result is larger than a scale that is not good by this part, at most."""
 
 _LEAST_SCALE = 2.0 ** -20
 _USUAL_SCALES = 11
@@ -50,7 +50,7 @@ class AssignError(MddagError):
 
 @dataclass(frozen=True)
 class Measured:
-    """The acceptance of some deadlines, and how sure it is."""
+    """The acceptance of some deadlines, with its confidence interval."""
 
     accepted: int
     runs: int
@@ -125,7 +125,7 @@ def scaled(task_set: TaskSet, budget: str, scale: float) -> dict[str, int]:
 
 
 def least_runs(target: float) -> int:
-    """Return how many runs it takes, all accepted, to show an acceptance of that target."""
+    """Return how many runs, all accepted, show an acceptance of that target."""
     runs = math.ceil(Z_95 ** 2 * target / (1.0 - target))
     while wilson(runs, runs)[0] < target:
         runs += 1

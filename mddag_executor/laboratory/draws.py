@@ -7,11 +7,11 @@ Theory of operation
 -------------------
 As in the paper, the execution time of a vertex is one uniform pick from its callback's values for
 each run, the same for the whole run and for every policy.  A callback that two DAGs trigger is two
-vertices, which are drawn apart.  The values are the quantile table of the declaration (ns), or
+vertices with separate draws.  The values are the quantile table of the declaration (ns), or
 measured ones, which the paper's program rounds up to whole microseconds, at least one.
 
-Run r of seed s takes its uniform numbers from a counter-based generator (Philox) with the key
-(s, r).  So a run is the same whatever runs before it, and in whichever process.
+The uniform numbers of run r of seed s come from a counter-based generator (Philox) with the key
+(s, r).  So a run has the same numbers in every process and range of runs.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def feasible(
     overhead_ns: int = 0,
 ) -> npt.NDArray[np.bool_]:
     """
-    Return for each run whether it could be accepted, as far as that is easily known.
+    Return for each run whether it could be accepted, as far as that is easy to tell.
 
     A run is not accepted by any scheduler that never lets a worker idle without need,
 
@@ -200,7 +200,7 @@ def _waiting(
     task_set: TaskSet, times: Times, workers: int, duration_ns: int, overhead_ns: int
 ) -> Floats:
     """
-    Return for how long a job can wait at most while nothing of its own longest path runs, ns.
+    Return how long a job can wait at most while no vertex of its longest path runs, ns.
 
     All workers are busy then (Graham), with what is released within the duration. With callback
     groups, processes or the interpreter's lock at least one is.

@@ -25,7 +25,7 @@ class Task:
 
     :ivar costs: the budgets.
     :ivar rad: RAD minus release.
-    :ivar latest: when a vertex has to be done, after the release, so that what follows can be.
+    :ivar latest: when a vertex must be done, after the release, so that its successors can be.
     :ivar sinks: index, relative deadline and length of the longest path, of each sink.
     :ivar volume: sum of the budgets.
     :ivar length: the longest path of all.
@@ -56,7 +56,7 @@ def tasks_of(task_set: TaskSet, budget: str = 'max') -> list[Task]:
     """
     Return the tasks of a task set.
 
-    :param budget: what of each declared execution time counts: ``max``, ``p99`` or ``mean``.
+    :param budget: which value of each execution time counts: ``max``, ``p99`` or ``mean``.
     """
     tables = Tables.build(task_set)
     tasks = []

@@ -10,16 +10,15 @@ one instant first the completions are given to the core, workers in ascending or
 releases in DAG order, then the core dispatches until it has nothing left to do (design section 9).
 A completion at the horizon counts; nothing is released or dispatched there any more.
 
-Where messages take time or executions fail, ``deliveries`` ends the executions, and the messages
-of an instant arrive between its completions and its releases.  Where CPUs are few
-or executions hold the interpreter, ``machine`` says after each instant when those finish that
-run.
+If messages take time or executions fail, ``deliveries`` ends the executions, and the messages of
+an instant arrive between its completions and its releases.  If CPUs are few or executions hold the
+interpreter, ``machine`` computes after each instant when the running ones finish.
 
 A job's deadlines count from its release, which is the time at which its source becomes ready,
 unless ``releases`` says that it was earlier (a sensor's message that arrived later).
 
 Like the rules this is plain integer arithmetic on lists, so that it can be compiled as it is;
-what is None then costs nothing.
+arguments that are None cost nothing then.
 """
 
 from __future__ import annotations
@@ -201,7 +200,7 @@ def run(
 
 
 def _end_busy(busy: list[int] | None, since: list[int], now: int) -> None:
-    """Count what still runs at the end."""
+    """Count the executions that still run at the end."""
     if busy is not None:
         for w in range(len(since)):
             if since[w] >= 0:
@@ -239,7 +238,7 @@ def _dispatch(
     running: list[int], since: list[int], busy: list[int] | None, log: list[LogEntry] | None,
     deliveries: Deliveries | None, machine: Machine | None,
 ) -> None:
-    """Dispatch what is to run now; ``running`` is kept for the log, which wants the preempted."""
+    """Dispatch what is to run now; ``running`` is for the preempted executions of the log."""
     if machine is not None:
         decide(t, s, machine, now)
     x = rules.schedule(t, s, key, now)

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What one simulated run is given: an execution time for each vertex, and the releases.
+The input of one simulated run: an execution time for each vertex, and the releases.
 
 Execution times are a list for each DAG, by local vertex index, in ns: each vertex has one for the
 whole run, as in the paper's experiment. (``draws`` has those of many runs, as arrays.)
@@ -40,7 +40,7 @@ def draw_execution_times(
     for dag in task_set.dags:
         row = []
         for vertex in dag.vertices:
-            # Draws even where nothing is declared: declaring one more time changes no other.
+            # Also if nothing is declared: then declaring one more time changes no other draw.
             share = generator.random()
             times_of_callback = vertex.callback.execution_time
             if times_of_callback is None and undeclared is not None:
@@ -149,7 +149,7 @@ def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns
 
 
 def declared_holds(task_set: TaskSet) -> list[list[int]]:
-    """Return by DAG which interpreter vertices are declared to hold, 0: none; empty: no vertex."""
+    """Return by DAG the interpreter that each vertex holds, 0: none; empty if no vertex does."""
     number = iter(processes_of(task_set))
     holds = [[next(number) * int(vertex.callback.holds_interpreter or False)
               for vertex in dag.vertices] for dag in task_set.dags]
