@@ -19,8 +19,17 @@ from mddag_executor.report.replays import (
     RECORDED_HEADER,
     recorded_rows,
 )
-from mddag_executor.report.tables import each_sink, missed_share, short_names, Sink, sink_rows
-from mddag_executor.report.text import format_ns, printable
+from mddag_executor.report.tables import (
+    each_sink,
+    missed_share,
+    percent,
+    rare_ends,
+    response_cells,
+    RESPONSES,
+    short_names,
+    Sink,
+)
+from mddag_executor.report.text import Cell, format_ns, printable
 from mddag_executor.text import counted
 
 MOST_ROWS = 50
@@ -121,14 +130,11 @@ def sinks_html(data: ReportData) -> str:
     The rows after the first ``MOST_ROWS`` are data for the page's script, which adds them when
     they are wanted.
     """
-    header, rows = sink_rows(data.tally.result()['dags'])
-    by_name = {}
-    for sink, cells in zip(each_sink(data.tally.result()['dags']), rows):
-        by_name[sink.dag, sink.name] = [sink.dag, *cells[1:]]
+    rare = rare_ends(total(data.tally.result()['dags']))
+    header = ['DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', *rare, *RESPONSES]
     ranked = RankedSink.every(data)
+    full = [(*_sink_cells(each.sink, rare), _reached(each.reached)) for each in ranked]
     bad = range(header.index('late'), header.index('median'))
-    full = [
-        (*by_name[each.sink.dag, each.sink.name], _reached(each.reached)) for each in ranked]
     shown = html_table([*header, 'max of deadline'], full[:MOST_ROWS], 2, bad,
                        attributes=(f'data-reached="{each.reached:.4f}"' for each in ranked))
     rest = [[*('-' if cell is None else printable(str(cell)) for cell in row[:-1]), each.reached]
@@ -140,6 +146,15 @@ def sinks_html(data: ReportData) -> str:
             f'<div class="wide" id="mddag-sinks">{shown}</div>\n'
             f'<script id="mddag-more-sinks" type="application/json">{json_for_html(rest)}'
             '</script>')
+
+
+def _sink_cells(sink: Sink, rare: Sequence[str]) -> list[Cell]:
+    verdicts = counts(sink.result)
+    return [
+        sink.dag, sink.shown_name, verdicts.due, verdicts.in_time,
+        percent(verdicts.in_time, verdicts.due), verdicts.late, verdicts.expired,
+        *(getattr(verdicts, name) for name in rare), *response_cells(sink.result['response_ns']),
+        format_ns(sink.result['relative_deadline_ns'])]
 
 
 def _reached(share: float) -> Html:

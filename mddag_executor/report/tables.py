@@ -19,8 +19,7 @@ from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 
 MOST_LINES = 12     # of drift
-HEADER = ('DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', 'median', 'p99', 'max',
-          'deadline')
+RESPONSES = ('median', 'p99', 'max', 'deadline')
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
@@ -46,7 +45,7 @@ class Sink(NamedTuple):
     """
     A sink in a table.
 
-    :ivar dag: the name of its DAG, and as the table shows it: in the DAG's first row only.
+    :ivar dag: the name of its DAG, and as a table shows it: in the DAG's first row only.
     :ivar name: its name, and as the table shows it.
     :ivar result: what there is of it.
     """
@@ -93,7 +92,7 @@ def sink_table(dags: Mapping[str, Any]) -> str:
             *(weakly_hard and _tolerate_cells(sink.result))])
         above = sink.dag
     return table(
-        ('DAG', 'sink', 'due', 'in time', 'late', *rare, *HEADER[7:], *weakly_hard), rows,
+        ('DAG', 'sink', 'due', 'in time', 'late', *rare, *RESPONSES, *weakly_hard), rows,
         marked=[not is_kept(sink.result) for sink, _ in found])
 
 
@@ -112,22 +111,6 @@ def worst_first(dags: Mapping[str, Any]) -> list[Sink]:
 def missed_share(verdicts: Counts) -> float:
     """Return which share of the due deadlines was missed."""
     return (verdicts.due - verdicts.in_time) / max(1, verdicts.due)
-
-
-def sink_rows(dags: Mapping[str, Any]) -> tuple[list[str], list[list[Cell]]]:
-    """Return the header and the rows of the table of sinks."""
-    rare = rare_ends(total(dags))
-    header = [*HEADER[:7], *rare, *HEADER[7:]]
-    rows: list[list[Cell]] = []
-    for sink in each_sink(dags):
-        verdicts = counts(sink.result)
-        rows.append([
-            sink.shown_dag, sink.shown_name, verdicts.due, verdicts.in_time,
-            percent(verdicts.in_time, verdicts.due), verdicts.late,
-            verdicts.expired, *(getattr(verdicts, name) for name in rare),
-            *response_cells(sink.result['response_ns']),
-            format_ns(sink.result['relative_deadline_ns'])])
-    return header, rows
 
 
 def rare_ends(every: Counts) -> list[str]:
