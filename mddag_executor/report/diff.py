@@ -3,8 +3,8 @@
 """
 Two runs side by side, sink by sink and callback by callback.
 
-Sinks and callbacks are the same where their names are.  What only one run has is listed with the
-other side empty.  A sink is *worse* in the second run if a larger share of its deadlines was
+Sinks and callbacks are the same where their names are. What only one run has is listed with the
+other side empty. A sink is *worse* in the second run if a larger share of its deadlines was
 missed there, if no job of it was due there but was in the first or, with a tolerance, if its p99
 response time grew by more than that.
 """

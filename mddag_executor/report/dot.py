@@ -57,7 +57,7 @@ def to_dot(picture: Picture) -> str:
 
 
 def quoted(text: str) -> str:
-    """Return a text as a quoted string of DOT that stands for just this text."""
+    """Return a text as a quoted string of DOT that means just this text."""
     return '"' + printable(text).replace('\\', '\\\\').replace('"', '\\"') + '"'
 
 

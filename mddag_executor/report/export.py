@@ -4,7 +4,7 @@
 A recording for spreadsheets and data frames: one row for each execution, or for each sink's job.
 
 Executions: a row is one run of a callback on a worker; a coroutine that was suspended has several,
-``first`` marks the first.  What no DAG declares has neither DAG nor job.
+``first`` marks the first. What no DAG declares has neither DAG nor job.
 
 Jobs: a row is the verdict about one job at one sink: ``in_time``, ``late``, ``overdue`` (not
 completed when the run ended past its deadline), ``expired``, ``failed`` or ``aborted``; the last
@@ -12,8 +12,8 @@ four have no completion.
 
 Columns that end in ``_ns`` are whole nanoseconds: times on the recording's clock, or durations.
 ``start_s`` and ``release_s`` are seconds since the run's first release (or execution, where one
-came before).  ``reference_deadline_ns`` is the vertex's (RAD), ``slack_ns`` what was left of it at
-the end.  ``worker`` -1 is a spare thread beside the pool.
+came before). ``reference_deadline_ns`` is the vertex's (RAD), ``slack_ns`` what was left of it at
+the end. ``worker`` -1 is a spare thread in addition to the pool.
 
 Rows come in the order of their releases, those without one by their readiness.
 """

@@ -43,7 +43,7 @@ _RIGHT = 24             # room for half of the last label of the time axis
 
 
 class Figures(NamedTuple):
-    """The figures of a report; ``histograms`` by what stands above each."""
+    """The figures of a report; ``histograms`` by sink."""
 
     overview: Any
     workers: Any

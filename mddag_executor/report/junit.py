@@ -4,7 +4,7 @@
 The verdicts of a replay as JUnit XML, which CI systems read: one test case for each sink.
 
 A sink within the tolerance passes; one that is not fails, with the reason; one of which no job
-was due is skipped, because nothing is known of it.  The time of a test case is the longest
+was due is skipped, because nothing is known of it. The time of a test case is the longest
 response time, in seconds.
 """
 

@@ -31,7 +31,7 @@ def to_mermaid(picture: Picture) -> str:
 
 
 def quoted(text: str) -> str:
-    """Return a text as a quoted label that stands for just this text."""
+    """Return a text as a quoted label that means just this text."""
     return '"' + _NOT_PLAIN.sub(lambda found: f'#{ord(found[0])};', printable(text)) + '"'
 
 

@@ -16,12 +16,12 @@ Tracks are in groups:
 * *ready callbacks*: a counter of those that wait for a worker or their group.
 
 Executions of one track may overlap (a reentrant group, jobs that overlap): then it has several
-tracks of one name, as Perfetto demands that slices of a track nest.  An execution goes to the
+tracks of one name, as Perfetto demands that slices of a track nest. An execution goes to the
 first of them that is free when it starts.
 
 A trace is a row of packets in protobuf's encoding; the numbers of the fields are those of
-Perfetto's ``trace_packet.proto``.  Names of events are in the first packet of an event (interned);
-each packet says with a flag that it needs them.  Times are the recording's, in nanoseconds.
+Perfetto's ``trace_packet.proto``. Names of events are in the first packet of an event (interned);
+each packet says with a flag that it needs them. Times are the recording's, in nanoseconds.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 Tables of what came of each sink, for live runs, simulations and replays alike.
 
 The numbers are those of the result format: ``completed`` counts all completions, ``late`` those
-after the deadline and what was overdue and open when the run ended.  For people *due* is every
+after the deadline and what was overdue and open when the run ended. For people *due* is every
 sink job that got a verdict, and *in time* what completed by its deadline.
 """
 
@@ -136,7 +136,7 @@ def percent(part: int, whole: int) -> str:
 
 
 def verdicts_line(dags: Mapping[str, Any]) -> str:
-    """Return the line that stands below a table of sinks: the verdicts about all of them."""
+    """Return the line below a table of sinks: the verdicts about all of them."""
     return verdicts_text(total(dags))
 
 

@@ -28,7 +28,7 @@ def printable(text: str) -> str:
     r"""
     Return a text with control characters written as escapes (`\x1b`).
 
-    Names come from files; a terminal must never obey what stands in them. Escaped are also
+    Names come from files; a terminal must never obey them. Escaped are also
     line breaks, changes of the writing direction and lone surrogates. (``msg_graph.errors`` has
     the same for its own errors; to take it from there would load YAML for every `--help`.)
     """

@@ -1,10 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Who is there, for nodes that ask: the nodes of the run, and what is recorded.
+Answers to questions about the ROS graph: the nodes of the run, and what is recorded.
 
-The middleware finds out in a time of its own. Here everybody is known at once. What is asked for
-beyond this is answered by the middleware, and a warning says that it is not the same in each run.
+The middleware discovers nodes after some time. Here all are known at once. Other questions go to
+the middleware, and a warning says that the answer is not the same in each run.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _OTHERS = (
 
 class Discovery:
     """
-    Answers who is there.
+    Answers questions about the ROS graph.
 
     :param kinds: returns the type of each recorded topic, as far as it is known.
     """
@@ -45,7 +45,7 @@ class Discovery:
         self._warn = warn
 
     def install(self, replacements: Replacements) -> None:
-        """Have nodes ask this."""
+        """Replace the methods with which nodes ask."""
         replace = replacements.replace
         replace(Node, 'get_topic_names_and_types', instead(self._topics))
         replace(Node, 'count_publishers', instead(self._publishers))

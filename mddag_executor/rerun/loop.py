@@ -16,8 +16,8 @@ long as ``times`` says, or as long as it has waited, if that is more. What it se
 until its virtual end, or until it begins to wait, for others may have to answer it. A message
 whose recorded transport time is negative left before the end, and does so here, too.
 
-What threads of others send has no virtual time: it is taken as of when it comes, and a warning
-says so.
+A message that another thread sends has no virtual time: it gets the time at which it arrives, and
+a warning says so.
 
 A recording may have pauses: the recorder was stopped, or the machine's clock set forward. No
 timer fires in a pause, and what has begun is completed, for ``DRAIN_NS`` at most. What else would
@@ -55,8 +55,8 @@ DRAIN_NS = 10_000_000_000
 """What has begun may go on this long after the end of the recording, and in a pause of it."""
 POLL_NS = 1_000_000
 """How often a waiting callback looks again, or asks again for the interpreter."""
-MOST_LOOKS = 1000
-"""A callback that looks at the time this often at one instant waits for time to pass."""
+MOST_POLLS = 1000
+"""A callback that reads the time this often at one instant waits for time to pass."""
 MOST_AT_ONCE = 20_000
 """More callbacks at one instant than this go in a circle in which nothing takes time."""
 
@@ -140,7 +140,7 @@ class Loop:
         self._resumed: set[Work] = set()
         self._at_once = 0
         self._stopped = False
-        self._looked_at = self._looks = self._ask_at = 0
+        self._polled_at = self._polls = self._ask_at = 0
 
     # --- what is to happen -----------------------------------------------------------------------
 
@@ -417,15 +417,15 @@ class Loop:
 
     def note_poll(self) -> None:
         """
-        Note that the calling run thread has looked at the time, or whether something has come.
+        Note that the calling run thread has read the time, or polled for something.
 
-        A run thread that looks all the time waits for time to pass: so time passes.
+        A run thread that polls all the time waits for time to pass: so time passes.
         """
-        if self._looked_at != self.now:
-            self._looked_at, self._looks = self.now, 0
-        self._looks += 1
-        if self._looks >= MOST_LOOKS:
-            self._looks = 0
+        if self._polled_at != self.now:
+            self._polled_at, self._polls = self.now, 0
+        self._polls += 1
+        if self._polls >= MOST_POLLS:
+            self._polls = 0
             self.wait(None, self.now + POLL_NS, 'for time to pass')
 
     def blocked(self) -> list[str]:

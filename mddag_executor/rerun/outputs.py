@@ -106,7 +106,7 @@ def _qos(profile: Any) -> str:
 
 
 class VirtualTraceWriter:
-    """Records events as ``TraceWriter`` does, but at once: nobody waits, and nothing is lost."""
+    """Records events as ``TraceWriter`` does, but at once: nothing waits, and nothing is lost."""
 
     dropped = 0
     error: TraceError | None = None

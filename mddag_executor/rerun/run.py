@@ -3,10 +3,10 @@
 """
 A rerun: real nodes, a recording, virtual time.
 
-``rerun`` puts the parts together: what is recorded (``recording``), the engine of live runs, the
-loop that drives it (``loop``), what carries messages (``messages``, ``services``), and what nodes
-see of time (``clocks``, ``timers``). The nodes are rclpy's own, in a context of their own that
-discovers nobody: for the middleware they do nothing at all.
+``Rerun`` puts the parts together: the recording (``inputs``), the engine of live runs, the loop
+that drives it (``loop``), the ways of messages (``messages``, ``services``, ``actions``), and the
+time that nodes see (``clocks``, ``timers``). The nodes are rclpy's own, in a context that discovers
+no others: for the middleware they do nothing at all.
 """
 
 from __future__ import annotations
@@ -297,7 +297,7 @@ class Rerun:
     def _started(self) -> None:
         """Begin to deliver, when each program has come to where it waits for something."""
         self._started_s = time.monotonic() - self._begun
-        gc.freeze()  # else each full collection looks at all that the nodes are made of
+        gc.freeze()  # else each full collection visits all objects of the nodes
         if all(guest.settled for guest in self._host.guests) and not self._hosted:
             raise RerunError(self._none_hosted())
         self._check_topics()

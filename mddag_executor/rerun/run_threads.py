@@ -47,7 +47,7 @@ class RunThread:
 
     :ivar until: returns whether that has come true; None: it waits for a time, or for the end.
     :ivar deadline: the virtual time at which it waits no longer; None: there is none.
-    :ivar execution: what it runs: kept for whoever drives the run.
+    :ivar execution: what it runs: kept for the thread that drives the run.
     :ivar ended: whether its function has ended.
     """
 

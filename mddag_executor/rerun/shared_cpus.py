@@ -73,7 +73,7 @@ class SharedCpus:
         self._machine.publishes_at[x] = places[-1][0] if places else NEVER
 
     def next_time(self) -> int:
-        """Return when somebody ends, or needs something else."""
+        """Return when the next execution ends, or needs another resource."""
         return min(self._machine.scalars[NEXT_TIME], *self._finish_at)
 
     def settle(self, now: int) -> None:
@@ -81,7 +81,7 @@ class SharedCpus:
         settle(self._state, self._machine, now)
 
     def share(self, now: int) -> None:
-        """Find out who goes on."""
+        """Decide which executions go on."""
         share(self._engine.tables, self._state, self._machine, now, self._finish_at)
         for worker, what in enumerate(self._running):
             if what is None:
