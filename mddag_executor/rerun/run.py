@@ -5,8 +5,8 @@ A rerun: real nodes, a recording, virtual time.
 
 ``Rerun`` puts the parts together: the recording (``inputs``), the engine of live runs, the loop
 that drives it (``loop``), the ways of messages (``messages``, ``services``, ``actions``), and the
-time that nodes see (``clocks``, ``timers``). The nodes are rclpy's own, in a context that discovers
-no others: for the middleware they do nothing at all.
+time that nodes see (``clocks``, ``timers``). The nodes are rclpy's own, in a context that
+discovers no others: for the middleware they do nothing at all.
 """
 
 from __future__ import annotations
