@@ -45,6 +45,7 @@ EXTRAS = {
     'docs/figures.md': ('matplotlib',),
     'docs/run.md': ('rclpy',),
     'docs/start.md': ('rclpy',),
+    'docs/tables.md': ('pyarrow', 'pandas', 'duckdb'),
 }
 
 

@@ -60,7 +60,7 @@ from mddag_executor.recording.tables import (
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import renamed
-from mddag_executor.trace.events import Event, Events
+from mddag_executor.trace.events import Batch, Column, Event, FIELDS, rows_at, with_fields
 from msg_graph import TaskSet
 import numpy as np
 
@@ -183,116 +183,106 @@ class _Source:
         self._strange: Counter[str] = Counter()
 
     def read(self, progress: Progress | None) -> Recording:
-        base = 0
-        for events in self._reader.chunks({
+        count = 0
+        for batch in self._reader.batches({
                 *_NUMBERS, *OWN_INIT_EVENTS, TASK_SET, _DROP, _HOSTED}):
-            self._chunk(events, base)
-            base += len(events)
+            self._take(batch)
+            count += len(batch)
             if progress is not None:
-                progress(base)
-        give_back()     # what the chunks needed
+                progress(count)
+        give_back()     # what the batches needed
         return self._recording()
 
-    # --- chunks ----------------------------------------------------------------------------------
+    # --- batches ---------------------------------------------------------------------------------
 
-    def _chunk(self, events: Events, base: int) -> None:
-        found: dict[str, tuple[Table, Ints]] = {}
-        for (kind,), of_kind, places in events.tables():
+    def _take(self, batch: Batch) -> None:
+        """Keep the events of a batch, executions as rows."""
+        columns: dict[str, Column] = {}
+        for column in batch.columns:
+            kind = column.fixed.head[0]
             if kind not in _NUMBERS:
-                self._others += [(base + place, (kind, *row)) for place, row in zip(
-                    places.tolist(), of_kind.tolist())]
-            elif kind in found:     # a second channel of that kind
-                self._kind(kind).add(of_kind, base + places)
+                _, found, places = batch.table(column)
+                self._others += [(place, (kind, *row)) for place, row in zip(
+                    places.tolist(), found.tolist())]
+            elif kind in columns:       # a second channel of that kind
+                self._keep(batch, column)
             else:
-                found[kind] = of_kind, places
-        for place, event in events.others():
+                columns[kind] = column
+        for place, event in batch.others():
             if None in event:
                 self._strange[f'{event[0]} without some of its fields'] += 1
             elif event[0] in _NUMBERS:
-                self._kind(event[0]).add(_one_row(event), np.array([base + place]))
+                self._kind(event[0]).add(_one_row(event), np.array([place]))
             else:
-                self._others.append((base + place, event))
-        if _DISPATCH in found:
-            self._adjacent(found, len(events), base)
-        for kind, (of_kind, places) in found.items():
-            if len(of_kind):
-                # a copy: what is left of a chunk must not keep it in memory
-                self._kind(kind).add(of_kind.copy(), base + places)
+                self._others.append((place, event))
+        if all(kind in columns and columns[kind].size for kind in (_DISPATCH, _START, _END)):
+            self._adjacent(batch, columns)
+        for column in columns.values():
+            self._keep(batch, column)
+
+    def _keep(self, batch: Batch, column: Column) -> None:
+        if len(column.at):
+            kind, found, places = batch.table(column)
+            self._kind(kind[0]).add(found, places)
 
     def _kind(self, name: str) -> _Kind:
         return self._kinds.setdefault(name, _Kind())
 
-    def _adjacent(
-        self, found: dict[str, tuple[Table, Ints]], length: int, base: int
-    ) -> None:
-        """Take the events out that stand next to each other as they were recorded (rule 2)."""
-        dispatch, at = found[_DISPATCH]
-        parts: list[tuple[Table, Ints, Ints]] = []      # rows, places, row by dispatch
-        fits = np.ones(len(at), dtype=np.bool_)
-        for step, kind in enumerate((_START, _END, _COMPLETE), 1):
-            if kind not in found:
-                if kind != _COMPLETE:
-                    return
-                parts.append((dispatch, at, np.full(len(at), -1)))
-                continue
-            of_kind, places = found[kind]
-            if len(places) == len(at) and (places == at + step).all():
-                which = np.arange(len(at))
-            else:
-                row_at = np.full(length + 5, -1)
-                row_at[places] = np.arange(len(places))
-                which = row_at[at + step]
-                if kind == _COMPLETE:       # several legs at once are put together later
-                    which = np.where(row_at[at + step + 1] < 0, which, -1)
-            there = which >= 0
-            same = there.copy()
-            for field in ('vtid', 'callback'):
-                same &= of_kind[field][which] == dispatch[field]
-            if kind == _COMPLETE:
-                for field in ('dag', 'vertex', 'job'):
-                    same &= of_kind[field][which] == dispatch[field]
-                which = np.where(same, which, -1)
-            else:
-                fits &= same
-            parts.append((of_kind, places, which))
-        (_, _, started), (ends, end_at, ended), (completes, complete_at, completed) = parts
-        if not fits.any():
-            return
-        if not fits.all():
-            taken = np.flatnonzero(fits)
-            started, ended, completed = started[taken], ended[taken], completed[taken]
-            dispatched, dispatched_at = dispatch[taken], at[taken]
-        else:
-            dispatched, dispatched_at = dispatch, at
-        table = self._rows(dispatched, dispatched['timestamp'], ends['timestamp'][ended])
-        self._dispatch_at.append(base + dispatched_at)
-        self._end_at.append(base + end_at[ended])
-        whole = completed >= 0
-        if whole.all():
-            self._complete(table, completes[completed])
-            self._complete_at.append(base + complete_at[completed])
-            self._seen.append(completes['timestamp'][completed].astype(np.int64))
-        else:
-            places, seen = (np.full(len(table), UNKNOWN) for _ in range(2))
+    def _adjacent(self, batch: Batch, columns: dict[str, Column]) -> None:
+        """Take out the events that are next to each other as they were recorded (rule 2)."""
+        kinds = [_DISPATCH, _START, _END]
+        at = columns[_DISPATCH].at
+        start_at = at + columns[_DISPATCH].size
+        end_at = start_at + columns[_START].size
+        complete_at = end_at + columns[_END].size
+        fits = _is_in(start_at, columns[_START].at) & _is_in(end_at, columns[_END].at)
+        complete = columns.get(_COMPLETE)
+        if complete is not None and complete.size:
+            # several legs at once are put together later
+            whole = fits & _is_in(complete_at, complete.at) & ~_is_in(
+                complete_at + complete.size, complete.at)
             if whole.any():
-                done = table[whole]
-                self._complete(done, completes[completed[whole]])
-                table[whole] = done
-                places[whole] = base + complete_at[completed[whole]]
-                seen[whole] = completes['timestamp'][completed[whole]]
-            self._complete_at.append(places)
-            self._seen.append(seen)
+                self._add_adjacent(batch, columns, [*kinds, _COMPLETE], at[whole])
+            fits &= ~whole
+        if fits.any():
+            self._add_adjacent(batch, columns, kinds, at[fits])
+
+    def _add_adjacent(
+        self, batch: Batch, columns: dict[str, Column], kinds: list[str], at: Ints
+    ) -> None:
+        """Make rows of executions whose events are next to each other, if they fit together."""
+        offsets = np.cumsum([0, *(columns[kind].size for kind in kinds)]).tolist()
+        row = np.dtype({
+            'names': kinds, 'formats': [columns[kind].fixed.kind for kind in kinds],
+            'offsets': offsets[:-1],
+            'itemsize': offsets[-2] + columns[kinds[-1]].fixed.kind.itemsize})
+        found = rows_at(batch.data, row, at + FIELDS)
+        same = np.ones(len(found), dtype=np.bool_)
+        for kind in kinds[1:]:
+            for field in ('vtid', 'callback', *(
+                    ('dag', 'vertex', 'job') if kind == _COMPLETE else ())):
+                same &= found[kind][field] == found[_DISPATCH][field]
+        if not same.all():
+            found, at = found[same], at[same]
+        parts = {kind: with_fields(found[kind], columns[kind].fixed.missing) for kind in kinds}
+        dispatch = parts[_DISPATCH]
+        table = self._rows(dispatch, dispatch['timestamp'], parts[_END]['timestamp'])
+        at_end = batch.base + at + offsets[2]
+        self._dispatch_at.append(batch.base + at)
+        self._end_at.append(at_end)
+        if kinds[-1] == _COMPLETE:
+            self._complete(table, parts[_COMPLETE])
+            self._complete_at.append(batch.base + at + offsets[3])
+            self._seen.append(parts[_COMPLETE]['timestamp'].astype(np.int64))
+        else:
+            self._complete_at.append(np.full(len(at), UNKNOWN))
+            self._seen.append(np.full(len(at), UNKNOWN))
         self._executions.add(table)
-        found[_DISPATCH] = dispatch[~fits], at[~fits]
-        for kind, which in ((_START, started), (_END, ended), (_COMPLETE, completed[whole])):
-            if kind in found:
-                of_kind, places = found[kind]
-                if len(which) == len(of_kind):
-                    found[kind] = of_kind[:0], places[:0]
-                else:
-                    rest = np.ones(len(of_kind), dtype=np.bool_)
-                    rest[which] = False
-                    found[kind] = of_kind[rest], places[rest]
+        for kind, offset in zip(kinds, offsets):
+            column = columns[kind]
+            rest = column.at[:0] if len(column.at) == len(at) else column.at[
+                ~_is_in(column.at, at + offset)]
+            columns[kind] = column._replace(at=rest)
 
     def _rows(self, dispatch: Table, start: Any, end: Any) -> Table:
         """Return rows of executions that were dispatched."""
@@ -470,8 +460,9 @@ class _Source:
         if published is None:
             return rows(PUBLICATIONS)
         time = published['timestamp'].astype(np.int64)
-        order = np.argsort(time, kind='stable')
-        published, time = published[order], time[order]
+        if (time[1:] < time[:-1]).any():
+            order = np.argsort(time, kind='stable')
+            published, time = published[order], time[order]
         by = running_at(executions, published['vtid'].astype(np.int64), time)
         return rows(
             PUBLICATIONS, len(published), publisher=published['publisher_handle'].view(np.int64)
@@ -642,6 +633,21 @@ def _joined(parts: list[Ints], last: Ints) -> Ints:
     return found
 
 
+def _is_in(places: Ints, known: Ints) -> Mask:
+    """Return which places are among known ones; both ascend."""
+    found = np.zeros(len(places), dtype=np.bool_)
+    if not len(places) or not len(known):
+        return found
+    # in most batches they are the same, but for the first or last one
+    first = int(np.searchsorted(known, places[0]))
+    part = known[first:first + len(places)]
+    found[:len(part)] = part == places[:len(part)]
+    if not found[:-1].all():
+        at = np.minimum(np.searchsorted(known, places), len(known) - 1)
+        found = known[at] == places
+    return found
+
+
 class _Numbering:
     """Turns a DAG and the place of a vertex in it to the vertex's number over all DAGs."""
 
@@ -748,13 +754,13 @@ def running_at(executions: Table, thread: Ints, time: Ints) -> Ints:
     ran = np.flatnonzero((executions['end'] >= 0) & (executions['start'] >= 0))
     threads = executions['thread'][ran]
     for number in np.unique(thread).tolist():
-        asked = np.flatnonzero(thread == number)
-        mine = ran[threads == number]
+        asked, mine = np.flatnonzero(thread == number), ran[threads == number]
         if not len(mine):
             continue
         start, end = executions['start'][mine], executions['end'][mine]
-        order = sort_by(start, -end)
-        mine, start, end = mine[order], start[order], end[order]
+        if (start[1:] <= start[:-1]).any():
+            order = sort_by(start, -end)
+            mine, start, end = mine[order], start[order], end[order]
         at = np.searchsorted(start, time[asked], 'right') - 1
         # what ran inside another may have ended before
         for _ in range(32):

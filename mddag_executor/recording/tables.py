@@ -218,6 +218,7 @@ class Recording:
     unjudged: dict[int, int] | None = None
     warnings: list[str] = field(default_factory=list)
     _keys: dict[int, str] | None = field(default=None, init=False, repr=False)
+    _callbacks: tuple[Ints, Ints] | None = field(default=None, init=False, repr=False)
 
     @property
     def dropped(self) -> Counter[str]:
@@ -226,15 +227,34 @@ class Recording:
         return Counter({
             name: n for name, n in zip(self.drop_reasons, counts.tolist()) if n})
 
+    def callbacks(self) -> tuple[Ints, Ints]:
+        """Return the numbers of the callbacks that ran, and by execution the index of its."""
+        if self._callbacks is None:
+            numbers, index = np.unique(self.executions['callback'], return_inverse=True)
+            self._callbacks = numbers, index.astype(np.int32)
+        return self._callbacks
+
+    def vertices_of_callbacks(self, which: Any = slice(None)) -> Ints:
+        """
+        Return by index of a callback the vertex that it ran as last; -1: it ran as none.
+
+        :param which: the executions to consider.
+        """
+        numbers, index = self.callbacks()
+        vertex, index = self.executions['vertex'][which], index[which]
+        found = np.full(len(numbers), UNKNOWN)
+        declared = vertex >= 0
+        found[index[declared]] = vertex[declared]
+        return found
+
     def callback_name(self, number: int) -> str:
         """Return what a callback is called: as declared, or by its node and what starts it."""
         if self._keys is None:
-            table, keys = self.executions, dict[int, str]()
-            declared = table[table['vertex'] >= 0]
-            numbers, first = np.unique(declared['callback'], return_index=True)
-            for each, vertex in zip(numbers.tolist(), declared['vertex'][first].tolist()):
-                keys[each] = self.task_set.vertices[vertex].callback.key
-            self._keys = keys
+            numbers, _ = self.callbacks()
+            self._keys = {
+                each: self.task_set.vertices[vertex].callback.key
+                for each, vertex in zip(numbers.tolist(), self.vertices_of_callbacks().tolist())
+                if vertex >= 0}
         return self._keys.get(number) or self.who.name(number)
 
     def cut(self, begin: int, end: int) -> Recording:

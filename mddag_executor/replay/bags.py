@@ -184,7 +184,7 @@ class Bag:
                          if _absolute(c.topic) in topics}
                 wanted = [c for c in reader.connections if c.id in known]
                 for connection, time, data in reader.messages(wanted) if wanted else ():
-                    self._add(known[connection.id], time, UNKNOWN, memoryview(data))
+                    self._add(known[connection.id], time, UNKNOWN, data)
                     used += 1
             finally:
                 reader.close()
@@ -233,7 +233,7 @@ class Bag:
         """Return the last arrival of any message, ns; None without any."""
         return self.stretches[-1][1] if self.stretches else None
 
-    def _add(self, topic: Topic, arrival: int, published: int, data: memoryview) -> None:
+    def _add(self, topic: Topic, arrival: int, published: int, data: bytes) -> None:
         if not 0 <= arrival < NEVER:
             return
         name = _absolute(topic.name)
@@ -242,7 +242,7 @@ class Bag:
             stamps = self.stamps[name] = Stamps()
             stamps.type = topic.message_type
         if self._keep is not None:
-            content = bytes(data)
+            content = data
             if content.startswith(_ZSTD):
                 content = _unpacked_message(content, _SPARE)
             self._keep(topic._replace(name=name), arrival, published, content)
@@ -251,16 +251,16 @@ class Bag:
         stamps.published.append(published if different else UNKNOWN)
         stamps.header.append(self._header(topic, data))
 
-    def _header(self, topic: Topic, data: memoryview) -> int:
+    def _header(self, topic: Topic, data: bytes) -> int:
         key = (topic.message_type, topic.definition)
         stamped = self._stamped.get(key)
         if stamped is None:
             stamped = self._stamped[key] = topic.encoding == 'cdr' and _is_stamped(topic)
         if not stamped:
             return UNKNOWN
-        head = bytes(data[:_STAMP])
+        head = data[:_STAMP]
         if head.startswith(_ZSTD):      # compressed message by message
-            head = _unpacked_message(bytes(data), _STAMP)
+            head = _unpacked_message(data, _STAMP)
         if len(head) < _STAMP or head[0] or head[1] > 1:
             return UNKNOWN
         seconds, nanoseconds = struct.unpack('<iI' if head[1] else '>iI', head[4:])

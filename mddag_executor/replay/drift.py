@@ -36,23 +36,28 @@ def drift_of(recording: Recording) -> list[Drift]:
     # what ran: declared callbacks when they were started, others once for each execution
     declared = (table['vertex'] >= 0) & (table['start'] >= 0)
     others = (table['vertex'] < 0) & (table['end'] >= 0) & (table['piece'] == 0)
-    counts = dict(zip(*(each.tolist() for each in np.unique(
-        table['callback'][declared | others], return_counts=True))))
+    numbers, callback_of = recording.callbacks()
+    counts = dict(zip(numbers.tolist(), np.bincount(
+        callback_of[declared | others], minlength=len(numbers)).tolist()))
     keys = declared_keys(who, recording.recorded_set)
-    started = table[declared]
-    of_callback, last = np.unique(started['callback'][::-1], return_index=True)
-    for callback, vertex in zip(of_callback.tolist(), started['vertex'][::-1][last].tolist()):
-        keys[callback] = vertices[vertex].callback.key
+    for callback, vertex in zip(
+            numbers.tolist(), recording.vertices_of_callbacks(declared).tolist()):
+        if vertex >= 0:
+            keys[callback] = vertices[vertex].callback.key
     ran: Counter[str] = Counter()
     for callback, key in keys.items():
         ran[key] += counts.get(callback, 0)
     dropped = Counter(vertices[v].callback.key for v in recording.drops['vertex'].tolist()
                       if v >= 0)
     publishes: defaultdict[str, Set[str]] = defaultdict(set)
-    by = recording.publications[recording.publications['execution'] >= 0]
-    pairs = np.unique(np.column_stack((
-        by['publisher'], table['callback'][by['execution']])), axis=0)
-    for number, callback in pairs.tolist():
+    sent = recording.publications
+    publishers, publisher_of = np.unique(sent['publisher'], return_inverse=True)
+    by = np.flatnonzero(sent['execution'] >= 0)
+    pairs = np.flatnonzero(np.bincount(
+        publisher_of[by] * len(numbers) + callback_of[sent['execution'][by]]))
+    for pair in pairs.tolist():
+        number = int(publishers[pair // len(numbers)])
+        callback = int(numbers[pair % len(numbers)])
         publisher = who.every_publisher.get(number)
         if callback in keys and publisher is not None and publisher.node is not None:
             publishes[keys[callback]] |= {publisher.topic}

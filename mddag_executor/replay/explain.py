@@ -191,15 +191,10 @@ class Explanation:
 
     def _vertices(self) -> dict[int, int]:
         """Return by callback the vertex that it ran as last."""
-        table, rows = self._recording.executions, self._rows
-        declared = rows[table['vertex'][rows] >= 0]
-        keys = table['callback'][declared] * np.int64(1 << 20) ^ table['vertex'][declared]
-        some = declared[np.unique(keys, return_index=True)[1]]
-        found: dict[int, int] = {}
-        for callback, vertex in sorted(zip(
-                table['callback'][some].tolist(), table['vertex'][some].tolist())):
-            found[callback] = vertex
-        return found
+        numbers, _ = self._recording.callbacks()
+        of = self._recording.vertices_of_callbacks(self._rows)
+        return {callback: vertex for callback, vertex in zip(numbers.tolist(), of.tolist())
+                if vertex >= 0}
 
     # --- results ---------------------------------------------------------------------------------
 

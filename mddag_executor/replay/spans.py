@@ -38,10 +38,9 @@ class Spans:
 
 def crowded(starts: Ints, ends: Ints, least: int) -> tuple[Ints, Ints]:
     """Return the starts and ends of the times at which at least so many spans last."""
-    times = np.concatenate([starts, ends])
-    step = np.repeat([1, -1], len(starts))
-    order = np.lexsort((step, times))       # at one instant what ends goes first
-    times, count = times[order], np.cumsum(step[order])
+    times = np.concatenate([np.sort(ends), np.sort(starts)])
+    order = np.argsort(times, kind='stable')    # at one instant, ends come first
+    times, count = times[order], np.cumsum(np.where(order < len(ends), -1, 1))
     full = count >= least
     before = np.r_[False, full[:-1]]
     return times[full & ~before], times[~full & before]

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Some of a trace's events at once, as columns of numbers, and as tuples."""
+"""Many events of a trace at once, as columns of numbers and as tuples."""
 
 from __future__ import annotations
 
@@ -12,9 +12,35 @@ import numpy.typing as npt
 
 Event = tuple[Any, ...]
 Ints = npt.NDArray[np.int64]
-Fixed = tuple[Event, Any, dict[str, int]]
-OTHER = 0xFFFF
-"""Stands for the channel of events that no fixed layout decodes."""
+FIELDS = 35
+"""Bytes of a message's record before the fields of its content."""
+
+
+class Fixed(NamedTuple):
+    """
+    How numpy decodes the messages of a channel, which all have one layout.
+
+    :ivar head: the beginning of the tuple of an event.
+    :ivar kind: the type of a row, from ``timestamp`` on.
+    :ivar missing: fields that the file does not have, with their values.
+    """
+
+    head: Event
+    kind: Any
+    missing: dict[str, int]
+
+
+class Column(NamedTuple):
+    """
+    The events of one channel in a batch.
+
+    :ivar at: where their records begin in the data, ascending.
+    :ivar size: how many bytes each record has; 0: not all have the same.
+    """
+
+    fixed: Fixed
+    at: Ints
+    size: int
 
 
 class Table(NamedTuple):
@@ -22,7 +48,7 @@ class Table(NamedTuple):
     The events of one kind.
 
     :ivar rows: a structured array with the event's fields, from ``timestamp`` on.
-    :ivar places: of each row, its place among all events of the batch.
+    :ivar places: of each row, ascending in the order of the file over all batches.
     """
 
     head: Event
@@ -30,65 +56,53 @@ class Table(NamedTuple):
     places: Ints
 
 
-class Events:
+class Batch:
     """
-    A batch of events in order.
+    The events of some chunks; to be used before the next batch is read.
 
-    Messages of a fixed layout are decoded by numpy, all of a kind at once.
-
-    :param data: in which messages begin at ``positions``.
-    :param channels: of each event its channel, ``OTHER``: it is in ``others``, at its position.
-    :param decoders: by channel the beginning of its tuples, the type of its rows, and what the
-        fields are that these do not have.
+    :param data: the records of the chunks.
+    :param base: the place of the first byte of the data in the order of the file.
+    :param others: the events that numpy cannot decode, with their places in the data.
     """
 
     def __init__(
-        self, data: bytes, channels: npt.NDArray[np.uint16], positions: Ints,
-        others: Sequence[Event], decoders: dict[int, Fixed],
+        self, data: bytearray, base: int, columns: Sequence[Column],
+        others: Sequence[tuple[int, Event]],
     ) -> None:
-        self._data = data
-        self._channels = channels
-        self._positions = positions
-        self._others = others
-        self._decoders = decoders
+        self.data, self.base = data, base
+        self.columns, self._others = columns, others
 
     def __len__(self) -> int:
-        """Return how many there are."""
-        return len(self._channels)
+        """Return how many events there are."""
+        return sum(len(column.at) for column in self.columns) + len(self._others)
 
-    def tables(self) -> Iterator[Table]:
-        """Yield the events of fixed layouts, channel by channel."""
-        order = np.argsort(self._channels, kind='stable')
-        channels = self._channels[order]
-        begins = np.r_[True, channels[1:] != channels[:-1]][:len(order)]
-        starts = np.flatnonzero(begins).tolist()
-        for start, end in zip(starts, [*starts[1:], len(order)]):
-            number = int(channels[start])
-            if number != OTHER:
-                head, kind, missing = self._decoders[number]
-                places = order[start:end]
-                rows = rows_at(self._data, kind, self._positions[places])
-                yield Table(head, _with_fields(rows, missing) if missing else rows, places)
+    def table(self, column: Column) -> Table:
+        """Return the events of one channel."""
+        rows = rows_at(self.data, column.fixed.kind, column.at + FIELDS)
+        return Table(column.fixed.head, with_fields(rows, column.fixed.missing),
+                     column.at + self.base)
 
     def others(self) -> list[tuple[int, Event]]:
         """Return the other events with their places."""
-        places = np.flatnonzero(self._channels == OTHER)
-        return [(place, self._others[number])
-                for place, number in zip(places.tolist(), self._positions[places].tolist())]
+        return [(self.base + place, event) for place, event in self._others]
 
     def __iter__(self) -> Iterator[Event]:
-        """Yield them as tuples."""
-        found: list[Any] = [None] * len(self)
-        for head, rows, places in self.tables():
-            for place, row in zip(places.tolist(), rows.tolist()):
-                found[place] = head + row
-        for place, event in self.others():
-            found[place] = event
-        return iter(found)
+        """Yield all events as tuples, in the order of the file."""
+        found: list[Event] = []
+        places = [np.array([place for place, _ in self._others], dtype=np.int64)]
+        found += [event for _, event in self._others]
+        for column in self.columns:
+            head, rows, _ = self.table(column)
+            found += [head + row for row in rows.tolist()]
+            places.append(column.at)
+        for number in np.argsort(np.concatenate(places), kind='stable').tolist():
+            yield found[number]
 
 
-def _with_fields(rows: Any, missing: dict[str, int]) -> Any:
-    """Return a structured array with more fields, the same in each row."""
+def with_fields(rows: Any, missing: dict[str, int]) -> Any:
+    """Return a structured array with more fields, each with one value in all rows."""
+    if not missing:
+        return rows
     kinds = [(name, rows.dtype[name]) for name in rows.dtype.names]
     wider = np.empty(len(rows), [*kinds, *((name, np.int64) for name in missing)])
     for name, _ in kinds:
@@ -98,8 +112,8 @@ def _with_fields(rows: Any, missing: dict[str, int]) -> Any:
     return wider
 
 
-def rows_at(data: bytes, kind: Any, positions: Ints) -> Any:
-    """Return the structures of a type that stand in data at positions, which are checked."""
+def rows_at(data: bytearray, kind: Any, positions: Ints) -> Any:
+    """Return the structures of a type at some positions in data; raise IndexError beyond it."""
     room = len(data) - kind.itemsize + 1
     # as plain bytes: numpy copies structures field by field
     found = np.ndarray(max(room, 0), f'V{kind.itemsize}', data, strides=(1,))[positions]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Collection, Iterable, Iterator
-from functools import partial
 import os
 import stat
 from typing import Any, BinaryIO, TypeVar
@@ -18,25 +17,17 @@ import warnings
 import weakref
 
 from mddag_executor.text import counted
-from mddag_executor.trace.blocks import (
-    Block,
-    has_copy,
-    open_data,
-    read_summary,
-    usable,
-    used_once,
-    what_was_used,
-)
+from mddag_executor.trace.blocks import Block, Damage, open_data, read_summary, scan
 from mddag_executor.trace.channels import Channels, Topic
 from mddag_executor.trace.errors import TraceError, TraceWarning
-from mddag_executor.trace.events import Event, Events
+from mddag_executor.trace.events import Batch, Event
 from mddag_executor.trace.reading import Message, Reading
 from mddag_executor.trace.records import LIBRARY
 from mddag_executor.trace.schema import PROCESS
 
 _REMEDY = 'check its name, that you may read it, and the disk it is on'
 _T = TypeVar('_T')
-_Way = Callable[[Reading, BinaryIO, Iterator[Block]], Iterator[_T]]
+_Way = Callable[[Reading, BinaryIO], Iterator[_T]]
 
 
 def _opened(path: str) -> BinaryIO:
@@ -94,6 +85,7 @@ class TraceReader:
         self.fields: dict[str, tuple[str, ...]] = {}
         self.topics: dict[int, Topic] = {}
         self.times = array('Q')
+        self._scanned: tuple[list[Block], Damage | None] | None = None
         stream = self._stream = _opened(self.path)
         self._closing = weakref.finalize(self, stream.close)
         try:
@@ -101,24 +93,14 @@ class TraceReader:
             self._start, library = open_data(stream, self.path)
             #: Whether this program wrote the file.
             self.written_here = library == LIBRARY
-            self._finished, self._summary = read_summary(stream, size, self._start)
-            self._copies = int(has_copy(stream, self._start, size))
+            self._finished, self._summary = read_summary(stream, size)
         except OSError as error:
             raise _unreadable(self.path, error) from None
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what another process gets to know: what was found, not the open file."""
-        return {name: value for name, value in vars(self).items()
-                if name not in ('_stream', '_closing')}
-
     @property
     def message_count(self) -> int | None:
-        """
-        Return how many messages there are to read, None where no sound summary counts them.
-
-        The copy of the declaration does not count.
-        """
-        return self._summary.messages - self._copies if self._summary else None
+        """Return how many messages there are to read; None: no sound summary counts them."""
+        return self._summary.messages if self._summary else None
 
     def may_have(self, name: str) -> bool:
         """Return whether there may be an event of that full name: where the summary names none."""
@@ -143,7 +125,7 @@ class TraceReader:
         :param sorted: whether to yield in the order of time instead of that of the file
         :raises TraceError: where the file can no longer be read, or is too unordered to be sorted
         """
-        return self._events(names, True, Reading.by_time if sorted else Reading.by_file)
+        return self._events(names, True, sorted)
 
     def layout_events(self, names: Iterable[str] | None) -> Iterator[Event]:
         """
@@ -151,42 +133,37 @@ class TraceReader:
 
         They have the fields that the file has, not those of the table.
         """
-        return self._events(names, False, Reading.by_time)
+        return self._events(names, False, True)
 
     def _events(
-        self, names: Iterable[str] | None, as_table: bool, way: _Way[Events]
+        self, names: Iterable[str] | None, as_table: bool, in_order: bool
     ) -> Iterator[Event]:
-        for batch in self._read(Channels(None if names is None else set(names), as_table), way):
-            yield from batch
+        channels = Channels(None if names is None else set(names), as_table)
+        if in_order:
+            yield from self._read(channels, Reading.by_time)
+        else:
+            for batch in self._read(channels, Reading.by_file):
+                yield from batch
 
-    def batches(self, names: Iterable[str]) -> Iterator[Events]:
-        """Yield what ``events`` yields in the order of time, many at once."""
-        return self._read(Channels(set(names), True), Reading.by_time)
-
-    def chunks(self, names: Iterable[str]) -> Iterator[Events]:
-        """Yield the same in the order of the file, chunk by chunk."""
+    def batches(self, names: Iterable[str]) -> Iterator[Batch]:
+        """Yield the named events in the order of the file, many at once."""
         return self._read(Channels(set(names), True), Reading.by_file)
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the messages of some topics, in the order of the file; they are not decoded."""
-        return self._read(Channels(set(), True), partial(
-            Reading.messages_of, topics=topics, times=self.times))
+        return self._read(Channels(set(), True), lambda reading, stream: reading.messages_of(
+            stream, topics, self.times))
 
     def _read(self, channels: Channels, way: _Way[_T]) -> Iterator[_T]:
-        reading = Reading(self.path, channels)
         self.fields, self.topics = channels.fields, channels.topics
-        twice: list[int] = []
-        blocks = usable(self._stream, self._start, self._size, self._summary, twice)
         try:
-            yield from way(reading, self._stream, blocks)
+            if self._scanned is None:
+                self._scanned = scan(self._stream, self._start, self._size)
+            reading = Reading(self.path, channels, *self._scanned)
+            yield from way(reading, self._stream)
         except OSError as error:
             raise _unreadable(self.path, error) from None
-        lines = [self._missing(reading), reading.undecoded(), *reading.odd_times()]
-        if reading.restored:
-            lines.append(f'{self.path}: the first chunk is damaged: used its copy')
-        if twice:
-            lines.append(used_once(self.path, twice))
-        for text in lines:
+        for text in (self._missing(reading), reading.undecoded(), reading.impossible_times()):
             if text and text not in self.warnings:
                 self.warnings.append(text)
 
@@ -197,7 +174,11 @@ class TraceReader:
         stated = (f'the file says that it holds {_contents(summary.chunks, summary.messages)}'
                   if summary else 'what there should be is not known')
         if damage:
-            return f'{what_was_used(self.path, damage, found, self._size)}; {stated}'
+            used = f'used all of it, {found}' if damage.offset >= self._size else (
+                f'used {found} before it, not the {self._size - damage.offset} bytes from there '
+                'on')
+            at = '' if damage.offset >= self._size else f' (at byte {damage.offset})'
+            return f'{self.path}: {damage.what}{at}: {used}; {stated}'
         if not self._finished:
             return (f'{self.path}: the summary at the end is damaged or missing: used all of the '
                     f'data, {found}')

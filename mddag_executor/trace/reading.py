@@ -3,30 +3,30 @@
 """
 One pass over a trace file, in the order of the file or of time.
 
-Theory of operation:
-
-1. The file is read block by block (`blocks`).  Where a block's messages begin, its message indexes
-   are used, if they fit what is there; else the records are walked over.  In memory are some
-   chunks, whatever the file's length.
-2. In the order of the file the events of one thread are in order, those of different threads are
-   not: each thread appends an event after it took its time, whenever it gets to run.
-3. In the order of time, chunks are loaded by the least time that their heads state, some at a
-   time, and an event is given out once no chunk that is still to be loaded can hold an earlier
-   one. That is exact for any disorder; it takes memory only for chunks that overlap in time, and
-   there is a limit to it. A head that states a time after its chunk's first event would break the
-   order: that is damage. Events of equal time come in the order of the file.
-4. In both orders a block is used only when everything before it in the file is sound, so what
-   damage leaves is always the beginning of the recording. It is kept in `damage`, not raised.
-5. In the order of time an event before 1970 or after 2116 (`times`) is left out and counted.
-6. A message in a sound chunk that does not decode is left out and counted.
-7. The messages of other topics are given out as they are, in the order of the file.
+Theory of operation
+-------------------
+1. The file is read block by block (``blocks``), some megabytes at a time.  The message indexes say
+   where the messages of each channel begin.  They are used if they fit what is there: every
+   message has its channel, and together with the definitions the messages fill the data.  Else the
+   records are read one after the other.
+2. In the order of the file, the events of one thread are in order.  Those of different threads are
+   not: each thread appends an event after it took its time.
+3. In the order of time, an event is yielded once no later block can have an earlier one: the heads
+   of the blocks say from when on they have messages.  Memory is needed only for blocks that
+   overlap in time, and it is limited.  Events of equal time are in the order of the file.
+4. A block is used only if everything before it in the file is sound.  So damage leaves the
+   beginning of the recording.  It is kept in ``damage``, not raised.
+5. A message in a sound block that does not decode is left out and counted.  In the order of time,
+   so is an event before 1970 or after 2116: a simulation would never come to its end.
 """
 
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
+from operator import itemgetter
 import struct
 from typing import Any, BinaryIO, NamedTuple
 
@@ -37,25 +37,21 @@ from mddag_executor.trace.blocks import Block, Damage, load
 from mddag_executor.trace.cdr import ENCAPSULATION
 from mddag_executor.trace.channels import Channels, Topic
 from mddag_executor.trace.errors import TraceError
-from mddag_executor.trace.events import Event, Events, Ints, OTHER, rows_at
-from mddag_executor.trace.times import Times
+from mddag_executor.trace.events import Batch, Column, Event, FIELDS, Ints, rows_at
+from mddag_executor.trace.times import NEVER
 import numpy as np
 
-_BATCH = 16                     # blocks that are loaded at a time in the order of time
-_PENDING_LIMIT = 2_000_000      # events in memory while putting them into the order of time
-
-# The beginning of a message's record, and where the fields of its content begin.
+_BATCH_BYTES = 1 << 21
+_PENDING_LIMIT = 2_000_000
+"""Events in memory while they are put into the order of time."""
 _HEAD = np.dtype({
-    'names': ['opcode', 'length', 'channel', 'encapsulation'], 'itemsize': 33,
-    'formats': ['u1', '<u8', '<u2', '<u2'], 'offsets': [0, 1, 9, 31]})
-_MESSAGE = np.dtype({
-    'names': ['length', 'channel', 'log_time', 'publish_time'], 'itemsize': 31,
-    'formats': ['<u8', '<u2', '<u8', '<u8'], 'offsets': [1, 9, 15, 23]})
+    'names': ['opcode', 'length', 'channel', 'log_time', 'publish_time', 'encapsulation'],
+    'formats': ['u1', '<u8', '<u2', '<u8', '<u8', '<u2'], 'offsets': [0, 1, 9, 15, 23, 31],
+    'itemsize': 33})
+"""The beginning of a message's record."""
 _CONTENT = records.RECORD.size
-_FIELDS = _CONTENT + records.MESSAGE_HEAD.size + 4      # 4: the encapsulation header
 _LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as _HEAD reads it
-_CHANNEL = np.dtype({'names': ['channel'], 'formats': ['<u2'], 'offsets': [9], 'itemsize': 11})
-_INDEX_ROOM = 1 << 16           # an index takes a third of its messages, and a head a channel
+_INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, bytes of entries
 _INDEX_ENTRY = np.dtype([('time', '<u8'), ('offset', '<u8')])
 
 
@@ -65,279 +61,246 @@ class Message(NamedTuple):
     topic: Topic
     log_time: int
     publish_time: int
-    data: memoryview
+    data: bytes
 
 
 class _Loaded(NamedTuple):
-    """What is left of a block: its events in the order of time (of the file, with `by_file`)."""
+    """
+    The data of some blocks, and where it begins for each, and ends.
 
-    data: bytes
-    times: Ints
-    channels: Any
-    positions: Ints
-    others: list[Event]
+    The buffer is larger than the data, and it is used again for the next blocks.
+    """
 
-    def some(self, which: Any) -> _Loaded:
-        """Return it with some of the events."""
-        return self._replace(times=self.times[which], channels=self.channels[which],
-                             positions=self.positions[which])
+    blocks: list[Block]
+    data: bytearray
+    begins: list[int]
+    indexes: list[bytes]
+
+    @property
+    def end(self) -> int:
+        """Return where the data ends."""
+        return self.begins[-1]
+
+    def block_at(self, position: int) -> Block:
+        """Return the block that a position in the data belongs to."""
+        return self.blocks[bisect_right(self.begins, position) - 1]
+
+    def until(self, offset: int) -> _Loaded:
+        """Return the same without the blocks from an offset in the file on."""
+        count = sum(block.offset < offset for block in self.blocks)
+        return _Loaded(self.blocks[:count], self.data, self.begins[:count + 1], self.indexes)
+
+
+_Places = dict[int, tuple[Ints, Any]]
+"""By channel where the records of its messages begin in the data, ascending, and their heads."""
 
 
 class Reading:
-    """One pass over a file: what it found, and what it could not use."""
+    """
+    One pass over a file: what it found, and what it could not use.
 
-    def __init__(self, path: str, channels: Channels) -> None:
-        """Begin; `channels` decides what becomes of the messages."""
+    :param channels: decides what becomes of the messages.
+    :param damage: what ends the blocks early.
+    """
+
+    def __init__(
+        self, path: str, channels: Channels, blocks: Sequence[Block], damage: Damage | None
+    ) -> None:
         self.chunks = 0             # used
         self.messages = 0           # in what was used, of all channels
-        self.damage: Damage | None = None
-        self.restored = False       # whether a copy stood in for a damaged chunk
-        self._path = path
-        self._channels = channels
+        self.damage = damage
+        self._path, self._channels, self._blocks = path, channels, blocks
         self._undecoded: Counter[str] = Counter()       # by topic and reason
-        self._times = Times()
-        self._sizes = np.full(1 << 16, 1 << 62, dtype=np.uint64)
-        self._met = (0, 0)
+        self._left_out: list[int] = []      # impossible times
+        self._place = 0             # of the next batch in the order of the file
+        self._used = 0              # blocks
+        self._buffer = bytearray()
 
-    def by_file(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Events]:
+    def by_file(self, stream: BinaryIO) -> Iterator[Batch]:
         """Yield the events in the order of the file."""
-        try:
-            for block in blocks:
-                yield self._events([self._decode(stream, block)])
-        except Damage as damage:
-            self._keep(damage)
+        for loaded, heads in self._messages(stream):
+            yield self._decoded(loaded, heads)
+
+    def by_time(self, stream: BinaryIO) -> Iterator[Event]:
+        """Yield the events in the order of time."""
+        starts = [block.start_time for block in self._blocks]
+        for number in range(len(starts) - 1, 0, -1):
+            starts[number - 1] = min(starts[number - 1], starts[number])
+        pending: list[Event] = []
+        time = itemgetter(1)
+        first = 0
+        for batch in self.by_file(stream):
+            new = [event for event in batch if 0 <= event[1] < NEVER]
+            if len(new) < len(batch):
+                self._left_out += [event[1] for event in batch if not 0 <= event[1] < NEVER]
+            if new and min(map(time, new)) < starts[first]:
+                self.damage = Damage('a chunk holds an event from before the time in its head',
+                                     self._blocks[first].offset)
+                break
+            pending += new
+            pending.sort(key=time)
+            first = self._used
+            if first < len(starts):
+                count = bisect_left(pending, starts[first], key=time)
+                yield from pending[:count]
+                del pending[:count]
+            if len(pending) > _PENDING_LIMIT:
+                raise TraceError(
+                    self._path, 'holds too much in disorder to put it into order of time',
+                    'sort it first, as with `mcap sort`')
+        yield from pending
 
     def messages_of(
-        self, stream: BinaryIO, blocks: Iterator[Block], topics: Collection[str],
-        times: array[int],
+        self, stream: BinaryIO, topics: Collection[str], times: array[int]
     ) -> Iterator[Message]:
-        """Yield the messages of some topics; add the times of all messages to `times`."""
-        try:
-            for block in blocks:
-                data, starts = self._starts(stream, block)
-                heads = rows_at(data, _MESSAGE, starts)
-                if (heads['length'] < records.MESSAGE_HEAD.size).any():
-                    raise Damage('a message is shorter than its head', block.offset)
-                of = self._channels.topics
-                if not np.isin(heads['channel'], list(of)).all():
-                    raise Damage('a message is of no channel', block.offset)
-                times.frombytes(heads['log_time'].tobytes())
-                wanted = np.isin(heads['channel'], [n for n in of if of[n].name in topics])
-                view = memoryview(data)
-                for start, (length, channel, log_time, publish_time) in zip(
-                        starts[wanted].tolist(), heads[wanted].tolist()):
-                    yield Message(of[channel], log_time, publish_time,
-                                  view[start + _FIELDS - 4:start + _CONTENT + length])
-        except Damage as damage:
-            self._keep(damage)
+        """Yield the messages of some topics; add the times of all messages to ``times``."""
+        known = self._channels.topics
+        for loaded, by_channel in self._messages(stream):
+            at, heads = _in_order(loaded, by_channel)
+            unknown = at[~np.isin(heads['channel'], list(known))]
+            if len(unknown):
+                self._end(Damage('a message is of no channel',
+                                 loaded.block_at(int(unknown[0])).offset))
+                at, heads = at[at < unknown[0]], heads[at < unknown[0]]
+            times.frombytes(heads['log_time'].tobytes())
+            wanted = np.isin(heads['channel'], [n for n in known if known[n].name in topics])
+            for start, (_, length, channel, log_time, publish_time, _) in zip(
+                    at[wanted].tolist(), heads[wanted].tolist()):
+                yield Message(known[channel], log_time, publish_time,
+                              bytes(loaded.data[start + FIELDS - 4:start + _CONTENT + length]))
 
-    def by_time(self, stream: BinaryIO, blocks: Iterator[Block]) -> Iterator[Events]:
-        """Yield the events in the order of time."""
-        known = self._scan(blocks)
-        order = sorted(range(len(known)), key=lambda number: known[number].start_time)
-        sound = 0                       # blocks before this one have been found sound,
-        usable = len(known)             # those from this one on have not and are not used
-        loaded: dict[int, _Loaded] = {}
-        for place, number in enumerate(order, 1):
-            if number < usable:
+    # --- where messages are ----------------------------------------------------------------------
+
+    def _messages(self, stream: BinaryIO) -> Iterator[tuple[_Loaded, _Places]]:
+        """Yield the data of some blocks, and by channel where its messages are in it."""
+        while self._used < len(self._blocks):
+            loaded = self._load(stream)
+            while loaded.blocks:
                 try:
-                    while sound < number:
-                        # This pass counts nothing: the block's turn is still to come.
-                        Reading(self._path, self._channels)._in_order(stream, known[sound])
-                        sound += 1
-                    loaded[number] = self._in_order(stream, known[number])
-                    sound = max(sound, number + 1)
+                    found = self._located(loaded)
+                    break
                 except Damage as damage:
-                    self._keep(damage)
-                    usable = min(sound, number)
-            if place == len(order):
-                yield self._events(_taken(loaded, None))
-            elif place % _BATCH == 0 or _pending(loaded) > _PENDING_LIMIT // 2:
-                yield self._events(_taken(loaded, known[order[place]].start_time))
-                if _pending(loaded) > _PENDING_LIMIT:
-                    raise TraceError(
-                        self._path, 'holds too much in disorder to put it into order of time',
-                        'sort it first, as with `mcap sort`')
+                    self._end(damage)
+                    loaded = loaded.until(damage.offset)
+            else:
+                return
+            self._used += len(loaded.blocks)
+            self.chunks += sum(block.chunk for block in loaded.blocks)
+            self.messages += sum(len(at) for at, _ in found.values())
+            yield loaded, found
+            self._place += loaded.end
 
-    def _events(self, parts: list[_Loaded]) -> Events:
-        """Return parts, which are in the order of the file, as one batch."""
-        fixed = self._channels.fixed
-        if len(parts) == 1:
-            part = parts[0]
-            return Events(part.data, part.channels, part.positions, part.others, fixed)
-        if not parts:
-            return Events(b'', np.empty(0, np.uint16), np.empty(0, np.int64), [], fixed)
-        positions: list[Ints] = []
-        others: list[Event] = []
-        length = 0
-        for part in parts:
-            other = part.channels == OTHER
-            positions.append(np.where(other, len(others), length) + part.positions)
-            others += part.others
-            length += len(part.data)
-        # stable, so that what has the same time stays in the order of the file
-        order = np.argsort(np.concatenate([part.times for part in parts]), kind='stable')
-        return Events(
-            b''.join(part.data for part in parts),
-            np.concatenate([part.channels for part in parts])[order],
-            np.concatenate(positions)[order], others, fixed)
+    def _end(self, damage: Damage) -> None:
+        """Use nothing from some damage on."""
+        # these would keep the data in memory
+        self.damage, damage.__context__ = damage.with_traceback(None), None
+        self._blocks = [block for block in self._blocks if block.offset < damage.offset]
 
-    def _keep(self, damage: Damage) -> None:
-        self.damage = damage.with_traceback(None)       # which would keep the chunk in memory
+    def _load(self, stream: BinaryIO) -> _Loaded:
+        """Return the data of the next blocks."""
+        blocks, begins = list[Block](), [0]
+        for block in self._blocks[self._used:]:
+            if blocks and begins[-1] + block.size > _BATCH_BYTES:
+                break
+            blocks.append(block)
+            begins.append(begins[-1] + block.size)
+        room = begins[-1] + _HEAD.itemsize      # a head can be read at any record, however short
+        if len(self._buffer) < room:
+            try:
+                self._buffer = bytearray(room)
+            except MemoryError:
+                self._end(Damage('a chunk does not fit into the memory', blocks[0].offset))
+                return _Loaded([], self._buffer, [0], [])
+        loaded = _Loaded(blocks, self._buffer, begins, [])
+        view = memoryview(self._buffer)
+        for block, begin, end in zip(blocks, begins, begins[1:]):
+            try:
+                loaded.indexes.append(load(stream, block, view[begin:end]))
+            except Damage as damage:
+                self._end(damage)
+                return loaded.until(damage.offset)
+        return loaded
 
-    def _scan(self, blocks: Iterator[Block]) -> list[Block]:
-        known = []
-        try:
-            for block in blocks:
-                known.append(block)
-        except Damage as damage:
-            self._keep(damage)
-        return known
+    def _located(self, loaded: _Loaded) -> _Places:
+        """
+        Return by channel where its messages are.
 
-    def _in_order(self, stream: BinaryIO, block: Block) -> _Loaded:
-        """Return the events of a block in the order of time."""
-        found = self._decode(stream, block)
-        times = found.times
-        if not len(times):
+        :raises Damage: when the records are not sound.
+        """
+        found = self._by_index(loaded)
+        if found is not None:
             return found
-        wrong = self._times.out_of_range(times)
-        if wrong.any():
-            found = found.some(~wrong)
-            times = found.times
-        if (times[1:] < times[:-1]).any():
-            found = found.some(np.argsort(times, kind='stable'))
-        if len(times) and found.times[0] < block.start_time:
-            raise Damage('a chunk holds an event from before the time in its head', block.offset)
-        return found
+        walked: dict[int, list[int]] = {}
+        for begin, end in zip(loaded.begins, loaded.begins[1:]):
+            for channel, at in self._walk(loaded, begin, end):
+                walked.setdefault(channel, []).append(at)
+        places = {channel: np.array(at, dtype=np.int64) for channel, at in walked.items()}
+        return {channel: (at, rows_at(loaded.data, _HEAD, at)) for channel, at in places.items()}
 
-    def _load(self, stream: BinaryIO, block: Block) -> tuple[bytes, Block]:
-        """Return a block's records, and the block that they are of: it, or its copy."""
-        try:
-            return load(stream, block), block
-        except Damage:
-            if block.copy is None:
-                raise
-        self.restored = True
-        return load(stream, block.copy), block.copy
-
-    def _starts(self, stream: BinaryIO, block: Block) -> tuple[bytes, Ints]:
-        """Return the records of a block, and where messages begin in them."""
-        data, source = self._load(stream, block)
-        end = len(data)
-        data += bytes(_HEAD.itemsize)       # a head can be read at any record, however short
-        starts = self._indexed(stream, source, data, end)
-        if starts is None:
-            starts = self._walk(data, 0, end, block, True)
-        self.messages += len(starts) * block.copies
-        self.chunks += block.chunk * block.copies
-        return data, starts
-
-    def _decode(self, stream: BinaryIO, block: Block) -> _Loaded:
-        """Return the events of a block in the order of the file; raise Damage where malformed."""
-        data, starts = self._starts(stream, block)
-        sizes = self._least_sizes()
-        least = sizes[rows_at(data, _CHANNEL, starts)['channel']]
-        wanted = least != 0
-        if not wanted.all():
-            starts, least = starts[wanted], least[wanted]
-        heads = rows_at(data, _HEAD, starts)
-        channels = heads['channel']
-        fixed = (heads['encapsulation'] == _LITTLE_ENDIAN) & (least <= heads['length'])
-        others: list[Event] = []
-        positions = starts + _FIELDS
-        if not fixed.all():
-            channels, known = channels.copy(), np.ones(len(starts), dtype=np.bool_)
-            for place in np.flatnonzero(~fixed).tolist():
-                start, before = int(starts[place]), len(others)
-                after = start + _CONTENT + int(heads['length'][place])
-                self._add_any(others, int(channels[place]), data[start:after])
-                known[place] = len(others) > before
-                channels[place], positions[place] = OTHER, before
-            channels, positions = channels[known], positions[known]
-        times = np.empty(len(positions), dtype=np.int64)
-        other = channels == OTHER
-        times[~other] = rows_at(data, np.dtype('<i8'), positions[~other])
-        times[other] = [event[1] for event in others]
-        return _Loaded(data, times, channels, positions, others)
-
-    def _least_sizes(self) -> Any:
-        """Return by channel the least length of its messages, 0 for those passed over."""
-        channels = self._channels
-        met = len(channels.passed_over), len(channels.fixed)
-        if met != self._met:
-            self._met = met
-            self._sizes[:] = 1 << 62
-            self._sizes[list(channels.passed_over)] = 0
-            for number, (_, kind, _) in channels.fixed.items():
-                self._sizes[number] = kind.itemsize + _FIELDS - _CONTENT
-        return self._sizes
-
-    def _indexed(self, stream: BinaryIO, block: Block, data: bytes, end: int) -> Any:
-        """Return where a chunk's messages begin by its indexes; None where these are not sound."""
-        if not block.chunk:
-            return None
-        parts = []
-        stream.seek(block.end)
-        content = stream.read(end // 3 + _INDEX_ROOM)
-        at = 0
-        while at + _CONTENT <= len(content) and content[at] == Opcode.MESSAGE_INDEX:
-            length = records.RECORD.unpack_from(content, at)[1]
-            first, at = at + _CONTENT + 6, at + _CONTENT + length
-            if length % _INDEX_ENTRY.itemsize != 6 or at > len(content):
+    def _by_index(self, loaded: _Loaded) -> _Places | None:
+        """Return it by the message indexes; None if these do not fit (rule 1)."""
+        entries: dict[int, list[tuple[int, bytes]]] = {}
+        for begin, index in zip(loaded.begins, loaded.indexes):
+            end = 0
+            while end < len(index):
+                _, length, channel, size = _INDEX_HEAD.unpack_from(index, end)
+                first = end + _INDEX_HEAD.size
+                end += _CONTENT + length
+                if size % _INDEX_ENTRY.itemsize or first + size != end:
+                    return None
+                entries.setdefault(channel, []).append((begin, index[first:end]))
+        found: _Places = {}
+        total = 0
+        for channel, parts in entries.items():
+            at = np.frombuffer(b''.join(part for _, part in parts), _INDEX_ENTRY)['offset']
+            at = at.astype(np.int64) + np.repeat(
+                [begin for begin, _ in parts],
+                [len(part) // _INDEX_ENTRY.itemsize for _, part in parts])
+            if not len(at):
+                continue
+            if (at[1:] <= at[:-1]).any() or at[0] < 0 or at[-1] >= loaded.end:
                 return None
-            parts.append(np.frombuffer(
-                content, _INDEX_ENTRY, length // _INDEX_ENTRY.itemsize, first)['offset'])
-        if not parts:
-            return None
-        starts = np.sort(np.concatenate(parts).astype(np.int64))
-        if not len(starts) or starts[0] < 0 or starts[-1] > end - _CONTENT:
-            return None
-        lengths = np.minimum(rows_at(data, np.dtype('<u8'), starts + 1), end).astype(np.int64)
-        befores, afters = np.empty(len(starts) + 1, np.int64), np.empty(len(starts) + 1, np.int64)
-        befores[0], afters[-1] = 0, end
-        befores[1:] = starts + _CONTENT + lengths
-        afters[:-1] = starts
-        if (rows_at(data, np.dtype('u1'), starts) != Opcode.MESSAGE).any():
-            return None
-        # what is between messages are definitions
-        gaps = np.flatnonzero(befores != afters).tolist()
-        if any(befores[gap] > afters[gap] for gap in gaps):
-            return None
-        found = [self._walk(data, int(befores[gap]), int(afters[gap]), block, False)
-                 for gap in gaps]
-        if any(map(len, found)):
-            return None
-        for gap in gaps:
-            self._walk(data, int(befores[gap]), int(afters[gap]), block, True)
-        return starts
+            heads = rows_at(loaded.data, _HEAD, at)
+            lengths = heads['length']
+            if (heads['opcode'] != Opcode.MESSAGE).any() or (heads['channel'] != channel).any() \
+                    or (lengths < records.MESSAGE_HEAD.size).any() or (
+                        lengths > loaded.end).any():
+                return None
+            found[channel] = at, heads
+            total += int(lengths.sum()) + _CONTENT * len(at)
+        if total == loaded.end:
+            return found
+        return found if total < loaded.end and self._define_between(loaded, found) else None
 
-    def _walk(self, data: bytes, position: int, end: int, block: Block, define: bool) -> Ints:
-        """Return where messages begin between two records; take in what is defined there."""
-        unpack = records.RECORD.unpack_from
-        starts = []
+    def _define_between(self, loaded: _Loaded, found: _Places) -> bool:
+        """Read what is between messages; return whether it is no message and all else fits."""
+        starts, heads = _in_order(loaded, found)
+        lengths = heads['length'].astype(np.int64)
+        ends, begins = np.append(0, starts + _CONTENT + lengths), np.append(starts, loaded.end)
+        if (ends > begins).any():
+            return False
+        gaps = np.flatnonzero(ends < begins)
+        return not any(
+            True for begin, end in zip(ends[gaps].tolist(), begins[gaps].tolist())
+            for _ in self._walk(loaded, begin, end))
+
+    def _walk(self, loaded: _Loaded, position: int, end: int) -> Iterator[tuple[int, int]]:
+        """Yield channels and positions of messages between two records; read definitions."""
+        unpack, data = records.RECORD.unpack_from, loaded.data
         while position < end:
             opcode, length = unpack(data, position)
             after = position + _CONTENT + length
             if after > end:
-                raise Damage('the records of a chunk do not fit into it', block.offset)
+                raise Damage('the records of a chunk do not fit into it',
+                             loaded.block_at(position).offset)
             if opcode == Opcode.MESSAGE:
-                starts.append(position)
-            elif define and opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define(opcode, data[position + _CONTENT:after], block)
+                if length < records.MESSAGE_HEAD.size:
+                    raise Damage('a message is shorter than its head',
+                                 loaded.block_at(position).offset)
+                yield int.from_bytes(data[position + 9:position + 11], 'little'), position
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._define(opcode, bytes(data[position + _CONTENT:after]), loaded.block_at(position))
             position = after
-        return np.array(starts, dtype=np.int64)
-
-    def _add_any(self, events: list[Event], channel: int, message: bytes) -> None:
-        """Add the event in a message record; count it where it cannot be decoded."""
-        try:
-            if message[_FIELDS - 4:_FIELDS - 2] != ENCAPSULATION[:2]:
-                raise ValueError('it is not plain little endian CDR')
-            head, unpack = self._channels.decoder(channel)
-            events.append(head + unpack(message[_FIELDS:]))
-        except (ValueError, struct.error) as error:
-            topic = self._channels.topics.get(channel)
-            name = f'channel {channel}' if topic is None else topic.name
-            self._undecoded[f'{name}: {error}'] += 1
 
     def _define(self, opcode: int, content: bytes, block: Block) -> None:
         try:
@@ -348,12 +311,52 @@ class Reading:
         except ValueError as error:
             raise Damage(str(error), block.offset) from None
 
-    def odd_times(self) -> list[str]:
-        """Return the lines about times that cannot be, or that jump."""
-        return [f'{self._path}: {text}' for text in self._times.lines('event')]
+    # --- what they say ---------------------------------------------------------------------------
+
+    def _decoded(self, loaded: _Loaded, found: _Places) -> Batch:
+        """Return the events of some blocks; count what cannot be decoded."""
+        columns, others = [], list[tuple[int, Event]]()
+        for channel, (at, heads) in found.items():
+            if channel in self._channels.passed_over:
+                continue
+            fixed = self._channels.fixed.get(channel)
+            lengths = heads['length'].astype(np.int64) + _CONTENT
+            if fixed is not None:
+                plain = (heads['encapsulation'] == _LITTLE_ENDIAN) & (
+                    lengths >= FIELDS + fixed.kind.itemsize)
+                mine = at if plain.all() else at[plain]
+                size = int(lengths[0]) if (lengths == lengths[0]).all() else 0
+                columns.append(Column(fixed, mine, size))
+                at, lengths = at[~plain], lengths[~plain]
+            for start, length in zip(at.tolist(), lengths.tolist()):
+                event = self._any(channel, bytes(loaded.data[start:start + length]))
+                if event is not None:
+                    others.append((start, event))
+        others.sort(key=itemgetter(0))
+        return Batch(loaded.data, self._place, columns, others)
+
+    def _any(self, channel: int, message: bytes) -> Event | None:
+        """Return the event in a message record; None, and count it, if it cannot be decoded."""
+        try:
+            if message[FIELDS - 4:FIELDS - 2] != ENCAPSULATION[:2]:
+                raise ValueError('it is not plain little endian CDR')
+            head, unpack = self._channels.decoder(channel)
+            return head + unpack(message[FIELDS:])
+        except (ValueError, struct.error) as error:
+            topic = self._channels.topics.get(channel)
+            name = f'channel {channel}' if topic is None else topic.name
+            self._undecoded[f'{name}: {error}'] += 1
+            return None
+
+    def impossible_times(self) -> str | None:
+        """Return the line about events at times that cannot be, None if there are none."""
+        if not self._left_out:
+            return None
+        return (f'{self._path}: left out: {counted(len(self._left_out), "event")} at an '
+                f'impossible time, the first at {self._left_out[0]} ns')
 
     def undecoded(self) -> str | None:
-        """Return the line about messages that could not be decoded, None where all could."""
+        """Return the line about messages that could not be decoded, None if all could."""
         if not self._undecoded:
             return None
         reason, count = self._undecoded.most_common(1)[0]
@@ -362,20 +365,8 @@ class Reading:
                 f'most of them ({count}) of {reason}')
 
 
-def _pending(loaded: dict[int, _Loaded]) -> int:
-    """Count the events that are loaded and not given out."""
-    return sum(len(part.times) for part in loaded.values())
+def _in_order(loaded: _Loaded, found: _Places) -> tuple[Ints, Any]:
+    """Return where all messages are, in the order of the file, and their heads."""
+    at = np.sort(np.concatenate([*(at for at, _ in found.values()), np.empty(0, dtype=np.int64)]))
+    return at, rows_at(loaded.data, _HEAD, at)
 
-
-def _taken(loaded: dict[int, _Loaded], before: int | None) -> list[_Loaded]:
-    """Take out the events before a time (None: all), in the order of the file."""
-    taken = []
-    for number in sorted(loaded):
-        part = loaded[number]
-        count = len(part.times) if before is None else int(np.searchsorted(part.times, before))
-        if count:
-            taken.append(part.some(slice(None, count)))
-            loaded[number] = part.some(slice(count, None))
-        if count == len(part.times):
-            del loaded[number]
-    return taken

@@ -52,12 +52,6 @@ class Times:
         self.furthest = 0
         self._example = 0
 
-    def out_of_range(self, times: Any) -> Any:
-        """Return which times of an array are impossible by themselves (rule 1)."""
-        wrong = (times < 0) | (times >= NEVER)
-        self._leave_out(times[wrong])
-        return wrong
-
     def _leave_out(self, times: Any) -> None:
         if len(times) and not self.left_out:
             self._example = int(times[0])

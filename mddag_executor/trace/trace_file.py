@@ -14,8 +14,6 @@ Theory of operation:
    file is finished. They make seeking possible and show a reader what should be there; nothing
    else depends on them.
 4. When writing fails the file is cut back to its last whole chunk.
-5. Without the declaration a trace is of no use. Where it is recorded first, it gets a chunk of its
-   own, and that chunk is written twice: one that is damaged later costs nothing.
 
 All methods are for one thread; `TraceWriter` is what many threads may call.
 """
@@ -53,7 +51,6 @@ import zstandard
 CHUNK_LIMIT = 256 * 1024
 KEPT = 'what was written before is there; '
 """What the remedy begins with where events are in the file that failed."""
-_TWICE = 'mddag:task_set'
 _COMPRESSION_LEVEL = 1      # of zstd; higher levels cost more than they save on such data
 
 
@@ -267,17 +264,6 @@ class TraceFile:
             channel.count += 1
             self._records.append(message)
             self._size += len(message)
-            if channel.event.key == _TWICE and self.given == 1:
-                self._write_twice(channel)
-
-    def _write_twice(self, channel: _Channel) -> None:
-        """Write the open chunk and a copy of it (rule 5); the channel is the only one in it."""
-        chunk = self._records, self._size, channel.index
-        self.flush()
-        self._records, self._size, channel.index = chunk
-        channel.count += 1
-        self.flush()
-        self.written -= 1
 
     def _extend_group(self, group: Group, entry: Sequence[Any], vpid: int) -> None:
         parts = group.parts

@@ -214,6 +214,7 @@ def test_any_disorder_is_put_into_order(tmp_path: Path, seed: int, finish: bool)
 def test_too_much_disorder_for_the_memory(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reading, '_PENDING_LIMIT', 150)
+    monkeypatch.setattr(reading, '_BATCH_BYTES', 1)
     path = tmp_path / 'a.mcap'
     recorded = mixture(400)
     write_chunks(path, [recorded[:100], recorded[100:200], recorded[200:300], recorded[300:]])
