@@ -299,7 +299,8 @@ class Reading:
                                  loaded.block_at(position).offset)
                 yield int.from_bytes(data[position + 9:position + 11], 'little'), position
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define(opcode, bytes(data[position + _CONTENT:after]), loaded.block_at(position))
+                self._define(opcode, bytes(data[position + _CONTENT:after]),
+                             loaded.block_at(position))
             position = after
 
     def _define(self, opcode: int, content: bytes, block: Block) -> None:
@@ -369,4 +370,3 @@ def _in_order(loaded: _Loaded, found: _Places) -> tuple[Ints, Any]:
     """Return where all messages are, in the order of the file, and their heads."""
     at = np.sort(np.concatenate([*(at for at, _ in found.values()), np.empty(0, dtype=np.int64)]))
     return at, rows_at(loaded.data, _HEAD, at)
-
