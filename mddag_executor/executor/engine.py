@@ -115,7 +115,7 @@ class Engine:
         if entity.depth and len(entity.waiting) >= entity.depth:
             entity.skipped += 1
             if entity.source >= 0:
-                self._skip_job(entity, due, now)
+                self._skip_job(entity, max(entity.since, min(due, now)), now)
         elif entity.source >= 0:
             self._start_job(work, max(entity.since, min(due, now)), now)
         else:
