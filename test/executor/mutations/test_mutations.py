@@ -23,13 +23,13 @@ import pytest
 
 from .mddag_mutations import MEANING, MUTATIONS
 
-pytestmark = pytest.mark.nightly
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(500)]
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
 TESTS = HERE.parent.relative_to(ROOT)
 
-HUNG_S = 20
+HUNG_S = 50
 """After so many seconds a test of a child hangs."""
 AT_ONCE_S = 4.0
 """A test that has failed sooner has not waited for one of its own time-outs, which are 5 s."""
@@ -154,7 +154,7 @@ def run(folder: Path, runs: list[tuple[str, list[str], list[str]]]) -> dict[str,
         [sys.executable, str(HERE / 'driver.py'), str(folder)], cwd=ROOT,
         env=environment, stdin=subprocess.PIPE, text=True, start_new_session=True)
     try:
-        child.communicate(json.dumps(jobs), timeout=150)
+        child.communicate(json.dumps(jobs), timeout=400)
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)  # and what it may have left
