@@ -53,8 +53,8 @@ def pays(name: str, plain_s: float) -> bool:
 def _is_compiled(name: str) -> bool:
     entry: Any = entry_points()[name]
     folder = entry.stats.cache_path
-    return bool(entry.signatures) or (
-        folder is not None and any(Path(folder).glob(f'*{name}*.nbi')))
+    return bool(entry.signatures) or (folder is not None and any(
+        Path(folder).glob(f'*{entry.py_func.__qualname__}*.nbi')))
 
 
 def prepare(name: str) -> None:

@@ -12,8 +12,8 @@ replaced, as an empty list has no type.  The policy is an additional field of th
 key function dispatches on it, so that all policies need one compilation.
 
 numba keeps the machine code of the entry points (``kernel``) on disk, as ``cache=True`` says.  It
-only checks the file of the entry point itself, so a hash of all sources is among what identifies
-the code.  numba is imported, and anything compiled, on first use only.
+only checks the file of the entry point itself, so a hash of all sources is part of the name under
+which the code is kept.  numba is imported, and anything compiled, on first use only.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ _NOT_COMPILED = frozenset({
     # for plain lists
     'empty', 'as_object', 'new_state', 'add_queue', 'rad_offsets', 'latest_starts', 'policy',
     'new_machine', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
+ENTRY_POINTS = ('accept_runs', 'run_once', 'free_run')
 _REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')
 
 
@@ -62,12 +63,13 @@ def entry_points() -> dict[str, Callable[..., Any]]:
             space[module.__name__.rsplit('.', 1)[1]] = inner
     structures.bind_policies(space)
     sources = _hash_of(*_MODULES, kernel, structures, vectors)
-    return {function.__name__: _cached(_bound(function, space))
-            for function in kernel.entry_points(sources)}
+    return {name: _cached(_bound(getattr(kernel, name), space), sources)
+            for name in ENTRY_POINTS}
 
 
-def _cached(function: FunctionType) -> Any:
+def _cached(function: FunctionType, sources: str) -> Any:
     from numba import njit
+    function.__qualname__ = f'{function.__name__}_{sources}'    # in the names of numba's files
     try:
         return njit(error_model='numpy', nogil=True, cache=True)(function)
     except RuntimeError:    # no folder to write to
@@ -79,17 +81,16 @@ def _functions(module: ModuleType) -> list[tuple[str, FunctionType]]:
     return [
         (name, value) for name, value in vars(module).items()
         if isinstance(value, FunctionType) and value.__module__ == module.__name__
-        and name not in _NOT_COMPILED and name != 'entry_points']
+        and name not in _NOT_COMPILED]
 
 
 def _bound(function: FunctionType, space: dict[str, Any]) -> FunctionType:
     """Return a function with the same code, whose globals are those of a namespace."""
-    return FunctionType(function.__code__, space, function.__name__, function.__defaults__,
-                        function.__closure__)
+    return FunctionType(function.__code__, space, function.__name__, function.__defaults__)
 
 
 def _hash_of(*modules: ModuleType) -> str:
     digest = hashlib.sha256()
     for module in modules:
         digest.update(Path(str(module.__file__)).read_bytes())
-    return digest.hexdigest()
+    return digest.hexdigest()[:16]

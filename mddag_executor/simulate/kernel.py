@@ -9,7 +9,6 @@ functions (see ``compiling``).  Structures are passed as addresses.
 
 from __future__ import annotations
 
-from types import FunctionType
 from typing import Any
 
 from mddag_executor.core.jobs import finish
@@ -58,59 +57,50 @@ def free_fields(structure: int, fields: int) -> None:
         free(as_vector(structure + 24 * field))
 
 
-def entry_points(sources: str) -> tuple[FunctionType, ...]:
+def accept_runs(
+    tables: int, load: int, state: int, costs: int, row: int, n_workers: int, preemptive: int,
+    polling: int, dispatch_overhead: int, switch_overhead: int, horizon: int, judge_open: bool,
+    accepted: Any,
+) -> None:
     """
-    Return the functions that the interpreter calls.
+    Simulate runs up to the first miss; return which of them had none.
 
-    :param sources: hash of all that is compiled, which identifies the machine code on disk.
+    :param costs: address of the execution times of the first run; the others follow.
+    :param row: bytes from one run to the next.
+    :param accepted: array of bool, one for each run.
     """
-    def accept_runs(
-        tables: int, load: int, state: int, costs: int, row: int, n_workers: int, preemptive: int,
-        polling: int, dispatch_overhead: int, switch_overhead: int, horizon: int, judge_open: bool,
-        accepted: Any,
-    ) -> None:
-        """
-        Simulate runs up to the first miss; return which of them had none.
+    t = as_tables(tables)
+    s = as_state(state)
+    arrivals = as_load(load)
+    for i in range(len(accepted)):
+        set_address(arrivals.costs, costs + i * row)
+        fill_state(
+            t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead, polling)
+        ended = run(t, s, key_of_policy, arrivals, horizon, True, None, None)
+        if judge_open:
+            finish(t, s, ended)
+        accepted[i] = not any_missed(s, 0)
+        clear_state(state)
+    free_state(state)
 
-        :param costs: address of the execution times of the first run; the others follow.
-        :param row: bytes from one run to the next.
-        :param accepted: array of bool, one for each run.
-        """
-        sources  # noqa: B018
-        t = as_tables(tables)
-        s = as_state(state)
-        arrivals = as_load(load)
-        for i in range(len(accepted)):
-            set_address(arrivals.costs, costs + i * row)
-            fill_state(
-                t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead, polling)
-            ended = run(t, s, key_of_policy, arrivals, horizon, True, None, None)
-            if judge_open:
-                finish(t, s, ended)
-            accepted[i] = not any_missed(s, 0)
-            clear_state(state)
-        free_state(state)
 
-    def run_once(
-        tables: int, load: int, orders: int, state: int, deliveries: int, machine: int, busy: int,
-        log: int,
-    ) -> int:
-        """Run a load and return when it ended; the caller frees what it leaves."""
-        sources  # noqa: B018
-        return run_load(
-            as_tables(tables), as_state(state), as_deliveries(deliveries), as_machine(machine),
-            key_of_policy, as_load(load), as_orders(orders), as_vector(busy), as_log(log), None)
+def run_once(
+    tables: int, load: int, orders: int, state: int, deliveries: int, machine: int, busy: int,
+    log: int,
+) -> int:
+    """Run a load and return when it ended; the caller frees what it leaves."""
+    return run_load(
+        as_tables(tables), as_state(state), as_deliveries(deliveries), as_machine(machine),
+        key_of_policy, as_load(load), as_orders(orders), as_vector(busy), as_log(log), None)
 
-    def free_run(state: int, deliveries: int, machine: int, busy: int, log: int) -> None:
-        """Free what ``run_once`` left."""
-        sources  # noqa: B018
-        free_state(state)
-        queues = as_machine(machine).lock_queue
-        for process in range(len(queues)):
-            free(queues[process])
-        free_fields(deliveries, DELIVERIES_FIELDS)
-        free_fields(machine, MACHINE_FIELDS)
-        free(as_vector(busy))
-        free(as_log(log))
 
-    return accept_runs, run_once, free_run  # type: ignore[return-value]
+def free_run(state: int, deliveries: int, machine: int, busy: int, log: int) -> None:
+    """Free what ``run_once`` left."""
+    free_state(state)
+    queues = as_machine(machine).lock_queue
+    for process in range(len(queues)):
+        free(queues[process])
+    free_fields(deliveries, DELIVERIES_FIELDS)
+    free_fields(machine, MACHINE_FIELDS)
+    free(as_vector(busy))
+    free(as_log(log))

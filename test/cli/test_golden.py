@@ -27,8 +27,9 @@ COMMANDS = {
     'analyse_json': 'graph analyse graph.yaml --json -',
     'assign': 'graph assign-deadlines graph.yaml --runs 20 -o out.yaml',
     'assign_target': 'graph assign-deadlines graph.yaml --target 0.8 --runs 40 --json out.json',
-    'place': 'graph place graph.yaml --processes 2 --cpus 2 -o out.yaml',
-    'place_json': 'graph place graph.yaml --processes 2 --cpus 2 --json - -o out.yaml',
+    'place': 'graph place graph.yaml --processes 2 --cpus 2 --duration 200ms -o out.yaml',
+    'place_json': (
+        'graph place graph.yaml --processes 2 --cpus 2 --duration 200ms --json - -o out.yaml'),
     'generate': 'generate --dags 2 --vertices 3:5 --sinks 2 --or-share 0.5 --seed 4',
     'simulate': 'simulate graph.yaml --duration 200ms',
     'simulate_json': 'simulate graph.yaml --duration 200ms --policy fifo --json -',
