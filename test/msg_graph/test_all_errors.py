@@ -69,7 +69,7 @@ def found(text: str) -> GraphErrors:
                (13, 'a path of one callback'), (14, "'y' names no callback")]),
     (LINKS, [(6, "no callback publishes '/c'"), (7, "no callback publishes '/d'"),
              (9, "'dag:' is for the source"), (8, "unknown callback 'w'"),
-             (8, "it reads '/e', which nobody")]),
+             (8, "it reads '/e', which no callback")]),
     (GRAPH, [(7, 'in a cycle'), (5, 'deadline but is no sink'), (6, 'has no deadline'),
              (9, 'has no deadline'), (11, 'no trigger or queue edge leads')]),
 ])
