@@ -5,7 +5,7 @@ VENV := .venv
 KILTED := .venv-kilted
 # Whole files of tests that run ROS come first, then the others one by one (see test/conftest.py).
 PYTEST_ARGS ?= -n 2
-TEST_TAKES := 6 minutes on two cores
+TEST_TAKES := 8 to 10 minutes on two cores
 BIN := $(VENV)/bin
 
 # The environment brings its own ROS packages. What a sourced ROS (or another environment's
@@ -28,7 +28,7 @@ help:
 	@echo 'make test-kilted  the tests of what runs ROS, with ROS 2 Kilted, in $(KILTED)/'
 	@echo 'make check-fresh  make demo and make test in new installations of Debian (CHECK_FRESH=...)'
 	@echo 'make nightly    make mutations, soak, stress and fuzz, and 20 times the random examples'
-	@echo 'make mutations  break the executor in 28 ways, each of which a test must notice'
+	@echo 'make mutations  break the executor in 27 ways, each of which a test must notice'
 	@echo 'make soak       the Autoware workload with random faults for SOAK_SECONDS (600)'
 	@echo 'make stress     deadline misses reported to all kinds of handlers, STRESS_SECONDS (20) each'
 	@echo 'make fuzz       read damaged traces and bags for FUZZ_SECONDS (600) each'
