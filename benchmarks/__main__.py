@@ -8,12 +8,13 @@ import argparse
 from collections.abc import Sequence
 import sys
 
-from benchmarks import core, evaluate, live, replay
+from benchmarks import core, evaluate, live, overload, replay
 from mddag_executor.cli.common import check_files
 from mddag_executor.cli.main import main
 from mddag_executor.cli.parsing import Parser
 
-BENCHMARKS = {'live': live, 'core': core, 'replay': replay, 'evaluate': evaluate}
+BENCHMARKS = {'live': live, 'core': core, 'replay': replay, 'evaluate': evaluate,
+              'overload': overload}
 
 
 def run(argv: Sequence[str]) -> int:

@@ -33,6 +33,9 @@ longer than its deadline, and a load that the workers or CPUs cannot do, are war
 
 _HEADER = ('DAG', 'period', 'vertices', 'critical path', 'load', 'sink', 'deadline')
 
+_BACKLOG_LOAD = 0.5
+"""Cores that one DAG may need before a backlog of its jobs is likely to hurt others."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -95,6 +98,17 @@ def _dag_result(dag: Dag, rad_offsets: list[int], workers: int) -> dict[str, Any
     }
 
 
+def _backlog(dag: Dag, load: float | None) -> Iterator[str]:
+    """Yield that jobs of a DAG can pile up, if they can and nothing bounds them."""
+    source = dag.vertices[dag.source].callback
+    latest = max(dag.vertices[sink].deadline_ns or 0 for sink in dag.sinks)
+    if (load is not None and load > _BACKLOG_LOAD and latest > dag.period_ns
+            and source.keep != 'newest' and dag.max_active_jobs is None):
+        yield (f"{dag.name}: its deadline is longer than its period, and it needs {load:.2f} "
+               "cores: a backlog can build up in an overload: add 'keep: newest' or "
+               "'max_active_jobs:' to its source, if old data is of no use")
+
+
 def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
     """Yield warnings about deadlines that cannot hold with the mean execution times."""
     from msg_graph.model import mean_execution_times, path_lengths
@@ -106,6 +120,7 @@ def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
                 yield (f'{vertex.name}: the longest path to it takes {format_ns(length)}, more '
                        f'than its deadline of {format_ns(vertex.deadline_ns)}: no scheduler can '
                        'keep it')
+        yield from _backlog(dag, result['dags'][dag.name]['load'])
     load, workers, cpus = result['load'], result['workers'], defaults.processors()
     if load is not None and load > workers:
         yield (f'{task_set.file}: a load of {load:.3f} is more than '

@@ -258,6 +258,15 @@ def add_policy(
         help=f'{prefix}one of {", ".join(POLICIES)} (default: {default})')
 
 
+def add_on_late(parser: argparse.ArgumentParser, default: str, prefix: str = '') -> None:
+    """Declare `--on-late`; a default with a blank in it is words, and stands for none."""
+    from mddag_executor.core.tables import ON_LATE
+    parser.add_argument(
+        '--on-late', choices=(*ON_LATE,), default=default if default in ON_LATE else None,
+        help=f'{prefix}what is done with a job that can no longer be in time, where the '
+        f'declaration does not say it (default: {default})')
+
+
 def add_seed(
     parser: argparse.ArgumentParser, what: str, kind: Callable[[str], int] = seed, default: int = 0
 ) -> None:

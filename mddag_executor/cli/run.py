@@ -83,6 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='end after this time, for instance 20s, with --synthetic after a warm-up of 1 s '
         '(default: run until Ctrl-C)')
     options.add_policy(parser)
+    options.add_on_late(parser, 'demote')
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
         help="how often to publish the executor's state on /diagnostics, for mddag top and other "
         "tools; 'off': never (default: 1s)")
@@ -187,7 +188,8 @@ def run_here(
             programs = host.load(args.node, ros_arguments(args.ros_args))
         from mddag_executor.executor.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
-            task_set, num_workers=workers, policy=args.policy, trace=args.trace,
+            task_set, num_workers=workers, policy=args.policy, on_late=args.on_late,
+            trace=args.trace,
             freeze_gc=True, diagnostics_period=args.diagnostics, process=args.process,
             overwrite=args.overwrite)
         # With `--json -` what nodes print must not get into the JSON.

@@ -92,7 +92,8 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     results = [(run.name, each) for run, each in zip(supervisor.runs, parts) if each is not None]
     result = {
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
-        'policy': args.policy, 'workers': defaults.workers(args.workers, task_set),
+        'policy': args.policy, 'on_late': args.on_late,
+        'workers': defaults.workers(args.workers, task_set),
         **together(task_set, results, plan), 'trace': None,
         'processes': [{
             'name': run.name, 'nodes': next(
@@ -203,7 +204,7 @@ def _probe(
 def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> list[str]:
     """Return the command line of a part, up to its name."""
     command = [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
-               '--policy', args.policy,
+               '--policy', args.policy, '--on-late', args.on_late,
                '--diagnostics', f'{args.diagnostics}ns' if args.diagnostics else 'off']
     if args.overwrite:
         command.append('--overwrite')

@@ -30,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     options.add_policy(parser)
+    options.add_on_late(parser, 'continue')
     options.add_seed(parser, 'seed of the drawn execution times', int)
     add('--judge', choices=('horizon', 'completions'), default='horizon',
         help='a job that is overdue at the end is late (horizon, the default), or only completed '
@@ -50,7 +51,7 @@ def main(args: argparse.Namespace) -> int:
     workers = defaults.workers(args.workers, task_set)
     times = execution_times(args, task_set, workers)
     settings = Settings(
-        policy=args.policy, workers=workers, duration_ns=args.duration,
+        policy=args.policy, on_late=args.on_late, workers=workers, duration_ns=args.duration,
         preemptive=bool(args.preemptive), judge=args.judge,
         stop_at_first_miss=args.stop_at_first_miss, cpus=args.cpus)
     load = periodic_load(task_set, times, args.duration)

@@ -22,7 +22,10 @@ from mddag_executor.core.state import (
     LEADS_OUT,
     NOT_JUDGED,
     OPEN,
+    OUTDATED,
     SINK_ABORTED,
+    SINK_DEMOTED,
+    SINK_DROPPED,
     SINK_EXPIRED,
     SINK_FAILED,
     SINK_IN_TIME,
@@ -31,7 +34,7 @@ from mddag_executor.core.state import (
     SKIP,
     State,
 )
-from mddag_executor.core.tables import NEVER, Tables
+from mddag_executor.core.tables import DEMOTE, NEVER, Tables
 
 
 def open_undeclared(s: State, dag: int, job: int, release: int) -> int:
@@ -72,6 +75,7 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     s.job_state[slot] = OPEN
     s.job_sinks_left[slot] = t.first_sink[dag + 1] - t.first_sink[dag]
     s.job_late[slot] = 0
+    s.job_hope[slot] = release if t.on_late[dag] == DEMOTE else NEVER
     s.job_active[slot] = 0
     _link_newest(s, dag, slot)
     base = s.job_base[slot]
@@ -212,6 +216,34 @@ def fail_job(t: Tables, s: State, slot: int, now: int) -> None:
     """Fail an open job (rule 8): each sink that has not completed is missed and failed."""
     _give_up_sinks(t, s, slot, SINK_FAILED)
     close_job(s, slot, FAILED, now)
+
+
+def outdate_job(t: Tables, s: State, slot: int, now: int) -> None:
+    """Drop a job whose source has not started when the next one's is ready (rule 13)."""
+    _give_up_sinks(t, s, slot, SINK_DROPPED)
+    close_job(s, slot, OUTDATED, now)
+
+
+def outdate_sink(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
+    """Drop a sink of an open job that has not started when the next job's is ready (rule 13)."""
+    head = s.job_base[slot] + t.region_offset[vertex]
+    if s.x_pending[head] < 0:
+        return
+    s.x_pending[head] = -1
+    judge(s, slot, SINK_DROPPED, vertex, s.job_release[slot] + t.sink_deadline[vertex], -1)
+    s.job_late[slot] += 1
+    s.job_sinks_left[slot] -= 1
+    if s.job_sinks_left[slot] == 0:
+        close_job(s, slot, OUTDATED, now)
+
+
+def announce_demoted(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
+    """Say once that a sink of an open job can no longer be in time, and is demoted (rule 7)."""
+    head = s.job_base[slot] + t.region_offset[vertex]
+    job = s.job_index[slot]
+    if s.job_state[slot] == OPEN and s.x_demoted[head] != job and s.x_pending[head] >= 0:
+        s.x_demoted[head] = job
+        judge(s, slot, SINK_DEMOTED, vertex, s.job_release[slot] + t.sink_deadline[vertex], now)
 
 
 def _give_up_sinks(t: Tables, s: State, slot: int, kind: int) -> None:

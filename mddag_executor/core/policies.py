@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+from mddag_executor.core.state import DEADLINE_KEYS, OTHER_KEYS, START_KEYS
 from mddag_executor.core.tables import Tables
 from mddag_executor.errors import MddagError
 
@@ -92,7 +93,8 @@ class Policy(NamedTuple):
 
     ``preemptive`` says how the paper's experiment runs the policy; an executor of callbacks
     cannot preempt and ignores it.  ``polling`` says that it works in rounds (rule 9 of
-    ``rules``).
+    ``rules``).  ``urgency`` says what the keys are: deadlines of sinks, latest starts for them, or
+    neither (rule 7).
     """
 
     name: str
@@ -100,6 +102,7 @@ class Policy(NamedTuple):
     preemptive: bool
     meaning: str
     polling: bool = False
+    urgency: int = OTHER_KEYS
 
     def mode(self, preemptive: bool | None, processes: int = 1) -> bool:
         """
@@ -121,13 +124,15 @@ class Policy(NamedTuple):
 
 
 POLICIES: dict[str, Policy] = {p.name: p for p in (
-    Policy('rad', key_rad, True, 'reference absolute deadline (extended GEDF of the paper)'),
+    Policy('rad', key_rad, True, 'reference absolute deadline (extended GEDF of the paper)',
+           urgency=DEADLINE_KEYS),
     Policy('rm', key_rm, True, 'rate monotonic: the shortest period first'),
     Policy('wc', key_wc, False, 'work-conserving baseline of the paper: job index, order'),
     Policy('fifo', key_fifo, False, 'order of becoming ready'),
     Policy('gedf', key_gedf, True, 'one deadline for each DAG: its latest'),
     Policy('dm', key_dm, True, 'deadline monotonic: the shortest relative deadline first'),
-    Policy('llf', key_llf, True, 'least laxity first: deadline less the critical path to it'),
+    Policy('llf', key_llf, True, 'least laxity first: deadline less the critical path to it',
+           urgency=START_KEYS),
     Policy('ros2', key_ros2, False, "rclcpp's executor: wait-set order by polling rounds", True),
     Policy('picas', key_picas, False, 'chain-aware fixed priorities (PiCAS)'),
 )}

@@ -42,9 +42,14 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     *overdue* until its verdict, which is not in time.  Jobs that are released less
     than ``SKIP`` after the first one, or before ``JUDGE_FROM``, get no verdicts: a warm-up.
     ``judge_from`` says that the run begins in earnest later: live, when all programs have started.
-7.  **Misses.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops what is left of it, as soon
-    as the miss is known: at a late completion, or when something of it comes first in the ready
-    queue after the deadline of a sink that is not done.  What has started runs on.
+7.  **Late jobs.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops what is left of it, as
+    soon as the miss is known: at a late completion, or when something of it comes first in the
+    ready queue after the deadline of a sink that is not done.  What has started runs on.
+    ``DEMOTE`` puts an execution behind all that can be in time, when it comes first in a queue and
+    none of the sinks that it leads to can be: the time plus the mean execution times on the
+    longest path to the sink is past its deadline.  Demoted executions go by their keys among
+    themselves.  An execution with sinks of both kinds has the earliest deadline of those that can
+    be in time as its RAD.  What runs keeps the key that it was dispatched with.
 8.  **Ends.**  A job ends in exactly one of completed, late, aborted, expired, failed.  It fails
     when an execution of it fails (a callback lets an exception out): that vertex has not
     delivered, so each sink that has not completed is missed.  After an abort executions of the
@@ -73,6 +78,9 @@ and ``heapq``, so that the same source runs on plain lists and can be compiled o
     run (``state.divide``).  Each has workers and an interpreter of its own, for which rules 5 and
     11 hold by themselves; what finds none of its workers idle is held back.  There is no
     preemption then, and no polling.
+13. **Only the newest.**  Of a source or sink with ``keep: newest`` at most one execution waits:
+    one that has not started is dropped when that of a later job becomes ready.  A job without its
+    source is ``OUTDATED``; a dropped sink is not in time.
 """
 
 from __future__ import annotations
@@ -86,6 +94,8 @@ from mddag_executor.core.jobs import (
     fail_job,
     free_slot,
     judge,
+    outdate_job,
+    outdate_sink,
     overdue,
 )
 from mddag_executor.core.policies import KeyFunction
@@ -93,6 +103,7 @@ from mddag_executor.core.queues import (
     add_stale,
     idle_worker,
     is_stale,
+    lower_key,
     may_start,
     next_queue,
     poll,
@@ -101,6 +112,7 @@ from mddag_executor.core.queues import (
 from mddag_executor.core.state import (
     ABORTED,
     add_slot,
+    BEHIND,
     COMPLETED,
     DISPATCH_OVERHEAD,
     DONE,
@@ -144,6 +156,30 @@ def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
         heappush(s.ready, entry)
     else:
         wait_for_poll(t, s, entry)
+    if t.keep_newest[s.x_vertex[x]] != 0:
+        _keep_newest(t, s, x, now)
+
+
+def _keep_newest(t: Tables, s: State, x: int, now: int) -> None:
+    """Drop the older one of two executions that wait where only the newest is kept (rule 13)."""
+    vertex = s.x_vertex[x]
+    before = s.newest_ready[vertex]
+    s.newest_ready[vertex] = x
+    if before < 0 or before == x or s.x_state[before] != WAITING or s.x_started[before] >= 0:
+        return
+    older = before
+    if s.job_index[s.x_slot[before]] > s.job_index[s.x_slot[x]]:
+        s.newest_ready[vertex] = before
+        older = x
+    slot = s.x_slot[older]
+    if slot == s.x_slot[s.newest_ready[vertex]]:
+        return  # another message of a sync of the same job
+    if s.job_state[slot] == OPEN:
+        if t.n_predecessors[vertex] == 0:
+            outdate_job(t, s, slot, now)
+        else:
+            outdate_sink(t, s, slot, vertex, now)
+    drop(s, older, now)
 
 
 def ready_undeclared(
@@ -219,7 +255,8 @@ def peek(t: Tables, s: State, now: int) -> int:
 
     On the way, what cannot go next leaves the queue: dropped and aborted executions for good,
     those whose group is busy into their group's heap (rule 4) or to the next poll (rule 9), those
-    that may not start into the heap of what is held back (rules 11 and 12).
+    that may not start into the heap of what is held back (rules 11 and 12).  Late ones go behind
+    (rule 7).
     """
     again = True
     divided = len(s.pool) > 0
@@ -230,6 +267,15 @@ def peek(t: Tables, s: State, now: int) -> int:
             entry = queue[0]
             x = entry[4]
             group = s.x_group[x]
+            slot = s.x_slot[x]
+            if (now > s.job_hope[slot] + s.start_by[s.x_vertex[x]] and entry[0] < BEHIND // 2
+                    and lower_key(t, s, x, now)):
+                heappop(queue)
+                heappush(s.ready, s.x_key[x])
+                if group >= 0 and s.group_owner[group] == -1:
+                    _release_group(s, group)  # others of it may go first
+                queue = next_queue(t, s, False)
+                continue
             if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
                 heappop(queue)
                 if s.scalars[POLLING] == 0:
@@ -246,7 +292,6 @@ def peek(t: Tables, s: State, now: int) -> int:
                     _release_group(s, group)  # others of it may go first
                 queue = next_queue(t, s, False)
                 continue
-            slot = s.x_slot[x]
             if s.job_state[slot] == OPEN:
                 if t.on_late[s.job_dag[slot]] != ABORT or not overdue(t, s, slot, now):
                     return x
@@ -328,13 +373,13 @@ def _begin(t: Tables, s: State, worker: int, now: int) -> int:
 
 def _put_back(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     """Put what is preempted into the ready queue again, with what is left of it (rules 3, 5)."""
-    ready, started = s.x_ready[x], s.x_started[x]
-    left = s.x_left[x] + s.scalars[SWITCH_OVERHEAD] - (now - started)
-    make_ready(t, s, key, x, now)
-    s.job_active[s.x_slot[x]] -= 1  # it was, and still is
-    s.x_ready[x] = ready
-    s.x_started[x] = started
-    s.x_left[x] = left
+    s.x_left[x] += s.scalars[SWITCH_OVERHEAD] - (now - s.x_started[x])
+    s.scalars[ORDER] += 1
+    slot = s.x_slot[x]
+    k = key(t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], s.scalars[ORDER])
+    s.x_key[x] = (k[0], k[1], k[2], k[3], x)
+    s.x_state[x] = WAITING
+    heappush(s.ready, s.x_key[x])
 
 
 def _leave_worker(s: State, x: int) -> None:

@@ -67,7 +67,7 @@ class Scheduler:
         self.state = as_object(new_state(
             tables, n_workers, preemptive=self.policy.mode(preemptive), propagate=propagate,
             dispatch_overhead=dispatch_overhead, switch_overhead=switch_overhead,
-            polling=self.policy.polling))
+            polling=self.policy.polling, urgency=self.policy.urgency))
         self._free_groups: list[int] = []
         # bound here: a method of its own would be one more call for each execution
         rule = self.tables, self.state

@@ -19,24 +19,31 @@ from mddag_executor.core.tables import NEVER, Tables
 # States of an execution; what is refused is suspended, too.
 IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
 
-# States of a job.  Of the last five every ended job is in exactly one.
-FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED = range(7)
+# States of a job.  Of the last six every ended job is in exactly one.
+FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED, OUTDATED = range(8)
 
 # Where a vertex is expected to run; LEADS_OUT: here, and one right after it is not.
 ELSEWHERE, HERE, LEADS_OUT = range(3)
 
 # Columns of ``scalars``.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- JUDGE_FROM, SKIP, N_HOLDING, N_SCALARS) = range(12)
+ JUDGE_FROM, SKIP, N_HOLDING, URGENCY, N_SCALARS) = range(13)
+
+# What the keys of a policy are (``URGENCY``): neither of the two, deadlines, or latest starts.
+OTHER_KEYS, DEADLINE_KEYS, START_KEYS = range(3)
+
+BEHIND = NEVER
+"""Added to the priority of a demoted execution (rule 7): behind all that can be in time."""
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  Each sink of a job is in time,
 # or late: it completed; or missed: it had not completed when the run ended past its deadline; or
-# its job was aborted, expired or failed.  Before one of these, except in time, it may be announced
-# that its deadline is over (overdue).  The deadline is that of the sink; the time that of the
+# its job was aborted, expired or failed, or the sink was dropped for a newer job's.  Before one of
+# these it may be announced that its deadline is over (overdue; not before in time), and that it
+# was demoted.  The deadline is that of the sink; the time that of the
 # decision, for a sink that completed the completion, else -1.  Instead of a vertex the end of a
 # job has -1, or NOT_JUDGED.
-(SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, JOB_END, DROP,
- SINK_OVERDUE) = range(9)
+(SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_DROPPED,
+ JOB_END, DROP, SINK_OVERDUE, SINK_DEMOTED) = range(11)
 SINK_COMPLETED = (SINK_IN_TIME, SINK_LATE)
 NOT_JUDGED = -2
 
@@ -73,6 +80,12 @@ class State(NamedTuple):
     # whether some of its vertices are not expected here; by vertex: whether it is (see ``expect``)
     partial: list[int]
     expected: list[int]
+    # by vertex: the latest start (``Tables.latest_start``) with what is known of execution times,
+    # and the execution that became ready last, where only the newest is kept
+    start_by: list[int]
+    newest_ready: list[int]
+    # ``Tables.reach_start`` with what is known of execution times
+    reach_by: list[int]
     # by slot
     job_dag: list[int]
     job_base: list[int]
@@ -81,6 +94,8 @@ class State(NamedTuple):
     job_state: list[int]
     job_sinks_left: list[int]
     job_late: list[int]
+    # what its latest starts count from: its release; NEVER: it goes on when it is late
+    job_hope: list[int]
     job_active: list[int]
     job_next: list[int]
     job_previous: list[int]
@@ -98,6 +113,8 @@ class State(NamedTuple):
     x_started: list[int]
     x_left: list[int]
     x_cost: list[int]
+    # of a sink: the last job that was demoted
+    x_demoted: list[int]
     # what was decided, for the driver to take away
     decisions: list[Decision]
 
@@ -130,6 +147,7 @@ def new_state(
     dispatch_overhead: int = 0,
     switch_overhead: int = 0,
     polling: bool = False,
+    urgency: int = OTHER_KEYS,
 ) -> State:
     """
     Make an empty state.
@@ -142,17 +160,18 @@ def new_state(
     :param dispatch_overhead: added to an execution each time it is dispatched, ns.
     :param switch_overhead: added to an execution each time it is preempted, ns.
     :param polling: what becomes ready waits for a poll (see ``queues``); never with preemption.
+    :param urgency: what the policy's keys are: ``DEADLINE_KEYS``, ``START_KEYS`` or neither.
     """
     state = empty(State)
     fill_state(
         tables, state, n_workers, int(preemptive), int(propagate), dispatch_overhead,
-        switch_overhead, int(polling))
+        switch_overhead, int(polling), urgency)
     return state
 
 
 def fill_state(
     t: Tables, s: State, n_workers: int, preemptive: int, propagate: int, dispatch_overhead: int,
-    switch_overhead: int, polling: int,
+    switch_overhead: int, polling: int, urgency: int,
 ) -> None:
     """Fill the columns of a state that is all empty; see ``new_state``."""
     for _ in range(N_SCALARS):
@@ -163,7 +182,13 @@ def fill_state(
     s.scalars[DISPATCH_OVERHEAD] = dispatch_overhead
     s.scalars[SWITCH_OVERHEAD] = switch_overhead
     s.scalars[POLLING] = polling
+    s.scalars[URGENCY] = urgency
     s.scalars[JUDGE_FROM] = -NEVER
+    for v in range(t.n_vertices + 1):
+        s.start_by.append(t.latest_start[v])
+        s.newest_ready.append(-1)
+    for i in range(len(t.reach_start)):
+        s.reach_by.append(t.reach_start[i])
     for _ in range(2):
         s.overtaking.append(1)
     if polling != 0:
@@ -193,6 +218,7 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
     s.job_state.append(FREE)
     s.job_sinks_left.append(0)
     s.job_late.append(0)
+    s.job_hope.append(NEVER)
     s.job_active.append(0)
     s.job_next.append(s.free_slot[dag])
     s.job_previous.append(-1)
@@ -212,6 +238,7 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_started.append(-1)
             s.x_left.append(0)
             s.x_cost.append(0)
+            s.x_demoted.append(-1)
 
 
 def divide(s: State, workers: list[int]) -> None:

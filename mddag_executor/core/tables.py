@@ -25,6 +25,9 @@ The offsets are relative to a job's release:
 * ``latest_start``: the latest time at which the vertex can start with every sink that it leads to
   in time, if each vertex takes its mean execution time (0 where none is declared) and never waits:
   the least of these sinks' deadlines minus the longest path to them (least laxity first).
+* ``reach_deadline``, ``reach_start``: the same two of each sink that the vertex leads to
+  (``reach_sink``), from ``first_reach`` of the vertex on.  ``mean_time`` is the declared mean
+  execution time, ``height`` the number of vertices on the longest way to a sink.
 
 ``process`` is the number of the declared process that a callback runs in, from 1.
 
@@ -47,7 +50,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from msg_graph import Callback, Dag, TaskSet, Vertex
-from msg_graph.model import path_lengths
+from msg_graph.model import path_lengths, topological_order
 
 NEVER = 2 ** 62
 """A time that is never reached (ns): larger than any clock, small enough to add to."""
@@ -59,8 +62,9 @@ MAX_ACTIVE_JOBS = 64
 EXPIRE_AFTER_NS = 1_000_000_000
 """A job that nothing of runs or waits expires so long after its latest deadline."""
 
-CONTINUE = 0
-ABORT = 1
+CONTINUE, DEMOTE, ABORT = range(3)
+ON_LATE = {'continue': CONTINUE, 'demote': DEMOTE, 'abort': ABORT}
+"""What is done with a late job, by its name in declarations and options."""
 
 _WAIT_SET = {'timer': 0, 'subscription': 1, 'sync': 1, 'service': 2}
 """Kinds of callbacks in the order in which executors of ROS 2 look them up."""
@@ -91,6 +95,13 @@ class Tables(NamedTuple):
     index_in_dag: list[int]
     rad_offset: list[int]
     latest_start: list[int]
+    first_reach: list[int]
+    reach_sink: list[int]
+    reach_deadline: list[int]
+    reach_start: list[int]
+    keep_newest: list[int]
+    mean_time: list[int]
+    height: list[int]
     sink_deadline: list[int]
     entity: list[int]
     chain_rank: list[int]
@@ -115,6 +126,7 @@ class Tables(NamedTuple):
         default_deadline: int = DEFAULT_DEADLINE_NS,
         max_active_jobs: int = NEVER,
         expire_after: int = NEVER,
+        on_late: str = 'continue',
     ) -> Tables:
         """
         Flatten a task set.
@@ -125,8 +137,9 @@ class Tables(NamedTuple):
         :param default_deadline: relative deadline of undeclared callbacks, ns.
         :param max_active_jobs: bound on the open jobs of a DAG that declares none itself.
         :param expire_after: how long past its latest deadline an idle job stays open, ns.
+        :param on_late: what is done with late jobs of a DAG that does not declare it.
         """
-        columns = _Columns(legs, groups, max_active_jobs, expire_after)
+        columns = _Columns(legs, groups, max_active_jobs, expire_after, ON_LATE[on_late])
         columns.enter(task_set.callbacks if task_set is not None else ())
         for dag in task_set.dags if task_set is not None else ():
             columns.add_dag(dag)
@@ -142,12 +155,13 @@ class _Columns:
     """Collects the columns of ``Tables`` DAG by DAG."""
 
     def __init__(
-        self, legs: bool, groups: bool, max_active_jobs: int, expire_after: int
+        self, legs: bool, groups: bool, max_active_jobs: int, expire_after: int, on_late: int
     ) -> None:
         self._legs = legs
         self._use_groups = groups
         self._max_active_jobs = max_active_jobs
         self._expire_after = expire_after
+        self._on_late = on_late
         self._groups: dict[tuple[str, str], int] = {}
         self._entities: dict[str, int] = {}
         self._n_entities = 0
@@ -158,6 +172,7 @@ class _Columns:
         self.lists: dict[str, list[int]] = {name: [] for name in names}
         self.lists['first_sink'].append(0)
         self.lists['first_successor'].append(0)
+        self.lists['first_reach'].append(0)
 
     def enter(self, callbacks: Sequence[Callback]) -> None:
         """Give each declared callback its place in the wait set."""
@@ -168,22 +183,33 @@ class _Columns:
     def add_dag(self, dag: Dag) -> None:
         lists = self.lists
         first = len(lists['dag_of'])
-        offsets, starts = rad_offsets(dag), latest_starts(dag)
+        reached = reached_sinks(dag)
+        heights = [0] * len(dag.vertices)
+        for index in reversed(topological_order(dag)):
+            heights[index] = 1 + max((heights[s] for s in dag.vertices[index].successors),
+                                     default=-1)
         self._keys += [vertex.callback.key for vertex in dag.vertices]
         lateness = path_lengths(dag, [1] * len(dag.vertices))
         self._chains += [
             (offset, dag.period_ns, dag.index, -late, index)
-            for index, (offset, late) in enumerate(zip(offsets, lateness))]
+            for index, (offset, late) in enumerate(zip(rad_offsets(dag), lateness))]
         region = 0
-        for vertex, offset, start in zip(dag.vertices, offsets, starts):
+        for vertex, sinks in zip(dag.vertices, reached):
             countdown, topics = len(vertex.predecessors), [0]
             if self._legs and countdown > 0:
                 topics = [topic for topic, _ in legs_of(vertex, dag.vertices)]
                 countdown = len(topics)
             lists['dag_of'].append(dag.index)
             lists['index_in_dag'].append(vertex.index)
-            lists['rad_offset'].append(offset)
-            lists['latest_start'].append(start)
+            lists['rad_offset'].append(min(deadline for _, deadline, _ in sinks))
+            lists['latest_start'].append(min(start for _, _, start in sinks))
+            lists['reach_sink'].extend(first + sink for sink, _, _ in sinks)
+            lists['reach_deadline'].extend(deadline for _, deadline, _ in sinks)
+            lists['reach_start'].extend(start for _, _, start in sinks)
+            lists['first_reach'].append(len(lists['reach_sink']))
+            lists['mean_time'].append(mean_time(vertex))
+            lists['height'].append(heights[vertex.index])
+            lists['keep_newest'].append(int(vertex.callback.keep == 'newest'))
             lists['sink_deadline'].append(-1 if vertex.deadline_ns is None else vertex.deadline_ns)
             lists['entity'].append(self._entities[vertex.callback.key])
             lists['region_offset'].append(region)
@@ -197,7 +223,7 @@ class _Columns:
             region += len(topics)
         lists['period'].append(dag.period_ns)
         lists['dag_deadline'].append(max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks))
-        lists['on_late'].append(ABORT if dag.on_late == 'abort' else CONTINUE)
+        lists['on_late'].append(self._on_late if dag.on_late is None else ON_LATE[dag.on_late])
         lists['max_active_jobs'].append(dag.max_active_jobs or self._max_active_jobs)
         lists['expire_after'].append(self._expire_after)
         lists['first_vertex'].append(first)
@@ -218,7 +244,8 @@ class _Columns:
         n_vertices = len(lists['dag_of'])
         undeclared = {
             'dag_of': n_dags, 'index_in_dag': 0, 'rad_offset': default_deadline,
-            'latest_start': default_deadline, 'sink_deadline': -1,
+            'latest_start': default_deadline, 'first_reach': len(lists['reach_sink']),
+            'keep_newest': 0, 'mean_time': 0, 'height': 0, 'sink_deadline': -1,
             'entity': self._n_entities, 'region_offset': 0,
             'n_legs': 1, 'first_leg': len(lists['leg_topic']), 'leg_topic': 0,
             'n_predecessors': 0, 'first_successor': len(lists['successors']),
@@ -273,32 +300,33 @@ def rad_offsets(dag: Dag) -> list[int]:
     The rule of the paper's extended GEDF: a sink has its own deadline, every other vertex the
     least of its successors', hence the least among the sinks that it leads to.
     """
-    return _least_backwards(dag, [0] * len(dag.vertices))
+    return [min(deadline for _, deadline, _ in sinks) for sinks in reached_sinks(dag)]
 
 
-def latest_starts(dag: Dag) -> list[int]:
+def mean_time(vertex: Vertex) -> int:
+    """Return the declared mean execution time, ns; 0 where none is declared."""
+    declared = vertex.callback.execution_time
+    return 0 if declared is None else declared.mean_ns
+
+
+def reached_sinks(dag: Dag) -> list[list[tuple[int, int, int]]]:
     """
-    Latest start minus release for each vertex of a DAG, ns, by local index; may be negative.
+    Return the sinks that each vertex of a DAG leads to, by local index.
 
-    See ``latest_start`` in the theory of operation.
+    :return: of each the local index, its deadline, and the latest start for it (see
+        ``latest_start`` in the theory of operation; it may be negative), ns.
     """
-    times = (vertex.callback.execution_time for vertex in dag.vertices)
-    return _least_backwards(dag, [0 if each is None else each.mean_ns for each in times])
-
-
-def _least_backwards(dag: Dag, costs: list[int]) -> list[int]:
-    """Return the least of the sinks' deadlines minus the costs on the way to them and there."""
-    offsets = [NEVER] * len(dag.vertices)
-    open_successors = [len(v.successors) for v in dag.vertices]
-    done = [v.index for v in dag.vertices if not v.successors]
-    for index in done:
+    costs = [mean_time(vertex) for vertex in dag.vertices]
+    deadlines = [NEVER if vertex.deadline_ns is None else vertex.deadline_ns
+                 for vertex in dag.vertices]
+    starts: list[dict[int, int]] = [{} for _ in dag.vertices]
+    for index in reversed(topological_order(dag)):
         vertex = dag.vertices[index]
-        if vertex.deadline_ns is not None:
-            offsets[index] = vertex.deadline_ns
-        offsets[index] -= costs[index]
-        for before in vertex.predecessors:
-            offsets[before] = min(offsets[before], offsets[index])
-            open_successors[before] -= 1
-            if open_successors[before] == 0:
-                done.append(before)
-    return offsets
+        if not vertex.successors:
+            starts[index][index] = deadlines[index]
+        for after in vertex.successors:
+            for sink, start in starts[after].items():
+                starts[index][sink] = min(start, starts[index].get(sink, NEVER))
+        starts[index] = {sink: start - costs[index] for sink, start in starts[index].items()}
+    return [[(sink, deadlines[sink], start) for sink, start in sorted(each.items())]
+            for each in starts]

@@ -23,8 +23,11 @@ from mddag_executor.core.state import (
     JOB_END,
     LATE,
     NOT_JUDGED,
+    OUTDATED,
     SINK_ABORTED,
     SINK_COMPLETED,
+    SINK_DEMOTED,
+    SINK_DROPPED,
     SINK_EXPIRED,
     SINK_FAILED,
     SINK_IN_TIME,
@@ -38,10 +41,11 @@ from msg_graph import Dag, TaskSet, Vertex, WeaklyHard
 
 VERDICTS = {
     SINK_IN_TIME: 'in_time', SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
-    SINK_ABORTED: 'aborted', SINK_FAILED: 'failed', SINK_OVERDUE: 'overdue'}
+    SINK_ABORTED: 'aborted', SINK_FAILED: 'failed', SINK_DROPPED: 'dropped',
+    SINK_OVERDUE: 'overdue'}
 """What a verdict of the core is called."""
 OUTCOMES = {COMPLETED: 'completed', LATE: 'late', ABORTED: 'aborted', EXPIRED: 'expired',
-            FAILED: 'failed'}
+            FAILED: 'failed', OUTDATED: 'dropped'}
 
 
 def quantile(ordered: Sequence[int], q: float) -> int:
@@ -68,6 +72,7 @@ class Counts(NamedTuple):
     expired: int
     aborted: int
     failed: int
+    dropped: int
 
     @property
     def missed(self) -> int:
@@ -81,16 +86,16 @@ class Counts(NamedTuple):
     @classmethod
     def total(cls, several: Iterable[Counts]) -> Counts:
         """Return the sums of several."""
-        return cls(*(sum(column) for column in zip(cls(0, 0, 0, 0, 0, 0), *several)))
+        return cls(*(sum(column) for column in zip(cls(0, 0, 0, 0, 0, 0, 0), *several)))
 
 
 def counts(sink: Mapping[str, Any]) -> Counts:
     """Return the verdicts that a sink's result holds, or its counters (``vars``)."""
     overdue = sink.get('overdue', 0)
-    aborted, failed = sink.get('aborted', 0), sink.get('failed', 0)
+    aborted, failed, dropped = (sink.get(key, 0) for key in ('aborted', 'failed', 'dropped'))
     in_time = sink['completed'] - (sink['late'] - overdue)
-    due = sink['completed'] + overdue + sink['expired'] + aborted + failed
-    return Counts(due, in_time, sink['late'], sink['expired'], aborted, failed)
+    due = sink['completed'] + overdue + sink['expired'] + aborted + failed + dropped
+    return Counts(due, in_time, sink['late'], sink['expired'], aborted, failed, dropped)
 
 
 def is_kept(sink: Mapping[str, Any]) -> bool:
@@ -148,7 +153,8 @@ def _added(deadline: int, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         return dict(parts[0])
     result = SinkTally(deadline, None).result()
     for part in parts:
-        for key in ('completed', 'late', 'overdue', 'expired', 'failed', 'aborted'):
+        for key in ('completed', 'late', 'overdue', 'expired', 'failed', 'aborted', 'dropped',
+                    'demoted'):
             result[key] += part[key]
         if 'tolerate' in part:
             worst = result.get('tolerate', part['tolerate'])['worst']
@@ -209,6 +215,8 @@ class SinkTally:
         self.expired = 0
         self.failed = 0
         self.aborted = 0
+        self.dropped = 0
+        self.demoted: int | None = 0  # None: not known, of a recording
         self.overdue = 0
         self.shortest: int | None = None
         self.longest: int | None = None
@@ -235,7 +243,8 @@ class SinkTally:
         return {
             'relative_deadline_ns': self.relative_deadline_ns, 'completed': self.completed,
             'late': self.late, 'overdue': self.overdue, 'expired': self.expired,
-            'failed': self.failed, 'aborted': self.aborted, 'response_ns': response}
+            'failed': self.failed, 'aborted': self.aborted, 'dropped': self.dropped,
+            'demoted': self.demoted, 'response_ns': response}
 
 
 class Tally:
@@ -277,6 +286,9 @@ class Tally:
                     self.ends[dag][deadline] += 1
             elif kind == DROP:
                 self.dropped += 1
+            elif kind == SINK_DEMOTED:
+                sink = self.sinks[vertex]
+                sink.demoted = (sink.demoted or 0) + 1
             elif kind == SINK_OVERDUE:
                 self.overdue[vertex, job] = deadline
                 self.sinks[vertex].late += 1
@@ -311,6 +323,8 @@ class Tally:
             sink.failed += 1
         elif kind == SINK_ABORTED:
             sink.aborted += 1
+        elif kind == SINK_DROPPED:
+            sink.dropped += 1
         if self.first_miss is None or (
                 kind == self._first_kind == SINK_MISSED
                 and deadline < self.first_miss['deadline_ns']):

@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
+from mddag_executor.core.estimates import MeanTimes
 from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE
@@ -68,6 +69,7 @@ class Engine:
 
     All times are ns on the trace's clock and do not decrease from call to call.
 
+    :param on_late: what is done with late jobs of a DAG that does not declare it.
     :param record: where trace events go; None records nothing.
     :param on_miss: gets every miss (see ``Verdicts``).
     :param process: which of the declared processes this is.
@@ -75,21 +77,24 @@ class Engine:
 
     def __init__(
         self, task_set: TaskSet | None, n_workers: int, policy: str, *, default_deadline: int,
-        max_active_jobs: int, expire_after: int, record: Record | None = None,
-        on_miss: Callable[[DeadlineMiss], None] | None = None, process: str | None = None,
+        max_active_jobs: int, expire_after: int, on_late: str = 'demote',
+        record: Record | None = None, on_miss: Callable[[DeadlineMiss], None] | None = None,
+        process: str | None = None,
     ) -> None:
         self.tables = Tables.build(
             task_set, legs=True, groups=False, default_deadline=default_deadline,
-            max_active_jobs=max_active_jobs, expire_after=expire_after)
+            max_active_jobs=max_active_jobs, expire_after=expire_after, on_late=on_late)
         self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
         self.deadlines = Deadlines(self.tables, self.scheduler.state)
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.jobs = Jobs(task_set)
+        self.mean_times = MeanTimes(self.tables, self.scheduler.state)
         self.other_processes = OtherProcesses.of(
             task_set, self.tables, self.scheduler, self.jobs, process)
         self.dag_names = [d.name for d in task_set.dags] if task_set else []
         self.n_workers = n_workers
         self.record = record
+        self.on_late = on_late
         self.undeclared = 0
         # how often a callback group did not let something run, and what waits for that
         self.refusals = 0
@@ -295,6 +300,8 @@ class Engine:
         entity.ready += 1
         entity.waiting[x] = None
         self._work[x] = work
+        if state.decisions:
+            self._decided(now)  # it took the place of an older one, which was dropped
 
     # --- what does not run -----------------------------------------------------------------------
 
@@ -501,6 +508,8 @@ class Engine:
             self._complete(x, end)
             return
         entity.failed += failed
+        if origin is not None:
+            self.mean_times.note(origin.vertex, entity.habit.mean_ns)
         if self.verdicts.tally.overdue and work.origin is not None:
             deadline = self.verdicts.tally.overdue.get((work.origin.vertex, work.origin.job), -1)
             if end <= deadline:  # that it was overdue was reported before this was known
@@ -598,10 +607,12 @@ class Engine:
             return
         for x in self.verdicts.add(decisions, now):
             work = self._work.pop(x, None)
-            if work is not None:  # the core dropped it: what is left of an aborted job
+            if work is not None:  # the core dropped it: of an aborted job, or for a newer one
                 work.entity.waiting.pop(x, None)
                 work.x = -1
-                self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'aborted', now)
+                origin = work.origin or NO_ORIGIN
+                why = 'aborted' if self.verdicts.was_aborted(origin.dag, origin.job) else 'newer'
+                self.verdicts.dropped(work.entity, origin, why, now)
 
     @property
     def is_judging(self) -> bool:

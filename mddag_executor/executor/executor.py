@@ -112,6 +112,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param graph: a declaration (path of a YAML file), a ``msg_graph.TaskSet``, or None.
     :param num_workers: threads of the pool; by default what the declaration says, else seven.
     :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
+    :param on_late: what is done with late jobs of a DAG that does not declare it: ``demote``,
+        ``continue`` or ``abort``.
     :param context: the context that the executor belongs to, or None for the default one.
     :param trace: path of an MCAP file to record to, or None. A file that is there already is kept:
         the constructor raises, unless ``overwrite`` is true.
@@ -144,6 +146,7 @@ class MultiDeadlineExecutor(BareExecutor):
         num_workers: int | None = None,
         *,
         policy: str = 'rad',
+        on_late: str = 'demote',
         context: Context | None = None,
         trace: str | os.PathLike[str] | None = None,
         on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,
@@ -167,6 +170,7 @@ class MultiDeadlineExecutor(BareExecutor):
             'max_active_jobs', max_active_jobs, settings.MOST_JOBS)
         settings.check_callable('on_deadline_miss', on_deadline_miss)
         find_policy(policy)
+        settings.check_on_late(on_late)
         settings.check_context(context)
         settings.check_process(process, task_set)
         thresholds = settings.check_thresholds(thresholds)
@@ -190,7 +194,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._engine = Engine(
             task_set, num_workers, policy, default_deadline=deadline_ns,
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
-            record=self._recorder.record if self._recorder else None,
+            on_late=on_late, record=self._recorder.record if self._recorder else None,
             on_miss=None if self._notifier is None else self._notifier.post, process=process)
         inbox = Inbox(self._engine, self._trace_clock, self._recorder, self._fail)
         self._pool = WorkerPool(

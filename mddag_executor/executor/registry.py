@@ -269,6 +269,8 @@ class Registry:
             if kind == TIMER and entity.source >= 0:
                 dag = self._tables.dag_of[entity.source]
                 entity.depth = self._tables.source_depth(dag)
+                if callback.keep == 'newest':
+                    entity.depth = max(2, entity.depth)  # the core drops the older one
         return entity
 
     def _number(self, group: Any) -> int:

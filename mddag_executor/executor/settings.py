@@ -14,6 +14,7 @@ import operator
 import os
 from typing import Any
 
+from mddag_executor.core.tables import ON_LATE
 from mddag_executor.defaults import workers
 from mddag_executor.errors import UsageError
 from msg_graph import load, parse_duration, TaskSet
@@ -161,6 +162,17 @@ def resolve(
     default_deadline = whole_number(
         'default_deadline', _nanoseconds(default_deadline), DAY, ' ns')
     return task_set, num_workers, default_deadline
+
+
+def check_on_late(on_late: object) -> None:
+    """
+    Check what is to be done with late jobs.
+
+    :raises UsageError: when it is not known.
+    """
+    if on_late not in [*ON_LATE]:
+        raise UsageError(
+            f"on_late: '{on_late}' is unknown: give one of {', '.join(ON_LATE)}")
 
 
 def thread_setting(

@@ -46,7 +46,8 @@ def statistics(
         dag['sinks'] = {name: sink for name, sink in dag['sinks'].items()
                         if name.partition('@')[0] not in elsewhere or counts(sink).due}
     return {
-        'policy': engine.scheduler.policy.name, 'workers': engine.n_workers,
+        'policy': engine.scheduler.policy.name, 'on_late': engine.on_late,
+        'workers': engine.n_workers,
         'deadline_missed': result['deadline_missed'], 'first_miss': result['first_miss'],
         'never_due': never_due(result['dags']), 'dags': result['dags'], 'stops': stops,
         'callbacks': callbacks, 'undeclared': undeclared,

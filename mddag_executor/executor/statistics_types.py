@@ -21,7 +21,9 @@ class SinkCounts(TypedDict):
     What came of the jobs at a sink.
 
     ``late`` counts completions after the deadline and, at the end of the run, jobs that were
-    ``overdue``. Jobs of which none completed have no ``response_ns``.
+    ``overdue``. ``dropped`` counts jobs that made place for a newer one (``keep: newest``),
+    ``demoted`` those that could no longer be in time and went behind others. Jobs of which none
+    completed have no ``response_ns``.
     """
 
     relative_deadline_ns: int
@@ -31,6 +33,8 @@ class SinkCounts(TypedDict):
     expired: int
     failed: int
     aborted: int
+    dropped: int
+    demoted: int
     response_ns: ResponseTimes | None
 
 
@@ -42,6 +46,7 @@ class JobEnds(TypedDict):
     aborted: int
     expired: int
     failed: int
+    dropped: int
 
 
 class DagCounts(TypedDict):
@@ -132,6 +137,7 @@ class Statistics(TypedDict):
     """
 
     policy: str
+    on_late: str
     workers: int
     deadline_missed: bool
     first_miss: FirstMiss | None

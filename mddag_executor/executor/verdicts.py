@@ -16,6 +16,8 @@ from mddag_executor.core.state import (
     DROP,
     EXPIRED,
     JOB_END,
+    OUTDATED,
+    SINK_DEMOTED,
     SINK_FAILED,
     SINK_IN_TIME,
     SINK_LATE,
@@ -29,6 +31,7 @@ from mddag_executor.executor.jobs import Origin
 from msg_graph import TaskSet
 
 KEEP_RESPONSES = 2_000
+_RECORDED_ENDS = {ABORTED: 'abort', EXPIRED: 'expire', OUTDATED: 'outdate'}
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,8 @@ class DeadlineMiss:
     ``kind`` is ``overdue`` if it had not completed at its deadline: that is reported then,
     whatever comes of it later.  It is ``late`` if the executor learnt of the completion first, at
     the time ``completed_ns`` (else None).  Before the deadline it is ``expired``, ``aborted``, or
-    ``failed`` (a callback of the job raised) if the job can no longer complete.
+    ``failed`` (a callback of the job raised) if the job can no longer complete, or ``dropped``
+    for a newer job (``keep: newest``).
     """
 
     dag: str
@@ -95,7 +99,7 @@ class Verdicts:
                 self._ended(dag, job, deadline, now)
             elif kind == SINK_OVERDUE:
                 self._report(kind, dag, vertex, job, deadline, None)
-            elif kind != SINK_IN_TIME:
+            elif kind not in (SINK_IN_TIME, SINK_DEMOTED):
                 self._missed(kind, dag, vertex, job, deadline, time, now)
         self.tally.add(decisions)  # last: it knows what was overdue before
         return dropped
@@ -105,9 +109,9 @@ class Verdicts:
             self._aborted[(dag, job)] = None
             if len(self._aborted) > REMEMBERED:
                 del self._aborted[next(iter(self._aborted))]
-        if self.record is not None and end in (ABORTED, EXPIRED):
-            self.record(
-                'abort' if end == ABORTED else 'expire', now, threading.get_native_id(), dag, job)
+        name = _RECORDED_ENDS.get(end)
+        if self.record is not None and name is not None:
+            self.record(name, now, threading.get_native_id(), dag, job)
 
     def was_aborted(self, dag: int, job: int) -> bool:
         """Return whether a job was aborted (the last few thousand are remembered)."""

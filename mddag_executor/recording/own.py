@@ -46,6 +46,7 @@ from mddag_executor.recording.tables import (
     Mask,
     MISSES,
     NOTHING,
+    OUTDATED,
     pick,
     PUBLICATIONS,
     Recording,
@@ -67,13 +68,14 @@ import numpy as np
 _DISPATCH, _START, _END, _COMPLETE = (
     'mddag:dispatch', 'ros2:callback_start', 'ros2:callback_end', 'mddag:complete')
 _PUBLISH, _RELEASE = 'ros2:rclcpp_publish', 'mddag:job_release'
-_DEADLINE, _FAIL, _EXPIRE, _ABORT, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN, _JUDGE_FROM = (
+(_DEADLINE, _FAIL, _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN,
+ _JUDGE_FROM) = (
     f'mddag:{name}' for name in (
-        'deadline', 'fail', 'expire', 'abort', 'lost', 'stop', 'drop', 'hosted', 'shutdown',
-        'judge_from'))
+        'deadline', 'fail', 'expire', 'abort', 'outdate', 'lost', 'stop', 'drop', 'hosted',
+        'shutdown', 'judge_from'))
 _NUMBERS = (_DISPATCH, _START, _END, _COMPLETE, _PUBLISH, _RELEASE, _DEADLINE, _FAIL, _EXPIRE,
-            _ABORT, _LOST, _STOP, _JUDGE_FROM, _SHUTDOWN)
-_JOB_ENDS = {_EXPIRE: EXPIRED, _ABORT: ABORTED, _FAIL: FAILED}
+            _ABORT, _OUTDATE, _LOST, _STOP, _JUDGE_FROM, _SHUTDOWN)
+_JOB_ENDS = {_EXPIRE: EXPIRED, _ABORT: ABORTED, _FAIL: FAILED, _OUTDATE: OUTDATED}
 _CORE = (_RELEASE, _COMPLETE, _DEADLINE, *_JOB_ENDS)
 """Events at which the executor's core saw something: the run lasts at least until there."""
 

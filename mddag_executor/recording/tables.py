@@ -51,8 +51,8 @@ ALL_LEGS = -1
 # What an execution completes.
 NOTHING, LEG, VERTEX = range(3)
 
-EXPIRED, ABORTED, FAILED, WITHDRAWN = range(4)
-REASONS = ('expired', 'aborted', 'failed', 'withdrawn')
+EXPIRED, ABORTED, FAILED, WITHDRAWN, OUTDATED = range(5)
+REASONS = ('expired', 'aborted', 'failed', 'withdrawn', 'dropped')
 """Why a job ended: names of the values of ``job_ends['reason']``."""
 
 

@@ -171,6 +171,7 @@ def reschedule_bag(
     policy: str | None = None,
     workers: int | None = None,
     preemptive: bool = False,
+    on_late: str = 'demote',
     times: Sequence[Sequence[int]] | None = None,
     seed: int = 0,
     dispatch_overhead: int = 0,
@@ -209,8 +210,9 @@ def reschedule_bag(
     settings = Settings(
         policy, workers or task_set.workers or DEFAULT_WORKERS, end, preemptive,
         dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
-        judge_from=bag.start + skip if skip else -NEVER)
+        judge_from=bag.start + skip if skip else -NEVER, on_late=on_late)
     return Reschedule(
-        task_set, work, Tables.build(task_set, max_active_jobs=NEVER), settings, bag.start,
+        task_set, work, Tables.build(task_set, max_active_jobs=NEVER, on_late=on_late), settings,
+        bag.start,
         {'trace': bag.name, 'declaration': task_set.file, 'start_ns': bag.start, 'end_ns': end,
          'messages': bag.count}, builder.warnings, skip=skip, notes=builder.notes)

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, legs_of, NEVER
-from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END, SINK_LATE
+from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END, OUTDATED, SINK_LATE
 from mddag_executor.recording import tables
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
@@ -37,6 +37,9 @@ Delay = Callable[[int, int, int, int], int]
 
 Id = tuple[int, int, int]
 """DAG, global vertex, job in the load."""
+
+_REASONS = {ABORTED: tables.ABORTED, EXPIRED: tables.EXPIRED, OUTDATED: tables.OUTDATED}
+"""What a recording calls the ends of jobs that did not complete."""
 
 
 class ComputedRun(NamedTuple):
@@ -156,15 +159,15 @@ class _Player:
         numbers = self._schedule.numbers
         return job if numbers is None or dag >= self._n_dags else numbers[dag][job]
 
-    def _job_ends(self) -> Iterator[tuple[int, int, int, bool, int]]:
+    def _job_ends(self) -> Iterator[tuple[int, int, int, int, int]]:
         """Yield when jobs end otherwise than by completing, and the vertex that aborts one."""
         late = (-1, -1, -1), -1
         for kind, dag, v, job, how, time in self._schedule.decisions:
             if kind == SINK_LATE:
                 late = (dag, job, time), v
-            elif kind == JOB_END and how in (ABORTED, EXPIRED) and dag < self._n_dags:
+            elif kind == JOB_END and how in _REASONS and dag < self._n_dags:
                 vertex = late[1] if late[0] == (dag, job, time) else -1
-                yield time, dag, job, how == ABORTED, vertex
+                yield time, dag, job, _REASONS[how], vertex
 
     def _until(self, now: int) -> None:
         """Note what is released and given up to an instant."""
@@ -184,9 +187,9 @@ class _Player:
 
     def _end_job(self) -> None:
         assert self._next_end is not None
-        now, dag, job, aborted, _ = self._next_end
+        now, dag, job, reason, _ = self._next_end
         self._ends.add(dag, -1, self._number(dag, job), now,
-                       tables.ABORTED if aborted else tables.EXPIRED, self._next_order())
+                       reason, self._next_order())
         self._next_end = next(self._ends_of_jobs, None)
 
     def _release(self, i: int, now: int) -> None:

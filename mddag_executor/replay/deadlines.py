@@ -39,8 +39,10 @@ from mddag_executor.core.state import (
     HERE,
     LATE,
     LEADS_OUT,
+    OUTDATED,
     SINK_ABORTED,
     SINK_COMPLETED,
+    SINK_DROPPED,
     SINK_EXPIRED,
     SINK_FAILED,
     SINK_IN_TIME,
@@ -66,7 +68,7 @@ the completion or the time at which the job was given up, ``row`` the job's row 
 
 _ENDS = {
     recorded.EXPIRED: (EXPIRED, SINK_EXPIRED), recorded.ABORTED: (ABORTED, SINK_ABORTED),
-    recorded.FAILED: (FAILED, SINK_FAILED)}
+    recorded.FAILED: (FAILED, SINK_FAILED), recorded.OUTDATED: (OUTDATED, SINK_DROPPED)}
 
 
 class Jobs(NamedTuple):
@@ -343,11 +345,12 @@ class Judged:
                 tally.ends[dag][end] += n
         for v, mine in zip(self.tables.sinks, self.by_sink()):
             sink = tally.sinks[v]
-            kinds = np.bincount(mine['kind'], minlength=SINK_FAILED + 1).tolist()
+            kinds = np.bincount(mine['kind'], minlength=SINK_DROPPED + 1).tolist()
             sink.completed = kinds[SINK_IN_TIME] + kinds[SINK_LATE]
+            sink.demoted = None
             sink.late, sink.overdue = kinds[SINK_LATE] + kinds[SINK_MISSED], kinds[SINK_MISSED]
-            sink.expired, sink.failed, sink.aborted = (
-                kinds[kind] for kind in (SINK_EXPIRED, SINK_FAILED, SINK_ABORTED))
+            sink.expired, sink.failed, sink.aborted, sink.dropped = (
+                kinds[kind] for kind in (SINK_EXPIRED, SINK_FAILED, SINK_ABORTED, SINK_DROPPED))
             done = mine[mine['completed'] >= 0]
             responses = np.sort(done['completed'] - done['release'])
             if len(responses):

@@ -117,7 +117,7 @@ class Reschedule:
             dag = self.task_set.dag(miss['dag']).index
             miss = {**miss, 'job': self.recorded_job(dag, miss['job'])}
         return {
-            'policy': settings.policy, 'workers': self.workers,
+            'policy': settings.policy, 'on_late': settings.on_late, 'workers': self.workers,
             'preemptive': settings.preemptive,
             **({} if settings.cpus is None else {'cpus': settings.cpus}),
             'duration_ns': duration,
@@ -148,6 +148,7 @@ def reschedule(
     policy: str | None = None,
     workers: int | None = None,
     preemptive: bool | None = None,
+    on_late: str = 'demote',
     overheads: bool = True,
     dispatch_overhead: int = 0,
     name: str | None = None,
@@ -165,6 +166,7 @@ def reschedule(
     :param workers: size of the pool of each process; None: as recorded.
     :param preemptive: whether a smaller key takes the worker of a larger one; None: as recorded,
         where the policy can.
+    :param on_late: what is done with late jobs of a DAG that does not declare it.
     :param overheads: whether noticing, dispatch and transport take the time that they took in the
         recording, or none.
     :param dispatch_overhead: added to each execution, ns.
@@ -195,7 +197,7 @@ def reschedule(
     bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
     tables = Tables.build(
         run.task_set, default_deadline=head.default_deadline, max_active_jobs=bound,
-        expire_after=EXPIRE_AFTER_NS)
+        expire_after=EXPIRE_AFTER_NS, on_late=on_late)
     recorded = Replay(run, skip)
     with no_garbage():
         builder = LoadBuilder(run, tables, each, max(0, head.cpus), _processes(run, ran))
@@ -227,7 +229,8 @@ def reschedule(
             'execution computes all the time')
     settings = Settings(
         policy, workers, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
-        judge_from=recorded.judged.judge_from, processes=max(1, len(placed)))
+        judge_from=recorded.judged.judge_from, processes=max(1, len(placed)),
+        on_late=on_late)
     start = run.end if run.start is None else run.start
     with no_garbage():
         return Reschedule(

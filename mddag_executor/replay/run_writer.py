@@ -22,7 +22,7 @@ import os
 from typing import Any
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, rad_offsets, Tables
-from mddag_executor.core.state import DROP
+from mddag_executor.core.state import ABORTED, DROP, JOB_END
 from mddag_executor.recording import tables
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.deadlines import Judged
@@ -32,6 +32,7 @@ from msg_graph import TaskSet
 
 PROCESS = 1
 _MOST = 2 ** 31 - 1
+_ENDS = {tables.ABORTED: 'abort', tables.EXPIRED: 'expire', tables.OUTDATED: 'outdate'}
 _Entry = tuple[tuple[int, int, int], str, int, int, tuple[Any, ...]]
 """Place in the order, name, time, thread, fields."""
 
@@ -74,8 +75,9 @@ def _events(run: ComputedRun, knows_cpu: bool) -> Iterator[_Entry]:
     yield from _executions(run, recording.executions, local, release, knows_cpu)
     for _, dag, _, job, now, reason, order in recording.job_ends.tolist():
         if reason != tables.FAILED:
-            name = 'abort' if reason == tables.ABORTED else 'expire'
-            yield (now, order, 0), name, now, 0, (dag, job)
+            yield (now, order, 0), _ENDS[reason], now, 0, (dag, job)
+    aborted = {(dag, job) for kind, dag, _, job, end, _ in run.decisions
+               if kind == JOB_END and end == ABORTED}
     missed = judged.missed
     for _, dag, sink, job, _, deadline, completed, until, _, order in missed.tolist():
         yield (until, min(order, NEVER), 1), 'deadline', until, 0, (
@@ -84,7 +86,8 @@ def _events(run: ComputedRun, knows_cpu: bool) -> Iterator[_Entry]:
     for kind, dag, vertex, job, _, now in run.decisions:
         if kind == DROP:
             yield (now, NEVER - 2, 0), 'drop', now, 0, (
-                address[vertex], dag, local[vertex], job, 'aborted')
+                address[vertex], dag, local[vertex], job,
+                'aborted' if (dag, job) in aborted else 'newer')
 
 
 def _executions(

@@ -67,7 +67,7 @@ def prepare(name: str) -> None:
         return
     nothing = EmptyMemory(max(len(Tables._fields) + 1, len(State._fields)))
     entry_points()[ACCEPT_RUNS](
-        nothing.address, nothing.address, nothing.address, 0, 0, 1, 0, 0, 0, 0, 1, False,
+        nothing.address, nothing.address, nothing.address, 0, 0, 1, 0, 0, 0, 0, 0, 1, False,
         np.zeros(0, dtype=np.bool_))
 
 
@@ -96,8 +96,9 @@ class AcceptRuns:
             self._tables[list(POLICIES).index(settings.policy)].address, load.address,
             working.address, times.ctypes.data, self._row, settings.workers,
             int(settings.preempts), int(find_policy(settings.policy).polling),
-            settings.dispatch_overhead_ns, settings.switch_overhead_ns, settings.duration_ns,
-            settings.judge == 'horizon', accepted)
+            find_policy(settings.policy).urgency, settings.dispatch_overhead_ns,
+            settings.switch_overhead_ns, settings.duration_ns, settings.judge == 'horizon',
+            accepted)
         return accepted
 
 

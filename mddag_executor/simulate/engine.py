@@ -63,6 +63,7 @@ class Orders(NamedTuple):
     intakes: int
     preemptive: int
     polling: int
+    urgency: int
     dispatch_overhead: int
     switch_overhead: int
     judge_from: int
@@ -87,7 +88,7 @@ def run_load(
     workers = [o.workers] * o.processes + [1] * (o.processes * o.intakes)
     fill_state(
         t, s, sum(workers), o.preemptive, 2 if sends else 1, o.dispatch_overhead,
-        o.switch_overhead, o.polling)
+        o.switch_overhead, o.polling, o.urgency)
     if len(workers) > 1:
         divide(s, workers)
     s.scalars[JUDGE_FROM] = o.judge_from

@@ -59,8 +59,8 @@ def free_fields(structure: int, fields: int) -> None:
 
 def accept_runs(
     tables: int, load: int, state: int, costs: int, row: int, n_workers: int, preemptive: int,
-    polling: int, dispatch_overhead: int, switch_overhead: int, horizon: int, judge_open: bool,
-    accepted: Any,
+    polling: int, urgency: int, dispatch_overhead: int, switch_overhead: int, horizon: int,
+    judge_open: bool, accepted: Any,
 ) -> None:
     """
     Simulate runs up to the first miss; return which of them had none.
@@ -75,7 +75,8 @@ def accept_runs(
     for i in range(len(accepted)):
         set_address(arrivals.costs, costs + i * row)
         fill_state(
-            t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead, polling)
+            t, s, n_workers, preemptive, 1, dispatch_overhead, switch_overhead, polling,
+            urgency)
         ended = run(t, s, key_of_policy, arrivals, horizon, True, None, None)
         if judge_open:
             finish(t, s, ended)

@@ -38,7 +38,8 @@ class SimulatedRun:
     def result(self) -> dict[str, Any]:
         """Return the result format of ``simulate --json``."""
         return {
-            'policy': self.settings.policy, 'workers': self.settings.workers,
+            'policy': self.settings.policy, 'on_late': self.settings.on_late,
+            'workers': self.settings.workers,
             'preemptive': self.settings.preempts, 'duration_ns': self.settings.duration_ns,
             'utilisation': self.utilisation, **self.tally.result(),
             **({} if self.settings.cpus is None else {'cpus': self.settings.cpus})}
@@ -66,7 +67,8 @@ def simulate(
     """
     check(settings)
     tables = Tables.build(
-        task_set, max_active_jobs=NEVER if max_active_jobs is None else max_active_jobs)
+        task_set, on_late=settings.on_late,
+        max_active_jobs=NEVER if max_active_jobs is None else max_active_jobs)
     ended, entries, decisions, _ = schedule(tables, load, settings, log=log, progress=progress)
     tally = Tally(task_set, tables)
     for time, dag in zip(load.times, load.dags):

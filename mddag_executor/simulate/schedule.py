@@ -39,6 +39,7 @@ class Settings:
     :ivar judge_from: jobs released before are not judged.
     :ivar processes: how many there are, each with an interpreter of its own; ``intakes``: and a
         pool of one more worker, behind those of all (see ``intakes``).
+    :ivar on_late: what is done with late jobs of a DAG that does not declare it.
     """
 
     policy: str = 'rad'
@@ -53,6 +54,7 @@ class Settings:
     judge_from: int = -NEVER
     processes: int = 1
     intakes: bool = False
+    on_late: str = 'continue'
 
     @property
     def preempts(self) -> bool:
@@ -64,7 +66,8 @@ class Settings:
         """Return the same as integers, for the engine; raise as ``preempts``."""
         return Orders(
             self.workers, self.processes, int(self.intakes), int(self.preempts),
-            int(find_policy(self.policy).polling), self.dispatch_overhead_ns,
+            int(find_policy(self.policy).polling), find_policy(self.policy).urgency,
+            self.dispatch_overhead_ns,
             self.switch_overhead_ns, self.judge_from, self.cpus or NEVER, self.duration_ns,
             int(self.stop_at_first_miss), int(self.judge == 'horizon'), 1)
 

@@ -150,6 +150,7 @@ _ALL = (
     _event('mddag', 'fail', dag=_I32, vertex=_I32, job=_I64),
     _event('mddag', 'expire', dag=_I32, job=_I64),
     _event('mddag', 'abort', dag=_I32, job=_I64),
+    _event('mddag', 'outdate', dag=_I32, job=_I64),
     # no thread of the process ran; of no length: from here on such stops are noticed
     _event('mddag', 'stop', begin=_I64, end=_I64),
     _event('mddag', 'lost', count=_I64),

@@ -17,6 +17,11 @@ Its reading of the documents:
   What it has ready or running goes on, without consequences.
 * ``abort`` takes effect at a late completion, and when what is next to be handed out belongs to a
   job that has an unfinished sink past its deadline. What has never run of the job vanishes.
+* ``demote``: what waits and cannot make any deadline that it leads to any more, if every vertex
+  on the longest way takes its mean time, goes after all that can. Among these, and as long as only
+  some deadlines are out of reach, ``rad`` and ``llf`` go by the deadlines within reach.
+* ``keep: newest`` at a source or sink: one of an earlier job that waits there and has never run
+  vanishes when the next one is ready.
 * ``ros2`` goes by rounds. When a worker is free and the round has nothing left that it could take,
   the next round is, of all that waits, the first of each callback. The worker goes through it by
   kind (timers, subscriptions and syncs, services), then by the callback's place in the file, and
@@ -37,7 +42,7 @@ from typing import Any, NamedTuple
 
 from msg_graph import Callback, Dag, TaskSet, Vertex
 
-from .dag_paths import least_laxity, reachable_sinks, ways_to
+from .dag_paths import laxity, reachable_sinks, ways_to
 
 Event = tuple[int, str, int, int, int, int]
 """(tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job)."""
@@ -64,6 +69,7 @@ class Execution:
     left: int
     arrival: int
     has_run: bool = False
+    dispatched: tuple[bool, int] | None = None  # the priority that it was dispatched with
 
 
 class Miss(NamedTuple):
@@ -83,13 +89,14 @@ class BruteForce:
         self, task_set: TaskSet, ticks: tuple[tuple[int, ...], ...], *, tick: int, horizon: int,
         workers: int, policy: str, preemptive: bool, dispatch_overhead: int = 0,
         switch_overhead: int = 0, judge: str = 'horizon', stop_at_first_miss: bool = False,
-        last_release: int | None = None,
+        last_release: int | None = None, on_late: str = 'continue',
     ) -> None:
         self.task_set = task_set
         self.dags = task_set.dags
         self.ticks = ticks
         self.tick = tick
         self.policy = policy
+        self.on_late = on_late
         self.preemptive = preemptive
         self.dispatch_overhead = dispatch_overhead
         self.switch_overhead = switch_overhead
@@ -101,9 +108,13 @@ class BruteForce:
         self.misses: list[Miss] = []
         self.counts = {
             (dag.index, sink): {'completed': 0, 'late': 0, 'overdue': 0, 'expired': 0,
-                                'failed': 0, 'aborted': 0}
+                                'failed': 0, 'aborted': 0, 'dropped': 0}
             for dag in self.dags for sink in dag.sinks}
         self.responses: dict[tuple[int, int], list[int]] = {key: [] for key in self.counts}
+        # by DAG, vertex and sink that it leads to: the latest start, ns after the release
+        self.laxity = {
+            (dag.index, v): {sink: laxity(dag, v, sink) for sink in reachable_sinks(dag, v)}
+            for dag in self.dags for v in range(len(dag.vertices))}
         self.sequence = 0
         self.now = 0
         self._simulate(horizon, stop_at_first_miss, last_release or horizon)
@@ -139,21 +150,41 @@ class BruteForce:
         assert relative is not None
         return job.release + relative // self.tick
 
-    def priority(self, execution: Execution) -> int:
+    def priority(self, execution: Execution) -> tuple[bool, int]:
         """Return what decides about preemption."""
+        if execution.dispatched is not None:
+            return execution.dispatched
+        all_sinks = {*self.laxity[execution.job.dag.index, execution.vertex.index]}
+        sinks = self._within_reach(execution, all_sinks)
+        return not sinks, self._priority(execution, sinks or all_sinks)
+
+    def _within_reach(self, execution: Execution, sinks: set[int]) -> set[int]:
+        """Return the sinks that what waits is not too late for."""
+        job = execution.job
+        if (job.dag.on_late or self.on_late) != 'demote':
+            return sinks
+        starts = {sink: job.release * self.tick + start for sink, start in self.laxity[
+            job.dag.index, execution.vertex.index].items()}
+        done = self.ticks[job.dag.index][execution.vertex.index] - execution.left
+        if self.now * self.tick <= min(starts.values()):
+            return sinks
+        now = (self.now - done) * self.tick
+        return {sink for sink, start in starts.items() if now <= start}
+
+    def _priority(self, execution: Execution, sinks: set[int]) -> int:
         job = execution.job
         if self.policy == 'rad':
-            sinks = reachable_sinks(job.dag, execution.vertex.index)
             return min(self._deadline(job, sink) for sink in sinks)
         if self.policy == 'gedf':
             return max(self._deadline(job, sink) for sink in job.dag.sinks)
         if self.policy == 'rm':
             return self._period(job.dag)
         if self.policy == 'dm':
-            sinks = reachable_sinks(job.dag, execution.vertex.index)
+            sinks = {*self.laxity[job.dag.index, execution.vertex.index]}
             return min(self._deadline(job, sink) for sink in sinks) - job.release
         if self.policy == 'llf':  # in ns: declared execution times are no multiples of a tick
-            return job.release * self.tick + least_laxity(job.dag, execution.vertex.index)
+            starts = self.laxity[job.dag.index, execution.vertex.index]
+            return job.release * self.tick + min(starts[sink] for sink in sinks)
         if self.policy == 'wc':
             return job.index
         if self.policy == 'ros2':
@@ -211,8 +242,29 @@ class BruteForce:
         self._ready(job, dag.vertices[dag.source])
 
     def _ready(self, job: Job, vertex: Vertex) -> None:
-        self.waiting.append(Execution(
-            job, vertex, self.ticks[job.dag.index][vertex.index], self._arrival()))
+        new = Execution(job, vertex, self.ticks[job.dag.index][vertex.index], self._arrival())
+        self.waiting.append(new)
+        if vertex.callback.keep == 'newest':
+            self._keep_newest([
+                e for e in self.waiting if e.vertex is vertex and not e.has_run])
+
+    def _keep_newest(self, waiting: list[Execution]) -> None:
+        for old in waiting:
+            if old.job.index == max(e.job.index for e in waiting):
+                continue
+            self.waiting.remove(old)
+            job, sink = old.job, old.vertex.index
+            if job.outcome is not None:
+                continue
+            if old.vertex.predecessors:
+                job.done.add(sink)
+                job.late = True
+                self.counts[job.dag.index, sink]['dropped'] += 1
+                self._miss(job, sink, None)
+                if not self._open_sinks(job):
+                    job.outcome = 'dropped'
+            else:
+                self._give_up(job, 'dropped')
 
     def _arrival(self) -> int:
         self.sequence += 1
@@ -325,6 +377,7 @@ class BruteForce:
         self._start(best, worker)
         victim.left += self.switch_overhead
         victim.arrival = self._arrival()
+        victim.dispatched = None
         self.waiting.append(victim)
         return True
 
@@ -347,6 +400,7 @@ class BruteForce:
 
     def _start(self, execution: Execution, worker: int) -> None:
         self.waiting.remove(execution)
+        execution.dispatched = self.priority(execution)
         execution.has_run = True
         execution.left += self.dispatch_overhead
         self.running[worker] = execution
@@ -365,7 +419,8 @@ class BruteForce:
                 'jobs': sum(job.dag is dag for job in self.jobs),
                 'ends': {outcome: sum(job.dag is dag and job.outcome == outcome
                                       for job in self.jobs)
-                         for outcome in ('completed', 'late', 'aborted', 'expired', 'failed')},
+                         for outcome in ('completed', 'late', 'aborted', 'expired', 'failed',
+                                         'dropped')},
                 'sinks': {dag.vertices[sink].name: self._sink(dag, sink) for sink in dag.sinks}}
             for dag in self.dags}
 

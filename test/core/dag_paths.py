@@ -37,10 +37,9 @@ def ways_to(dag: Dag, index: int) -> Iterator[list[int]]:
         yield [index]
 
 
-def least_laxity(dag: Dag, index: int) -> int:
-    """Return the least of the sinks' deadlines less the mean times of a path to them, in ns."""
-    return min(
-        (path[-1].deadline_ns or 0) - sum(
-            v.callback.execution_time.mean_ns for v in path
+def laxity(dag: Dag, index: int, sink: int) -> int:
+    """Return the deadline of a sink less the mean times of the longest path to it, in ns."""
+    return (dag.vertices[sink].deadline_ns or 0) - max(
+        sum(v.callback.execution_time.mean_ns for v in path
             if v.callback.execution_time is not None)
-        for path in paths(dag, index))
+        for path in paths(dag, index) if path[-1].index == sink)

@@ -129,13 +129,14 @@ def _triggers(draw: st.DrawFn, callbacks: list[dict[str, Any]]) -> dict[str, Any
 @st.composite
 def task_sets(
     draw: st.DrawFn, /, max_dags: int = 3, max_callbacks: int = 5, groups: bool = True,
-    bounds: bool = True,
+    bounds: bool = True, newest: bool = False,
 ) -> TaskSet:
     """
     Draw a task set: one to some DAGs with AND, OR, unequal deadlines, shared callbacks.
 
     :param groups: some callbacks are in mutually exclusive groups, also across DAGs.
-    :param bounds: some DAGs abort late jobs or bound their open jobs.
+    :param bounds: some DAGs abort or demote late jobs or bound their open jobs.
+    :param newest: some sources and sinks keep only the newest.
     """
     every: list[dict[str, Any]] = []
     n_dags = draw(st.integers(1, max_dags))
@@ -151,7 +152,8 @@ def task_sets(
                 callback['timer'] = _ticks(draw, 3, 15)
                 callback['dag'] = f'dag{dag}'
                 if bounds:
-                    callback['on_late'] = draw(st.sampled_from(['continue', 'abort']))
+                    callback['on_late'] = draw(
+                        st.sampled_from(['continue', 'demote', 'demote', 'abort']))
                     if draw(st.booleans()):
                         callback['max_active_jobs'] = draw(st.integers(1, 3))
             mine.append(callback)
@@ -169,10 +171,12 @@ def task_sets(
             group = draw(st.sampled_from([None, None, 'g', 'h']))
             if group is not None:
                 callback['group'] = group
-        if draw(st.booleans()):  # only llf looks at it; the times of a run are the case's
+        if draw(st.booleans()):  # for llf and demote; the times of a run are the case's
             callback['execution_time'] = _ticks(draw, 1, 9)
         if not callback['publishes']:
             callback['deadline'] = _ticks(draw, 1, 40)
+        if newest and ('timer' in callback or 'deadline' in callback):
+            callback['keep'] = draw(st.sampled_from(['all', 'all', 'newest']))
         callback['publishes'] = sorted(callback['publishes'])
         del callback['topic']
         if not callback['publishes']:

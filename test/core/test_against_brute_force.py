@@ -24,6 +24,9 @@ def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False
         last_release=last_release)
     assert case.events(run) == brute.events
     result = run.result()
+    for dag in result['dags'].values():
+        for sink in dag['sinks'].values():
+            del sink['demoted']  # counted when it is noticed
     assert result['dags'] == brute.result()
     assert result['first_miss'] == brute.first_miss()
     assert result['deadline_missed'] == bool(brute.misses)
@@ -40,11 +43,11 @@ def test_everything_at_once(
     """Groups, bounds, aborts and overheads, or none of them, as in the paper."""
     with_groups, with_bounds, overheads = (data.draw(st.booleans()) for _ in range(3))
     compare(data.draw(cases((policy,), groups=with_groups, bounds=with_bounds,
-                            overheads=overheads)), horizon, judge, stop)
+                            newest=with_bounds, overheads=overheads)), horizon, judge, stop)
 
 
 @examples(150)
-@given(cases(), st.integers(5, 30))
+@given(cases(newest=True), st.integers(5, 30))
 def test_until_all_is_done(case: Case, last_release: int) -> None:
     """Releases end and the run goes on until nothing is left: every job ends, and only once."""
     work = sum(map(sum, case.ticks))

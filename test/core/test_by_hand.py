@@ -180,7 +180,8 @@ def test_a_completion_at_the_horizon_counts_and_a_release_there_does_not_happen(
     run = case([single('a', 10, 10)], {'a': 10}).run(20)
     dag = run.result()['dags']['a']
     assert dag['jobs'] == 2
-    assert dag['ends'] == {'completed': 2, 'late': 0, 'aborted': 0, 'expired': 0, 'failed': 0}
+    assert dag['ends'] == {'completed': 2, 'late': 0, 'aborted': 0, 'expired': 0, 'failed': 0,
+                           'dropped': 0}
     assert run.ended_ns == 20_000
 
 
@@ -224,13 +225,15 @@ TWO_SINKS = [source('s', 50), after('s', 'x', 2), after('s', 'y', 40)]
 def test_a_late_job_goes_on_or_is_aborted() -> None:
     ticks = {'s': 1, 'x': 2, 'y': 1}
     going_on = case(TWO_SINKS, ticks).run(50).result()['dags']['s']
-    assert going_on['ends'] == {'completed': 0, 'late': 1, 'aborted': 0, 'expired': 0, 'failed': 0}
+    assert going_on['ends'] == {'completed': 0, 'late': 1, 'aborted': 0, 'expired': 0, 'failed': 0,
+                           'dropped': 0}
     assert [s['completed'] for s in going_on['sinks'].values()] == [1, 1]
     aborting = [{**TWO_SINKS[0], 'on_late': 'abort'}, *TWO_SINKS[1:]]
     of = case(aborting, ticks)
     assert starts(of, 50) == ['s.0', 'x.0']
     dag = of.run(50).result()['dags']['s']
-    assert dag['ends'] == {'completed': 0, 'late': 0, 'aborted': 1, 'expired': 0, 'failed': 0}
+    assert dag['ends'] == {'completed': 0, 'late': 0, 'aborted': 1, 'expired': 0, 'failed': 0,
+                           'dropped': 0}
     assert [(s['completed'], s['late'], s['aborted']) for s in dag['sinks'].values()] == [
         (1, 1, 0), (0, 0, 1)]
 
@@ -242,7 +245,8 @@ def test_the_oldest_job_expires_to_make_room() -> None:
     # to its end for nothing. At 30 job 1 expires; its source still runs, but x.1 never does.
     dag = of.run(40).result()['dags']['s']
     assert dag['jobs'] == 4
-    assert dag['ends'] == {'completed': 0, 'late': 0, 'aborted': 0, 'expired': 2, 'failed': 0}
+    assert dag['ends'] == {'completed': 0, 'late': 0, 'aborted': 0, 'expired': 2, 'failed': 0,
+                           'dropped': 0}
     assert dag['sinks']['/n:x']['expired'] == 2
     assert dag['sinks']['/n:x']['completed'] == 0
     assert starts(of, 40) == ['s.0', 'x.0', 's.1', 's.2', 'x.2']

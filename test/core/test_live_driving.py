@@ -36,6 +36,7 @@ from mddag_executor.core.state import (
     OPEN,
     SINK_ABORTED,
     SINK_COMPLETED,
+    SINK_DEMOTED,
     SINK_EXPIRED,
 )
 
@@ -181,7 +182,8 @@ class LiveDriver(RuleBasedStateMachine):
         run = self.by_x[x]
         assert run in able
         if not self.scheduler.policy.polling:  # what waits for the next poll may be smaller
-            assert run.key == min(other.key for other in able), 'a smaller key waits'
+            keys = self.state.x_key  # those that were demoted have others now
+            assert keys[run.x] == min(keys[other.x] for other in able), 'a smaller key waits'
         run.fate, run.began, run.owns = RUNNING, True, True
         worker = self.state.x_worker[x]
         assert worker == min(idle) if schedule else worker in idle
@@ -283,7 +285,7 @@ class LiveDriver(RuleBasedStateMachine):
                 self.dropped(decision)
             elif kind == JOB_END:
                 self.ended(decision)
-            else:
+            elif kind != SINK_DEMOTED:
                 _, dag, vertex, job, _, _ = decision
                 self.sinks[dag, vertex, job] += 1
                 assert self.sinks[dag, vertex, job] == 1, 'two verdicts'

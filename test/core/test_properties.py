@@ -35,7 +35,7 @@ from mddag_executor.simulate.engine import run_load
 from mddag_executor.simulate.machine import Machine
 from msg_graph import Dag
 
-from .dag_paths import least_laxity
+from .dag_paths import laxity, reachable_sinks
 from .task_sets import Case, cases, examples, task_sets, TICK
 
 Id = tuple[int, int, int]
@@ -117,7 +117,9 @@ class Schedule:
         return {
             'rad': (release + rad_offset(dag, v), v, d),
             'gedf': (release + max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks), v, d),
-            'llf': (release + least_laxity(dag, v), v, d), 'dm': (rad_offset(dag, v), job),
+            'llf': (release + min(
+                laxity(dag, v, sink) for sink in reachable_sinks(dag, v)), v, d),
+            'dm': (rad_offset(dag, v), job),
             'rm': (dag.period_ns, job), 'wc': (job,), 'fifo': (self.ready[each],),
             'ros2': (0,),  # what waits for the next poll is not to be compared: see test_polling
             'picas': self.chain(d, v),

@@ -220,7 +220,7 @@ def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_execut
         statistics = executor.statistics()
         assert statistics['undeclared'] == 0 and statistics['never_ran'] == []
         assert ends(executor) == {
-            'completed': n, 'late': 0, 'aborted': 0, 'expired': expired, 'failed': 0}
+            'completed': n, 'late': 0, 'aborted': 0, 'expired': expired, 'failed': 0, 'dropped': 0}
     assert up.statistics()['dags']['chain']['sinks'] == {}
     sink = down.statistics()['dags']['chain']['sinks']['/last:sink']
     assert (sink['completed'], sink['late']) == (n, 0)

@@ -142,7 +142,8 @@ def test_a_job_to_the_millisecond(tmp_path: Path) -> None:
     assert result['utilisation'] == pytest.approx(14 / 200)
     camera = result['dags']['/camera']
     assert camera['jobs'] == 1
-    assert camera['ends'] == {'completed': 1, 'late': 0, 'aborted': 0, 'expired': 0, 'failed': 0}
+    assert camera['ends'] == {'completed': 1, 'late': 0, 'aborted': 0, 'expired': 0, 'failed': 0,
+                              'dropped': 0}
     join = camera['sinks']['/fuse:join']
     assert (join['completed'], join['late'], join['relative_deadline_ns']) == (1, 0, 18 * MS)
     assert join['response_ns'] == dict.fromkeys(('min', 'median', 'p99', 'max'), 15 * MS)

@@ -225,7 +225,8 @@ def test_a_failed_job_is_told_wherever_verdicts_are(
             '3 of 10 jobs missed the deadline (1 failed: a callback raised)')
         assert program.main(['replay', str(failed), *mode, '--json', '-']) == 0
         dag = json.loads(capsys.readouterr().out)['dags']['/n']
-        assert dag['ends'] == {'completed': 7, 'late': 2, 'aborted': 0, 'expired': 0, 'failed': 1}
+        assert dag['ends'] == {'completed': 7, 'late': 2, 'aborted': 0, 'expired': 0, 'failed': 1,
+                               'dropped': 0}
         assert dag['sinks']['/n:a']['failed'] == 1
     assert program.main(['diff', str(trace), str(failed), '--fail-on-worse']) == 1
     assert '2 late, 0 expired, 1 failed; policy' in capsys.readouterr().out
@@ -266,7 +267,8 @@ def test_a_warm_up_is_left_out(
         result = json.loads(capsys.readouterr().out)
         assert result['dags']['/n']['jobs'] == due
         assert result['dags']['/n']['ends'] == {
-            'completed': due - late, 'late': late, 'aborted': 0, 'expired': 0, 'failed': 0}
+            'completed': due - late, 'late': late, 'aborted': 0, 'expired': 0, 'failed': 0,
+            'dropped': 0}
         assert result['skip_ns'] == {'0': 0, '20ms': 20 * MS, '20001us': 20_001_000}.get(
             skip, 31 * MS)
     page = tmp_path / 'report.html'

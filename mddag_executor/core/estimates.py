@@ -1,0 +1,50 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Latest starts from measured execution times, for drivers that measure (rule 7).
+
+``State.start_by`` and ``reach_by`` begin with the declared execution times.  When the measured
+mean of a vertex has changed by more than an eighth, those of its DAG are computed again.  So an
+execution costs one comparison.
+"""
+
+from __future__ import annotations
+
+from mddag_executor.core.state import State
+from mddag_executor.core.tables import Tables
+
+CHANGE = 8
+"""A mean counts as changed when it differs by more than this fraction (an eighth)."""
+LEAST_CHANGE_NS = 100_000
+
+
+class MeanTimes:
+    """The measured mean execution times of a run, by global vertex."""
+
+    def __init__(self, t: Tables, s: State) -> None:
+        self._t = t
+        self._s = s
+        self._mean = t.mean_time[:]
+
+    def note(self, vertex: int, mean: int) -> None:
+        """Note the mean time of the last executions of a vertex, ns."""
+        known = self._mean[vertex]
+        change = mean - known
+        if change * CHANGE > known + LEAST_CHANGE_NS or -change * CHANGE > known + LEAST_CHANGE_NS:
+            self._mean[vertex] = mean
+            self._update(self._t.dag_of[vertex])
+
+    def _update(self, dag: int) -> None:
+        """Compute the latest starts of a DAG again."""
+        t, s = self._t, self._s
+        first, last = t.first_vertex[dag:dag + 2]
+        starts: dict[tuple[int, int], int] = {}
+        for vertex in sorted(range(first, last), key=lambda v: t.height[v]):
+            after = t.successors[t.first_successor[vertex]:t.first_successor[vertex + 1]]
+            for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
+                sink = t.reach_sink[i]
+                start = t.reach_deadline[i]
+                for each in after:
+                    start = min(start, starts.get((each, sink), start))
+                s.reach_by[i] = starts[vertex, sink] = start - self._mean[vertex]
+            s.start_by[vertex] = min(s.reach_by[t.first_reach[vertex]:t.first_reach[vertex + 1]])
