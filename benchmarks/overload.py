@@ -15,10 +15,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+from benchmarks import arguments
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, table
 from mddag_executor.core.tally import total
-from mddag_executor.generate import generate, Options
+from mddag_executor.laboratory.generate import generate
+from mddag_executor.laboratory.generate_options import Options
 from mddag_executor.simulate import (
     draw_execution_times,
     periodic_load,
@@ -40,7 +42,8 @@ WAYS = (('rad', 'continue'), ('rad', 'demote'), ('rad', 'abort'), ('fifo', 'cont
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    options.add(parser, '--graph', '--duration', '--preemptive', '--json')
+    arguments.add_graph(parser)
+    options.add(parser, '--duration', '--preemptive', '--json')
     add('--sets', type=options.positive_int, metavar='N',
         help='random sets instead of a declaration')
     add('--workers', type=options.positive_int, default=7, metavar='W', help='(default: 7)')
@@ -53,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Measure and print."""
     factors = [float(each) for each in args.loads.split(',')]
-    sets = [common.load_workload(args.graph)] if args.sets is None else list(_random(args))
+    sets = [arguments.load_workload(args.graph)] if args.sets is None else list(_random(args))
     rows: list[dict[str, Any]] = []
     with Progress('simulating', len(factors) * len(sets)) as line:
         for load in factors:
