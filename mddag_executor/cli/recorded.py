@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _WITH = 'with --reschedule: '
 _ONLY_RESCHEDULED = (
-    'workers', 'cpus', 'processes', 'policy', 'on_late', 'preemptive', 'overheads',
+    'workers', 'cpus', 'processes', 'policy', 'preemptive', 'overheads',
     'execution_times', 'seed')
 _RECORDED = -1
 """Overheads as they were recorded."""
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'{_WITH}run the nodes in N processes, packed by the recorded times, or in those of '
         'a YAML file with `processes:` (default: as recorded)')
     options.add_policy(parser, _WITH, 'as recorded')
-    options.add_on_late(parser, 'demote, as live', _WITH)
+    options.add_on_late(parser, 'continue', _WITH)
     options.add(
         parser, '--preemptive', only=_WITH, otherwise='as recorded, if the policy can')
     add('--overheads', type=_overheads, metavar='WHICH',
@@ -162,7 +162,7 @@ def _rescheduled(
     with Progress('replaying') as line:
         return reschedule(
             path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
-            on_late=args.on_late or 'demote',
+            on_late=args.on_late,
             overheads=recorded, dispatch_overhead=0 if recorded else args.overheads, name=name,
             progress=line.events, skip=args.skip, cpus=args.cpus, processes=_processes(args))
 
@@ -187,7 +187,7 @@ def _rescheduled_bag(
     with Progress('replaying'):
         return reschedule_bag(
             path, task_set, policy=args.policy, workers=args.workers,
-            preemptive=bool(args.preemptive), on_late=args.on_late or 'demote', times=times,
+            preemptive=bool(args.preemptive), on_late=args.on_late, times=times,
             seed=args.seed or 0,
             dispatch_overhead=args.overheads or 0, name=name, skip=args.skip, cpus=args.cpus)
 

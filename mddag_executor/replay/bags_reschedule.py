@@ -171,7 +171,7 @@ def reschedule_bag(
     policy: str | None = None,
     workers: int | None = None,
     preemptive: bool = False,
-    on_late: str = 'demote',
+    on_late: str = 'continue',
     times: Sequence[Sequence[int]] | None = None,
     seed: int = 0,
     dispatch_overhead: int = 0,

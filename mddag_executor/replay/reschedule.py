@@ -148,7 +148,7 @@ def reschedule(
     policy: str | None = None,
     workers: int | None = None,
     preemptive: bool | None = None,
-    on_late: str = 'demote',
+    on_late: str = 'continue',
     overheads: bool = True,
     dispatch_overhead: int = 0,
     name: str | None = None,
