@@ -1,0 +1,90 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What the core does in an overload, and that it does nothing without one (rules 7 and 13)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from mddag_executor.core.tally import counts
+from msg_graph import ExecutionTime
+
+from .task_sets import Case, cases, declaration, examples, TICK
+
+
+def with_times(case: Case, on_late: Any = None) -> Case:
+    """Return a case that declares its execution times."""
+    return replace(case, task_set=replace(case.task_set, dags=tuple(
+        replace(dag, on_late=on_late, vertices=tuple(
+            replace(vertex, callback=replace(
+                vertex.callback, execution_time=ExecutionTime((ticks * TICK,), (50.0,))))
+            for vertex, ticks in zip(dag.vertices, row)))
+        for dag, row in zip(case.task_set.dags, case.ticks))))
+
+
+@examples(300)
+@given(cases(bounds=False), st.integers(5, 60))
+def test_demote_without_an_overload_changes_nothing(case: Case, horizon: int) -> None:
+    case = with_times(case)
+    run = case.run(horizon)
+    assume(not run.tally.missed)
+    latest = max(v.deadline_ns or 0 for v in case.task_set.vertices) // TICK
+    demoted = with_times(case, on_late='demote').run(horizon)
+    assert _until(case, run, horizon - latest) == _until(case, demoted, horizon - latest)
+
+
+def _until(case: Case, run: Any, end: int) -> list[Any]:
+    """Return the events before a time: what is released later may be too much for the workers."""
+    return [event for event in case.events(run) if event[0] < end]
+
+
+def single(name: str, period: int, deadline: int, **more: Any) -> dict[str, Any]:
+    return {'node': '/n', 'name': name, 'timer': f'{period}us', 'deadline': f'{deadline}us',
+            'dag': name, **more}
+
+
+def results(callbacks: list[dict[str, Any]], ticks: Sequence[int], horizon: int) -> Any:
+    """Return of each sink what came of it, on one worker."""
+    case = Case(declaration(callbacks), tuple((each,) for each in ticks), 1, 'rad', False)
+    dags = case.run(horizon).result()['dags']
+    return {name: next(iter(dag['sinks'].values())) for name, dag in dags.items()}
+
+
+def test_late_work_does_not_go_before_what_can_be_in_time() -> None:
+    # The heavy one is late from its second job on, and then always has the earlier deadline.
+    in_time = {}
+    for on_late in ('continue', 'demote'):
+        heavy = single('heavy', 10, 12, execution_time='12us', on_late=on_late)
+        light = single('light', 20, 15, execution_time='2us', on_late=on_late)
+        sinks = results([heavy, light], [12, 2], 400)
+        assert (sinks['heavy']['demoted'] > 0) == (on_late == 'demote')
+        in_time[on_late] = counts(sinks['light']).in_time
+    assert in_time['continue'] < in_time['demote']
+
+
+def test_a_sink_that_can_be_in_time_keeps_its_deadline() -> None:
+    # At 10 the source of the second job is too late for near, and not for far.
+    callbacks = [
+        single('block', 100, 2, execution_time='10us'),  # it goes first
+        {'node': '/n', 'name': 'source', 'timer': '100us', 'dag': 'two', 'on_late': 'demote',
+         'publishes': ['/a'], 'execution_time': '1us'},
+        {'node': '/n', 'name': 'near', 'subscription': '/a', 'deadline': '5us'},
+        {'node': '/n', 'name': 'far', 'subscription': '/a', 'deadline': '40us'},
+        single('other', 100, 50, execution_time='10us')]
+    case = Case(declaration(callbacks), ((10,), (1, 1, 1), (10,)), 1, 'rad', False)
+    sinks = case.run(90).result()['dags']['two']['sinks']
+    assert sinks['/n:near']['demoted'] == sinks['/n:near']['late'] == 1
+    assert sinks['/n:far']['response_ns']['max'] == 12 * TICK  # other went after it
+    assert sinks['/n:near']['response_ns']['max'] == 23 * TICK  # and before this
+
+
+def test_only_the_newest_is_kept() -> None:
+    callbacks = [single('slow', 35, 100, execution_time='30us'),
+                 single('fast', 10, 200, keep='newest')]
+    sinks = results(callbacks, [30, 1], 350)
+    assert sinks['fast']['dropped'] >= 10
+    assert sinks['fast']['response_ns']['max'] <= 20 * TICK
