@@ -1,33 +1,34 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Who holds the GIL: declared, or measured at each execution.
+Whether a callback holds the GIL: declared, or measured at each execution.
 
 Theory of operation
 -------------------
-Python's global interpreter lock lets one thread compute at a time.  The core therefore starts a
-callback that holds the GIL only if nothing as urgent holds it (rule 11 of ``core.rules``).
+Python's global interpreter lock (GIL) lets one thread compute at a time.  The core therefore
+starts a callback that holds the GIL only if no callback as urgent holds it (rule 11 of
+``core.rules``).
 
-1.  *Measured.*  An execution takes some time (wall), its thread computes for a part of it (own),
-    and the other threads of the process compute meanwhile (others).  If it computed for over four
-    fifths of its time, it holds the GIL.  If it computed for less than half of the time in which
-    no other thread computed, it waits for something else than the GIL, and does not hold it;
-    unless a CPU was taken away from it, so that it may have waited for that.  Anything between
-    says nothing.
-2.  *Unknown.*  If the first executions say nothing, the next ones are treated as if they held
-    the GIL: no other one computes then, which shows what they do.  Later, after every
-    ``UNCLEAR_RUNS`` executions that said nothing, one execution is treated so (a trial).
-3.  *A callback that computes with the GIL released* (numpy, hashlib) looks as if it held it.
-    Declare ``holds_interpreter: false`` to have several of these run in parallel.
+1.  *Measured.*  Of each execution, three times are measured: its duration (wall), the CPU time of
+    its thread (own), and the CPU time of all other threads of the process (others).  If own is
+    over four fifths of wall, the callback holds the GIL.  If own is less than half of the time in
+    which no other thread computed, the callback waits for something else and does not hold the
+    GIL, unless it was preempted on its CPU and may have waited for that.  Anything between is
+    inconclusive.
+2.  *Unknown.*  After inconclusive first executions, the next ones are treated as if they held the
+    GIL: then no other callback computes, and the measurement is conclusive.  Later, one execution
+    is treated so (a trial) after every ``UNCLEAR_RUNS`` inconclusive ones.
+3.  *A callback that computes with the GIL released* (numpy, hashlib) is measured as if it held it.
+    Declare ``holds_interpreter: false`` to run several such callbacks in parallel.
 4.  *A callback that waits though it usually computes* would keep others from the GIL.
-    ``GilCheck`` checks its thread, first after ``FIRST_CHECK_NS`` and then ever more seldom, but
-    only while something waits for the GIL.  If the thread waits, the execution gives the GIL back.
+    ``GilCheck`` checks its thread while others wait for the GIL, first after ``FIRST_CHECK_NS``
+    and then at growing intervals.  If the thread waits, the execution gives the GIL up.
 5.  *Waiting, not starving.*  A thread that has not computed since the last check may have waited
-    for something, for the GIL, or for a CPU.  It waited for something if it got no CPU at all and
-    is asleep: a thread that waits for the GIL wakes up every ``SWITCH_INTERVAL_S``.  It also did
-    if for half of the time it was not ready to run and no other thread computed, which it could
-    have waited for.  Anything else is unclear, and counts only after ``UNCLEAR_CHECKS`` times, so
-    that nothing is kept from the GIL for ever.
+    for an event, for the GIL, or for a CPU.  It waited for an event if it got no CPU and is
+    asleep, because a thread that waits for the GIL wakes up every ``SWITCH_INTERVAL_S``.  It also
+    did if, for half of the time, it was not ready to run and no other thread computed.  Anything
+    else is unclear, and counts only after ``UNCLEAR_CHECKS`` checks, so that the GIL is not
+    withheld from others for ever.
 """
 
 from __future__ import annotations
@@ -43,30 +44,30 @@ from time import clock_gettime_ns, process_time_ns, pthread_getcpuclockid
 from typing import NamedTuple
 
 COMPUTES = 0.8
-"""A callback that computes for this part of its time holds the GIL."""
+"""A callback that computes for this fraction of its time holds the GIL."""
 WAITS = 0.5
-"""A callback that computes for less than this part of the time it had waits for something else."""
+"""A callback that computes for less than this fraction of its available time has waited."""
 SHORT_NS = 2_000
-"""A callback that usually computes for less than half of this is not worth an order."""
+"""A callback that usually computes for less than half of this is not worth ordering."""
 LATELY = 8
-"""An average is over about so many executions; one of so many short ones is measured."""
+"""Averages cover about this many executions; one in this many short executions is measured."""
 UNCLEAR_RUNS = 8
-"""After so many executions that said nothing, one runs as if it held the GIL."""
+"""After this many inconclusive executions, one runs as if it held the GIL."""
 
 FIRST_CHECK_NS = 2_000_000
 LAST_CHECK_NS = 20_000_000
-"""The time between two checks grows from the first to the last; a brief callback begins there."""
+"""The interval between checks grows from the first to the last; short callbacks use the last."""
 IDLE_SHARE = 0.05
-"""A thread that computed for this part of the time since the last check computes."""
+"""A thread that computed for this fraction of the time since the last check computes."""
 UNCLEAR_CHECKS = 8
-"""After so many unclear checks in a row, about 100 ms, a thread is treated as one that waits."""
+"""After this many unclear checks in a row, about 100 ms, a thread is treated as waiting."""
 
 SWITCH_INTERVAL_S = 0.001
 """
 Python's switch interval while an executor spins.
 
-With 5 ms, the default, an arrival beside a computing callback is known 5.4 ms late, with 1 ms
-1.3 ms late, and 100 ms of computing take the same time.
+With the default of 5 ms, an arrival during a computing callback is known 5.4 ms late; with 1 ms,
+1.3 ms late.  100 ms of computing take the same time with both.
 """
 
 
@@ -74,9 +75,9 @@ class GilHabit:
     """
     Whether one callback holds the GIL while it runs.
 
-    :param declared: what the declaration says; None: it is measured.
+    :param declared: the declared value; None: it is measured.
     :ivar holds: 1 or 0, for its next execution.
-    :ivar mean_ns: for how long its executions compute, lately.
+    :ivar mean_ns: recent average of its executions' CPU time.
     :ivar is_known: whether ``holds`` is declared, or has been measured.
     :ivar rests: how many of its next executions need not be measured.
     """
@@ -96,12 +97,12 @@ class GilHabit:
 
     def ran(self, wall: int, own: int, others: int, starved: bool = False) -> None:
         """
-        Learn from an execution that was measured.
+        Update the habit from a measured execution.
 
-        :param wall: how long it took, ns.
-        :param own: for how long its thread computed, ns.
-        :param others: for how long all other threads of the process computed meanwhile, ns.
-        :param starved: whether another thread took the CPU away from it meanwhile.
+        :param wall: its duration, ns.
+        :param own: CPU time of its thread, ns.
+        :param others: CPU time of all other threads of the process meanwhile, ns.
+        :param starved: whether another thread preempted it on its CPU meanwhile.
         """
         runs = self._runs = min(self._runs + 1, LATELY)
         self.mean_ns += (own - self.mean_ns) // runs
@@ -138,10 +139,10 @@ class GilHabit:
 
 class Schedule(NamedTuple):
     """
-    What the kernel says of a thread.
+    The kernel's scheduling data of a thread.
 
-    :ivar delay_ns: for how long it was ready to run and got no CPU; 0 if that is not known.
-    :ivar slices: how often it got a CPU; -1 if that is not known.
+    :ivar delay_ns: how long it was ready to run without a CPU; 0 if unknown.
+    :ivar slices: how often it got a CPU; -1 if unknown.
     :ivar is_asleep: whether it neither runs nor is ready to run.
     """
 
@@ -155,7 +156,7 @@ _libc.read.restype = ctypes.c_ssize_t
 
 
 def _read(path: str) -> bytes:
-    """Return the beginning of a file of procfs; nothing if there is none."""
+    """Return the beginning of a file of procfs; empty if there is no such file."""
     file = _libc.open(path.encode(), os.O_RDONLY | os.O_CLOEXEC)
     if file < 0:
         return b''
@@ -166,7 +167,7 @@ def _read(path: str) -> bytes:
 
 
 def schedule_of(tid: int) -> Schedule:
-    """Return what the kernel says of a thread of this process, by its native id."""
+    """Return the scheduling data of a thread of this process, by its native id."""
     folder = f'/proc/self/task/{tid}'
     figures = _read(f'{folder}/schedstat').split()
     state = _read(f'{folder}/stat').rpartition(b') ')[2][:1]
@@ -176,7 +177,7 @@ def schedule_of(tid: int) -> Schedule:
 
 
 def cpu_ns(ident: int) -> int:
-    """Return for how long a thread has computed."""
+    """Return the CPU time of a thread, ns."""
     return clock_gettime_ns(pthread_getcpuclockid(ident))
 
 
@@ -191,7 +192,7 @@ class GilCheck:
     """
     Finds out whether an execution that holds the GIL computes.
 
-    :ivar at: when to check next, monotonic ns; 0: not.
+    :ivar at: when to check next, monotonic ns; 0: never.
     """
 
     __slots__ = ('at', '_subject', '_step', '_last', '_unclear')
@@ -205,28 +206,28 @@ class GilCheck:
 
     def begin(self, subject: object, now: int, after: int) -> None:
         """
-        Check an execution, unless that is done already.
+        Start checking an execution, unless it is being checked already.
 
-        :param after: after how long to check first, ns.
+        :param after: time until the first check, ns.
         """
         if self._subject is not subject:
             self._subject = subject
             self._step = after
             self._last = None
             self._unclear = 0
-            # on a grid, so that the timer is not set again for each of several short callbacks
+            # on a grid, so that several short callbacks do not each set the timer again
             self.at = (now + self._step) // FIRST_CHECK_NS * FIRST_CHECK_NS + FIRST_CHECK_NS
 
     def end(self) -> None:
-        """Check nothing more."""
+        """Stop checking."""
         self._subject = None
         self.at = 0
 
     def waits(self, ident: int, tid: int, now: int) -> bool:
         """
-        Return whether the thread has waited for something else than the GIL since the last check.
+        Return whether the thread has waited for anything but the GIL since the last check.
 
-        :param ident: that of the thread in Python; ``tid``: its native id.
+        :param ident: the thread's id in Python; ``tid``: its native id.
         :param now: monotonic ns.
         """
         last = self._last
@@ -251,7 +252,7 @@ class GilCheck:
 
 
 def times_preempted() -> int:
-    """Return how often the kernel took a CPU away from the calling thread."""
+    """Return how often the kernel has preempted the calling thread."""
     return getrusage(RUSAGE_THREAD).ru_nivcsw
 
 
@@ -262,7 +263,7 @@ _usual_interval = 0.0
 
 @contextmanager
 def short_switch_interval() -> Iterator[None]:
-    """Have Python's threads take turns more often while entered; nested and from any thread."""
+    """Shorten Python's switch interval while entered; nested and from any thread."""
     global _spinning, _usual_interval
     with _lock:
         if _spinning == 0:

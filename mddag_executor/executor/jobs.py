@@ -1,23 +1,24 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Which job does a message belong to?  Publications are noted, messages are looked up.
+Find the job that a message belongs to: publications are noted, messages are looked up.
 
 Theory of operation
 -------------------
-1.  A message says when it was published: its source timestamp, which the middleware reads from the
+1.  The source timestamp of a message says when it was published.  The middleware reads it from the
     system clock inside ``publish``.  Every ``publish`` of a trigger topic by a callback of this
-    executor is noted as a *publication*: the window of system time that it took, the publisher's
-    running number, and the execution that published it.
-2.  A subscription of this process is served by the thread that publishes (``publishing``), which
-    knows its publication: if nothing else has arrived, there is nothing to look up.
-3.  Any other message belongs to the publication of its topic whose window holds its timestamp and
-    which has its publication sequence number.  A publisher is expected to have sent nothing before
-    it was counted; two messages in a row that differ by the same number show that it had.
-4.  When no publication fits (a publisher in another process) or several do, the answer is None and
-    the message runs as an undeclared callback: never dropped, never guessed.
+    executor is noted as a *publication*: its window of system time, the publisher's sequence
+    count, and the publishing execution.
+2.  A subscription of this process is served by the publishing thread (``publishing``), which knows
+    the publication.  If nothing else has arrived, no lookup is needed.
+3.  Any other message belongs to the publication of its topic whose window contains its timestamp
+    and which has its publication sequence number.  A publisher is assumed to have sent nothing
+    before it was counted.  Two consecutive messages that differ from the count by the same number
+    show that it had.
+4.  If no publication fits (a publisher in another process) or several do, the result is None and
+    the message runs as an undeclared callback.  It is never dropped, and its job is never guessed.
 
-Publications of other processes that these announce (``announcements``) are found in the same way.
+Publications announced by other processes (``announcements``) are found in the same way.
 """
 
 from __future__ import annotations
@@ -32,15 +33,15 @@ from mddag_executor.executor.bounds import MOST
 from msg_graph import TaskSet
 
 ROUNDING_NS = 2
-"""DDS stamps are multiples of 2**-32 s: they may lie this far outside of the window."""
+"""DDS timestamps are multiples of 2**-32 s: they may be this far outside of the window."""
 
 _STILL_PUBLISHING = 2 ** 63 - 1
 NO_NUMBER = -(2 ** 62)
-"""The count of a publication within another one of its publisher, in a signal handler."""
+"""The count of a publication made by a signal handler within another one of its publisher."""
 
 
 class Origin(NamedTuple):
-    """The execution that published: its job's slot, DAG and index, and its global vertex."""
+    """The publishing execution: its job's slot, DAG and index, and its global vertex."""
 
     slot: int
     dag: int
@@ -53,10 +54,10 @@ NO_ORIGIN = Origin(-1, -1, -1, -1)
 
 class Announced(NamedTuple):
     """
-    What another process announces of the execution that published.
+    What another process announces about a publishing execution.
 
-    :ivar name: of its job: where that was released first, and its number there.
-    :ivar dag: its index, -1 for none.
+    :ivar name: of its job: the process that first released it, and its number there.
+    :ivar dag: its index, -1: none.
     :ivar vertex: the global vertex.
     :ivar release: of the job, on the machine's steady clock in ns.
     """
@@ -69,26 +70,25 @@ class Announced(NamedTuple):
 
 class PublisherNumbers:
     """
-    How a publisher's own count and the middleware's publication sequence numbers differ.
+    The difference between a publisher's count and the middleware's sequence numbers.
 
-    A publisher is expected to have sent nothing before it was counted.
-
-    :ivar offset: what the sequence number is more than the count.
+    :ivar offset: sequence number minus count; 0 as long as the publisher is assumed to have sent
+        nothing before it was counted.
     """
 
     __slots__ = ('offset', '_unlike')
 
     def __init__(self) -> None:
         self.offset = 0
-        # the offset and the count of the last message that another offset would explain
+        # another possible offset, and the count of the last message that it would explain
         self._unlike: tuple[int, int] | None = None
 
     def agree(self, count: int, sequence: int) -> bool:
         """
-        Return whether a message is the publication of this count, whose window alone fits.
+        Return whether a message is the publication with this count; only its window fits.
 
-        Messages of two publications in a row that differ from the count by the same number show
-        that the publisher had sent something before.
+        Messages of two consecutive publications that differ from the count by the same number show
+        that the publisher had sent messages before.
         """
         offset = sequence - count
         if offset == self.offset:
@@ -105,13 +105,13 @@ class PublisherNumbers:
 
 class PublisherState:
     """
-    What is kept for each publisher: its topic, and how many messages it has published.
+    The state of a publisher: its topic, and how many messages it has published.
 
-    :ivar is_tracked: whether a declared callback has published a trigger topic with it: from then
-        on its publications are counted.
-    :ivar sending: the publication that is just being sent.
-    :ivar lock: serialises the publications of a trigger topic; a signal handler may publish in the
-        thread that holds it.
+    :ivar is_tracked: whether a declared callback has published a trigger topic with it, which
+        starts the counting of its publications.
+    :ivar sending: the publication that is being sent.
+    :ivar lock: serialises the publications of a trigger topic; reentrant, as a signal handler may
+        publish in the thread that owns it.
     """
 
     __slots__ = ('lock', 'topic', 'count', 'numbers', 'is_tracked', 'sending')
@@ -141,7 +141,7 @@ class Publication:
         self.origin = origin
 
     def holds(self, stamp: int) -> bool:
-        """Return whether a message with this source timestamp may be its message."""
+        """Return whether a message with this source timestamp may belong to the publication."""
         return self.begin - ROUNDING_NS <= stamp <= self.end + ROUNDING_NS
 
 
@@ -158,11 +158,11 @@ class Topic:
         self.publications: deque[Publication] = deque(maxlen=MOST)
         self.announced: deque[Publication] = deque(maxlen=4 * MOST)
         self.is_announced = False
-        # how many publications have not returned; what is announced once there are none
+        # how many publications have not returned; announcements wait until this is zero
         self.open = 0
         self.to_announce: list[Publication] = []
         self.lock = threading.Lock()
-        # gets the stamp of each message, where other processes subscribe (see ``other_processes``)
+        # receives the stamp of each message if other processes subscribe (see ``other_processes``)
         self.on_header: Callable[[int, Origin], None] | None = None
 
 
@@ -170,8 +170,8 @@ class Jobs:
     """
     Notes publications, and finds the job that a message belongs to.
 
-    :param task_set: the declaration; None: there is no job.
-    :ivar topics: what is kept of each topic that a declared callback publishes.
+    :param task_set: the declaration; None: there are no jobs.
+    :ivar topics: the state of each topic that a declared callback publishes.
     """
 
     def __init__(self, task_set: TaskSet | None) -> None:
@@ -180,7 +180,7 @@ class Jobs:
         self._release_from = [d.release_from for d in task_set.dags] if task_set else []
         self.unknown = 0
         self.doubtful = 0
-        # announces publications to other processes that have returned
+        # announces publications that have returned to other processes
         self.announce: Announce | None = None
 
     def publish(
@@ -192,7 +192,7 @@ class Jobs:
             topic.on_header(header_stamp(msg), origin)
         publication = Publication(time_ns(), state.numbers, origin, state.count)
         interrupted, state.sending = state.sending, publication
-        if interrupted is not None:  # by a signal handler: who gets which number is not known
+        if interrupted is not None:  # by a signal handler: the order of the numbers is unknown
             interrupted.sequence = publication.sequence = NO_NUMBER
         topic.publications.append(publication)
         is_announced = topic.is_announced and self.announce is not None
@@ -223,7 +223,7 @@ class Jobs:
             self.announce(send, name, several)
 
     def announce_on(self, topics: set[str]) -> None:
-        """Have the publications on these topics announced."""
+        """Announce the publications on these topics from now on."""
         for name, topic in self.topics.items():
             topic.is_announced = name in topics
 
@@ -232,7 +232,7 @@ class Jobs:
         self.topics[topic].announced.append(publication)
 
     def note_headers(self, on_header: Callable[[int, Origin], None], topics: set[str]) -> None:
-        """Have ``on_header`` called for each message on these topics, before it is published."""
+        """Call ``on_header`` for each message on these topics, before it is published."""
         for name, topic in self.topics.items():
             topic.on_header = on_header if name in topics else None
 
@@ -240,11 +240,11 @@ class Jobs:
         self, topic: str, stamp: int, sequence: int | None, counted: bool = True
     ) -> Origin | Announced | None:
         """
-        Return the origin of a message, or None when nothing or more than one thing fits.
+        Return the origin of a message, or None when no publication or more than one fits.
 
         :param stamp: its source timestamp, system time in ns.
-        :param sequence: its publication sequence number, where the middleware gives one.
-        :param counted: whether it counts that nothing was found.
+        :param sequence: its publication sequence number, if the middleware reports one.
+        :param counted: whether a failed lookup is counted.
         """
         known = self.topics.get(topic)
         if known is None:
@@ -268,7 +268,7 @@ class Jobs:
         return None
 
     def is_released_at_arrival(self, dag: int) -> bool:
-        """Return whether the jobs of a DAG are released when the message of the source arrives."""
+        """Return whether jobs of a DAG are released when the message of the source arrives."""
         return self._release_from[dag] == 'arrival'
 
     def release(
@@ -278,28 +278,28 @@ class Jobs:
         Return the release of the job that a source's message starts, on the trace's clock.
 
         :param now: the time on the trace's clock.
-        :return: the release, and the header's stamp where it comes from that, else -1.
+        :return: the release, and the header's stamp if the release was taken from it, else -1.
         """
         kind = self._release_from[dag]
         stamp = header_stamp(message) if kind == 'header_stamp' else -1
         if kind == 'arrival' or (kind == 'header_stamp' and stamp < 0):
-            return now, -1  # raw, without a header, or not stamped: only its arrival is known
+            return now, -1  # raw, without header or stamp: only its arrival is known
         if kind == 'source_timestamp':
             return steady_time(source_timestamp, now), -1
         return steady_time(stamp, now), stamp
 
 
 def steady_time(system_time: int, now: int) -> int:
-    """Return a time of the system's clock on the trace's clock, which reads ``now``."""
+    """Convert a time of the system clock to the trace's clock, which reads ``now``."""
     return now - time_ns() + system_time
 
 
 def header_stamp(message: Any) -> int:
-    """Return the stamp of a message's header (or of a Header), system time in ns; -1 for none."""
+    """Return the stamp of a message's header (or of a Header), system time in ns; -1: none."""
     stamp = getattr(getattr(message, 'header', message), 'stamp', None)
     if stamp is None:
         return -1
     try:
         return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or -1
     except (AttributeError, TypeError, ValueError):
-        return -1  # something else is called so
+        return -1  # a field of another type has this name

@@ -1,23 +1,24 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The one place in which idle workers wait: an epoll over everything that can happen.
+The one place in which idle workers wait: an epoll over all events.
 
 Theory of operation
 -------------------
-1.  *Channels.*  The middleware announces what arrives by writing to an eventfd (``listeners``).
-    A channel is such a descriptor with the sources that share it: most sources have one of their
-    own; when there are more than ``fd_budget`` of them, several share one.
+1.  *Channels.*  The middleware announces arrivals by writing to an eventfd (``listeners``).  A
+    channel is an eventfd with the sources that share it.  Most sources have their own; if there
+    are more than ``fd_budget`` sources, several share one.
 2.  *Waiting.*  All descriptors are registered edge-triggered in one epoll.  However many workers
     wait, the kernel wakes exactly one for each event.  ``wake`` wakes one more.
-3.  *Time.*  One timerfd stands for the earliest of all times at which something has to be done.
-4.  *Muting.*  Nobody is woken for what cannot start.  While a callback holds the GIL for long,
-    what holds it, too, and has more time than the callback needs stays in the middleware.  So
-    sources whose callbacks hold the GIL are registered in nested epolls by relative deadline
-    (``URGENCIES_NS``), and ``mute`` switches off those with at least a given relative deadline:
-    one system call each.  ``unmute`` switches them on again, and returns what has arrived.
-5.  Descriptors of removed sources are used again, never closed before the end: if an entity is
-    being destroyed elsewhere, its listener may write once more, which then wakes for nothing.
+3.  *Time.*  One timerfd is set to the earliest time at which anything has to be done.
+4.  *Muting.*  No thread is woken for a callback that cannot start.  While a callback holds the GIL
+    for long, messages for callbacks that hold it too and have more time than the running one needs
+    stay in the middleware.  So sources whose callbacks hold the GIL are registered in nested
+    epolls by relative deadline (``URGENCIES_NS``).  ``mute`` switches off those with at least a
+    given relative deadline, with one system call each.  ``unmute`` switches them on again and
+    returns the arrivals.
+5.  Descriptors of removed sources are used again and closed only at the end.  If an entity is
+    being destroyed concurrently, its listener may write once more; that wake-up is spurious.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ URGENCIES_NS = tuple(ms * 1_000_000 for ms in (2, 5, 10, 20, 50, 100, 200, 500))
 """
 Relative deadlines at which the nested epolls begin; a source is in the last that it reaches.
 
-A callback that holds the GIL for another 250 ms mutes nothing any more: what has a deadline of
-500 ms may overtake it (``core.queues.PATIENCE``).
+A callback that holds the GIL for another 250 ms mutes nothing: a callback with a deadline of 500
+ms may overtake it (``core.queues.PATIENCE``).
 """
 
 ALWAYS = -1
-"""The urgency of what is never muted."""
+"""The urgency of sources that are never muted."""
 
 _EDGE = select.EPOLLIN | select.EPOLLET
 
@@ -48,10 +49,10 @@ Events = list[tuple[int, int]]
 
 class ChannelSource(Protocol):
     """
-    What a channel announces arrivals for.
+    The interface of a source, as the loop uses it.
 
-    :ivar asks_others: ``collect`` calls code of others, so nobody may have a lock.
-    :ivar is_counted: the descriptor is its own, so its count says how much has arrived.
+    :ivar asks_others: ``collect`` calls foreign code, so the caller must hold no lock.
+    :ivar is_counted: the descriptor is not shared, so its count is the number of arrivals.
     """
 
     fd: int
@@ -60,16 +61,16 @@ class ChannelSource(Protocol):
     asks_others: bool
 
     def collect(self) -> None:
-        """Take what has arrived."""
+        """Collect the arrivals."""
 
 
 def fd_budget() -> int:
-    """Return how many eventfds to use at most: a quarter of what the process may open."""
+    """Return the most eventfds to use: a quarter of the descriptors that the process may open."""
     return max(16, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4)
 
 
 def urgency_of(relative_deadline_ns: int) -> int:
-    """Return the nested epoll for sources with such a relative deadline, or ALWAYS."""
+    """Return the nested epoll for sources with this relative deadline, or ALWAYS."""
     found = ALWAYS
     for index, bound in enumerate(URGENCIES_NS):
         if relative_deadline_ns >= bound:
@@ -78,7 +79,7 @@ def urgency_of(relative_deadline_ns: int) -> int:
 
 
 class EventLoop:
-    """An epoll with its channels; all methods but ``wait`` and ``wake`` under one lock."""
+    """An epoll with its channels; all methods but ``wait`` and ``wake`` need one lock."""
 
     def __init__(self, urgencies_ns: tuple[int, ...] = URGENCIES_NS) -> None:
         self._epoll = select.epoll()
@@ -102,7 +103,7 @@ class EventLoop:
 
     @property
     def fd(self) -> int:
-        """Return the descriptor of the epoll, for another epoll to wait for."""
+        """Return the descriptor of the epoll, for use in another epoll."""
         return self._epoll.fileno()
 
     # --- sources ---------------------------------------------------------------------------------
@@ -111,7 +112,7 @@ class EventLoop:
         """
         Give a source a descriptor; the caller sets the listener.
 
-        :param share: all sources that name the same share one, because they are seldom used.
+        :param share: sources with the same name share one descriptor, as they are seldom used.
         """
         most = 0
         if share:
@@ -136,7 +137,7 @@ class EventLoop:
         self._epoll.register(source.fd, _EDGE)
 
     def add_own(self, source: ChannelSource) -> None:
-        """Wait for a source that has a descriptor of its own."""
+        """Wait for a source that has its own descriptor."""
         self._channels[source.fd] = (source,)
         self._epoll.register(source.fd, _EDGE)
 
@@ -161,22 +162,22 @@ class EventLoop:
         return source in self._channels.get(source.fd, ())
 
     def move(self, source: ChannelSource, urgency: int) -> None:
-        """Have a source muted with its urgency from now on; ALWAYS: never."""
+        """Mute a source with this urgency from now on; ALWAYS: never mute it."""
         if source.fd < 0 or source.urgency == urgency or source.fd in self._shared_fds:
             return
         self._home(source.urgency).unregister(source.fd)
-        self._home(urgency).register(source.fd, _EDGE)  # reports what has arrived meanwhile
+        self._home(urgency).register(source.fd, _EDGE)  # reports earlier arrivals
         source.urgency = urgency
 
     def _home(self, urgency: int) -> select.epoll:
         return self._epoll if urgency == ALWAYS else self._nested[urgency]
 
     def hold(self, sources: Iterable[ChannelSource]) -> None:
-        """Wake nobody for some sources until ``release``; from any thread, without the lock."""
+        """Stop wake-ups for some sources until ``release``; from any thread, without the lock."""
         self._set_mask(sources, 0)
 
     def release(self, sources: Iterable[ChannelSource]) -> None:
-        """End ``hold``; what has arrived and was not taken wakes somebody."""
+        """End ``hold``; arrivals that were not collected wake a thread."""
         self._set_mask(sources, _EDGE)
 
     def _set_mask(self, sources: Iterable[ChannelSource], mask: int) -> None:
@@ -185,29 +186,29 @@ class EventLoop:
             epoll = self._epoll if urgency == ALWAYS else self._nested[urgency]
             try:
                 epoll.modify(fd, mask)
-                if source.fd != fd:  # removed just now: somebody else may have its descriptor
+                if source.fd != fd:  # removed just now: another source may have its descriptor
                     epoll.modify(fd, _EDGE)
             except (OSError, ValueError):
                 pass  # it was removed or moved just now
 
     def announce(self, source: ChannelSource, count: int = 1) -> None:
-        """Have a source looked at once more, as if so much had arrived."""
+        """Announce a source again, as if ``count`` more messages had arrived."""
         if source.fd >= 0:
             os.eventfd_write(source.fd, count)
 
     # --- waiting ---------------------------------------------------------------------------------
 
     def wait(self, timeout_s: float = -1) -> Events:
-        """Return events, waiting for one until the time is over; -1: for ever."""
+        """Return events, waiting for one until the timeout; -1: for ever."""
         return [] if self._epoll.closed else self._epoll.poll(timeout_s)
 
     def sources(
         self, events: Events
     ) -> tuple[list[ChannelSource], list[ChannelSource], bool]:
         """
-        Return the sources at which something has arrived, and whether the timer has expired.
+        Return the sources with arrivals, and whether the timer has expired.
 
-        Those that call code of others come second.
+        Sources that call foreign code come second.
         """
         found: list[ChannelSource] = []
         asking: list[ChannelSource] = []
@@ -227,26 +228,26 @@ class EventLoop:
         return found, asking, expired
 
     def wake(self) -> None:
-        """Wake one of those that wait; from any thread, also after ``close``."""
+        """Wake one waiting thread; from any thread, also after ``close``."""
         try:
             os.eventfd_write(self._bell, 1)
         except (OSError, ValueError):
             pass
 
     def wake_all(self) -> None:
-        """Wake all that wait, and let nobody wait until ``let_wait``."""
+        """Wake all waiting threads, and let no thread wait until ``let_wait``."""
         os.eventfd_write(self._leave, 1)
         self._epoll.register(self._leave, select.EPOLLIN)
 
     def let_wait(self) -> None:
-        """End what ``wake_all`` has begun."""
+        """End ``wake_all``: threads may wait again."""
         self._epoll.unregister(self._leave)
         os.eventfd_read(self._leave)
 
     # --- muting ----------------------------------------------------------------------------------
 
     def mute(self, relative_deadline_ns: int) -> None:
-        """Wake nobody for sources that hold the GIL and have at least this relative deadline."""
+        """Stop wake-ups for sources that hold the GIL and have at least this relative deadline."""
         first = len(self._nested)
         while first > 0 and self._urgencies_ns[first - 1] >= relative_deadline_ns:
             first -= 1
@@ -257,7 +258,7 @@ class EventLoop:
         self._muted = first
 
     def unmute(self) -> Events:
-        """End muting; return what has arrived meanwhile, so that nobody is woken for that."""
+        """End muting; return the arrivals meanwhile, so that no thread is woken for them."""
         found: Events = []
         for index in range(self._muted, len(self._nested)):
             nested = self._nested[index]
@@ -268,9 +269,9 @@ class EventLoop:
 
     def close(self) -> None:
         """
-        Close all descriptors, once; nobody waits any more.
+        Close all descriptors, once; no thread waits any more.
 
-        Those of sources that still have a listener stay open: it may write to them.
+        Descriptors of sources that still have a listener stay open: it may write to them.
         """
         fds = [*self._free, self._bell, self._leave, self.timer.fd]
         self._bell = self._leave = self.timer.fd = -1
@@ -282,5 +283,5 @@ class EventLoop:
             epoll.close()
 
     def __del__(self) -> None:
-        """Close what an executor that was never shut down has left open."""
+        """Close the descriptors of an executor that was never shut down."""
         self.close()

@@ -1,16 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What is taken from each kind of entity, and what is to be called for it.
+Collect messages, requests and responses from entities, and make work of them.
 
-A source belongs to one entity.  It is given a descriptor to which the middleware writes when
-something arrives (``loop``), and ``collect`` then takes what is there.  Messages and requests are
-taken under the engine's lock, so they stay in order whoever takes them; rclpy keeps the GIL while
-it takes, so nothing else could run meanwhile anyway.
+A source belongs to one entity.  It has a descriptor to which the middleware writes at each arrival
+(``loop``); ``collect`` then takes what has arrived.  Messages and requests are taken under the
+engine's lock, so they stay in order whichever thread takes them.  This costs no parallelism,
+because rclpy keeps the GIL while it takes.
 
-What exceeds a bound stays in the middleware: requests beyond ``SERVICE_DEPTH``, and messages
-beyond ``MOST`` if the QoS profile keeps all.  They are collected when one of those that
-wait starts (``Entity.collect_more``).
+Anything beyond a bound stays in the middleware: requests beyond ``SERVICE_DEPTH``, and messages
+beyond ``MOST`` if the QoS profile keeps all.  These are collected when a waiting one starts
+(``Entity.collect_more``).
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from mddag_executor.executor.work import Work
 from rclpy.exceptions import InvalidHandle
 
 SERVICE_DEPTH = 10
-"""How many requests wait in Python at most: as many as rclpy's default profile for services."""
+"""How many requests wait in Python at most: the depth of rclpy's default profile for services."""
 
 
 class Arrivals(Protocol):
-    """What gets the messages and requests that were taken; all under the engine's lock."""
+    """Receives collected messages and requests; all methods are called under the engine's lock."""
 
     def message(
         self, entity: Entity, args: tuple[Any, ...], info: dict[str, Any],
         publication: Publication | None,
     ) -> None:
-        """Handle a message; ``publication``: that which has just sent it, if that is certain."""
+        """Handle a message; ``publication``: the one that has just sent it, if certain."""
 
     def request(self, work: Work) -> None:
         """Handle a request."""
@@ -52,10 +52,10 @@ class Arrivals(Protocol):
 
 class Source:
     """
-    An entity that something arrives at.
+    An entity at which messages, requests or responses arrive.
 
     :ivar fd: its descriptor (see ``loop``), -1: none.
-    :ivar urgency: the nested epoll in which that is registered.
+    :ivar urgency: the nested epoll in which ``fd`` is registered.
     """
 
     __slots__ = ('entity', 'handle', 'fd', 'urgency', 'is_counted', '_loop', '_arrivals')
@@ -72,7 +72,7 @@ class Source:
 
     def listen(self) -> None:
         """
-        Have the middleware announce what arrives.
+        Let the middleware announce arrivals.
 
         :raises InvalidHandle: when the entity has been destroyed.
         """
@@ -80,7 +80,7 @@ class Source:
             set_listener(self.kind, self.handle.pointer, self.fd)
 
     def ignore(self) -> bool:
-        """End what ``listen`` has begun; return False if the entity is just being destroyed."""
+        """End ``listen``; return False if the entity is just being destroyed."""
         try:
             with self.handle:
                 clear_listener(self.kind, self.handle.pointer)
@@ -89,21 +89,21 @@ class Source:
             return False
 
     def collect(self) -> None:
-        """Take what has been announced since the last call."""
+        """Collect all arrivals announced since the last call."""
         count = MANY
         if self.is_counted:
             try:
                 count = os.eventfd_read(self.fd)
             except (OSError, ValueError):
-                return  # somebody else has taken it, or it was just removed
+                return  # another thread has collected it, or it was just removed
         self._collect(count)
 
     def collect_all(self) -> None:
-        """Take what is there, whatever was announced."""
+        """Collect all arrivals, announced or not."""
         self._collect(MANY)
 
     def _collect(self, left: int) -> None:
-        """Take so many at most; what is left after ``MOST`` is announced again."""
+        """Take ``left`` arrivals at most; the rest after ``MOST`` is announced again."""
         entity = self.entity
         if entity.removed:
             return  # another executor may have it now
@@ -125,7 +125,7 @@ class Source:
             self._loop.announce(self, left)
 
     def take_one(self) -> bool:
-        """Take one and post it; return whether there was one."""
+        """Take one arrival and post it; return whether there was one."""
         raise NotImplementedError
 
 
@@ -152,12 +152,12 @@ class SubscriptionSource(Source):
 
     def collect_published(self, publication: Publication | None) -> bool:
         """
-        Take what has been announced since the last call, right after a publication.
+        Collect the announced arrivals, right after a publication.
 
-        If nothing but the publication's message was announced, it is the publication's.
-        The caller holds the engine's lock.
+        If only the publication's message was announced, the message is known to be the
+        publication's.  The caller holds the engine's lock.
 
-        :return: whether there was anything.
+        :return: whether there was any arrival.
         """
         try:
             announced = os.eventfd_read(self.fd)
@@ -170,7 +170,7 @@ class SubscriptionSource(Source):
         try:
             taken = self._take()
         except compat.RCL_ERRORS:
-            self.collect_all()  # which finds out why
+            self.collect_all()  # finds out the reason
             return True
         if taken is None:
             return False
@@ -214,7 +214,7 @@ class ClientSource(Source):
     """
     A client: its responses complete futures, whose callbacks run in the executor.
 
-    It is collected by the spinning thread, without the engine's lock.
+    The spinning thread collects from it, without the engine's lock.
 
     :param executor: the executor.
     :param responded: called after each response.

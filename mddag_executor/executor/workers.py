@@ -1,31 +1,32 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The worker threads: they wait for what happens, report it to the engine, and run its choice.
+The worker threads: they wait for events, report them to the engine, and run its choice.
 
 Theory of operation
 -------------------
-1.  *A turn.*  A worker thread reports the end of its last execution, takes what has arrived, and
-    asks the engine for the next execution: all of it in one section under one lock.  If there is
-    none, it waits in the epoll (``loop``); the kernel wakes exactly one thread for each event.
-2.  *Nothing is overlooked.*  When no thread waits in the epoll, a thread that has more to run
-    polls it first, every ``BRIEF_NS``, so that an urgent arrival is known before the next choice.
-3.  *Waking others.*  If more than one execution may start, one waiting thread is woken, which
-    does the same.  But nothing is woken while a callback runs that usually ends within
-    ``BRIEF_NS``, or did so after it had published, lately: its thread will be there.  If it is
-    not, the guard (``guard``) wakes another thread.
-4.  *Threads wait in the epoll as they are needed.*  A spin begins with one of them; another is
-    admitted when an execution starts and none waits.  All others are parked, each on a lock of
-    its own, which is released exactly once for each admission.  A thread that wakes for something
-    that the thread of a brief callback will run is parked again: where arrivals are that dense,
-    one thread does everything, and none waits in the epoll until the guard expires.
-5.  *Time* is in ``due``, what is not announced while a callback holds the GIL in ``muting``.
-6.  *Lending.*  A callback that waits inside ``Client.call`` gives its worker back to the core; if
-    fewer threads are left than there are workers, a new one is made.  ``MOST`` callbacks may do so
-    at the same time; more of them keep their workers.
-7.  *Coroutines.*  A coroutine that waits for a future is suspended: it keeps its callback group
-    but no worker, and becomes ready again, under the key it had, when the future is done.
-8.  Whatever a callback raises, or a thread of the pool itself, goes to ``fail`` and ends the
+1.  *A turn.*  A worker thread reports the end of its last execution, collects arrivals, and asks
+    the engine for the next execution: all in one section under one lock.  If there is none, the
+    thread waits in the epoll (``loop``).  The kernel wakes exactly one thread for each event.
+2.  *No event is overlooked.*  When no thread waits in the epoll, a thread that has more to run
+    polls it first, every ``BRIEF_NS``.  So an urgent arrival is known before the next choice.
+3.  *Waking others.*  If more than one execution may start, one waiting thread is woken, which does
+    the same.  No thread is woken while a *short* callback runs, because its thread will be free in
+    time.  A callback is short if it usually ends within ``BRIEF_NS``, or within ``BRIEF_NS`` of a
+    publication that it has made.  If it runs longer, the guard (``guard``) wakes another thread.
+4.  *Admission to the epoll.*  A spin begins with one waiting thread.  Another one is admitted when
+    an execution starts and no thread waits.  All other threads are parked, each on its own lock,
+    which is released exactly once for each admission.  A thread that wakes for an execution that
+    the thread of a short callback will run is parked again.  So if arrivals are dense, one thread
+    does everything, and none waits in the epoll until the guard expires.
+5.  *Time* is in ``due``.  ``muting`` has the arrivals not announced while a callback holds the
+    GIL.
+6.  *Lending.*  A callback that waits inside ``Client.call`` returns its worker to the core.  If
+    fewer threads are left than there are workers, a thread is made.  At most ``MOST`` callbacks
+    lend at the same time; further ones keep their workers.
+7.  *Coroutines.*  A coroutine that waits for a future is suspended.  It keeps its callback group
+    but no worker.  When the future is done, it becomes ready again, with the same key.
+8.  *Errors.*  An exception of a callback or of a thread of the pool goes to ``fail`` and ends the
     spin.
 """
 
@@ -69,16 +70,18 @@ class WorkerThread:
     """
     A thread that runs callbacks.
 
-    :ivar work: the execution that it runs.
-    :ivar worker: the worker of the core that it was last.
-    :ivar permit: released when it is admitted to the epoll.
-    :ivar has_lent: whether its callback has given its worker back; ``waits``: and waits.
-    :ivar is_polling: whether it waits in the epoll; ``is_parked``: for a permit.
+    :ivar work: the running execution.
+    :ivar worker: the number of its last worker in the core.
+    :ivar permit: a lock, released to admit the thread to the epoll.
+    :ivar has_lent: whether its callback has returned its worker; ``waits``: whether it still
+        waits.
+    :ivar is_polling: whether the thread waits in the epoll; ``is_parked``: for its permit.
     :ivar waits_since: since when it has waited in the epoll, on the trace's clock.
-    :ivar published: when the callback that runs has published first (monotonic ns); 0: not yet.
-    :ivar start: when the execution began that has just ended, and ``end``: when it ended, on the
+    :ivar published: when the running callback first published (monotonic ns); 0: not yet.
+    :ivar start: when the execution that has just ended began; ``end``: when it ended; both on the
         trace's clock.
-    :ivar waits_for: what that waits for, if it goes on later; ``raised``: what it has raised.
+    :ivar waits_for: the future that this execution waits for, if it goes on later; ``raised``: its
+        exception.
     """
 
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
@@ -101,18 +104,18 @@ class WorkerThread:
         self.raised: BaseException | None = None
 
     def begin(self) -> None:
-        """Note which thread it is; called in the thread."""
+        """Note the ids of the calling thread."""
         self.vtid, self.ident = threading.get_native_id(), threading.get_ident()
 
     def is_brief(self) -> bool:
-        """Return whether a callback runs in the thread that probably ends soon."""
+        """Return whether the thread runs a callback that will probably end within ``BRIEF_NS``."""
         work = self.work
         return work is not None and (
             work.entity.wall_ns <= BRIEF_NS
             or self.published > 0 and work.entity.tail_ns <= BRIEF_NS)
 
     def publishes(self, publisher: Any, msg: Any, topic: str) -> None:
-        """Note that its callback publishes."""
+        """Note that the running callback publishes."""
         record, work = self.engine.record, self.work
         if record is not None:
             record(PUBLICATION, self.pool.clock.now(), self.vtid, id(publisher), id(msg))
@@ -122,12 +125,12 @@ class WorkerThread:
             self.published = monotonic_ns()
 
     def lend(self) -> Any:
-        """Lend its worker while entered: the callback waits for a service."""
+        """Lend the worker while entered: the callback waits for a service."""
         return self.pool.lend(self)
 
     @property
     def job(self) -> tuple[str, int, int] | None:
-        """Return DAG, index and release of the job whose callback runs; None for no job."""
+        """Return DAG, index and release of the job whose callback runs; None: no job."""
         work = self.work
         if work is None or work.origin is None:
             return None
@@ -139,13 +142,13 @@ class WorkerPool:
     """
     The worker threads, with the lock and the clock of the engine.
 
-    :param fail: gets every exception that a callback lets out.
-    :param context_ended: whether the context has ended: callbacks fail then for that reason.
+    :param fail: receives every exception that a callback raises.
+    :param context_ended: whether the context has ended, which makes callbacks fail.
     :param prepare_thread: called first in each worker thread (priority, CPU set).
-    :param inbox: gets what was taken.
+    :param inbox: receives the collected messages and requests.
     :ivar running: whether executions may start.
-    :ivar stopped_at: when that ended, on the trace's clock; 0: it has not.
-    :ivar is_current: whether the registry knows of all entities that were made or destroyed.
+    :ivar stopped_at: when ``running`` became false, on the trace's clock; 0: it is true.
+    :ivar is_current: whether the registry knows all entities.
     """
 
     def __init__(
@@ -156,7 +159,7 @@ class WorkerPool:
         self.engine = engine
         self.clock = clock
         self._offset = clock.offset_ns
-        # reentrant only so that it knows its owner, as a signal handler may run in there
+        # reentrant only to know its owner: a signal handler may run inside
         self.lock = engine_lock(engine.validate, engine.size)
         self._deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
@@ -173,13 +176,13 @@ class WorkerPool:
         self.adopt: Callable[[Any], None] = lambda future: None
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
         self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
-        #: called when there is something that the registry does not know of
+        #: called when there is an entity that the registry does not know
         self.entities_changed: Callable[[], None] = lambda: None
         #: called when deadlines were missed
         self.missed: Callable[[], None] = lambda: None
-        #: called when it is noticed that the context has ended
+        #: called when the end of the context is noticed
         self.context_ended: Callable[[], None] = lambda: None
-        #: called with begin and end of a time in which no thread of the process ran (monotonic)
+        #: called with begin and end of a time in which no thread of the process ran (monotonic ns)
         self.stopped: Callable[[int, int], None] = lambda begin, end: None
         self._fail = fail
         self._context_ended = context_ended
@@ -188,7 +191,7 @@ class WorkerPool:
         self._parked: list[WorkerThread] = []
         self._visitors: list[WorkerThread] = []
         self.polling = 0
-        # when the epoll was polled last, and the timerfd brought up to date
+        # when the epoll was last polled, and the timerfd last set
         self._polled_at = self._updated_at = 0
         self._waiting_calls = 0
         self._bell_rings = False
@@ -196,21 +199,21 @@ class WorkerPool:
         self._leaving = False
         self._all_left = threading.Event()
         self._is_stepping = False
-        # the coroutines that have yielded: they continue in the next step
+        # coroutines that have yielded: they continue in the next step
         self._of_next_step: list[Work] = []
         self._last = 0
-        # the thread that has dispatched last a callback that is expected to end soon
+        # the thread that last dispatched a short callback
         self._leader: WorkerThread | None = None
         self._misses = 0
         self.muting = Muting(engine, self.loop, self.timers, inbox)
         self.due = DueTimes(self, context_ended)
-        #: what wakes a thread when a callback that was expected to end soon does not
+        #: wakes a thread when a short callback runs longer than expected
         self.guard = Guard(self._guard_expired)
 
-    # --- what happens elsewhere ------------------------------------------------------------------
+    # --- events ----------------------------------------------------------------------------------
 
     def tick(self) -> int:
-        """Return the engine's time now; it never decreases.  The caller has the lock."""
+        """Return the engine's time now; it never decreases.  The caller holds the lock."""
         now = monotonic_ns() + self._offset
         if now < self._last:
             now = self._last
@@ -219,9 +222,9 @@ class WorkerPool:
 
     def report(self, event: Callable[..., None], *args: Any) -> None:
         """
-        Give the engine an event, and have run what is ready then.
+        Report an event to the engine, and wake a thread for the ready executions.
 
-        :param event: a method of the engine; it gets the arguments and the time.
+        :param event: a method of the engine, called with the arguments and the time.
         """
         if self.is_inside():
             self._defer(partial(self.report, event, *args))
@@ -231,16 +234,16 @@ class WorkerPool:
             self.wake_for_more()
 
     def is_inside(self) -> bool:
-        """Return whether the calling thread has the lock: in a signal handler or a finalizer."""
+        """Return whether the calling thread owns the lock: in a signal handler or a finalizer."""
         return self.lock._is_owned()  # type: ignore[no-any-return]
 
     def _defer(self, function: Callable[[], None]) -> None:
-        """Have something done as soon as the lock is free."""
+        """Call a function as soon as the lock is free."""
         self._deferred.append(function)
         self.loop.wake()
 
     def post(self, several: list[Work]) -> None:
-        """Make executions ready that no DAG declares."""
+        """Make undeclared executions ready."""
         if self.is_inside():
             self._defer(partial(self.post, several))
             return
@@ -261,20 +264,20 @@ class WorkerPool:
             self.wake_for_more()
 
     def leave_group(self, work: Work) -> None:
-        """Note that an execution may run: its callback group has let it through."""
+        """Note that the callback group of an execution has let it run."""
         with self.lock:
             self.tick()
             self.engine.leave_group(work)
             self.wake_for_more()
 
     def call_at(self, at: int, function: Callable[[], None]) -> None:
-        """Have a function called at a time (monotonic ns), without the lock, by a worker."""
+        """Let a worker thread call a function at a time (monotonic ns), without the lock."""
         with self.lock:
             self.due.call_at(at, function)
             self.due.arm(monotonic_ns())
 
     def wake_for_more(self) -> None:
-        """Wake a thread if an idle worker may start something; the caller has the lock."""
+        """Wake a thread if an idle worker may start an execution; the caller holds the lock."""
         if not self.running:
             return
         if self.engine.may_start_more(self._last):
@@ -287,7 +290,7 @@ class WorkerPool:
             self.due.check_holder(monotonic_ns())
 
     def _guard_expired(self) -> None:
-        """Wake a thread, as a callback that was expected to end soon has not."""
+        """Wake a thread because a short callback runs longer than expected."""
         with self.lock:
             now = self.tick()
             self.guard.end()
@@ -306,14 +309,14 @@ class WorkerPool:
             self._admit()
 
     def _admit(self) -> None:
-        """Let one more thread wait in the epoll; the caller has the lock."""
+        """Let one more thread wait in the epoll; the caller holds the lock."""
         if self._parked and (self.running or self._closed) and not self._is_stepping:
             self._parked.pop().permit.release()
 
     # --- threads ---------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Let executions start; makes the threads the first time."""
+        """Let executions start; the first call makes the threads."""
         self._resume_of_last_step()
         with self.lock:
             if self._closed:
@@ -328,7 +331,7 @@ class WorkerPool:
                 self._admit()
 
     def pause(self) -> None:
-        """Start nothing more; what runs goes on.  No thread waits in the epoll any more then."""
+        """Start no more executions; running ones finish.  No thread waits in the epoll then."""
         with self.lock:
             self.start_no_more()
             self.muting.end(self.running)
@@ -344,16 +347,16 @@ class WorkerPool:
             self.loop.let_wait()
 
     def start_no_more(self) -> None:
-        """Start nothing more, from now on; for those who must not wait for the lock."""
+        """Start no more executions; for callers that must not wait for the lock."""
         if self.running:
             self.stopped_at = self.clock.now()
             self.running = False
 
     def close(self, timeout: float | None) -> bool:
         """
-        End the threads; return False when a callback still ran after ``timeout`` seconds.
+        End the threads; return False if a callback still ran after ``timeout`` seconds.
 
-        A callback that waits for a service is not waited for: nobody would answer it any more.
+        Callbacks that wait for a service are not waited for: no thread would answer them any more.
         """
         self.pause()
         with self.lock:
@@ -369,7 +372,6 @@ class WorkerPool:
 
     @staticmethod
     def _join(each: WorkerThread, deadline: int | None) -> bool:
-        """Wait until a thread has ended; return whether it has."""
         thread = each.thread
         if thread is None or thread is threading.current_thread():
             return True
@@ -382,7 +384,7 @@ class WorkerPool:
             try:
                 thread.join(left)
             except RuntimeError:
-                break  # just being started
+                break  # it is just being started
         return True
 
     def _new_thread(self) -> WorkerThread:
@@ -442,11 +444,10 @@ class WorkerPool:
 
     def _turn(self, me: WorkerThread, events: Events, is_last: bool = False) -> bool:
         """
-        Report what has ended, take what has arrived, and find what to run: ``me.work``.
+        Report the last end, collect arrivals, and find the next execution: ``me.work``.
 
-        False: there is nothing, and the thread is to wait in the epoll, or is parked.
-
-        :param is_last: nothing more is to run in this thread.
+        :param is_last: run nothing more in this thread.
+        :return: False: there is no execution, and the thread is to wait in the epoll or is parked.
         """
         arrived: list[ChannelSource] = []
         expired = False
@@ -463,7 +464,7 @@ class WorkerPool:
         timed: list[Callable[[], None]] = []
         engine = self.engine
         with self.lock:
-            now = monotonic_ns() + self._offset  # as in tick: a call less for each execution
+            now = monotonic_ns() + self._offset  # inlined tick: saves a call for each execution
             if now < self._last:
                 now = self._last
             self._last = self.inbox.now = now
@@ -476,7 +477,7 @@ class WorkerPool:
             if me.work is not None:
                 self._report_end(me, me.work, now, calls)
             if events:
-                self._bell_rings = False  # whoever waits may have heard it
+                self._bell_rings = False  # the waiting thread may have received it
                 for source in arrived:
                     if self.running:
                         source.collect()
@@ -498,16 +499,16 @@ class WorkerPool:
         return self._turn(me, []) if timed else found
 
     def _do_deferred(self) -> None:
-        """Do what was to wait for the lock."""
+        """Call the functions that waited for the lock."""
         while self._deferred:
             try:
                 function = self._deferred.popleft()
             except IndexError:
-                break  # another thread has taken it
+                break  # another thread has removed it
             function()
 
     def _call(self, functions: list[Callable[[], None]]) -> None:
-        """Call functions, of which none may end the thread."""
+        """Call functions; their exceptions do not end the thread."""
         for function in functions:
             try:
                 function()
@@ -515,7 +516,7 @@ class WorkerPool:
                 self._fail(error)
 
     def _choose(self, me: WorkerThread, now: int, has_events: bool) -> bool:
-        """Set what to run, or where to wait; return whether there is something to run."""
+        """Set the next execution, or where to wait; return whether there is an execution."""
         engine = self.engine
         work = engine.dispatch(me.worker, now) if self.running else None
         if work is None:
@@ -542,9 +543,9 @@ class WorkerPool:
 
     def _rest(self, me: WorkerThread, has_events: bool) -> None:
         """
-        Have a thread that found nothing to run wait in the epoll, or be parked.
+        Let a thread without an execution wait in the epoll, or park it.
 
-        :param has_events: it has just taken what arrived.
+        :param has_events: whether it has just collected arrivals.
         """
         if me.thread is None:  # a visitor: the thread of a spin_once
             return
@@ -564,7 +565,7 @@ class WorkerPool:
                 self._parked.append(me)
 
     def arm(self) -> None:
-        """Set the timerfd again, since timers have come; the caller has the lock."""
+        """Set the timerfd again for new timers; the caller holds the lock."""
         self.due.arm(monotonic_ns())
 
     def thread_of(self, work: Work) -> WorkerThread | None:
@@ -595,7 +596,7 @@ class WorkerPool:
         self._note_times(me, entity, start, monotonic_ns())
 
     def _execute_measured(self, me: WorkerThread, work: Work, entity: Entity) -> None:
-        """Run it, and measure for how long its thread and others compute meanwhile."""
+        """Run the execution, and measure how long this thread and others compute meanwhile."""
         habit = entity.habit
         is_known = habit.rests > 0
         process = preempted = 0
@@ -617,10 +618,10 @@ class WorkerPool:
         self._note_times(me, entity, start, end)
 
     def _note_times(self, me: WorkerThread, entity: Entity, start: int, end: int) -> None:
-        """Note from when to when (monotonic ns) a thread's execution ran."""
+        """Note when (monotonic ns) a thread's execution began and ended."""
         wall = end - start
         if wall > BRIEF_NS:
-            entity.habit.rests = 0  # whoever runs for long is measured each time
+            entity.habit.rests = 0  # long callbacks are measured each time
         if entity.ran:
             entity.wall_ns += (wall - entity.wall_ns) >> 3
         else:
@@ -633,9 +634,9 @@ class WorkerPool:
         self, me: WorkerThread, work: Work, now: int, calls: list[Callable[[], None]]
     ) -> None:
         """
-        Report what became of a thread's execution; the caller has the lock.
+        Report how a thread's execution ended; the caller holds the lock.
 
-        :param calls: gets what is to be called then, without the lock.
+        :param calls: receives the functions to call afterwards without the lock.
         """
         engine, entity = self.engine, work.entity
         me.work = None
@@ -649,7 +650,7 @@ class WorkerPool:
         if engine.to_ask_again:
             engine.ask_again()
         if entity.removed:
-            self.entities_changed()  # it can be forgotten now
+            self.entities_changed()  # the registry can forget it now
         if entity.is_nested != entity.habit.holds and entity.classify is not None:
             entity.classify()
 
@@ -657,7 +658,7 @@ class WorkerPool:
         self, me: WorkerThread, work: Work, now: int, calls: list[Callable[[], None]]
     ) -> bool:
         """
-        Report an execution that waits, has raised something, or has lent its worker.
+        Report an execution that waits, has raised an exception, or has lent its worker.
 
         :return: whether it ran: its callback group may have refused it.
         """
@@ -679,7 +680,7 @@ class WorkerPool:
             engine.finished(work, start, end, now, me.vtid, worker)
         elif waits_for is not None:
             engine.suspended(work, start, end, me.vtid, worker)
-        elif self._context_ended():  # which may destroy nodes, too
+        elif self._context_ended():  # this may destroy nodes, too
             engine.left_open(
                 work, start, end, me.vtid, worker, not isinstance(raised, Destroyed))
         elif isinstance(raised, Destroyed):
@@ -689,7 +690,7 @@ class WorkerPool:
         return True
 
     def _settle_end(self, work: Work, waits_for: Any, raised: BaseException | None) -> None:
-        """Have a suspended execution resumed, or an exception reported; without the lock."""
+        """Resume a suspended execution later, or report an exception; without the lock."""
         if waits_for is not None:
             if waits_for is NEXT_TURN or not hasattr(waits_for, 'add_done_callback'):
                 if self._is_stepping:
@@ -744,7 +745,7 @@ class WorkerPool:
         finally:
             me.waits = waits_before
 
-    # --- a thread that visits --------------------------------------------------------------------
+    # --- spin_once -------------------------------------------------------------------------------
 
     @contextmanager
     def stepping(self) -> Iterator[None]:
@@ -758,14 +759,14 @@ class WorkerPool:
                 self.muting.end(False)
 
     def resume_stepping(self) -> None:
-        """Go on as in ``stepping``, after ``start`` and ``pause``."""
+        """Continue as in ``stepping``, after ``start`` and ``pause``."""
         with self.lock:
             self.running = self._is_stepping = True
             self.stopped_at = 0
             self.due.begin(self.tick() - self._offset)
 
     def run_one(self, events: Events) -> bool:
-        """Take what has arrived, and run one execution in the calling thread, if there is one."""
+        """Collect arrivals, and run one execution in the calling thread, if there is one."""
         me = WorkerThread(self, None)
         me.begin()
         self._resume_of_last_step()
@@ -793,6 +794,6 @@ class WorkerPool:
             self.resume(work)
 
     def is_idle(self) -> bool:
-        """Return whether nothing runs and nothing is ready."""
+        """Return whether no execution runs or is ready."""
         return not self.engine.has_waiting and (
             self.engine.idle_workers >= self.engine.n_workers)
