@@ -1,24 +1,28 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What recorded executions would have taken alone, without others that compute beside them.
+Estimates isolated execution times: without other executions that compute in parallel.
 
-Theory of operation
--------------------
-An execution takes the time from when it could have started to its end: dispatch and callback.  In
-that it stood still while it waited for Python's lock, or for a CPU.  How long, the model of the
-machine tells (``simulate.machine``) that predictions are made with: executions that are started
-when the recorded ones could have, and take what these would have alone, must end when these did.
-So the times are sought with which they do: first each takes what was recorded; what it then ends
-too late is taken off, down to its CPU time, and so on.  Of ``TURNS`` tries the best one counts.
-What the model does not explain stays in the time, so that a schedule like the recorded one gives
-the recorded response times.  A long recording goes window by window, each with its best try.
+Theory of operation ------------------- The recorded time of an execution is from when it could
+start to its end: dispatch and callback. It includes pauses in which the execution waited for the
+GIL or for a CPU.  The machine model of predictions (``simulate.machine``) says how long these
+pauses are.  Wanted are isolated times for which the model, with the recorded starts, gives the
+recorded ends.
 
-That is right where as many run beside one another as in the recording.  Where fewer do, what the
-model leaves over has to be told apart.  The part ``LEAST`` of a callback's executions wait hardly
-for others: what each of them waits, every one waits for itself.  What one waits for beyond that,
-no longer than others ran, is *theirs*.  It is taken off in proportion to the time in which more
-ran than can: with one worker none of it is left.
+1. Begin with the recorded times.  Whatever the model ends too late is subtracted, down to the CPU
+   time of the execution.  Of ``TURNS`` iterations the best one counts.
+2. Pauses that the model does not explain remain in the time.  So a schedule like the recorded one
+   has the recorded response times.
+3. Long recordings are split into windows; each window uses its own best iteration.
+
+The result is right if as many executions run in parallel as in the recording.  With fewer workers,
+part of the unexplained pauses disappears:
+
+4. The fastest fifth (``LEAST``) of a callback's executions is assumed not to have waited for
+   others.  What an execution waited beyond that, at most the time in which others ran, is time
+   waiting for others.
+5. This time is subtracted in proportion to the time in which more executions ran than the new pool
+   allows.  With one worker all of it is subtracted.
 """
 
 from __future__ import annotations
@@ -34,12 +38,14 @@ import numpy as np
 import numpy.typing as npt
 
 ENOUGH = 5
-"""So many executions are enough to say what is usual."""
+"""Minimum number of executions for a median."""
 LEAST = 0.2
-"""So many of a callback's executions wait for nothing but what it waits for itself."""
+"""Quantile of a callback's waiting times that is assumed to be independent of other callbacks."""
 TURNS = 8
 WINDOW = 50_000
-"""So many executions the model runs at once, and more until nothing runs: up to as many again."""
+"""
+Minimum number of executions in a window; it ends where the fewest run, before twice this number.
+"""
 
 Flags = npt.NDArray[np.bool_]
 
@@ -48,9 +54,10 @@ class Recorded(NamedTuple):
     """
     Recorded executions, by columns, ns.
 
-    ``could`` says when they could have started, and ``took`` what they took from then on;
-    ``cpu`` is -1 where it is not known; ``locks`` says whether they compute with Python's lock,
-    ``interpreter`` which one that is, from 1; ``callback`` is a number.
+    ``could`` is when they could have started, ``took`` the time from then to the end, ``cpu`` the
+    CPU time (-1: unknown), ``locks`` whether they hold the GIL while they compute, ``interpreter``
+    the number of the process's interpreter, from 1, ``callback`` a number, and ``warm`` whether
+    the worker had not slept.
     """
 
     could: Ints
@@ -63,28 +70,28 @@ class Recorded(NamedTuple):
 
     @property
     def least(self) -> Ints:
-        """Return what they took at least, alone, too: their CPU time."""
+        """Return the lower bound of the isolated time: the CPU time."""
         least: Ints = np.minimum(np.maximum(0, self.cpu), self.took)
         return least
 
     def of(self, which: Flags | Ints) -> Recorded:
-        """Return some of them."""
+        """Return the chosen executions."""
         return Recorded(
             self.could[which], self.took[which], self.cpu[which], self.locks[which],
             self.interpreter[which], self.callback[which], self.warm[which])
 
     def beside(self, others: Recorded) -> Recorded:
-        """Return these with others behind them."""
+        """Return these executions, followed by others."""
         columns: Any = map(np.concatenate, zip(self, others))
         return Recorded(*columns)
 
 
 def alone(ran: Recorded, cpus: int = 0, workers: int = NEVER) -> Ints:
     """
-    Return what executions would have taken alone.
+    Return isolated execution times.
 
-    :param cpus: of the machine; 0: not known.
-    :param workers: how many each process is to have, if that is fewer than in the recording.
+    :param cpus: CPUs of the machine; 0: unknown.
+    :param workers: workers of each process, if fewer than in the recording.
     """
     took = ran.took.copy()
     at_once = workers * int(ran.interpreter.max(initial=1)) if workers < NEVER else NEVER
@@ -106,7 +113,7 @@ def alone(ran: Recorded, cpus: int = 0, workers: int = NEVER) -> Ints:
 
 
 def _windows(ran: Recorded) -> Iterator[Ints]:
-    """Yield executions in the order in which they could start, parted where the fewest ran."""
+    """Yield windows of executions by possible start, split where the fewest executions run."""
     order = np.argsort(ran.could, kind='stable')
     while len(order):
         which = order[:2 * WINDOW]
@@ -122,10 +129,11 @@ def _windows(ran: Recorded) -> Iterator[Ints]:
 
 def colder(callback: Ints, warm: Flags, took: Ints) -> Ints:
     """
-    Return what executions take more than if their workers had not slept, or would if they had.
+    Return the extra time of executions whose worker slept before, or would have if it slept.
 
-    Those take more: a thread has to be woken, and finds cold caches.  It is the difference of the
-    medians of a callback, or where that is not known the median one; below 0 for what was warm.
+    A thread that slept must be woken and finds cold caches.  The extra time is the difference of a
+    callback's medians or, if unknown, the median difference; it is negative for cache-warm
+    executions.
     """
     found = np.full(len(took), -1)
     for which in _by_callback(callback, np.ones(len(took), dtype=np.bool_)):
@@ -139,7 +147,7 @@ def colder(callback: Ints, warm: Flags, took: Ints) -> Ints:
 
 
 def _by_callback(callback: Ints, those: Flags) -> Iterator[Ints]:
-    """Yield some executions of each callback."""
+    """Yield the chosen executions of each callback."""
     places = np.flatnonzero(those)
     places = places[np.argsort(callback[places], kind='stable')]
     for which in np.split(places, np.flatnonzero(np.diff(callback[places])) + 1):
@@ -149,10 +157,11 @@ def _by_callback(callback: Ints, those: Flags) -> Iterator[Ints]:
 
 def _explained(ran: Recorded, cpus: int, runs: int) -> Ints:
     """
-    Return the times with which the model ends executions when they ended.
+    Return the isolated times for which the model gives the recorded ends.
 
     :param ran: in the order of ``could``.
-    :param runs: how many of as many executions there are to be in all.
+    :param runs: how often the model will run on as many executions: decides whether it is
+        compiled.
     """
     found, took, least_wrong = ran.took, ran.took, -1
     for _ in range(TURNS):
@@ -167,7 +176,7 @@ def _explained(ran: Recorded, cpus: int, runs: int) -> Ints:
 
 
 def _ends(ran: Recorded, took: Ints, cpus: int, runs: int) -> Ints:
-    """Return when the model ends executions that take so long alone; see ``_explained``."""
+    """Return the ends that the model gives for isolated times; see ``_explained``."""
     count = len(took)
     ended = np.searchsorted(np.sort(ran.could + took), ran.could, 'right')
     most = int((np.arange(1, count + 1) - ended).max(initial=1))
@@ -178,7 +187,7 @@ def _ends(ran: Recorded, took: Ints, cpus: int, runs: int) -> Ints:
         'locks': ran.locks.astype(np.int64)}
     load = Load(cost_base=[0] * n, cost_stride=[1] * n, **columns)
     tables = _interpreters(n)
-    # those that stand still are more than those that ran
+    # at most this many pause in addition to those that run
     settings = Settings('fifo', 2 * most + 2, cpus=cpus or count + 1,
                         duration_ns=int(ran.could[-1] + took.sum() + 1))
     log = np.asarray(schedule(
@@ -191,7 +200,7 @@ def _ends(ran: Recorded, took: Ints, cpus: int, runs: int) -> Ints:
 
 
 def _interpreters(n: int) -> Tables:
-    """Return tables with a DAG of one vertex, of which nothing is declared, in each process."""
+    """Return tables of one process per DAG, each DAG with one undeclared vertex."""
     one = Tables.build(None)
     columns: dict[str, Any] = {
         name: value * n for name, value in one._asdict().items() if isinstance(value, list)}
@@ -203,7 +212,7 @@ def _interpreters(n: int) -> Tables:
 
 
 def _theirs(ran: Recorded, took: Ints, beside: Ints) -> Ints:
-    """Return what executions that take so long waited for others, which ran ``beside`` them."""
+    """Return how long executions waited for others, which ran for ``beside``."""
     waited = took - ran.least
     theirs = np.zeros_like(took)
     for which in _by_callback(ran.callback, ran.cpu >= 0):
@@ -213,7 +222,7 @@ def _theirs(ran: Recorded, took: Ints, beside: Ints) -> Ints:
 
 
 def _beside(begins: Ints, ends: Ints, others: int = 1) -> Ints:
-    """Return by interval for how long there were at least so many others."""
+    """Return by interval how long at least ``others`` other intervals overlapped it."""
     times = np.concatenate([begins, ends])
     order = np.argsort(times, kind='stable')
     passed = np.diff(times[order])

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Replay as recorded: the deadlines of a run, and where its time went."""
+"""Replay as recorded: judge the deadlines of a run and break down its response times."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from msg_graph.drift import Drift
 
 class Replay:
     """
-    A recording, and what came of it.
+    A recording and its evaluation.
 
-    :param skip: how long after the first release jobs are not judged (a warm-up), ns.
+    :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
     :ivar judged: the verdicts; ``tally`` has their sums.
-    :ivar warnings: what is missing or doubtful, one line each.
+    :ivar warnings: missing or doubtful data, one line each.
     """
 
     def __init__(self, recording: Recording, skip: int = 0) -> None:
@@ -52,14 +52,14 @@ class Replay:
 
     @cached_property
     def usage(self) -> Usage:
-        """Return what callbacks and workers used."""
+        """Return how much time callbacks and workers used."""
         found = Usage(self.recording, self._waited)
         give_back()
         return found
 
     @cached_property
     def explanation(self) -> Explanation:
-        """Return why deadlines were missed."""
+        """Return the causes of missed deadlines."""
         found = Explanation(self.recording, self.judged, self.chains)
         give_back()
         return found
@@ -69,15 +69,15 @@ class Replay:
         return group_waits(self.recording)
 
     def drift(self) -> list[Drift]:
-        """Return where the run and the declaration disagree."""
+        """Return the differences between the run and the declaration."""
         return drift_of(self.recording)
 
     @property
     def duration_ns(self) -> int:
         """
-        Return the time from the first release (or execution) to the end of the run.
+        Return the time from the first release or execution to the end of the run, ns.
 
-        Of a run without jobs it is that of the recording.
+        Without jobs it is the duration of the recording.
         """
         recording, begun = self.recording, self.recording.head.time
         start = begun if recording.start is None else recording.start
@@ -119,9 +119,9 @@ class Replay:
 
 def slack(sink: dict[str, Any]) -> dict[str, int] | None:
     """
-    Return how much before its deadline a sink completed, ns; negative where it was late.
+    Return the slack of a sink: deadline minus completion, ns; negative for late jobs.
 
-    ``p1`` is what 99 % of the completions had at least.
+    99 % of the completions had at least the slack ``p1``.
     """
     response, deadline = sink['response_ns'], sink['relative_deadline_ns']
     if response is None:
@@ -131,7 +131,7 @@ def slack(sink: dict[str, Any]) -> dict[str, int] | None:
 
 
 def recording_result(run: Recording) -> dict[str, Any]:
-    """Return the part of a result about the trace itself."""
+    """Return the part of a result that describes the trace."""
     return {
         'trace': run.name, 'declaration': run.head.file, 'start_ns': run.start,
         'end_ns': run.end, 'shut_down': run.shut_down, 'lost': run.lost}
@@ -144,7 +144,7 @@ def replay(
     """
     Replay a trace as recorded; see ``open_recording`` and ``Replay``.
 
-    :param skip: how long after the first release jobs are not judged (a warm-up), ns.
+    :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
     :param span: begin and end of the part to replay, ns after the start; see ``Recording.cut``.
     """
     recording = open_recording(path, task_set, name, progress)

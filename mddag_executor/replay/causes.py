@@ -1,37 +1,34 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Why deadlines were missed: the parts of the time of each such job, and the one cause among them.
+The parts of the time of each job that missed its deadline, and the one cause of the miss.
 
-Theory of operation
--------------------
-The time of a job, from its release to its completion at the sink (or until it was given up), goes
-along its critical chain (see ``chains``).  Each piece of it is split:
+Theory of operation ------------------- The time of a job, from its release to its completion at
+the sink (or to its early end), is split along its critical chain (see ``chains``):
 
-* what overlaps a recorded stop of the machine is the *machine*'s;
-* before the source is ready the job is *released late*, but as far as all workers were busy, so
-  that none noticed the timer or the message, it *waited*;
-* a callback that is ready waits: for its *group*, as far as another of the group ran; else it
-  *waited* as far as all workers were busy; else, with a free worker, for the *interpreter* as far
-  as something else ran; and where nothing ran though a worker was free, for the *machine*;
-* a callback that runs *ran*, and *ran long* beyond what is usual: its own median, or the longest
-  time that is declared, if that is less.  Where its CPU time is recorded, and it computes but did
-  not compute longer than usual, it had to share the *interpreter* as far as others held it, too,
-  and else the *machine* gave it no CPU;
-* *transport* is from the end of a callback until the next one is ready;
-* a job that was given up waits for a callback that never ran: its message is *lost*, unless it was
-  ready and waited.
+* overlap with a recorded stop of the machine: *machine*;
+* before the source is ready: *waited* while all workers were busy, so that none could notice the
+  timer or message; else *released late*;
+* ready callback: *group* while another callback of its group ran; else *waited* while all workers
+  were busy; else, with an idle worker, *interpreter* while any callback ran, *machine* while none
+  ran;
+* running callback: *ran* up to the usual time (its median or, if less, the declared maximum) and
+  *ran long* beyond.  If its CPU time is recorded, shows computing and is not unusual, the excess
+  is *interpreter* while other callbacks held the GIL, else *machine*: it got no CPU;
+* end of a callback until the next one is ready: *transport*;
+* job that ended early because of a callback that never ran: *waited* if the callback was ready,
+  else its message is *lost*.
 
-The cause of a miss is that of which there is most, beyond what is usual.  Two rules go before:
+The largest part, beyond what is usual, is the cause of the miss.  Two rules precede:
 
-* What waited while, or soon after, the machine stood still had to wait for the backlog: up to the
-  length of the stalls it counts as the machine's.
-* If all of that together is less than the lateness, the usual times are too long for the deadline,
-  and they count, too: what callbacks usually take as *ran long*.
+* Waiting during or shortly after a stall of the machine is caused by the backlog.  It counts as
+  *machine*, up to the length of the stalls.
+* If all unusual time together is less than the lateness, the usual times are too long for the
+  deadline.  Then they count, too: usual execution times as *ran long*.
 
-A job whose callback raised has *failed*; one that expired for want of a message has *lost* it.
-Where a timer's release was skipped because the callback still waited for the one before, that
-one's cause is its cause, too; if that one was in time, the job *waited*.
+A job whose callback raised has *failed*; a job that expired without its message has *lost* it. A
+timer's release that was skipped because the previous execution still waited has the cause of the
+previous job; if that one was in time, it *waited*.
 """
 
 from __future__ import annotations
@@ -47,9 +44,9 @@ CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transp
           'lost', 'failed')
 (WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, LOST, FAILED,
  RAN_USUALLY, UNKNOWN) = range(11)
-#: What a part of a job's time may be; the last two are no causes.
+# : Kinds of time of a job; the last two are not causes.
 PARTS = (*CAUSES, 'ran', 'unknown')
-#: What is done about it.
+# : Remedies.
 REMEDIES = {
     'waited': 'more workers, or shorter callbacks before it',
     'ran long': 'make the callback shorter, or declare the time that it takes',
@@ -63,19 +60,20 @@ REMEDIES = {
             'depth), reliable QoS, or a publisher that always publishes',
     'failed': 'mend what the callback raises'}
 _NOTHING_NS = 1_000_000
-_ABOUT_BITS = 4     # up to a 16th more is usual, too
+_ABOUT_BITS = 4     # up to a 16th above the usual time is usual
 _WAITS = (WAITED, INTERPRETER, GROUP)
 
 MISSED = np.dtype([
     ('kind', 'i8'), ('sink', 'i8'), ('job', 'i8'), ('release', 'i8'), ('until', 'i8'),
     ('at', 'i8'), ('length', 'i8')])
-"""Columns of a miss: ``at`` is the vertex that the job came to, ``length`` that of its chain."""
+"""
+Columns of a miss: ``at`` is the vertex that the job reached, ``length`` the length of its chain.
+"""
 PARTS_OF = np.dtype([
     ('miss', 'i8'), ('vertex', 'i8'), ('cause', 'i8'), ('begin', 'i8'), ('end', 'i8'),
     ('ns', 'i8')])
 """Columns of a part of the time of a miss; ``cause`` is an index of ``PARTS``."""
-# A span of time of a miss, at a vertex; of a wait how much of it was for the group, of a run its
-# CPU time.
+# A time span of a miss at a vertex: of a wait its group part, of an execution its CPU time.
 _SPAN = np.dtype([
     ('miss', 'i8'), ('vertex', 'i8'), ('kind', 'i8'), ('begin', 'i8'), ('end', 'i8'),
     ('more', 'i8')])
@@ -84,12 +82,12 @@ _LAG, _BEFORE, _WAIT, _RUN, _TRANSPORT, _PENDING = range(6)
 
 class Pool(NamedTuple):
     """
-    What ran and stood still in the time that is looked at.
+    What ran and what stalled during the misses.
 
-    :ivar full: when all workers were busy; ``some``: when anything ran that may have held the
-        interpreter (a callback that lent its worker waits); ``shared``: when several did hold it.
-    :ivar stalls: begin and end of each.
-    :ivar knows_workers: whether the number of workers is known, and an idle one takes what is
+    :ivar full: when all workers were busy; ``some``: when any callback ran that may have held the
+        GIL (a callback that lent its worker does not); ``shared``: when several held it.
+    :ivar stalls: begin and end of each stall.
+    :ivar knows_workers: whether the number of workers is known, and an idle one starts what is
         ready.
     """
 
@@ -102,10 +100,10 @@ class Pool(NamedTuple):
 
 class Usual(NamedTuple):
     """
-    What is usual.
+    Usual times.
 
-    :ivar runs: by global vertex how long it runs; ``cpu``: how long it computes.
-    :ivar lags: by DAG how late its release is seen.
+    :ivar runs: by global vertex the execution time; ``cpu``: the CPU time.
+    :ivar lags: by DAG the release lag.
     """
 
     runs: Ints
@@ -115,17 +113,17 @@ class Usual(NamedTuple):
 
 class Never(NamedTuple):
     """
-    What is known of what never ran.
+    What is known of executions that never ran.
 
-    :ivar dropped: by vertex and job, why its execution was dropped.
-    :ivar started: executions that were started, with vertex, job, ready and start.
+    :ivar dropped: by vertex and job the reason why the execution was dropped.
+    :ivar started: executions that were started: vertex, job, ready, start.
     """
 
     dropped: dict[tuple[int, int], str]
     started: Table
 
     def waiting(self, vertices: Ints, times: Ints) -> Ints:
-        """Return of each vertex the job whose execution waited at the time beside it, or -1."""
+        """Return by vertex the job whose execution waited at the given time, or -1."""
         jobs = np.full(len(vertices), -1)
         for vertex in np.unique(vertices).tolist():
             mine = self.started[self.started['vertex'] == vertex]
@@ -145,7 +143,7 @@ class Found(NamedTuple):
     """
     Misses (a table of ``MISSED``), their causes, and the parts of their times in order.
 
-    :ivar too_short: of which misses the deadline is too short for what is usual.
+    :ivar too_short: misses whose deadline is shorter than the usual times.
     """
 
     misses: Table
@@ -162,7 +160,7 @@ def find(
     Find the causes of misses.
 
     :param rows: a table of ``MISSED``; ``chain``: the links of their chains (``chains.LINKS``),
-        one after the other, ends first.
+        one chain after the other, each from its end.
     :param dag_of: by global vertex its DAG; ``deadline``: its relative deadline as a sink.
     :param is_source: by global vertex whether it is its DAG's source.
     """
@@ -207,11 +205,12 @@ def find(
 
 
 def _spans(rows: Table, chain: Table, is_source: Any) -> Table:
-    """Return the spans of time that misses went through, each in order."""
+    """Return the time spans of misses, each miss in order."""
     n, lengths = len(rows), rows['length']
     first = np.cumsum(lengths) - lengths
     of = np.repeat(np.arange(n), lengths)
-    is_last = np.zeros(len(chain), dtype=np.bool_)      # of its chain: it stands first
+    # last link of its chain, which comes first in the table
+    is_last = np.zeros(len(chain), dtype=np.bool_)
     is_last[first[lengths > 0]] = True
     until = rows['until'][of]
     ready, start, end = chain['ready'], chain['start'], chain['end']
@@ -244,7 +243,7 @@ def _spans(rows: Table, chain: Table, is_source: Any) -> Table:
 
 
 def _ran_long(spans: Table, more: Ints, usual: Usual, pool: Pool) -> Ints:
-    """Split the time for which callbacks ran longer than usual."""
+    """Split the time beyond the usual execution times."""
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
     cpu, vertex = spans['more'], spans['vertex']
     computed = np.maximum(0, cpu - usual.cpu[vertex])
@@ -258,7 +257,7 @@ def _ran_long(spans: Table, more: Ints, usual: Usual, pool: Pool) -> Ints:
 
 
 def _waits(spans: Table, left: Ints, pool: Pool) -> Ints:
-    """Split the time for which callbacks waited, but for stalls."""
+    """Split the waiting time, without stalls."""
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
     times[:, GROUP] = np.minimum(spans['more'], left)
     left = left - times[:, GROUP]
@@ -281,9 +280,9 @@ def _pending(
     rows: Table, spans: Table, times: Ints, left: Ints, never: Never, pool: Pool, is_source: Any
 ) -> None:
     """
-    Find out what became of the callbacks that never ran; they wait or are lost.
+    Find what callbacks that never ran were pending for: they waited, or their message is lost.
 
-    A timer's release that was skipped waited if all workers were busy for most of that time.
+    A timer's skipped release waited if all workers were busy for most of the time.
     """
     open_ones = np.flatnonzero(spans['kind'] == _PENDING).tolist()
     started = never.started if open_ones else never.started[:0]
@@ -304,20 +303,20 @@ def _pending(
 
 
 def _unusual(total: Ints, lags: Ints) -> Ints:
-    """Return of each miss the times by cause, beyond what is usual."""
+    """Return by miss the unusual time of each cause."""
     amounts: Ints = total[:, :len(CAUSES)].copy()
     amounts[:, RELEASED_LATE] -= np.minimum(amounts[:, RELEASED_LATE], lags)
     return amounts
 
 
 def _too_short(rows: Table, unusual: Ints, deadline: Ints) -> Any:
-    """Return of which misses the deadline is too short for what is usual."""
+    """Return which misses have a deadline that is shorter than the usual times."""
     lateness = rows['until'] - rows['release'] - deadline
     return (unusual == 0) | ((rows['kind'] == SINK_LATE) & (unusual < lateness))
 
 
 def delayed_by(rows: Table, stall: tuple[int, int]) -> Any:
-    """Return which misses a stall, or the backlog after it, may have delayed."""
+    """Return which misses a stall or its backlog may have delayed."""
     begin, end = stall
     return (rows['release'] < 2 * end - begin) & (rows['until'] > begin)
 
@@ -325,8 +324,8 @@ def delayed_by(rows: Table, stall: tuple[int, int]) -> Any:
 def _causes(
     rows: Table, total: Ints, amounts: Ints, pool: Pool, never: Never, is_source: Any
 ) -> Ints:
-    """Return the cause of each miss; ``amounts`` are the times that count for it."""
-    credit = np.zeros(len(rows), dtype=np.int64)    # what the machine may have delayed
+    """Return the cause of each miss; ``amounts`` are the times that are compared."""
+    credit = np.zeros(len(rows), dtype=np.int64)    # time that the machine may have caused
     for stall in pool.stalls:
         credit[delayed_by(rows, stall)] += stall[1] - stall[0]
     after_stall = credit > 0
@@ -349,10 +348,10 @@ def _given_up(
     rows: Table, which: Ints, causes: Ints, skipped: Ints, never: Never, is_source: Any
 ) -> Ints:
     """
-    Return the causes of some misses whose jobs were given up.
+    Return the causes of misses whose jobs ended early.
 
     :param causes: of all misses.
-    :param skipped: their causes if their releases were skipped, and nothing waited.
+    :param skipped: causes of skipped releases for which no execution waited.
     """
     found = causes[which]
     kind, job, at, until = (rows[name][which] for name in ('kind', 'job', 'at', 'until'))
@@ -363,7 +362,7 @@ def _given_up(
     found[skips] = skipped[which[skips]]
     before = never.waiting(at, until)
     waits = skips & (before >= 0) & (found != MACHINE)
-    raised = rows['kind'] == SINK_FAILED     # which does not say why something waited
+    raised = rows['kind'] == SINK_FAILED     # a failure does not say why an execution waited
     of = dict(zip(
         zip(rows['sink'][~raised].tolist(), rows['job'][~raised].tolist()),
         causes[~raised].tolist()))
@@ -377,11 +376,11 @@ def behind(
     same_group: Any,
 ) -> dict[int, list[tuple[int, int]]]:
     """
-    Return by part the callbacks behind which it waited, and how long each ran, longest first.
+    Return by part the callbacks that ran while it waited, and how long, longest first.
 
     :param chosen: the numbers of the parts.
-    :param runs: by callback when it ran; ``on_workers``: when it kept a worker busy by that.
-    :param same_group: returns of a vertex and a callback whether they share a group.
+    :param runs: by callback when it ran; ``on_workers``: when its executions occupied a worker.
+    :param same_group: returns whether a vertex and a callback share a callback group.
     """
     found: dict[int, list[tuple[int, int]]] = {}
     if not len(chosen) or not runs:
@@ -407,7 +406,7 @@ MOST_BEHIND = 5
 
 
 def to_explain(found: Found) -> Ints:
-    """Return the parts for which to find what they waited behind."""
+    """Return the parts that waited for other callbacks."""
     parts, rows = found.parts, found.misses
     share = 10 * parts['ns'] >= (rows['until'] - rows['release'])[parts['miss']]
     which: Ints = np.flatnonzero(np.isin(parts['cause'], _WAITS) & share)

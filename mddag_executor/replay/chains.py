@@ -1,28 +1,27 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Where the time of a job went, along its critical chain.
+Splits the response time of a job along its critical chain.
 
-Theory of operation
--------------------
-The critical chain of a sink's completion is found backwards: the sink's vertex became ready when
-the last message that it needed arrived, which the vertex before it published; and so on up to the
-source.  Along the chain the response time, completion minus release, splits without rest into
+Theory of operation ------------------- The critical chain of a completed sink is found backwards.
+A vertex became ready when the last message that it needed arrived; the vertex that published this
+message is the previous link; the first link is the source.  The response time (completion minus
+release) is the sum of:
 
-* release lag: from the release until the source was ready (a timer noticed late, or, with
-  `release_from: header_stamp`, the way of the sensor's message);
-* waiting: from ready to the start of the execution, for a worker or for the callback group (the
-  part while another callback of the group ran);
-* executing: from the start until the next vertex was ready, or the execution's end, whichever
-  was first;
-* suspended: in between, while a coroutine waited;
+* release lag: from the release until the source was ready (timer latency or, with `release_from:
+  header_stamp`, the transport of the sensor's message);
+* waiting: from ready to the start of the execution, for a worker or for the callback group (while
+  another callback of the group ran);
+* executing: from the start until the next vertex was ready or the execution ended, whichever was
+  first;
+* suspended: the gaps within an execution in which a coroutine waited;
 * transport: from the end of an execution until the next vertex was ready;
-* unknown: what came before the part of the chain that is in the recording.
+* unknown: the time before the first recorded link.
 
-A callback that publishes early may still run when the sink completes.  Then it has executed until
-its message arrived, and which of its legs it was is not known.
+A callback that publishes early may still run when the sink completes.  Its execution then counts
+until its message arrived; which of its legs ran is unknown.
 
-All chains of a DAG are followed at once, step by step.
+All chains of a DAG are followed at once, link by link.
 """
 
 from __future__ import annotations
@@ -53,16 +52,16 @@ LINKS = np.dtype([
     ('of', 'i8'), ('vertex', 'i8'), ('leg', 'i8'), ('ready', 'i8'), ('start', 'i8'),
     ('end', 'i8'), ('busy', 'i8'), ('group', 'i8'), ('cpu', 'i8')])
 """
-Columns of a link, a step of a chain.
+Columns of a link of a chain.
 
-``of`` is whose chain it is; ``leg`` the leg that completed the vertex (-1: it still ran); of the
-execution readiness, first start, last end and the time that its pieces took, how much of its
-waiting was for its callback group, and its CPU time (-1: not known), ns.
+``of`` is the number of the chain; ``leg`` is the leg that completed the vertex (-1: still
+running). Times of the execution: ready, first start, last end, total time of its pieces, waiting
+for the callback group, CPU time (-1: unknown), ns.
 """
 
 
 class _Dag(NamedTuple):
-    """The vertices of a DAG: which vertex each leg's message comes from, by local number."""
+    """The vertices of a DAG; by leg the local number of the vertex that publishes its message."""
 
     first: int
     before: Ints
@@ -72,13 +71,13 @@ class _Dag(NamedTuple):
 
 class Chains:
     """
-    The chains of a recording that was judged.
+    The chains of a judged recording.
 
-    :param waited: by execution how long its first piece waited for its group, ns.
+    :param waited: by execution how long its first piece waited for its callback group, ns.
     """
 
     def __init__(self, judged: Judged, executions: Table, waited: Ints) -> None:
-        if not len(executions):     # a row that -1 may stand for
+        if not len(executions):     # row -1 must exist
             executions, waited = rows(EXECUTIONS, 1), np.zeros(1, dtype=np.int64)
         self._judged, self._executions, self._waited = judged, executions, waited
         self._dags = [self._dag(dag, first) for dag, first in zip(
@@ -99,10 +98,10 @@ class Chains:
         self, dag: int, row: Ints, vertex: Ints, order: Ints, time: Ints
     ) -> tuple[Ints, Mask]:
         """
-        Return the executions of (local) vertices of jobs as of places in the order.
+        Find the executions of (local) vertices of jobs at positions in the order of events.
 
-        :param time: of these places, ns.
-        :return: rows of executions, -1 where there is none, and whether they had not completed.
+        :param time: times of these positions, ns.
+        :return: rows of executions, -1: none; and whether the vertex had not completed yet.
         """
         jobs = self._judged.jobs[dag]
         found = np.where(jobs.done_order[row, vertex] < order, jobs.done[row, vertex], -1)
@@ -114,7 +113,7 @@ class Chains:
         return found, running
 
     def _running(self, dag: int, row: Ints, vertex: Ints, time: Ints) -> Ints:
-        """Return the executions that had started last, -1 where none had."""
+        """Return the executions that started last; -1: none started."""
         cells, starts, links = self._starts(dag)
         cell = row * len(self._dags[dag].n_legs) + vertex
         at = np.searchsorted(cells, cell, 'right') - 1
@@ -132,9 +131,9 @@ class Chains:
 
     def _starts(self, dag: int) -> tuple[Ints, Ints, Ints]:
         """
-        Return by job and vertex when what started, and the rows of these executions.
+        Return by job and vertex the start times, and the rows of these executions.
 
-        The row of a piece that goes on where nothing else has started is that of the first.
+        A resumed piece without a recorded first piece gets the row of its execution.
         """
         found = self._started.get(dag)
         if found is None:
@@ -154,7 +153,7 @@ class Chains:
         return found
 
     def links(self, dag: int, link: Ints, running: Mask) -> Table:
-        """Return executions as links; of those that run it is not known when they end."""
+        """Return executions as links; the end of a running execution is unknown."""
         table = pick(self._executions, link)
         found = np.zeros(len(link), dtype=LINKS)
         found['vertex'], found['ready'] = table['vertex'], table['ready']
@@ -172,9 +171,9 @@ class Chains:
         self, dag: int, row: Ints, order: Ints, time: Ints, link: Ints, running: Mask
     ) -> Iterator[tuple[Ints, Table]]:
         """
-        Yield the links of chains, the last ones first: whose they are, and the links.
+        Yield the links of chains from last to first: numbers of the chains, and links.
 
-        :param link: rows of the executions with which the chains end, -1: there is no chain.
+        :param link: rows of the executions that end the chains; -1: no chain.
         """
         of, which = self._dags[dag], np.flatnonzero(link >= 0)
         link, running = link[which], running[which]
@@ -190,7 +189,8 @@ class Chains:
             link, running = self.link(dag, row[which], publisher, order[which], time[which])
             started = self._start(link, running)
             good = (link >= 0) & (started <= since)
-            for i in np.flatnonzero(leg < 0).tolist():      # it is not known whose message it was
+            # the publisher of the message is unknown
+            for i in np.flatnonzero(leg < 0).tolist():
                 link[i], running[i] = self._latest(
                     dag, row[which[i]], of.before[local[i], :of.n_legs[local[i]]],
                     order[which[i]], time[which[i]], since[i])
@@ -205,7 +205,7 @@ class Chains:
     def _latest(
         self, dag: int, row: Any, publishers: Ints, order: Any, time: Any, since: Any
     ) -> tuple[int, bool]:
-        """Return which publisher, of those that had started, ended last."""
+        """Return the publisher that ended last, of those that had started."""
         n = len(publishers)
         link, running = self.link(dag, np.full(n, row), publishers, np.full(n, order),
                                   np.full(n, time))
@@ -220,14 +220,14 @@ class Chains:
 
     def of_misses(self, dag: int, missed: Table) -> tuple[Ints, Table]:
         """
-        Return the chains of misses of a DAG, as far as their jobs came.
+        Return the chains of the misses of a DAG, as far as their jobs got.
 
         :param missed: verdicts.
-        :return: the vertex that each job came to, and the links, ``of`` being the place in
+        :return: the last vertex that each job reached, and the links; ``of`` is the row in
             ``missed``.
         """
         of, row = self._dags[dag], missed['row']
-        # as of right after a completion, and right before a job was given up
+        # right after a completion, or right before an early end
         order = missed['order'] + (missed['kind'] == SINK_LATE)
         time, n, size = missed['until'], len(missed), len(of.n_legs)
         every, running = self.link(
@@ -245,7 +245,7 @@ class Chains:
             back, first = back[some], missing[some].argmax(axis=1)
             at[back] = publishers[some, first]
         link, runs = every[everyone, at], running[everyone, at]
-        # the last message that it waited for
+        # the last message that the vertex waited for
         publishers = of.before[at]
         ends = np.where(publishers >= 0, end[everyone[:, None], publishers], -1)
         ends[(publishers >= 0) & (every[everyone[:, None], publishers] < 0)] = -1
@@ -259,7 +259,7 @@ class Chains:
     # --- breakdown -------------------------------------------------------------------------------
 
     def breakdown(self) -> dict[int, dict[str, Any]]:
-        """Return by sink where the time of its completed jobs went: means, and the worst job."""
+        """Return by sink the breakdown of its completed jobs: means, and the worst job."""
         found: dict[int, dict[str, Any]] = {}
         judged = self._judged
         for sink, verdicts in zip(judged.tables.sinks, judged.by_sink()):
@@ -288,22 +288,23 @@ class Chains:
     def _split(
         self, dag: int, sink: int, done: Table
     ) -> tuple[dict[str, Ints], Ints, list[Table]]:
-        """Return the parts of response times, of these what was for groups, and the links."""
+        """Return the parts of response times, their waiting for callback groups, and the links."""
         of = self._dags[dag]
         n = len(done)
         parts = {name: np.zeros(n, dtype=np.int64) for name in Breakdown._fields}
         lag, waiting, executing, suspended, transport, unknown = parts.values()
         group = np.zeros(n, dtype=np.int64)
         row, order, completed = done['row'], done['order'], done['completed']
-        # as of right after its completion
+        # right after its completion
         link, running = self.link(dag, row, np.full(n, sink - of.first), order + 1, completed)
         until, release = completed.copy(), done['release']
-        begun = np.zeros(n, dtype=np.bool_)     # whether the chain reaches to the source
+        begun = np.zeros(n, dtype=np.bool_)     # whether the chain reaches the source
         kept: list[Table] = []
         for which, links in self.follow(dag, row, order + 1, completed, link, running):
             ready, start, end = links['ready'], links['start'], links['end']
             published = until[which] if not kept else np.minimum(end, until[which])
-            # Where in the execution a pause was is not kept: it counts as far as there is room.
+            # The position of a pause within the execution is not recorded: it counts as far as it
+            # fits.
             pause = np.where(links['leg'] < 0, 0, np.maximum(
                 0, np.minimum(end - start - links['busy'], published - start)))
             waiting[which] += start - ready

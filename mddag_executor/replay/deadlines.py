@@ -3,23 +3,22 @@
 """
 The verdicts of a recording, computed from its tables.
 
-Theory of operation
--------------------
-The rules are those of the scheduler core (``core.rules``, 1, 2, 6, 8 and 10), for all jobs at
-once; ``test/replay/test_deadlines.py`` holds the two against each other.
+Theory of operation ------------------- The rules are rules 1, 2, 6, 8 and 10 of the scheduler core
+(``core.rules``), applied to all jobs at once; ``test/replay/test_deadlines.py`` compares both
+implementations.
 
-1. A vertex has completed with the completion that made the last of its legs whole.
-2. A job ends when all its sinks have completed, or before that when it expired, was aborted or
-   failed as recorded.  What completes afterwards does not count.
-3. A sink that completed by its absolute deadline is in time, after it late.  If the job ended
-   before, the sink has the verdict of that end.  If the run ended past the deadline, the sink
-   is overdue.
-4. Jobs that are released before ``judge_from``, as it was at the time of the verdict, or outside
-   of ``judged_releases`` are not judged.
-5. Which vertices a process expects (``hosted``) holds for the jobs that are released afterwards.
+1. A vertex completes when the last of its legs completes.
+2. A job ends when all its sinks have completed, or earlier if it is recorded as expired, aborted
+   or failed.  Later completions do not count.
+3. A sink that completed by its absolute deadline is in time, later it is late.  If the job ended
+   before, the sink gets the verdict of that end.  If the run ended after the deadline, the sink is
+   overdue.
+4. Jobs released before ``judge_from`` (its value at the time of the verdict) or outside
+   ``judged_releases`` are not judged.
+5. A change of the vertices that a process expects (``hosted``) applies to jobs released after it.
 
-The misses that the executor recorded must be the ones found here; if they are not, the recording
-lacks something or this program is wrong, and ``Judged.differences`` says so.
+The executor's recorded misses must equal the computed ones.  If they differ, the recording is
+incomplete or this program is wrong; ``Judged.differences`` reports it.
 """
 
 from __future__ import annotations
@@ -60,10 +59,10 @@ VERDICTS = np.dtype([
     ('kind', 'i1'), ('dag', 'i4'), ('sink', 'i4'), ('job', 'i8'), ('release', 'i8'),
     ('deadline', 'i8'), ('completed', 'i8'), ('until', 'i8'), ('row', 'i8'), ('order', 'i8')])
 """
-Columns of the table of verdicts, one row for each judged job at each sink, in order.
+Columns of the table of verdicts: one row per judged job and sink, in order.
 
-``kind`` is one of the core's decisions, ``completed`` -1 if the sink never completed, ``until``
-the completion or the time at which the job was given up, ``row`` the job's row in ``Jobs``.
+``kind`` is one of the core's decisions; ``completed`` is -1 if the sink never completed; ``until``
+is the time of completion, or of the end of the job; ``row`` is the job's row in ``Jobs``.
 """
 
 _ENDS = {
@@ -73,11 +72,11 @@ _ENDS = {
 
 class Jobs(NamedTuple):
     """
-    The jobs of one DAG, by row, in the order of their releases.
+    The jobs of one DAG, one row each, in the order of their releases.
 
-    ``done`` and ``done_order`` have for each job and vertex of the DAG the row of the execution
-    that completed it (-1: none) and its place in the order.  ``ended`` is the place in the order
-    at which the job was given up.
+    ``done`` and ``done_order`` have, by job and vertex, the row of the execution that completed
+    the vertex (-1: none) and its position in the order of events.  ``ended`` is the position at
+    which the job ended early.
     """
 
     number: Ints
@@ -88,16 +87,16 @@ class Jobs(NamedTuple):
     ended: Ints
 
     def rows_of(self, jobs: Any) -> Ints:
-        """Return the rows of jobs, -1 of those that are not there."""
+        """Return the rows of jobs; -1 for unknown jobs."""
         return look_up(self.number, jobs)
 
 
 class Judged:
     """
-    What came of the deadlines of a recording.
+    The verdicts of a recording.
 
     :ivar verdicts: a table of ``VERDICTS``; ``tally`` has its sums.
-    :ivar jobs: by DAG.
+    :ivar jobs: the jobs, by DAG.
     :ivar contradictions: events that contradict earlier ones.
     """
 
@@ -165,14 +164,14 @@ class Judged:
         completed = np.full(done.shape, -1)
         completed[done] = self._recording.executions['end'][jobs.done[:, local][done]]
         late = done & (completed > deadline)
-        # when the last of what ends here was done
+        # position at which the last sink completed
         closed = np.where(here, np.where(done, order, NEVER), -1).max(axis=1, initial=-1)
         if expected is not None:
             inner = expected == LEADS_OUT
             closed = np.maximum(closed, np.where(
                 inner, np.where(jobs.done_order < jobs.ended[:, None], jobs.done_order, NEVER),
                 -1).max(axis=1, initial=-1))
-        closed[closed < 0] = NEVER      # nothing ends here
+        closed[closed < 0] = NEVER      # no sinks here
         ended = np.minimum(jobs.ended, closed)
         judged_order, judged_until = self._recording.judged_order, self._recording.judged_until
         open_then = (jobs.released < judged_order) & (ended > judged_order)
@@ -222,20 +221,20 @@ class Judged:
         return jobs, verdicts
 
     def _given_up(self, jobs: Jobs, ends: Table) -> tuple[Ints, Ints]:
-        """Note when jobs ended as recorded; return why, and at which time."""
+        """Note when jobs ended early; return the reason and the time."""
         reason, when = np.full(len(jobs.number), -1), np.full(len(jobs.number), -1)
         ends = ends[sort_by(ends['order'])][::-1]
         row = jobs.rows_of(ends['job'])
         known = (row >= 0) & (ends['order'] > jobs.released[np.maximum(row, 0)]) if len(
             jobs.number) else np.zeros(len(ends), dtype=np.bool_)
         row, ends = row[known], ends[known]
-        # of several the first one, which is written last
+        # the first end of several wins: it is written last
         jobs.ended[row] = ends['order']
         reason[row], when[row] = ends['reason'], ends['time']
         return reason, when
 
     def _late_ends(self, jobs: Jobs, ends: Table, ended: Ints) -> None:
-        """Count ends of jobs that were not open."""
+        """Count ends of jobs that had ended already."""
         if not self._recording.same or not len(ends):
             return
         ends = ends[ends['reason'] <= recorded.ABORTED]
@@ -248,7 +247,7 @@ class Judged:
         self.contradictions += int((~open_ones).sum())
 
     def _expected(self, dag: int, jobs: Jobs) -> Ints | None:
-        """Return by job and vertex where it is expected; None: all of them here (rule 5)."""
+        """Return by job and vertex whether it is expected; None: all are expected (rule 5)."""
         changes = [(order, vertices) for order, of, vertices in self._recording.hosted
                    if of == dag]
         if not changes:
@@ -265,10 +264,9 @@ class Judged:
         self, dag: int, jobs: Jobs, completing: Ints, expected: Ints | None
     ) -> tuple[Ints, Ints]:
         """
-        Fill in which executions completed which vertices (rule 1).
+        Fill in the executions that completed vertices (rule 1).
 
-        :return: the places in the order of completions of what had completed before, and the rows
-            of their jobs.
+        :return: positions of duplicate completions, and the rows of their jobs.
         """
         executions = self._recording.executions
         first = self.tables.first_vertex[dag]
@@ -278,7 +276,7 @@ class Judged:
         if len(jobs.number):
             known &= order > jobs.released[np.maximum(row, 0)]
         if not known.all():
-            # of a job that was not released before; else of one that has ended
+            # no such job was released before, or it has ended
             newest = np.maximum.accumulate(np.r_[-1, jobs.number])
             before = newest[np.searchsorted(jobs.released, order)]
             self.contradictions += int(
@@ -289,7 +287,7 @@ class Judged:
         vertex = executions['vertex'][completing] - first
         n_legs = np.array(self.tables.n_legs[first:first + jobs.done.shape[1]])
         single = n_legs[vertex] == 1
-        # the first completion of each, which is written last
+        # the first completion of each vertex wins: it is written last
         places, orders = jobs.done.reshape(-1), jobs.done_order.reshape(-1)
         cell = row * jobs.done.shape[1] + vertex
         duplicate = np.zeros(len(cell), dtype=np.bool_)
@@ -310,7 +308,7 @@ class Judged:
         self, jobs: Jobs, mine: Ints, cell: Ints, order: Ints, completing: Ints, n_legs: Ints,
         duplicate: Mask,
     ) -> None:
-        """Fill in which vertices of several legs have completed."""
+        """Fill in the completions of vertices with several legs."""
         leg = self._recording.executions['leg'][completing[mine]].astype(np.int64)
         width, n = int(n_legs.max()), jobs.done.shape[1]
         legs = n_legs[cell[mine] % n]
@@ -320,7 +318,7 @@ class Judged:
         number = np.r_[mine[~every], np.repeat(mine[every], legs[every])]
         at = np.r_[leg[~every], np.concatenate(
             [np.arange(each) for each in legs[every].tolist()] or [leg[:0]])]
-        back = np.argsort(number, kind='stable')[::-1]      # in the order of completion, reversed
+        back = np.argsort(number, kind='stable')[::-1]      # in the reverse order of completion
         number, at = number[back], at[back]
         done_leg = np.full((jobs.done.size, width), -1)
         done_leg[cell[number], at] = number
@@ -384,13 +382,13 @@ class Judged:
 
     def differences(self) -> str | None:
         """
-        Return how the recorded misses differ from those found, None if they do not.
+        Return how the recorded misses differ from the computed ones; None if they are equal.
 
-        Only of use if the end of the run is recorded: elsewhere the trace may be cut between a
+        Only meaningful if the end of the run is recorded: otherwise the trace may end between a
         completion and its verdict.
         """
         if self.skip or not self._recording.same:
-            return None  # what was recorded is of all jobs
+            return None  # the recorded sums count all jobs
         missed, before = self.missed, self._recording.misses
         columns = ('dag', 'sink', 'job', 'deadline', 'completed')
         found = Counter(zip(*(missed[name].tolist() for name in columns)))
@@ -406,7 +404,7 @@ class Judged:
 
 
 class _Judging:
-    """From which release on jobs are judged, over the course of the run (rule 4)."""
+    """The first judged release, as it changes during the run (rule 4)."""
 
     def __init__(self, recording: Recording, skip: int) -> None:
         changes = [(-1, -NEVER)]
@@ -424,7 +422,7 @@ class _Judging:
         self._begin, self._end = recording.judged_releases or (-NEVER, NEVER)
 
     def is_judged(self, order: Any, release: Any) -> Mask:
-        """Return whether jobs of some releases are judged at some places in the order."""
+        """Return whether jobs are judged, by release and position in the order of events."""
         in_range = (release >= self._begin) & (release < self._end)
         if len(self._orders) == 1:
             judged: Mask = np.broadcast_to(
@@ -437,21 +435,20 @@ class _Judging:
 
 
 def _split(table: Table, dag: Any, n_dags: int) -> list[Table]:
-    """Return the rows of each DAG."""
     order = np.argsort(dag, kind='stable')
     borders = np.searchsorted(dag[order], np.arange(n_dags + 1))
     return [table[order[begin:end]] for begin, end in zip(borders, borders[1:])]
 
 
 def look_up(numbers: Ints, wanted: Any) -> Ints:
-    """Return the places of numbers, -1 of those that are not there."""
+    """Return the positions of numbers; -1 for missing numbers."""
     if not len(numbers):
         return np.full(len(wanted), -1)
     order = None
     if (numbers[1:] < numbers[:-1]).any():
         order = np.argsort(numbers, kind='stable')
         numbers = numbers[order]
-    if numbers[-1] - numbers[0] == len(numbers) - 1:    # without a gap
+    if numbers[-1] - numbers[0] == len(numbers) - 1:    # numbers without gaps
         at = wanted - numbers[0]
         there = (wanted >= numbers[0]) & (wanted <= numbers[-1])
     else:
@@ -463,9 +460,9 @@ def look_up(numbers: Ints, wanted: Any) -> Ints:
 
 def judge(recording: Recording, skip: int = 0) -> Judged:
     """
-    Return what came of the deadlines of a recording.
+    Judge the deadlines of a recording.
 
-    :param skip: how long after the first release jobs are not judged (a warm-up), ns.
+    :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
     """
     return Judged(recording, skip)
 

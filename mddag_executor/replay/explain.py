@@ -3,12 +3,10 @@
 """
 Explains the missed deadlines of a recording: see ``causes``.
 
-Theory of operation
--------------------
-The chain of a miss is that of its sink (see ``chains``); of a job that was given up it is that of
-the vertex that the job came to.  What is usual of a callback or release is the median over the
-whole recording.  Stops of the machine are those that the executor recorded; as it notices them up
-to a slice late, a stop begins with the last event before it.
+Theory of operation ------------------- A miss has the chain of its sink (see ``chains``) or, if
+the job ended early, of the vertex that the job reached.  The usual time of a callback or release
+is its median over the whole recording.  Stops of the machine are recorded by the executor up to
+one slice late, so a stop begins with the last event before it.
 """
 
 from __future__ import annotations
@@ -44,18 +42,18 @@ from mddag_executor.replay.usage import ran
 import numpy as np
 
 _NO_END = 2 ** 62
-_STEPS = 32     # of an octave
+_STEPS = 32     # per octave
 
 
 class Explanation:
-    """Why the deadlines of a recording were missed."""
+    """The causes of the missed deadlines of a recording."""
 
     def __init__(self, recording: Recording, judged: Judged, chains: Chains) -> None:
         self._recording, self._task_set = recording, recording.task_set
         self._tables, self._who = judged.tables, recording.who
         self._rows = ran(recording)
         policy = POLICIES.get(recording.head.policy)
-        # of several processes it is not known whose workers were busy
+        # with several processes it is unknown whose workers were busy
         self._workers = recording.head.workers if recording.declared and \
             recording.processes == 1 and not (policy is not None and policy.polling) else 0
         #: Begin and end of each stop of the machine.
@@ -67,7 +65,7 @@ class Explanation:
             np.array([*self._tables.dag_of, 0], dtype=np.int64),
             np.array([*self._tables.sink_deadline, 0], dtype=np.int64),
             np.array([*(not v.predecessors for v in self._task_set.vertices), False]))
-        # by sink and cause how many
+        # number of misses by sink and cause
         self._counts = np.zeros((len(self._task_set.vertices) + 1, len(CAUSES)), dtype=np.int64)
         np.add.at(self._counts, (missed['sink'], self.found.causes), 1)
         self._in_stops = dict.fromkeys(self.stops, 0)
@@ -99,7 +97,7 @@ class Explanation:
         return missed, every
 
     def _pool(self, missed: Table) -> Pool:
-        """Return what ran and stood still meanwhile."""
+        """Return what ran and what stalled during the misses."""
         table, rows = self._recording.executions, self._rows
         on_workers = rows[table['worker'][rows] >= 0]
         start, end = table['start'][on_workers], table['end'][on_workers]
@@ -114,12 +112,12 @@ class Explanation:
             [stop for stop in self.stops if stop[1] >= first], self._workers > 0)
 
     def _usual(self) -> Usual:
-        """Return what is usual of callbacks and releases."""
+        """Return the usual times of callbacks and releases."""
         task_set, table = self._task_set, self._recording.executions
         place = np.array([*task_set.places_of_vertices(), 0], dtype=np.int64)
         longest = [_NO_END if v.callback.execution_time is None
                    else v.callback.execution_time.quantiles_ns[-1] for v in task_set.vertices]
-        # of a sync the last message makes it run; the others are only kept
+        # the last message of a sync vertex starts it; the others are only stored
         rows = self._rows
         whole = rows[(table['completes'][rows] == VERTEX) & (table['vertex'][rows] >= 0)]
         of = place[table['vertex'][whole]]
@@ -139,12 +137,11 @@ class Explanation:
             *(drops[name].tolist() for name in ('vertex', 'job', 'reason')))}
 
     def _started(self) -> Table:
-        """Return the executions of declared callbacks that were started."""
         table = self._recording.executions
         return pick(table, (table['vertex'] >= 0) & (table['start'] >= 0))
 
     def _stops(self) -> list[tuple[int, int]]:
-        """Return the stops of the machine, from the last event before each on."""
+        """Return the stops of the machine, each from the last event before it."""
         recording = self._recording
         stops = recording.stops[recording.stops['end'] - recording.stops['start'] >= LEAST_NS]
         if not len(stops):
@@ -161,7 +158,7 @@ class Explanation:
         return sorted(found)
 
     def _behind(self) -> dict[int, list[tuple[int, int]]]:
-        """Return by part of a miss behind which callbacks it waited, and for how long."""
+        """Return by part of a miss the callbacks that it waited for, and how long."""
         if self._waited is not None:
             return self._waited
         self._waited = {}
@@ -184,7 +181,7 @@ class Explanation:
             runs[callback] = on_workers[callback] = Spans(
                 table['start'][mine], table['end'][mine])
             busy = mine[table['worker'][mine] >= 0]
-            if len(busy) < len(mine):       # else it lent its worker
+            if len(busy) < len(mine):       # some executions lent their worker
                 on_workers[callback] = Spans(table['start'][busy], table['end'][busy])
         self._waited = behind(self.found.parts, chosen, runs, on_workers, same_group)
         return self._waited
@@ -199,7 +196,7 @@ class Explanation:
     # --- results ---------------------------------------------------------------------------------
 
     def summary(self) -> dict[str, Any]:
-        """Return how many misses there are of each cause, in all and by sink, and the stops."""
+        """Return the number of misses by cause, in total and by sink, and the stops."""
         names = [v.name for v in self._task_set.vertices]
         return {
             'missed': int(self._counts.sum()),
@@ -213,8 +210,8 @@ class Explanation:
         """
         Return the result format of ``explain --json``.
 
-        :param sink: the global vertex of the only sink whose jobs are wanted.
-        :param job: the only job.
+        :param sink: global vertex of the only sink to report.
+        :param job: the only job to report.
         """
         return {**self.summary(), 'jobs': list(self._jobs(sink, job))}
 
@@ -249,7 +246,7 @@ class Explanation:
                 {'callback': names[callback], 'ns': took} for callback, took in waited]}
 
     def _names(self) -> dict[int, str]:
-        """Return what the callbacks are called behind which something waited."""
+        """Return the names of the callbacks that others waited for."""
         vertices, ran_as = self._task_set.vertices, self._vertices()
         callbacks = {callback for each in self._behind().values() for callback, _ in each}
         return {
@@ -263,7 +260,7 @@ class Explanation:
             missed['sink'].tolist(), missed['job'].tolist(), self.found.causes.tolist())}
 
     def worst(self) -> dict[str, Any] | None:
-        """Return the job that was most late; of those that never completed, the first."""
+        """Return the latest job; if none completed, the first miss."""
         every = self.found.misses
         if not len(every):
             return None
@@ -275,10 +272,10 @@ class Explanation:
 
     def mostly(self) -> list[dict[str, Any]]:
         """
-        Return for each sink and cause how many misses, and where most of that time went.
+        Return by sink and cause the number of misses, and where most of their time went.
 
-        ``ns`` is the mean time of the misses with that cause, ``vertex`` where most of it went,
-        ``behind`` the callback behind which they waited longest, None where they did not wait.
+        ``ns`` is the mean time of the misses with this cause, ``vertex`` where most of it went,
+        and ``behind`` the callback that they waited for longest, None if they did not wait.
         """
         at: dict[tuple[int, int], Counter[int]] = {}
         after: dict[tuple[int, int], Counter[int]] = {}
@@ -307,7 +304,7 @@ class Explanation:
 
 def medians(numbers: Any, times: Ints, count: int) -> Ints:
     """
-    Return the median of times of each number, exact to 3 %; 0 for a number without times.
+    Return the median time of each number, exact to 3 %; 0 without times.
 
     :param count: how many numbers there are.
     """

@@ -1,17 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What noticing took in a recording: timers that were due, and messages of other processes.
+Measures what noticing due timers and messages of other processes cost in a recording.
 
-Theory of operation
--------------------
-The intake of a process (``simulate.intakes``) is not recorded, but what it does is seen twice:
+Theory of operation ------------------- The intake thread of a process (``simulate.intakes``) is
+not recorded.  Its work shows in two ways:
 
-* An execution that computes with Python's lock stands still meanwhile: its time is longer than
-  its CPU time.  So what noticing takes of the interpreter is the median of that of executions in
-  which just one timer, or one message, was noticed.
-* What is noticed is ready some time after it was due, or sent.  Where nothing computes then, that
-  is how long it takes alone; where a callback does, a switch interval more.
+* A computing execution that holds the GIL pauses while the intake runs, so its duration exceeds
+  its CPU time.  The intake's GIL time is the median excess of executions during which exactly one
+  timer or message was noticed.
+* A timer or message is ready some time after it was due or sent.  If no callback computes, this is
+  the intake's latency; if one computes, a switch interval is added.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ import numpy as np
 
 class Noticed(NamedTuple):
     """
-    What was noticed, by columns: rounds of timers, and messages of other processes.
+    What was noticed: rounds of timers, and messages of other processes.
 
-    ``due`` is when a timer was due or the publisher of a message had ended, ``ready`` when what
-    it starts was ready; ``interpreter`` is whose it was, from 1.
+    ``due`` is when the timer was due or the message's publisher ended; ``ready`` is when the
+    started callback was ready; ``interpreter`` is the number of the process's interpreter, from 1.
     """
 
     due: Ints
@@ -39,7 +38,7 @@ class Noticed(NamedTuple):
     timer: Flags
 
     def costs(self, ran: Recorded) -> Costs:
-        """Return what noticing took, beside these executions; what is not known as usual."""
+        """Measure what noticing costs in parallel with these executions; defaults if unknown."""
         ran = ran.of(ran.locks & (ran.cpu >= 0))
         beside = np.zeros(len(self.due), dtype=np.bool_)
         alone = np.zeros(len(ran.could), dtype=np.bool_)
@@ -71,7 +70,7 @@ class Noticed(NamedTuple):
         return Costs(**found)
 
     def executions(self, costs: Costs) -> Recorded:
-        """Return what the intakes did as executions."""
+        """Return the work of the intakes as executions."""
         takes = np.where(self.timer, costs.timer_ns, costs.message_ns)
         more = np.where(self.timer, costs.timer_rest, costs.message_rest)
         took = np.maximum(takes, self.ready - self.due + more)

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of every kind: one place that distinguishes them."""
+"""Opens recordings of every kind; the only place that distinguishes the kinds."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ class Traces:
     """
     The traces of the processes of one run.
 
-    :ivar paths: of the traces.
-    :ivar offsets: how far clocks of other machines are ahead of the first trace's, ns, by the
-        last word of a trace's name, as ``control`` of ``run.control.mcap``.  Else they are
-        estimated from messages.
+    :ivar paths: paths of the traces.
+    :ivar offsets: how far the clocks of other machines are ahead of the first trace's clock, ns,
+        by the last word of the trace's name (``control`` of ``run.control.mcap``).  Missing
+        offsets are estimated from messages.
     """
 
     paths: Sequence[str]
     offsets: Mapping[str, int] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        """Return what messages call them."""
+        """Return the name that messages use."""
         return ', '.join(self.paths)
 
 
@@ -46,13 +46,13 @@ def open_recording(
     progress: Progress | None = None,
 ) -> Recording:
     """
-    Read a recording: a trace of this executor, an imported one, or the traces of one run.
+    Read a trace of this executor, an imported trace, or the traces of one run.
 
-    :param task_set: the declaration that judges; None: the one in the trace, if it has one.
-    :param name: what messages call the recording, where that is not its path.
-    :param progress: called now and then with the number of events read so far.
-    :raises mddag_executor.trace.TraceError: when it is no trace.
-    :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, or none of
+    :param task_set: the declaration to judge by; None: the one in the trace, if any.
+    :param name: the recording's name in messages, if not its path.
+    :param progress: called regularly with the number of events read.
+    :raises mddag_executor.trace.TraceError: if a file is not a trace.
+    :raises mddag_executor.replay.ReplayError: if the recording has nothing to replay or none of
         the declaration's callbacks.
     """
     if not isinstance(path, (str, os.PathLike, TraceReader)):
@@ -76,9 +76,9 @@ def open_recording(
 
 def check_declared(path: Given, name: str) -> None:
     """
-    Find out whether a recording says which deadlines there are.
+    Check that a recording declares deadlines.
 
-    :raises ReplayError: when it does not.
+    :raises ReplayError: if it does not.
     """
     if isinstance(path, (str, os.PathLike, TraceReader)):
         reader = path if isinstance(path, TraceReader) else None
@@ -87,19 +87,19 @@ def check_declared(path: Given, name: str) -> None:
             reader = reader or TraceReader(path)
             if read_head(reader) is None:
                 from mddag_executor.replay.imported_run import ImportedRun
-                ImportedRun(reader, name, None)     # unless it is none
+                ImportedRun(reader, name, None)     # None: the trace is an imported one
                 raise undeclared(name)
 
 
 def undeclared(name: str) -> ReplayError:
-    """Return the error for a recording that is to be judged, but says nothing of deadlines."""
+    """Return the error for a recording without declared deadlines."""
     return ReplayError(
         name, 'it was imported, so nothing in it says which callbacks have which deadlines',
         'give the GRAPH')
 
 
 def has_declaration(path: str | os.PathLike[str], name: str | None = None) -> bool:
-    """Return whether a trace says which deadlines there are."""
+    """Return whether a trace declares deadlines."""
     with named_errors(os.fspath(path), name or os.fspath(path)):
         head = read_head(TraceReader(path))
         return head is not None and is_declared(head)
