@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+import re
 from typing import NamedTuple
 
 from mddag_executor.errors import InputError
@@ -14,6 +15,8 @@ from mddag_executor.trace.errors import renamed
 from msg_graph import GraphError, loads, TaskSet
 
 TASK_SET = 'mddag:task_set'
+_RENAMED = re.compile(r'\bon_miss(?=[\'"]?\s*:)')
+"""The key that versions before 2.0 wrote for ``on_late``: their recordings stay readable."""
 _RECORD = 'record a run with mddag run GRAPH … --trace'
 
 
@@ -67,7 +70,7 @@ def declared(head: Head, name: str) -> TaskSet:
             name, 'it was recorded without a declaration, so there are no jobs',
             'give the GRAPH that judges it (mddag graph from-trace drafts one)')
     try:
-        return loads(head.yaml, head.file or name)
+        return loads(_RENAMED.sub('on_late', head.yaml), head.file or name)
     except GraphError as error:
         raise ReplayError(
             name, f'the declaration that it was recorded with is wrong ({error})',
