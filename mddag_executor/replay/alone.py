@@ -3,11 +3,12 @@
 """
 Estimates isolated execution times: without other executions that compute in parallel.
 
-Theory of operation ------------------- The recorded time of an execution is from when it could
-start to its end: dispatch and callback. It includes pauses in which the execution waited for the
-GIL or for a CPU.  The machine model of predictions (``simulate.machine``) says how long these
-pauses are.  Wanted are isolated times for which the model, with the recorded starts, gives the
-recorded ends.
+Theory of operation
+-------------------
+The recorded time of an execution is from when it could start to its end: dispatch and callback. It
+includes pauses in which the execution waited for the GIL or for a CPU.  The machine model of
+predictions (``simulate.machine``) says how long these pauses are.  Wanted are isolated times for
+which the model, with the recorded starts, gives the recorded ends.
 
 1. Begin with the recorded times.  Whatever the model ends too late is subtracted, down to the CPU
    time of the execution.  Of ``TURNS`` iterations the best one counts.

@@ -3,8 +3,10 @@
 """
 The parts of the time of each job that missed its deadline, and the one cause of the miss.
 
-Theory of operation ------------------- The time of a job, from its release to its completion at
-the sink (or to its early end), is split along its critical chain (see ``chains``):
+Theory of operation
+-------------------
+The time of a job, from its release to its completion at the sink (or to its early end), is split
+along its critical chain (see ``chains``):
 
 * overlap with a recorded stop of the machine: *machine*;
 * before the source is ready: *waited* while all workers were busy, so that none could notice the
@@ -26,7 +28,7 @@ The largest part, beyond what is usual, is the cause of the miss.  Two rules pre
 * If all unusual time together is less than the lateness, the usual times are too long for the
   deadline.  Then they count, too: usual execution times as *ran long*.
 
-A job whose callback raised has *failed*; a job that expired without its message has *lost* it. A
+A job whose callback raised has *failed*; a job that expired without its message has *lost* it.  A
 timer's release that was skipped because the previous execution still waited has the cause of the
 previous job; if that one was in time, it *waited*.
 """
@@ -44,9 +46,9 @@ CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transp
           'lost', 'failed')
 (WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, LOST, FAILED,
  RAN_USUALLY, UNKNOWN) = range(11)
-# : Kinds of time of a job; the last two are not causes.
+#: Kinds of time of a job; the last two are not causes.
 PARTS = (*CAUSES, 'ran', 'unknown')
-# : Remedies.
+#: By cause what to do about it.
 REMEDIES = {
     'waited': 'more workers, or shorter callbacks before it',
     'ran long': 'make the callback shorter, or declare the time that it takes',

@@ -3,10 +3,11 @@
 """
 Splits the response time of a job along its critical chain.
 
-Theory of operation ------------------- The critical chain of a completed sink is found backwards.
-A vertex became ready when the last message that it needed arrived; the vertex that published this
-message is the previous link; the first link is the source.  The response time (completion minus
-release) is the sum of:
+Theory of operation
+-------------------
+The critical chain of a completed sink is found backwards. A vertex became ready when the last
+message that it needed arrived; the vertex that published this message is the previous link; the
+first link is the source.  The response time (completion minus release) is the sum of:
 
 * release lag: from the release until the source was ready (timer latency or, with `release_from:
   header_stamp`, the transport of the sensor's message);

@@ -3,9 +3,10 @@
 """
 The verdicts of a recording, computed from its tables.
 
-Theory of operation ------------------- The rules are rules 1, 2, 6, 8 and 10 of the scheduler core
-(``core.rules``), applied to all jobs at once; ``test/replay/test_deadlines.py`` compares both
-implementations.
+Theory of operation
+-------------------
+The rules are rules 1, 2, 6, 8 and 10 of the scheduler core (``core.rules``), applied to all jobs
+at once; ``test/replay/test_deadlines.py`` compares both implementations.
 
 1. A vertex completes when the last of its legs completes.
 2. A job ends when all its sinks have completed, or earlier if it is recorded as expired, aborted

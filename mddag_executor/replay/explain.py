@@ -3,10 +3,12 @@
 """
 Explains the missed deadlines of a recording: see ``causes``.
 
-Theory of operation ------------------- A miss has the chain of its sink (see ``chains``) or, if
-the job ended early, of the vertex that the job reached.  The usual time of a callback or release
-is its median over the whole recording.  Stops of the machine are recorded by the executor up to
-one slice late, so a stop begins with the last event before it.
+Theory of operation
+-------------------
+A miss has the chain of its sink (see ``chains``) or, if the job ended early, of the vertex that
+the job reached.  The usual time of a callback or release is its median over the whole recording.
+Stops of the machine are recorded by the executor up to one slice late, so a stop begins with the
+last event before it.
 """
 
 from __future__ import annotations

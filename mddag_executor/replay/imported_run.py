@@ -5,27 +5,27 @@ An imported recording: releases, executions, completions and ends of jobs as tab
 
 Theory of operation
 -------------------
-A first pass over the trace finds out who is who (``entities``) and which of them the declaration
-means (``mapping``).  The second links executions and messages (``linker``); jobs are made from
-what is linked, and go to the observers.
+The first pass over the trace identifies nodes and callbacks (``entities``) and matches them with
+the declaration (``mapping``).  The second links executions and messages (``linker``) and assigns
+them to jobs.
 
-1. *Releases.*  A timer is due at t_init + n * period (rcl keeps that grid, also after it was late
-   by more than a period: it leaves out what it missed).  An execution's release is the last such
-   time at its start; because `rcl_timer_init` is recorded a little after the timer has read its
-   clock, one that starts up to `_SLACK_NS` before it has that release, too, then as of its start.
-   Where t_init is not recorded, or the execution before has that release already (the timer was
-   reset, or goes by another clock), it is released when it starts, and that is said.
-   A subscription or service that nobody in the graph feeds is released as declared: by the stamp
-   in the header or of the source, or when its message was taken.
+1. *Releases.*  A timer is due at t_init + n * period.  rcl keeps this grid even if a timer is more
+   than a period late: it skips the missed times.  The release of an execution is the last due time
+   at its start.  `rcl_timer_init` is recorded shortly after the timer has read its clock, so an
+   execution that starts up to `_SLACK_NS` before a due time has that release, too, at its start.
+   If t_init is unknown, or the previous execution has the same release (the timer was reset, or
+   uses another clock), the release is the start; a warning reports it. A subscription or service
+   without publisher in the graph is released as declared: by header stamp, source timestamp, or
+   the time at which its message was taken.
 2. *Jobs.*  Any other execution belongs to the job of the execution that published its message, as
-   the successor of that one's vertex.  What ran for a message that is not in the recording, or of
-   a callback that published for no job, ran as an undeclared callback.
-3. *Ready* is a timer's release, else the source timestamp (the publication, within a process):
-   when a message has reached its reader is not recorded, so the way there counts as waiting.
-4. A job that has not completed `EXPIRE_AFTER_NS` past its latest deadline, and of which nothing
-   runs, counts as expired, as in the executor's core does it.  What is open at the end of the
-   recording is judged as of the last event.  A job of which it is not known what it did, because
-   of what is missing in the recording (see ``doubts``), is withdrawn instead: it is not judged.
+   a successor of that vertex.  An execution for a message that is not recorded, or that was
+   published for no job, counts as undeclared.
+3. *Ready* is a timer's release, otherwise the source timestamp (within a process: the
+   publication). Arrival at the reader is not recorded, so transport counts as waiting.
+4. A job that has not completed `EXPIRE_AFTER_NS` after its latest deadline, with no execution
+   running, has expired, as in the executor's core.  Open jobs at the end of the recording are
+   judged at the last event.  A job whose fate is unknown because of missing events (see
+   ``doubts``) is withdrawn: it is not judged.
 """
 
 from __future__ import annotations
@@ -75,10 +75,10 @@ _OWN = ('mddag:job_release', 'mddag:dispatch')
 
 class Ended(NamedTuple):
     """
-    What has ended with a run of a callback in a thread.
+    What ended with a run of a callback in a thread.
 
-    :ivar piece: how many pieces of the execution were before; ``last``: whether it is the last.
-    :ivar start: of the execution; ``busy``: how long it ran.
+    :ivar piece: number of earlier pieces of the execution; ``last``: whether it is the last.
+    :ivar start: start of the execution; ``busy``: how long it ran.
     """
 
     piece: int
@@ -89,11 +89,11 @@ class Ended(NamedTuple):
 
 class ImportedRun(LinkObserver):
     """
-    A recorded run of another executor, which ``read`` turns to tables.
+    A run of another executor; ``read`` turns it into tables.
 
-    :param reader: of the trace, which no declaration is in.
-    :param task_set: the declaration that judges; None: there is none.
-    :param head: of a trace of this executor; None: another one recorded it.
+    :param reader: a trace without declaration.
+    :param task_set: the declaration to judge by; None: none.
+    :param head: head of a trace of this executor; None: another executor recorded it.
     :param linker: links its events.
     """
 
@@ -113,23 +113,23 @@ class ImportedRun(LinkObserver):
                 threads.add(event[2:4])
                 first = event[1] if first is None else first
             elif name_of_event in _OWN:
-                own = True      # of this executor, but what it ran is lost
+                own = True      # recorded by this executor, but its executions are lost
             else:
                 init.append(event)
         if first is None or own and head is None:
             raise no_run(reader)
-        #: Who is who in it.
+        #: The nodes and callbacks.
         self.who = Entities()
         self.who.read(init)
-        # What another executor goes by is not recorded; it takes the place of the pool.
+        # The policy of another executor is not recorded; its name replaces the pool.
         self.head = head or Head(
             first, '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
         self._imported = head is None
         self._matching = Matching(name, self.who, threads, task_set)
-        #: The declaration that judges; none is recorded.
+        #: The declaration to judge by; none is recorded.
         self.task_set = self.recorded_set = self._matching.task_set
         self.targets = self._matching.target
-        #: The first release or the time at which the first execution became ready, ns.
+        #: The first release, or when the first execution became ready, ns.
         self.start: int | None = None
         #: The last event's time, ns.
         self.end = min(max(0, first), NEVER - 1)
@@ -151,7 +151,7 @@ class ImportedRun(LinkObserver):
         self._graph()
 
     def _graph(self) -> None:
-        """Look up who starts whom: sources by callback, successors by vertex and callback."""
+        """Index the graph: sources by callback, successors by vertex and callback."""
         self._dags: tuple[Dag, ...] = self.task_set.dags
         self._source: dict[str, tuple[int, int]] = {}
         self._next: dict[tuple[int, str], int] = {}
@@ -159,7 +159,7 @@ class ImportedRun(LinkObserver):
         vertices = {v.callback.key: number for number, v in enumerate(self.task_set.vertices)}
         self._vertex = {number: vertices[target.callback.key]
                         for number, target in self.targets.items()}
-        # by the vertices before and after, and the place of the topic
+        # by the vertices before and after, and the index of the topic
         self._leg: dict[tuple[int, int, int], int] = {}
         first = 0
         for dag in self._dags:
@@ -184,16 +184,16 @@ class ImportedRun(LinkObserver):
 
     @property
     def lost(self) -> int:
-        """Return how many events the tracer says to have discarded."""
+        """Return how many events the tracer discarded, as it reports."""
         return self._linker.discarded
 
     @property
     def unjudged(self) -> dict[int, int]:
-        """Return by DAG for how many jobs it is not known what they did."""
+        """Return by DAG the number of jobs whose fate is unknown."""
         return self._doubts.withdrawn
 
     def read(self, progress: Function[[int], None] | None = None) -> Recording:
-        """Return the recording; ``progress`` is called now and then with a number of events."""
+        """Return the recording; ``progress`` is called regularly with the number of events."""
         count, take = 0, self._linker.take
         with named_errors(self._reader.path, self.name):
             for event in self._reader.layout_events(self._linker.events):
@@ -219,7 +219,7 @@ class ImportedRun(LinkObserver):
             callback_vertex=self._vertex, unjudged=self.unjudged, warnings=self.warnings)
 
     def _judged_until(self) -> int:
-        """Return up to when what is open is judged."""
+        """Return the time at which open jobs are judged."""
         return self.end
 
     def _next_order(self) -> int:
@@ -252,7 +252,7 @@ class ImportedRun(LinkObserver):
         return min(sent or run.taken or run.start, run.start)
 
     def _assign(self, run: Execution, target: Target, message: Publication | None) -> None:
-        """Find the job that an execution belongs to."""
+        """Find the job of an execution."""
         key = target.callback.key
         if key in self._source:
             dag, vertex = self._source[key]
@@ -293,7 +293,7 @@ class ImportedRun(LinkObserver):
         return min(run.taken or run.start, run.start)
 
     def over(self, run: Execution) -> None:
-        """Note when an execution ended, and what it completed."""
+        """Note the end of an execution, and what it completed."""
         columns = self._executions.columns
         columns['end'][run.number] = run.end
         columns['worker'][run.number] = self._workers.setdefault(run.thread, len(self._workers))
@@ -313,11 +313,11 @@ class ImportedRun(LinkObserver):
         columns['order'][run.number] = self._next_order()
 
     def _ended(self, run: Execution) -> Ended:
-        """Return what has ended with a run of a callback: one piece is all of an execution."""
+        """Return what ended; here each execution has one piece."""
         return Ended(0, True, run.start, run.end - run.start)
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
-        """Return whether an execution completes its vertex: of a sync's legs the last one does."""
+        """Return whether an execution completes its vertex: the last leg of a sync vertex does."""
         if self._sizes[vertex] == 1:
             return True
         done = self._legs.setdefault((vertex, job), set())
@@ -343,14 +343,14 @@ class ImportedRun(LinkObserver):
             jobs.extendleft(reversed(running))
 
     def _close(self, dag: int, job: int, release: int) -> bool:
-        """Take a job that cannot be judged out of the run; return whether it is one."""
+        """Withdraw a job that cannot be judged; return whether it is one."""
         doubted = self._doubts.close(dag, job, release)
         if doubted:
             self._ends.add(dag, job, UNKNOWN, WITHDRAWN, self._next_order())
         return doubted
 
     def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
-        """Note what is not known of a callback."""
+        """Note the jobs of a callback whose fate becomes unknown."""
         if callback is None:
             self._doubts.discarded(time)
         elif (target := self.targets.get(callback.number)) is not None:
@@ -360,7 +360,7 @@ class ImportedRun(LinkObserver):
             self._active[(dag, job)] -= 1
 
     def sent(self, message: Publication) -> None:
-        """Keep in mind which jobs have sent what."""
+        """Remember the jobs of a publication."""
         of = None if message.run is None else message.run.of
         if of is not None and (message.stamp or message.within):
             self._doubts.sent(of[0], of[2], message.topic)
@@ -385,7 +385,7 @@ class ImportedRun(LinkObserver):
 
     @property
     def warnings(self) -> list[str]:
-        """Return what is missing or doubtful, one line each, once it has been played."""
+        """Return missing or doubtful data, one line each; only valid after ``read``."""
         name, path = self.name, self._reader.path
         lines = [renamed(text, path, name) for text in self._reader.warnings]
         if self.who.incomplete:

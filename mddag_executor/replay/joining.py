@@ -1,29 +1,30 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The traces of several processes as the recording of one run.
+Joins the traces of several processes into the recording of one run.
 
 Theory of operation
 -------------------
-Each trace becomes a recording; the tables of all are put together in the order of time.
+Each trace becomes a recording; their tables are merged in the order of time.
 
-1. *Clocks.*  Each process counts its trace's time from the steady clock of the machine, by an
-   offset that is recorded (``caret_init``).  So the times of one machine are put on the first
-   trace's clock exactly; those of others by an offset that is given, or that messages show
-   (``clocks``), else they are taken as they are.
-2. *Who is who.*  Addresses, which are those of one process, get the number of the trace above
-   their 48 bits; workers are counted through.  A process or thread with a number that another
-   trace has already, as in containers or on another machine, gets a number of its own.
-3. *Jobs* are numbered anew, in the order of their first release.  A release is that of a job that
-   another process has released already if it is the same, to ``SAME_RELEASE``; of a DAG whose jobs
-   header stamps join, also if it follows that within the DAG's period: the stamp is taken later
-   than a timer is due.  What fits nothing is a job of its own.  A stamp is a time of the source's
-   clock, wherever it is recorded.
-4. Of a DAG that several run, those vertices are expected that are in any of the processes.  Jobs
-   are judged from the time on from which all processes have judged that were there at first.
-5. A process whose end is not recorded was killed.  Its open jobs are said, and the run goes on.
-6. *One run.*  Traces are of one run if their times, from the first event to the last, overlap, or
-   others' bridge them; but a vertex runs in one process at a time.  All else is refused.
+1. *Clocks.*  A trace's times are the machine's steady clock plus a recorded offset
+   (``caret_init``).  So all traces of one machine are converted exactly to the first trace's
+   clock. For other machines the offset is given or estimated from messages (``clocks``), otherwise
+   0.
+2. *Numbers.*  Addresses are unique within a process; the number of the trace is added above their
+   48 bits.  Workers are numbered consecutively.  A process or thread id that another trace uses,
+   too (containers, other machines), is replaced by an unused one.
+3. *Jobs* are renumbered in the order of their first release.  Releases of two processes belong to
+   the same job if they are equal within ``SAME_RELEASE``.  If header stamps join the jobs of a
+   DAG, a release also belongs to the job that was released up to one period of the DAG earlier:
+   the stamp is later than the timer was due.  Any other release is a new job.  A stamp is a time
+   of the source machine's clock, no matter which machine recorded it.
+4. If several processes run a DAG, the vertices of all of them are expected.  Jobs are judged as
+   soon as all processes that existed at the beginning judge.
+5. A process without recorded end was killed.  Its open jobs are reported, and the run continues.
+6. *One run.*  Traces belong to one run if their time ranges, from first to last event, overlap
+   directly or through other traces, and no vertex runs in two processes at a time.  Otherwise they
+   are refused.
 """
 
 from __future__ import annotations
@@ -92,12 +93,12 @@ def label_of(path: str) -> str:
 
 
 def names_of(paths: Iterable[str]) -> set[str]:
-    """Return what an offset may call traces: by their paths, or their processes."""
+    """Return the names of traces that an offset may use: paths or processes."""
     return {name for path in paths for name in (path, label_of(path))}
 
 
 class _Part:
-    """One of the traces: where its times, workers and addresses are in the whole."""
+    """One trace: the position of its times, workers and addresses in the joined recording."""
 
     def __init__(self, place: int, path: str, name: str) -> None:
         self.place, self.name = place, name
@@ -128,15 +129,15 @@ class _Part:
                     self.judges_from = event[4]
         self.shift = 0
         self.label = label_of(name)
-        # by vertex: when it ran first, and last
+        # by vertex the time of its first and last execution
         self.ran: dict[int, tuple[int, int]] = {}
         self.first_worker = 0
         self.first_spare = 0
         self.last = 0
-        #: By DAG the vertices that are here, where not all are.
+        #: By DAG the vertices that run here; only if some run elsewhere.
         self.hosted: dict[int, frozenset[int]] = {}
-        # of each release: the number of its job, whether no other process had it before, and how
-        # many legs are to complete here
+        # By release: number of its job, whether no other process released it before, and number of
+        # legs to complete here.
         self.number = self.expected = np.empty(0, dtype=np.int64)
         self.is_first: Mask = np.empty(0, dtype=np.bool_)
         #: DAGs and numbers of the jobs that are open at the end.
@@ -146,13 +147,13 @@ class _Part:
 
     @property
     def first(self) -> int:
-        """Return when it begins, by the clock of the whole."""
+        """Return the time of its first event, by the joined clock."""
         return self.head.time + self.shift
 
     def read(
         self, who: Entities, threads: Numbers, count: int, progress: Progress | None
     ) -> None:
-        """Read its tables, by the clock and with the addresses of the whole (rules 1 and 2)."""
+        """Read its tables, with joined times and addresses (rules 1 and 2)."""
         found, self.seen_at = read_process(
             self.reader, self.name, self.head, who, self._edited,
             None if progress is None else lambda more: progress(count + more))
@@ -168,7 +169,7 @@ class _Part:
         for addresses in (found.executions['callback'], found.publications['publisher']):
             addresses[(addresses > 0) & (addresses < 1 << _BITS)] |= self.place << _BITS
         worker = found.executions['worker']
-        worker += np.where(worker < 0, 0, np.where(      # else it was lent
+        worker += np.where(worker < 0, 0, np.where(      # other threads lent themselves
             worker < self.head.workers, self.first_worker, self.first_spare)).astype(worker.dtype)
         thread = found.executions['thread']
         numbers, of = np.unique(thread, return_inverse=True)
@@ -179,7 +180,7 @@ class _Part:
             for name, column in _HAPPENED.items()))
 
     def _edited(self, event: Event) -> Event:
-        """Return an event that says who is who with the addresses of the whole."""
+        """Return an event of the initialisation with joined addresses."""
         kinds = EVENTS[event[0]].fields
         return (*event[:4], *(
             value | self.place << _BITS if kind == 'uint64' and field not in _NO_ADDRESSES
@@ -188,9 +189,9 @@ class _Part:
 
     def renumber(self, legs: Ints) -> RowNumbers:
         """
-        Give all tables the jobs of the whole, and leave out what belongs to none of them.
+        Renumber the jobs in all tables; drop rows of unknown jobs.
 
-        :param legs: by vertex how many it has.
+        :param legs: by vertex the number of its legs.
         :return: the new numbers of executions.
         """
         found = self.recording
@@ -223,7 +224,7 @@ class _Part:
         return new
 
     def _note_ran(self, started: Table) -> None:
-        """Note when vertices ran first, and last."""
+        """Note the first and last execution of vertices."""
         started = pick(started, sort_by(started['vertex'], started['start']))
         ran = [(int(started['start'][begin]), int(started['vertex'][begin]),
                 int(started['start'][until - 1]))
@@ -235,11 +236,11 @@ class Joined:
     """
     Joins traces of this executor.
 
-    :param files: path of each, and what messages call it.
-    :param offsets: how far clocks of other machines are ahead of the first trace's, ns, by the
-        last word of a trace's name, or its path.
-    :raises mddag_executor.trace.TraceError: when one is no trace.
-    :raises ReplayError: when they are not of one run.
+    :param files: paths of the traces, and their names in messages.
+    :param offsets: how far clocks of other machines are ahead of the first trace's clock, ns, by
+        the last word of a trace's name, or its path.
+    :raises mddag_executor.trace.TraceError: if a file is not a trace.
+    :raises ReplayError: if the traces are of several runs.
     """
 
     def __init__(
@@ -264,17 +265,17 @@ class Joined:
         self._machines = clocks.machines([(part.boot, part.clock) for part in self._parts])
         self._set_clocks(self._given(offsets))
         self._workers = workers
-        #: How many workers each process has, at most.
+        #: Number of workers of each process, at most.
         self.workers_each = max(part.head.workers for part in self._parts)
-        #: Which worker is of which process: by the last word of its trace's name.
+        #: Names of workers: the last word of the trace's name.
         self.worker_names = [
             f'{part.label} {worker}' for part in self._parts
             for worker in range(part.head.workers)]
-        # of each DAG: releases with their numbers, and in which parts they have been seen
+        # by DAG: releases with their job numbers, and the parts that have released the job
         self._releases: list[deque[tuple[int, int, set[int]]]] = [
             deque(maxlen=_KEPT) for _ in self.task_set.dags]
         self._next = [0] * len(self.task_set.dags)
-        #: By vertex how many legs it has, and by DAG its vertices.
+        #: By vertex the number of its legs, and by DAG its vertices.
         self._legs = np.array([max(1, len(legs_of(vertex, dag.vertices)))
                                for dag in self.task_set.dags for vertex in dag.vertices])
         first_of = np.cumsum([0, *(len(dag.vertices) for dag in self.task_set.dags)]).tolist()
@@ -282,7 +283,7 @@ class Joined:
         self._hosted: list[tuple[int, int, int, frozenset[int]]] = []
 
     def _given(self, offsets: Mapping[str, int]) -> dict[int, int]:
-        """Return the offsets that are given, by machine."""
+        """Return the given offsets, by machine."""
         found: dict[int, int] = {}
         for label, ahead in offsets.items():
             machine = next(
@@ -301,7 +302,7 @@ class Joined:
         return found
 
     def _set_clocks(self, given: Mapping[int, int]) -> None:
-        """Put all on the first trace's clock (rule 1)."""
+        """Convert all traces to the first trace's clock (rule 1)."""
         several = set(self._machines) - {0}
         for part, machine in zip(self._parts, self._machines):
             part.shift = self._parts[machine].clock - part.clock
@@ -325,9 +326,9 @@ class Joined:
         """
         Return the recording of the whole run.
 
-        :param progress: called now and then with the number of events read so far.
-        :raises mddag_executor.trace.TraceError: when one cannot be read.
-        :raises ReplayError: when they are of several runs.
+        :param progress: called regularly with the number of events read.
+        :raises mddag_executor.trace.TraceError: if a trace cannot be read.
+        :raises ReplayError: if the traces are of several runs.
         """
         who, threads, count = Entities(by_address=True), Numbers(), 0
         for part in self._parts:
@@ -348,7 +349,7 @@ class Joined:
         return found
 
     def _join(self, found: Recording, rows: Sequence[RowNumbers]) -> None:
-        """Put the tables of all together; ``rows``: the new numbers of executions."""
+        """Merge the tables of all traces; ``rows``: the new numbers of executions."""
         parts = self._parts
         ranks = self._ranks()
         before = 0
@@ -378,14 +379,14 @@ class Joined:
             for place, order, dag, vertices in self._hosted]
 
     def _ranks(self) -> list[Ints]:
-        """Return by part the places in the order of all, by its own; 0 is before all."""
+        """Return by part the joined positions of its positions in the order; 0 is before all."""
         times = np.concatenate([part.seen_at for part in self._parts])
         rank = np.empty(len(times), dtype=np.int64)
         rank[np.argsort(times, kind='stable')] = np.arange(1, len(times) + 1)
         return np.split(rank, np.cumsum([len(part.seen_at) for part in self._parts])[:-1])
 
     def _set_end(self, found: Recording) -> None:
-        """Find out from when on the run is judged, and until when (rules 4 and 5)."""
+        """Find when judging begins and ends (rules 4 and 5)."""
         judges_from = max(self._judging(), default=0)
         if judges_from:
             found.judge_from = [(0, judges_from)]
@@ -407,7 +408,7 @@ class Joined:
     # --- jobs ------------------------------------------------------------------------------------
 
     def _number_jobs(self) -> None:
-        """Give jobs numbers (rule 3), and note which vertices are expected (rule 4)."""
+        """Assign numbers to jobs (rule 3), and note the expected vertices (rule 4)."""
         events: list[tuple[int, int, int, int, Any]] = []
         for part in self._parts:
             of, seen_at = part.recording, part.seen_at
@@ -435,7 +436,7 @@ class Joined:
                 self._hosted.append((place, order, which, every))
                 continue
             dag, release, noticed = (column[which] for column in columns[place])
-            if release < noticed:   # else that of a stamp which was still to come there
+            if release < noticed:   # otherwise the release is a stamp in the future
                 release = self._by_source(self.task_set.dags[dag], release, part)
             known = self._find(self.task_set.dags[dag], release, place)
             if known is None:
@@ -454,7 +455,7 @@ class Joined:
             part.expected[which] = legs_here[place][dag]
 
     def _by_source(self, dag: Dag, release: int, part: _Part) -> int:
-        """Return a release from a stamp of another machine, by the clock of that."""
+        """Convert a release that is a stamp of another machine from the clock of that machine."""
         if dag.release_from != 'header_stamp' or self._vertices[
                 dag.index][dag.source] in part.hosted.get(dag.index, self._vertices[dag.index]):
             return release
@@ -466,7 +467,7 @@ class Joined:
         return release - part.shift + found.shift
 
     def _find(self, dag: Dag, release: int, place: int) -> tuple[int, int, set[int]] | None:
-        """Return the job of a release that another process has announced (rule 3)."""
+        """Return the job of a release that another process has released (rule 3)."""
         stamped = dag.release_from == 'header_stamp'
         best = None
         for known in reversed(self._releases[dag.index]):
@@ -482,7 +483,7 @@ class Joined:
         return best
 
     def _check_run(self) -> None:
-        """Refuse what several runs have left (rule 6)."""
+        """Refuse traces of several runs (rule 6)."""
         runs: list[list[_Part]] = []
         for part in sorted(self._parts, key=lambda part: part.first):
             if not runs or part.first > max(each.last for each in runs[-1]):
@@ -505,7 +506,7 @@ class Joined:
                 + several * ' (or --offset, if clocks of machines differed)')
 
     def _judging(self) -> Iterator[int]:
-        """Yield from when on processes judge; not of one started again, or that never did."""
+        """Yield when processes begin to judge, if they ever do; without restarted ones."""
         labels = {part.label for part in self._parts}
         for part in self._parts:
             if 0 < part.judges_from < NEVER and part.label.partition('.')[0] not in labels - {
@@ -513,7 +514,7 @@ class Joined:
                 yield part.judges_from + part.shift
 
     def _placed(self) -> list[Process]:
-        """Return which nodes ran in which process."""
+        """Return the nodes of each process."""
         if self.task_set.processes:
             return list(self.task_set.processes)
         return [
@@ -522,7 +523,7 @@ class Joined:
             for part in self._parts]
 
     def _lines(self, end: int) -> Iterator[str]:
-        """Yield what is missing of each trace, and what ended with its process (rule 5)."""
+        """Yield missing data of each trace, and jobs that ended with its process (rule 5)."""
         for part in self._parts:
             yield from part.recording.warnings
             if part.end is not None:

@@ -1,48 +1,47 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What belongs together in a recording of CARET or ros2_tracing: executions and their messages.
+Links the events of a CARET or ros2_tracing recording to executions and messages.
 
 Theory of operation
 -------------------
-Two stages go through the events in the order of time.  The first keeps what each thread does; the
-second, `LAG_NS` of recorded time later, calls its observer, also in the order of time: a
-subscriber may run before the tracer has recorded the stamp of the message that it runs for.
+Events are processed in two stages, each in the order of time.  The first tracks each thread.  The
+second calls the observer `LAG_NS` of recorded time later: a subscriber may run before the tracer
+has recorded the source timestamp of its message.
 
-1. *Executions*: `callback_start` to the next `callback_end` of the same callback in the same
-   thread (CARET: of the same address; that is the same, except where a callback runs in several
-   threads at once).  A callback may run inside another (one that spins); what ends before what
-   began inside it shows that an end was lost.
-2. *Publications*, within a thread: `rclcpp_publish`, then `rcl_publish` of the same publisher (in
-   rclpy the only one; from Iron on the only one with the publisher's handle), then what writes it
-   and what has the source timestamp.  `rclcpp_intra_publish` before `rclcpp_publish` of the same
-   publisher is the same publication, as of then.  The source timestamp comes with
+1. *Executions* last from `callback_start` to the next `callback_end` of the same callback in the
+   same thread (CARET: the same address; this differs only if a callback runs in several threads at
+   once).  Callbacks may nest (one spins).  If the outer one ends first, an end was lost.
+2. *Publications*, within a thread: `rclcpp_publish`, then `rcl_publish` of the same publisher (the
+   only event of rclpy; from Iron on the only one with the publisher's handle), then the
+   middleware's write and the source timestamp.  `rclcpp_intra_publish` before `rclcpp_publish` of
+   the same publisher is the same publication, at its own time.  Sources of the source timestamp:
 
-   * CARET and Cyclone DDS: `dds_write`, then `dds_bind_addr_to_stamp`, of the message's address,
-   * CARET and Fast DDS, up to Galactic: `dds_write`, `dds_bind_addr_to_addr` from the message to
-     what it became, then `dds_bind_addr_to_stamp` of that,
-   * CARET and Fast DDS, from Humble on: `dds_bind_addr_to_stamp` of address 0, which stands for
-     what the thread has published last,
-   * CARET from Jazzy on: in `dds_write` already,
+   * CARET, Cyclone DDS: `dds_write`, then `dds_bind_addr_to_stamp` of the message's address,
+   * CARET, Fast DDS up to Galactic: `dds_write`, `dds_bind_addr_to_addr` from the message to
+     its serialised form, then `dds_bind_addr_to_stamp` of that form,
+   * CARET, Fast DDS from Humble on: `dds_bind_addr_to_stamp` of address 0, which means the
+     thread's last publication,
+   * CARET from Jazzy on: `dds_write`,
    * ros2_tracing from Jazzy on: `rmw_publish`; before, with an instrumented Cyclone DDS:
      `dds:write_pre` of the message's address, then `dds:write`.
 
-   Until September 2021 CARET's events were called `ros2_hook`, some of their fields otherwise.
-3. *Messages between processes*: `dispatch_subscription_callback` (Galactic, Humble) names the
-   callback and the source timestamp; later formats have `rmw_take` in the same thread before the
-   `callback_start`.  In August 2021 `dispatch` named the callback and the message's address, and
-   `take_type_erased`, before it in the same thread, that address and the source timestamp.  The
-   publication is the one on the same topic with that source timestamp.
-4. *Messages within a process*: in Humble by the message's address, followed through the copies
-   (`message_construct`) to `dispatch_intra_process_subscription_callback` (in August 2021
-   `dispatch_intra_process`); from Iron on by buffer and index of the ring buffer that it went
-   through (`rclcpp_ring_buffer_enqueue`, `_dequeue`).
-5. `rmw_take` inside an execution is a message that the callback took itself (a queue edge).
-6. What does not fit (an end without a start, a start without an end, a message whose publication
-   is not in the recording, a publisher's that lacks a tracepoint) is counted by callback or topic,
-   and the observer learns where it is not known what a callback ran for.
+   Until September 2021 CARET's events were named `ros2_hook`, with other names of some fields.
+3. *Messages between processes*: `dispatch_subscription_callback` (Galactic, Humble) has the
+   callback and the source timestamp; later formats have `rmw_take` before the `callback_start` in
+   the same thread.  In August 2021 `dispatch` had the callback and the message's address, and
+   `take_type_erased`, before it in the same thread, the address and the source timestamp.  The
+   publication is the one on the same topic with the same source timestamp.
+4. *Messages within a process*: in Humble by the message's address, followed through copies
+   (`message_construct`) to `dispatch_intra_process_subscription_callback` (August 2021:
+   `dispatch_intra_process`); from Iron on by buffer and index of the ring buffer
+   (`rclcpp_ring_buffer_enqueue`, `_dequeue`).
+5. `rmw_take` inside an execution: the callback itself took the message (a queue edge).
+6. Events that don't match (ends without starts, starts without ends, messages without publication,
+   publishers without tracepoint) are counted by callback or topic.  The observer is notified if
+   the cause of an execution is unknown.
 
-Publications are kept until `KEEP` newer ones of their topic have come.
+Of each topic the `KEEP` newest publications are kept.
 """
 
 from __future__ import annotations
@@ -70,15 +69,15 @@ class Execution:
     An execution of a callback.
 
     :ivar thread: process and thread.
-    :ivar end: -1 while it runs, or where its end was lost.
-    :ivar stamp: source timestamp of the message that it runs for; 0: none is known.
-    :ivar stated: the message's header stamp, where the recording has it; else 0.
-    :ivar taken: when the message was taken, ns; 0: that is not recorded.
-    :ivar inner: when another one last began in its thread while it ran, ns; 0: none did.
-    :ivar ready: for those who use it: when it became ready, ns.
-    :ivar of: for those who use it: DAG, vertex and job that it belongs to.
-    :ivar leg: for those who use it: which leg of the vertex it is.
-    :ivar number: for those who use it: identifies it.
+    :ivar end: -1 while it runs, or if its end was lost.
+    :ivar stamp: source timestamp of the message that started it; 0: unknown.
+    :ivar stated: header stamp of the message; 0: not recorded.
+    :ivar taken: when the message was taken, ns; 0: not recorded.
+    :ivar inner: last start of another execution nested in this one, ns; 0: none.
+    :ivar ready: set by observers: when it became ready, ns.
+    :ivar of: set by observers: its DAG, vertex and job.
+    :ivar leg: set by observers: its leg of the vertex.
+    :ivar number: set by observers: its number.
     """
 
     __slots__ = ('callback', 'thread', 'start', 'end', 'stamp', 'stated', 'taken', 'message',
@@ -102,11 +101,11 @@ class Execution:
 
 class Publication:
     """
-    A message that was published; times in ns, 0 where they are not recorded.
+    A published message; times in ns, 0: not recorded.
 
-    :ivar run: the execution that published it, None: none did.
-    :ivar message: its address, and `written` that of what the middleware made of it.
-    :ivar number: for those who use it: identifies it.
+    :ivar run: the execution that published it; None: none.
+    :ivar message: address of the message; `written`: address of its serialised form.
+    :ivar number: set by observers: its number.
     """
 
     __slots__ = ('publisher', 'run', 'rclcpp', 'rcl', 'dds', 'stamp', 'message', 'written',
@@ -126,20 +125,20 @@ class Publication:
 
     @property
     def time(self) -> int:
-        """Return when it was published."""
+        """Return the time of the publication."""
         return self.rclcpp or self.rcl
 
     @property
     def topic(self) -> str:
-        """Return its topic, empty where that is not known."""
+        """Return the topic; empty if unknown."""
         return self.publisher.topic if self.publisher is not None else ''
 
 
 class LinkObserver:
-    """Gets what the linker finds, in the order of time, and does nothing with it."""
+    """Base of observers: receives executions and messages in the order of time."""
 
     def began(self, run: Execution, message: Publication | None) -> None:
-        """Note that an execution has begun, with the message that it runs for."""
+        """Note the begin of an execution, and the message that started it."""
 
     def sent(self, message: Publication) -> None:
         """Note that a message was published."""
@@ -152,10 +151,10 @@ class LinkObserver:
 
     def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
         """
-        Note that something is not recorded.
+        Note that events are missing.
 
-        :param callback: it ran, it is not known for what; None: events were discarded.
-        :param run: its execution, where only the end is not recorded.
+        :param callback: the callback that ran for an unknown reason; None: events were discarded.
+        :param run: its execution, if only the end is missing.
         """
 
 
@@ -178,10 +177,10 @@ _SAID = {
 
 class Losses:
     """
-    What is lost or odd in a recording, counted by what it affects.
+    Counts missing or odd events, by what they affect.
 
-    :param said: by kind a noun, and what to say of so many.
-    :param most: how many of the affected are named.
+    :param said: by kind a noun, and the text for a number of them.
+    :param most: how many of the affected callbacks or topics are named.
     """
 
     def __init__(self, said: Mapping[str, tuple[str, str]], most: int) -> None:
@@ -189,11 +188,11 @@ class Losses:
         self._counts: dict[str, Counter[str]] = {kind: Counter() for kind in said}
 
     def count(self, kind: str, affected: str, number: int = 1) -> None:
-        """Count something of a kind."""
+        """Count events of a kind."""
         self._counts[kind][affected] += number
 
     def lines(self) -> list[str]:
-        """Return what to say about it."""
+        """Return the counts as text."""
         return [
             f'{counted(sum(counts.values()), noun)} {text}: '
             + listed([f'{name} ({n})' for name, n in counts.most_common()], self._most)
@@ -201,20 +200,20 @@ class Losses:
 
 
 class _Thread:
-    """What a thread does."""
+    """The state of a thread."""
 
     __slots__ = ('stack', 'last', 'take', 'erased', 'fresh')
 
     def __init__(self) -> None:
         self.stack: list[Execution] = []
         self.last: Publication | None = None
-        # (callback it names or None, its subscription's callbacks or None, stamp, stated, message,
+        # (named callback or None, callbacks of the subscription or None, stamp, stated, message,
         # time)
         self.take: tuple[Callback | None, list[Callback] | None, int, int, Publication | None,
                          int] | None = None
-        # by `take_type_erased`: the message's address, its stamp and the time; zeros: none
+        # from `take_type_erased`: address of the message, stamp, time; zeros: none
         self.erased = 0, 0, 0
-        self.fresh = True       # nothing has started in it so far
+        self.fresh = True       # no execution has started yet
 
 
 class Linker:
@@ -222,7 +221,7 @@ class Linker:
 
     def __init__(self, entities: Entities, observer: LinkObserver) -> None:
         self.losses = Losses(_SAID, 3)
-        #: What the tracer itself says that it discarded.
+        #: Number of events that the tracer discarded, as it reports.
         self.discarded = 0
         self._entities = entities
         self._observer = observer
@@ -233,10 +232,10 @@ class Linker:
         self._by_address: dict[tuple[int, int], Publication] = {}
         self._by_slot: dict[tuple[int, int, int], tuple[Publication, bool]] = {}
         self._by_rclcpp: set[Publisher] = set()
-        self._by_rcl: Counter[Publisher] = Counter()        # publications by rcl alone
-        # by the identity of a layout, which is kept so that no other gets it
+        self._by_rcl: Counter[Publisher] = Counter()        # publications by rcl only
+        # by id of a layout; the layout is kept so that its id is not reused
         self._known: dict[int, tuple[Layout, Handler, dict[str, int]]] = {}
-        self._fields: dict[str, int] = {}       # of the event that is being taken in
+        self._fields: dict[str, int] = {}       # fields of the current event
         caret: dict[str, Handler] = {
             'dds_write': self._dds_write,
             'dds_bind_addr_to_addr': self._became,
@@ -264,11 +263,11 @@ class Linker:
             'ros2:rclcpp_ring_buffer_dequeue': self._dequeue,
             'mddag:lost': self._lost,
         }
-        #: Full names of the events that it needs.
+        #: Full names of the events that the linker needs.
         self.events = frozenset(self._handlers)
 
     def take(self, event: Event) -> None:
-        """Link an event as ``TraceReader.layout_events`` has it; times never decrease."""
+        """Link an event of ``TraceReader.layout_events``; times never decrease."""
         layout, now, pid, tid = event[:4]
         queue = self._queue
         while queue and queue[0][0] < now - LAG_NS:
@@ -286,7 +285,7 @@ class Linker:
         known[1](event, thread, state)
 
     def finish(self) -> None:
-        """Report what is left; what runs has no end, unless others ran after it."""
+        """Process the remaining events; the last running executions of threads have no end."""
         for run in self.running:
             if run.inner:
                 self._without_end(run, run.inner)
@@ -298,11 +297,11 @@ class Linker:
 
     @property
     def running(self) -> list[Execution]:
-        """Return what runs now."""
+        """Return the running executions."""
         return [run for state in self._threads.values() for run in state.stack]
 
     def _get(self, event: Event, field: str) -> int:
-        """Return a field of an event; 0 where it has none."""
+        """Return a field of an event; 0 if it is missing."""
         place = self._fields.get(field)
         value = None if place is None else event[place]
         return value if isinstance(value, int) else 0
@@ -327,7 +326,8 @@ class Linker:
             if (named is not None and named is not callback
                     or possible is not None and callback not in possible
                     or callback.kind in ('timer', 'service')):
-                run.stamp = run.stated = run.taken = 0      # it was taken for something else
+                # the message belongs to another execution
+                run.stamp = run.stated = run.taken = 0
                 run.message = None
         if state.stack:
             state.stack[-1].inner = now
@@ -365,7 +365,7 @@ class Linker:
         callback = self._entities.callback(thread[0], self._get(event, 'callback'), now)
         state.last = None
         if not any(run.callback is callback for run in state.stack):
-            # else it began before the recording did
+            # otherwise it began before the recording
             if not state.fresh or callback.made >= self._entities.begin:
                 self.losses.count('starts', callback.label)
                 self._queue.append((now, self._observer.lost_sight, (callback, None, now)))
@@ -386,7 +386,6 @@ class Linker:
     # --- publications ----------------------------------------------------------------------------
 
     def _publication(self, event: Event, thread: Thread, state: _Thread) -> Publication:
-        """Begin a publication."""
         handle = self._get(event, 'publisher_handle')
         publisher = None
         if handle:
@@ -413,7 +412,7 @@ class Linker:
         handle = self._get(event, 'publisher_handle')
         if last is not None and last.within and (not handle or (
                 self._entities.publishers.latest(thread[0], handle, event[1]) is last.publisher)):
-            last.within = False     # the same one, to other processes, too
+            last.within = False     # the same publication, now to other processes
             last.message = self._get(event, 'message')
             return
         self._publication(event, thread, state).rclcpp = event[1]
@@ -460,7 +459,7 @@ class Linker:
         if last is not None and self._get(event, 'data') == last.message:
             last.dds = event[1]
         else:
-            state.last = None       # the stamp that follows is of something else
+            state.last = None       # the following stamp belongs to another publication
 
     def _written(self, event: Event, thread: Thread, state: _Thread) -> None:
         self._stamp(state, 0, self._get(event, 'timestamp_'))
@@ -474,7 +473,7 @@ class Linker:
         self._know(last.topic, stamp, last)
 
     def _know(self, topic: str, stamp: int, message: Publication | None) -> None:
-        """Note of which publication a source timestamp is; None: of one of several."""
+        """Note the publication of a source timestamp; None: ambiguous."""
         known = self._by_stamp.setdefault(topic, {})
         known[stamp] = None if stamp in known else message
         if len(known) > KEEP:
@@ -493,7 +492,7 @@ class Linker:
     def _dispatch_erased(self, event: Event, thread: Thread, state: _Thread) -> None:
         callback = self._entities.callback(thread[0], self._get(event, 'callback'), event[1])
         (address, stamp, time), state.erased = state.erased, (0, 0, 0)
-        if address == self._get(event, 'message'):      # else the event of its taking was lost
+        if address == self._get(event, 'message'):      # otherwise its `take_type_erased` was lost
             state.take = callback, None, stamp, 0, None, time
 
     def _take(self, event: Event, thread: Thread, state: _Thread) -> None:
@@ -528,7 +527,7 @@ class Linker:
     def _enqueue(self, event: Event, thread: Thread, state: _Thread) -> None:
         place = thread[0], self._get(event, 'buffer'), self._get(event, 'index')
         if state.last is None:
-            self._by_slot.pop(place, None)      # the publication was lost: never the older one
+            self._by_slot.pop(place, None)      # the publication was lost: don't use the older one
             return
         if self._get(event, 'overwritten'):
             before = self._by_slot.get(place)

@@ -1,44 +1,40 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The load of a recorded run: releases, execution times and what took time between them.
+The load of a recorded run: releases, execution times, transport and dispatch times.
 
 Theory of operation
 -------------------
-* The jobs are those that were released, in that order.  A source is ready when it was in the
-  recording, which is a little after a timer's release, or long after that of a message whose
-  header carries it.
-* The executor looks for timers in rounds and dispatches no job of a round before it has noticed
-  all of it: a more urgent one may follow.  A timer that was due when the one before it was noticed
-  is of the same round.
-* The execution time of a vertex in a job is what its execution took, the pieces of a coroutine
-  added up.  Where it did not complete (the job was dropped, expired, or open at the end) it is the
-  median of the callback's executions in the recording, or else the declared mean.
-* A job that expired when it was released never ran: its timer was noticed later than its next
-  period.  That depends on the machine, not on the scheduler, so it is skipped again.
-* Of a sync vertex that is the leg that made it whole.  The legs before it, which only keep their
-  message, load the workers as what no DAG declares does: each piece is a job of the undeclared
-  DAG, ready when it was in the recording.  Callback groups of undeclared callbacks are not kept.
-* Where CPU times are recorded, an execution time is what the execution would have taken alone (see
-  ``alone``), and the load says what it computed and whether it held the interpreter: as recorded,
-  or as the declaration says.
-* *Transport*: a message is there some time after the callback that published it has ended (or
-  before that: it published early).  That is the time from its end to the successor's readiness.
-* *Dispatch*: the time from when an execution could have started to when it did (see
-  ``dispatches``).  It is added to the execution time, because the worker is taken.
-* In other processes than recorded, what notices timers and messages does so anew, as
-  ``simulate.intakes`` says: it takes what it took in the recording (see ``noticed``).  A job whose
-  timer was noticed too late is not skipped then.
-* Where there is no such time in a job, the median of the edge, or of all executions, stands in.
-* What was not published is not published again: if an execution completed without publishing on a
-  topic on which its callback published in other jobs, and no execution followed in that job, the
-  edge never comes true.  What could only run after that has no execution time.
+* Jobs are the released jobs, in the order of release.  A source is ready when it was in the
+  recording: shortly after a timer's release, possibly long after the header stamp of a message.
+* The executor polls timers in rounds, and dispatches the jobs of a round only after all of it is
+  noticed, because a more urgent one may follow.  A timer that was due when the previous one was
+  noticed belongs to the same round.
+* The execution time of a vertex is the sum of the pieces of its execution.  If it did not complete
+  (dropped, expired, open at the end), it is the callback's median, otherwise the declared mean.
+* A job that expired at its release never ran: its timer was noticed after its next period.  This
+  depends on the machine, not on the scheduler, so the job is skipped again.
+* A sync vertex has the execution time of the leg that completed it.  Earlier legs, which only
+  store their message, load the workers like undeclared callbacks: each piece is a job of the
+  undeclared DAG, ready when it was in the recording.  Their callback groups are ignored.
+* If CPU times are recorded, execution times are isolated execution times (see ``alone``), and the
+  load has the CPU time and whether the GIL was held (as recorded or declared).
+* *Transport* is the time from the end of the publishing execution until the successor is ready;
+  negative if it published early.
+* *Dispatch* is the time from when an execution could have started until it started (see
+  ``dispatches``).  It occupies the worker, so it is added to the execution time.
+* If processes differ from the recorded ones, intakes (``simulate.intakes``) notice timers and
+  messages at the recorded costs (see ``noticed``).  Jobs of late timers are not skipped then.
+* A time that is missing in a job is replaced by the median of the edge, or of all executions.
+* Missing publications are kept: if an execution completed without publishing on a topic that its
+  callback used in other jobs, and no execution followed in that job, the edge is not satisfied.
+  Vertices that need it have no execution time.
 
-Without overheads (``overheads=False``) transport and dispatch take no time and a timer's source is
-ready at its release: what an ideal executor on the same machine would do.
+Without overheads (``overheads=False``) transport and dispatch take no time, and timers are ready
+at their release, as in an ideal executor on the same machine.
 
-Inside the engine a job's index is its place among the recorded jobs of its DAG; ``jobs`` has the
-indices that were recorded.
+Within the engine a job's index is its position among the recorded jobs of its DAG; ``jobs`` has
+the recorded indices.
 """
 
 from __future__ import annotations
@@ -73,10 +69,10 @@ class RecordedLoad(NamedTuple):
     A load made from a recording.
 
     ``jobs`` has, by DAG, the recorded index of each job; ``demand`` the execution times of all
-    declared jobs, ns; ``estimated`` counts vertices of jobs whose execution time was not recorded,
-    ``executions`` all of them; ``unknown`` names callbacks of which no time is known at all.
-    ``dispatches`` is what of ``load.costs`` is dispatch; it is empty without overheads.
-    ``dispatch_ns`` and ``transport_ns`` are medians of what was measured, None where nothing was.
+    declared jobs, ns; ``estimated`` counts vertices of jobs without a recorded execution time,
+    ``executions`` counts all; ``unknown`` names callbacks without any known time. ``dispatches``
+    is the dispatch part of ``load.costs``; it is empty without overheads. ``dispatch_ns`` and
+    ``transport_ns`` are measured medians, None if nothing was measured.
     """
 
     load: Load
@@ -97,7 +93,7 @@ _COLUMNS = {
     'took': (_VERTEX, 'i8'), 'start': (_VERTEX, 'i8'), 'end': (_VERTEX, 'i8'),
     'cpu': (_VERTEX, 'i8'), 'dispatch': (_VERTEX, 'i4'), 'held': (_VERTEX, 'i2'),
     'arrived': (_EDGE, 'i8'), 'sent': (_EDGE, 'i1')}
-"""What is known by job, by job and vertex, or by job and edge; ns, or unknown (``sent``: 1)."""
+"""Columns by job, by job and vertex, or by job and edge; ns or unknown (``sent``: 1)."""
 
 
 class _Jobs:
@@ -118,7 +114,7 @@ class _Jobs:
 
     if TYPE_CHECKING:
         def __getattr__(self, name: str) -> Any:
-            """Say that there are the columns, too."""
+            """Declare the columns for type checkers."""
 
     def rows(self, name: str) -> Any:
         """Return a column as an array with a row for each job."""
@@ -128,11 +124,11 @@ class _Jobs:
 
 class LoadBuilder:
     """
-    Makes a load of a recording.
+    Makes a load from a recording.
 
-    :param n_workers: how many workers each process was recorded with.
-    :param cpus: how many there were; 0: not known.
-    :param processes: by vertex the process that it ran in, from 1; None: all in one.
+    :param n_workers: number of workers of each recorded process.
+    :param cpus: number of CPUs; 0: unknown.
+    :param processes: by vertex the recorded process, from 1; None: one process.
     """
 
     def __init__(
@@ -146,7 +142,7 @@ class LoadBuilder:
         self._callbacks = task_set.places_of_vertices()
         self._cpus = cpus
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
-        # by global vertex and leg: the edge (number in its DAG) that its message makes true
+        # by global vertex and leg: the edge (number in its DAG) that its message satisfies
         numbers = edge_numbers(tables)
         self._edges_into = [
             [numbers[first + before, first + vertex.index]
@@ -176,7 +172,7 @@ class LoadBuilder:
         del self._row
 
     def _find_rounds(self, of_dag: Sequence[Any]) -> None:
-        """Find out which timers were noticed in one round."""
+        """Find which timers were noticed in one round."""
         timers = [(number, place) for number, mine in enumerate(of_dag) if self._timer[number]
                   for place in range(len(mine))]
         columns = [np.concatenate([mine[name] for number, mine in enumerate(of_dag)
@@ -189,7 +185,7 @@ class LoadBuilder:
         begins = np.ones(len(order), dtype=np.bool_)
         begins[1:] = (process[1:] != process[:-1]) | (release[1:] > noticed[:-1])
         number = np.cumsum(begins) - 1
-        #: When each round of timers ended.
+        #: End of each round of timers.
         self._rounds = noticed[np.r_[np.flatnonzero(begins)[1:] - 1, len(order) - 1]] \
             if len(order) else noticed
         rounds = np.empty(len(order), dtype=np.int64)
@@ -201,7 +197,7 @@ class LoadBuilder:
                 at += len(jobs.numbers)
 
     def _job_ends(self) -> None:
-        """Keep what failed and what was skipped: it does so again."""
+        """Keep failed and skipped executions: they fail or are skipped again."""
         ends = self._recording.job_ends
         for dag, jobs in enumerate(self._jobs):
             mine = ends[ends['dag'] == dag]
@@ -213,7 +209,7 @@ class LoadBuilder:
             self._skipped |= {(dag, each) for each in row[skipped].tolist()}
 
     def _take_pieces(self, n_workers: int) -> None:
-        """Find out how late pieces were dispatched; keep what is undeclared."""
+        """Find the dispatch times of pieces; keep undeclared pieces."""
         table, rows = self._recording.executions, ran(self._recording)
         piece = table[rows]
         vertex, row = piece['vertex'].astype(np.int64), self._row[rows]
@@ -231,8 +227,7 @@ class LoadBuilder:
             np.where(first, ready, piece['start']), piece['start'], piece['end'], process)
         numbers = np.arange(len(rows))
         others = np.flatnonzero(vertex < 0)
-        # when ready, what it took, its dispatch or -1: undeclared callbacks, and legs that
-        # completed nothing
+        # ready, duration, dispatch or -1: undeclared callbacks, and legs that completed nothing
         self._others = np.column_stack((
             np.where(first, piece['ready'], piece['start']), piece['end'] - piece['start'],
             numbers))[others]
@@ -247,7 +242,7 @@ class LoadBuilder:
             jobs.dispatch[row[those] * jobs.size + vertex[those] - self._first[dag]] = those
 
     def _groups(self, callback: Any, vertex: Ints) -> Ints:
-        """Return what identifies the mutually exclusive groups of pieces, or -1."""
+        """Return numbers of the mutually exclusive groups of pieces, or -1."""
         different, which = np.unique(callback, return_inverse=True)
         known = self._recording.who.groups
         group = np.array([known.get(each, _UNTOLD) for each in different.tolist()],
@@ -258,7 +253,7 @@ class LoadBuilder:
         return np.maximum(group, -1)
 
     def _take_completions(self) -> None:
-        """Note what executions took that completed something."""
+        """Note the execution times of executions that completed a vertex."""
         table = self._recording.executions
         rows = np.flatnonzero(
             (table['completes'] != recorded_tables.NOTHING) & (table['vertex'] >= 0)
@@ -293,7 +288,7 @@ class LoadBuilder:
             jobs.noticed[row[source]] = done['ready'][source]
 
     def _all_at_once(self, jobs: _Jobs, rows: Ints, edges: list[int]) -> None:
-        """Where one execution stands for all legs, only the last message's time is known."""
+        """If one execution completes all legs, only the last message's time is known."""
         ends = jobs.rows('end')[rows][:, [jobs.publishers[edge] for edge in edges]]
         arrived = jobs.rows('arrived')
         for edge, end in zip(edges, ends.T):
@@ -301,7 +296,7 @@ class LoadBuilder:
             arrived[rows[early], edge] = end[early]
 
     def _take_publications(self) -> None:
-        """Note which edges the publications of jobs made true."""
+        """Note which edges the publications of jobs satisfied."""
         edges_from: dict[tuple[int, str], list[int]] = {}
         numbers = edge_numbers(self._tables)
         for dag, first in zip(self._task_set.dags, self._first):
@@ -325,7 +320,7 @@ class LoadBuilder:
                     jobs.rows('sent')[row[mine & (vertex_of == v)], edge] = 1
 
     def times(self) -> list[list[int]]:
-        """Return by DAG and vertex what an execution takes, 0 where nothing says it."""
+        """Return by DAG and vertex the execution time, 0 if unknown."""
         typical = self._typical()
         return [[typical.get(vertex.callback.key, 0) for vertex in dag.vertices]
                 for dag in self._task_set.dags]
@@ -335,12 +330,12 @@ class LoadBuilder:
         anew: bool = False,
     ) -> RecordedLoad:
         """
-        Return what was collected.
+        Return the load.
 
-        :param process: by vertex the process that it is to run in; None: as recorded.
-        :param workers: how many each process is to have, if that is fewer than in the recording.
-        :param anew: whether intakes are to notice timers and messages anew, not as recorded; so
-            they do only where CPU times say how long others computed.
+        :param process: by vertex the process to run it in; None: as recorded.
+        :param workers: workers of each process, if fewer than in the recording.
+        :param anew: whether intakes notice timers and messages, instead of the recorded times;
+            this needs CPU times, which say how long others computed.
         """
         self._close()
         process = process or self._process
@@ -358,7 +353,7 @@ class LoadBuilder:
         demand, executions = int(took.sum()), len(took)
         if overheads:
             took += late
-        if intakes is not None:     # who dispatches computes, too
+        if intakes is not None:     # dispatching needs CPU time, too
             cpu[cpu >= 0] += late[cpu >= 0]
             took += intakes.send_ns * self._by_execution(self._sends(process))
         others = self._others[sort_by(*self._others.T)]
@@ -370,7 +365,7 @@ class LoadBuilder:
         columns: dict[str, Any] = {
             'holds': np.concatenate([held, more]) if held.any() else [],
             'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
-            # where as many run beside one another, workers go on as they did
+            # with as many workers in parallel, workers sleep and wake as recorded
             'warmth': np.concatenate([warmth, more]) if overheads and workers < NEVER else [],
             'delays': delays, 'delay_stride': [jobs.n_edges for jobs in self._jobs],
             'delay_base': [0, *accumulate(
@@ -383,7 +378,7 @@ class LoadBuilder:
             unknown, usual, transport, late if overheads else late[:0], intakes)
 
     def _close(self) -> None:
-        """Put the columns of all DAGs' jobs together, and leave each DAG its part of them."""
+        """Join the columns of all DAGs' jobs; each DAG keeps a view of its part."""
         self._whole: dict[str, Any] = {}
         for name in _COLUMNS:
             parts = [getattr(jobs, name) for jobs in self._jobs]
@@ -392,14 +387,14 @@ class LoadBuilder:
                 setattr(jobs, name, part)
 
     def _drop(self, *columns: str) -> None:
-        """Forget columns: of long runs they are large."""
+        """Free columns, which are large for long runs."""
         for name in columns:
             del self._whole[name]
             for jobs in self._jobs:
                 delattr(jobs, name)
 
     def _unsent(self) -> list[Any]:
-        """Return by DAG, job and edge whether it was not published, as far as that is known."""
+        """Return by DAG, job and edge whether the edge was not published, as far as known."""
         found = []
         for jobs in self._jobs:
             sent, arrived, end = map(jobs.rows, ('sent', 'arrived', 'end'))
@@ -408,7 +403,7 @@ class LoadBuilder:
         return found
 
     def _never_ready(self, dag: Dag, unsent: Any) -> Any:
-        """Return by job and vertex what cannot run, because an edge before it is unsent."""
+        """Return by job and vertex whether it cannot run, because an earlier edge is unsent."""
         first = self._first[dag.index]
         found = np.zeros((len(unsent), len(dag.vertices)), dtype=np.bool_)
         if unsent.any():
@@ -420,10 +415,10 @@ class LoadBuilder:
 
     def _estimate(self, process: Sequence[int], unsent: list[Any]) -> tuple[int, list[str]]:
         """
-        Fill in what was not recorded of executions: what they took and computed.
+        Fill in execution and CPU times that were not recorded.
 
-        :param unsent: by DAG, job and edge whether it never comes true.
-        :return: how many there are, and the callbacks of which no time is known at all.
+        :param unsent: by DAG, job and edge whether the edge is not satisfied.
+        :return: their number, and the callbacks without any known time.
         """
         typical = self._typical()
         unknown: dict[str, None] = {}
@@ -442,7 +437,7 @@ class LoadBuilder:
                         unknown[key] = None
                     took[missing[:, v], v] = typical.get(key, 0)
                 known = cpu[:, v] >= 0
-                if known.any():     # those that did not complete are like the others
+                if known.any():     # executions that did not complete are like the others
                     share = cpu[known, v].sum() / max(1, took[known, v].sum())
                     cpu[missing[:, v], v] = took[missing[:, v], v] * min(1.0, share)
                     held[missing[:, v], v] = held[known, v].mean() >= 0.5
@@ -454,7 +449,7 @@ class LoadBuilder:
         return estimated, list(unknown)
 
     def _fates(self, bases: list[int], executions: int) -> list[int]:
-        """Return which executions failed, or were skipped; empty: none."""
+        """Return which executions failed or were skipped; empty: none."""
         fates = [RUNS] * executions if self._failed or self._skipped else []
         for vertex, row in self._failed:
             dag = self._tables.dag_of[vertex]
@@ -474,13 +469,13 @@ class LoadBuilder:
         self, workers: int, anew: bool
     ) -> tuple[Any, int | None, Any, Any, Costs | None]:
         """
-        Make times those that executions would have taken alone (see ``alone``).
+        Convert times to isolated execution times (see ``alone``).
 
-        ``took`` becomes what their callbacks take.
+        ``took`` becomes the isolated times of callbacks.
 
-        :return: how late executions were, by number, the last one what is usual; that; and by
-            execution what it takes more since its worker had slept (see ``Load.warmth``), and
-            what the executor takes for it; and what intakes take, if ``anew``.
+        :return: dispatch time by number of an execution, with the usual one last; the usual one;
+            by execution the extra time if its worker slept (see ``Load.warmth``); the executor's
+            own cost per execution; and the costs of intakes, if ``anew``.
         """
         intakes = None
         number, took, start, cpu, held = (
@@ -498,7 +493,7 @@ class LoadBuilder:
             self._notice_sooner(start - late, workers)
         ran: Any = (took >= 0) & (start >= 0)
         if ran.all():
-            ran = slice(None)   # which copies nothing: there may be millions
+            ran = slice(None)   # a slice copies nothing: there may be millions
         warmth = np.zeros(len(took) * (workers < NEVER), dtype=np.int64)
         if (cpu[ran] >= 0).any():
             recorded = Recorded(
@@ -515,7 +510,7 @@ class LoadBuilder:
             del beyond
             if workers < NEVER:
                 warmth[ran] = colder(recorded.callback, recorded.warm, cost)
-            # what is less than recorded: it began late, or it stood still later
+            # the reduction: it began late, or was paused later
             began = recorded.took - cost
             del recorded
             began = np.minimum(began, np.maximum(0, late[ran] - (usual or 0)))
@@ -525,9 +520,10 @@ class LoadBuilder:
 
     def _notice_sooner(self, could: Any, workers: int) -> None:
         """
-        Take off rounds what they were late since more executions ran than can when they were due.
+        Reduce the latency of rounds for which more executions ran than the new pool allows.
 
-        They become as late as those others are for which just as many ran as can: rank by rank.
+        Timer latency is taken from the recorded rounds at which as many executions ran as the new
+        pool allows, rank by rank.
 
         :param could: when executions could have started.
         """
@@ -552,7 +548,7 @@ class LoadBuilder:
         noticed[of] = np.minimum(noticed[of], ends[number[of]])
 
     def _when_due(self) -> tuple[Any, Any, Any]:
-        """Return when each round of timers was due, and ended, and in which process it was."""
+        """Return of each round of timers when it was due, when it ended, and its process."""
         number, release = self._whole['round'], self._whole['release']
         of = np.flatnonzero(number >= 0)
         ends = self._rounds.copy()
@@ -582,7 +578,7 @@ class LoadBuilder:
         return Noticed(came[0], came[1], came[2], came[3] > 0)
 
     def _sends(self, process: Sequence[int]) -> list[int]:
-        """Return by vertex whether it is to send to other processes, less whether it did."""
+        """Return by vertex whether it sends to other processes, minus whether it did."""
         found = [0] * self._tables.n_vertices
         for how, sign in ((process, 1), (self._process, -1)):
             for before in {a for a, b in edge_numbers(self._tables) if how[a] != how[b]}:
@@ -592,10 +588,10 @@ class LoadBuilder:
     def _load(
         self, costs: Any, bases: list[int], others: Ints, overheads: bool
     ) -> Load:
-        # time when ready, DAG, place of the job in its DAG, release
+        # ready, DAG, row of the job in its DAG, release
         parts = [np.column_stack((
             others, np.full(len(others), len(self._jobs)), np.arange(len(others)), others))]
-        rounds = np.r_[self._rounds, _UNKNOWN]      # the last of none
+        rounds = np.r_[self._rounds, _UNKNOWN]      # end of a missing round
         for dag, jobs in zip(self._task_set.dags, self._jobs):
             ideal = self._timer[dag.index] and not overheads
             ready: Any = jobs.release if ideal else np.maximum(jobs.noticed, rounds[jobs.round])
@@ -610,10 +606,9 @@ class LoadBuilder:
         self, overheads: bool, process: Sequence[int], intakes: Costs | None
     ) -> tuple[Any, int | None]:
         """
-        Return the transports by job, and the median of all that were measured.
+        Return the transports by job, and the median of all measured ones.
 
-        Where an edge is to cross from one process to another and did not, or did and is not to,
-        it takes what is usual of such edges.
+        An edge that newly crosses processes, or no longer does, gets the usual time of such edges.
         """
         delays: list[Any] = []
         measured: dict[bool, list[Any]] = {False: [np.zeros(0)], True: [np.zeros(0)]}
@@ -642,7 +637,7 @@ class LoadBuilder:
                 int(np.median(everything)) if len(everything) else None)
 
     def _crossings(self, process: Sequence[int]) -> list[list[tuple[bool, bool]]]:
-        """Return by DAG for each edge whether it left its process, and whether it is to."""
+        """Return by DAG and edge whether it crossed processes, and whether it will."""
         found: list[list[tuple[bool, bool]]] = [[] for _ in self._jobs]
         was = self._process
         for a, b in edge_numbers(self._tables):
@@ -650,7 +645,7 @@ class LoadBuilder:
         return found
 
     def _typical(self) -> dict[str, int]:
-        """Return by callback the median of its recorded times, or else the declared mean."""
+        """Return by callback the median of its recorded times, otherwise the declared mean."""
         recorded: dict[str, list[Any]] = {}
         for dag, jobs in zip(self._task_set.dags, self._jobs):
             for vertex in dag.vertices:

@@ -3,8 +3,9 @@
 """
 Measures what noticing due timers and messages of other processes cost in a recording.
 
-Theory of operation ------------------- The intake thread of a process (``simulate.intakes``) is
-not recorded.  Its work shows in two ways:
+Theory of operation
+-------------------
+The intake thread of a process (``simulate.intakes``) is not recorded.  Its work shows in two ways:
 
 * A computing execution that holds the GIL pauses while the intake runs, so its duration exceeds
   its CPU time.  The intake's GIL time is the median excess of executions during which exactly one
