@@ -8,21 +8,21 @@ Theory of operation
 Entries do not depend on each other, so the first error of each is collected and all are raised
 together. ``derive`` checks the rules about several entries (publishers, cycles, sinks, …).
 
-A declaration may be put together from several files:
+A declaration may consist of several files:
 
-1. ``include:`` lists files. Their nodes and paths come before those of the file itself, in that
-   order, each time that the file is listed. ``workers:`` and ``processes:`` of an included file do
-   not count: they are about the whole system.
-2. ``arguments:`` names the arguments of a file, with default values (none: it must be given).
-   ``set:`` of an include gives its value, which replaces ``$(name)`` in all values of the file.
-3. Names in an included file (nodes, topics, services, DAGs and, with dots, paths) are put below
-   the ``namespace:`` of the include. A name that ``remap:`` lists becomes the other name instead,
-   which the including file uses.
+1. ``include:`` lists files. Their nodes and paths come before those of the including file, in that
+   order, each time that the file is listed. ``workers:`` and ``processes:`` of an included file
+   are ignored: they concern the whole system.
+2. ``arguments:`` names the arguments of a file, with default values (none: required). ``set:`` of
+   an include gives a value, which replaces ``$(name)`` in all values of the file.
+3. Names in an included file (nodes, topics, services, DAGs and, with dots, paths) are prefixed
+   with the ``namespace:`` of the include. A name that ``remap:`` lists becomes the other name, as
+   used in the including file.
 4. An included file is processed from the inside out: its own includes, its arguments, then its
-   names. The result is a tree like that of one file, and every part of it knows its file and line.
-5. The path of a file is relative to the file that includes it. It must be in the folder of the
-   first file or below, also by way of symbolic links. Files that include each other in a cycle are
-   an error, and so are too many files, levels or entries.
+   names. The result is a tree like that of one file; every part of it keeps its file and line.
+5. The path of a file is relative to the including file. It must be in the folder of the first file
+   or below, also after resolving symbolic links. Include cycles are an error, as are too many
+   files, levels or entries.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ class Declaration:
     """
     A declaration as written in its files; callbacks in the order of the file.
 
-    :ivar text: all of it in one text, which needs no other file.
-    :ivar entries: the entry of each callback, by its key, and of each path, by its name; they
-        know the lines.
+    :ivar text: the whole declaration as one text without includes.
+    :ivar entries: the entry of each callback, by its key, and of each path, by its name, with
+        their lines.
     """
 
     file: str
@@ -90,9 +90,9 @@ class Declaration:
 
 def parse_declaration(text: str, file: str, path: str | None = None) -> Declaration:
     """
-    Return the declaration that a YAML text holds, with all that it includes.
+    Return the declaration in a YAML text, with all its includes.
 
-    :param path: the file that it was read from; None: it can include nothing.
+    :param path: its file; None: it cannot include any.
     """
     tree, top = top_of(text, file)
     found = Collector()
@@ -125,7 +125,7 @@ def parse_declaration(text: str, file: str, path: str | None = None) -> Declarat
 
 
 def _one_text(file: str, workers: int | None, nodes: list[Part], paths: list[Part]) -> str:
-    """Return the text of a declaration that was put together; only its lines differ."""
+    """Return the text of an assembled declaration; only its lines differ."""
     lines = [f'# put together from {printable(file)} and what it includes', 'mddag: 1']
     if workers is not None:
         lines.append(f'workers: {workers}')
@@ -276,16 +276,16 @@ def _top(tree: Tree, file: str) -> Entry:
 
 
 def is_composed(entry: Entry) -> bool:
-    """Return whether a declaration is put together, or has arguments."""
+    """Return whether a declaration has includes or arguments."""
     return entry.has('include') or entry.has('arguments')
 
 
 @dataclass
 class Assembler:
     """
-    Puts a declaration together.
+    Assembles a declaration from its files.
 
-    :ivar path: of the first file; None: it was not read from a file, and can include nothing.
+    :ivar path: of the first file; None: it was not read from a file, and cannot include any.
     """
 
     path: str | None
@@ -340,7 +340,7 @@ class Assembler:
     def _locate(
         self, entry: Entry, file: str, chain: list[tuple[str, str]]
     ) -> tuple[str, str]:
-        """Return the real path of an included file, and what errors call it."""
+        """Return the real path of an included file, and its name in errors."""
         text = entry.get('file')
         if self.path is None:
             raise entry.error(
@@ -383,7 +383,7 @@ def _argument_values(entry: Entry, tree: Mapping, given: dict[str, str]) -> dict
     """
     Return the values of a file's arguments.
 
-    :param given: those that an include sets; the others have their defaults.
+    :param given: those set by an include; the others have their defaults.
     """
     declared = tree.entries.get('arguments', Mapping(tree.line))
     if not isinstance(declared, Mapping):
@@ -444,7 +444,7 @@ def _changed(tree: Tree, change: Callable[[Scalar], str]) -> Tree:
 
 class _Renaming:
     """
-    Changes names of an included file to those that the including one uses (rule 3).
+    Changes names of an included file to those used in the including one (rule 3).
 
     :param entry: of ``include:``.
     """
@@ -457,7 +457,7 @@ class _Renaming:
         self._seen: set[str] = set()
 
     def check(self) -> None:
-        """Raise if a name is remapped that the included file does not have."""
+        """Raise if a remapped name does not occur in the included file."""
         for name, line in self._lines.items():
             if name not in self._seen:
                 raise GraphError(

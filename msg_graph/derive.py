@@ -11,31 +11,31 @@ Source: Yano and Azumi, "Multi-Deadline DAG Scheduling Model for Autonomous Driv
 Rules 1, 2, 3 and 6 concern callbacks (``Links``), the others make vertices.
 
 1. *Trigger edges* come from topics: from each callback that publishes a topic to each subscription
-   or sync callback that the topic starts. *Queue edges* (``reads``) start nothing; they only serve
-   end-to-end analysis.
+   or sync callback that the topic starts. *Queue edges* (``reads``) start no callback; they only
+   serve end-to-end analysis.
 2. A *source* is a timer, or a subscription or service with a ``period:``, whose messages come from
-   outside of the graph. Every topic that starts any other callback must be published in the graph.
-   Only a source has a period, a DAG's name and what else concerns a whole DAG.
-3. Callbacks and topics must form no cycle. All rules below go along one topological order of
-   both together, so that a topic with many publishers and many subscribers costs their sum, not
-   their product.
-4. *OR*: a subscription callback runs once for each message, so it has one vertex for each vertex
-   of each publisher of its topic, and so have the callbacks after it. *AND*: a sync callback is
-   one vertex, after all vertices of all publishers of all its topics.
-5. Hence a vertex that is no sync has one predecessor and lies in its DAG. A sync joins what must
-   lie in one DAG already: two sources joined by a sync are an error. So every vertex leads back to
-   exactly one source, and the weakly connected components are the vertices of one source each.
-6. A *sink* is a callback that starts none; as rule 4 gives each subscriber a vertex for each
-   vertex of its publisher, all vertices of a callback are sinks or none is. Each sink has a
-   deadline, shorter or longer than the period, and nothing else has one.
-7. DAGs are numbered by their sources' places in the file. The vertices of a DAG are numbered by
-   their callbacks' places in the file, several of one callback in the order of the vertices that
-   start them, that is of the publishers. The edges of a vertex are listed in the order of the
-   topics that it publishes, those of one topic by index.  A DAG is called by ``dag:``, else after
-   its source's node, or, if several sources of the node have no ``dag:``, ``/node/callback``.
+   outside of the graph. A topic that starts any other callback must be published in the graph.
+   Only a source declares a period, a DAG's name and other properties of a whole DAG.
+3. Callbacks and topics must form no cycle. All rules below follow one topological order of both
+   together. So a topic with many publishers and many subscribers costs their sum, not their
+   product.
+4. *OR*: a subscription callback runs once for each message. So it, and each callback after it, has
+   one vertex for each vertex of each publisher of its topic. *AND*: a sync callback is one vertex,
+   after all vertices of all publishers of all its topics.
+5. Hence a vertex that is no sync has one predecessor and lies in the DAG of that. A sync joins
+   only vertices of one DAG: two sources joined by a sync are an error. So every vertex leads back
+   to exactly one source, and each weakly connected component is the vertices of one source.
+6. A *sink* is a callback that starts no other callback. By rule 4, either all vertices of a
+   callback are sinks or none is. Each sink has a deadline, shorter or longer than the period; no
+   other callback has one.
+7. DAGs are numbered in the order of their sources in the file; the vertices of a DAG in the order
+   of their callbacks in the file, those of one callback in the order of the publishers' vertices.
+   The edges of a vertex follow the order of the topics that it publishes, those of one topic the
+   vertex index. A DAG has the name of ``dag:``, else that of its source's node, or, if several
+   sources of the node have no ``dag:``, ``/node/callback``.
 8. Errors are collected in stages, so that none is a consequence of another: trigger and queue
    edges; then cycles, deadlines and paths; then the vertices.
-9. The number of vertices and edges is bounded before they are made, as rule 4 multiplies.
+9. The number of vertices and edges is bounded before they are made, because rule 4 multiplies.
 """
 
 from __future__ import annotations
@@ -86,9 +86,10 @@ def loads(
     Return the task set of a declaration.
 
     :param text: the YAML; bytes must be UTF-8.
-    :param name: what errors call it.
-    :param path: the file that it comes from, if it may include others from its folder.
-    :param without_deadline: gets the keys of the sinks without a deadline; None: they are errors.
+    :param name: the name used in errors.
+    :param path: its file, if it may include others from its folder.
+    :param without_deadline: receives the keys of the sinks without a deadline; None: they are
+        errors.
     :raises GraphError: it is not YAML, or breaks a rule of the language or of the model.
     """
     text = decode(text, name) if isinstance(text, bytes) else text
@@ -106,8 +107,8 @@ def no_garbage() -> Iterator[None]:
     """
     Switch the cyclic garbage collector off.
 
-    Reading a declaration makes hundreds of thousands of objects and no garbage; searching them for
-    garbage takes a quarter of the time.
+    Reading a declaration makes hundreds of thousands of objects and no garbage; the collector
+    would take a quarter of the time.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -124,7 +125,8 @@ def derive_task_set(
     """
     Return the task set of a declaration.
 
-    :param without_deadline: gets the keys of the sinks without a deadline; None: they are errors.
+    :param without_deadline: receives the keys of the sinks without a deadline; None: they are
+        errors.
     """
     links = Links(declaration)
     found = Collector()
@@ -159,7 +161,7 @@ def derive_task_set(
 
 
 class Links:
-    """Publishers and subscribers by topic; callbacks by their places in the file."""
+    """Publishers and subscribers by topic; callbacks are places in the file."""
 
     def __init__(self, declaration: Declaration) -> None:
         self.entries = declaration.entries
@@ -175,7 +177,7 @@ class Links:
 
     @staticmethod
     def is_source(callback: Callback) -> bool:
-        """Whether a job starts with this callback (rule 2); ``check_triggers`` came first."""
+        """Return whether a job starts with this callback (rule 2), after ``check_triggers``."""
         return callback.period_ns is not None
 
     def check_triggers(self) -> None:
@@ -187,7 +189,7 @@ class Links:
             raise self.entries[callback.key].error(
                 'service', 'a service is a source, and it has no period',
                 "add 'period:' with the time between two requests")
-        # header_stamp says of a timer what its messages carry on to other processes
+        # for a timer, header_stamp describes the messages it sends to other processes
         if callback.kind == 'timer' and callback.release_from == 'source_timestamp':
             raise self.entries[callback.key].error(
                 'release_from', 'a timer is released when it is due',
@@ -236,7 +238,7 @@ class Links:
         before.update((place, () if self.is_source(callback) else callback.topics)
                       for place, callback in enumerate(self.callbacks))
         sorter = TopologicalSorter(before)
-        with suppress(CycleError):  # it sorts what is not on one all the same
+        with suppress(CycleError):  # callbacks outside of a cycle are sorted nevertheless
             sorter.prepare()
         order: list[int] = []
         while ready := sorter.get_ready():
@@ -249,7 +251,7 @@ class Links:
 
     def _refuse_cycle(self, cycle: list[int]) -> None:
         # The edge to cut: one into a sync, which keeps its other topics, else one against the
-        # order of the file, which is most likely the one that leads back.
+        # order of the file, which most likely leads back.
         edges = [(cycle[i - 1], place) for i, place in enumerate(cycle)]
         publisher, cut = max(
             edges, key=lambda edge: (self.callbacks[edge[1]].kind == 'sync', edge[0] - edge[1]))
@@ -272,7 +274,7 @@ class Links:
             f"'reads:' and {how}")
 
     def _cycles(self, stuck: set[int]) -> Iterator[list[int]]:
-        """Yield cycles without a common callback: walk back from publisher to publisher."""
+        """Yield cycles without a common callback by walking back from publisher to publisher."""
         while stuck:
             place: int | None = min(stuck)
             walk: dict[int, None] = {}
@@ -286,7 +288,7 @@ class Links:
                 yield places[places.index(place):][::-1]
 
     def check_deadlines(self, without: list[str] | None) -> None:
-        """Check that sinks, and nothing else, have deadlines (rule 6); or collect the others."""
+        """Check that exactly the sinks have deadlines (rule 6); or collect those without."""
         for_each(self.callbacks, lambda each: self._check_deadline(each, without))
 
     def _check_deadline(self, callback: Callback, without: list[str] | None) -> None:
@@ -382,7 +384,7 @@ class _Expansion:
     edges: int = 0
 
     def expand(self, place: int) -> None:
-        """Make the vertices of one callback; those of its publishers exist."""
+        """Make the vertices of one callback, after those of its publishers."""
         callback = self.links.callbacks[place]
         if self.links.is_source(callback):
             self._bound(place, 1, 0)
@@ -447,7 +449,7 @@ def _dags(links: Links, expansion: _Expansion) -> tuple[Dag, ...]:
 
 
 def _dag_names(links: Links, sources: list[int]) -> dict[int, str]:
-    """Return by source the name that it declares, else that of its node; of several its own."""
+    """Return the name of each source's DAG (rule 7)."""
     names: dict[int, str] = {}
     taken: dict[str, int] = {}
     unnamed = Counter(callback.node for callback in map(links.callbacks.__getitem__, sources)

@@ -5,11 +5,11 @@ Run unmodified node programs in this process, with all of their nodes on one exe
 
 Theory of operation
 -------------------
-1. Each program runs in a thread of its own.  A thread that a program starts belongs to it, too.
-2. While a ``Host`` is entered, the following does something else:
+1. Each program runs in its own thread.  A thread that a program starts belongs to the program.
+2. While a ``Host`` is entered, these functions are replaced:
 
    =================================  ============================================================
-   ``init`` of the default context    nothing: the context is initialised already
+   ``init`` of the default context    does nothing: the context is initialised already
    its ``shutdown``                   called by a program's thread, ends that program; called by
                                       any other thread (in a callback), ends the run
    its ``ok``                         is also False in the threads of a program that has ended
@@ -19,14 +19,14 @@ Theory of operation
    ``signal.signal``, ``getsignal``   keep a handler for each program: see ``guest_signals``
    =================================  ============================================================
 
-3. A program that spins gives its nodes to the host's executor and waits until the run or the
-   program ends.  A program ends by ``rclpy.shutdown`` or when it returns.  Its nodes are removed
-   then, unless it has returned them.  The run ends with the last program.
-4. An exception of a callback is raised by the spin of its program.  The nodes that a program has
+3. A program that spins passes its nodes to the host's executor and waits until the run or the
+   program ends.  A program ends by ``rclpy.shutdown`` or when it returns.  Its nodes are then
+   removed, unless it has returned them.  The run ends with the last program.
+4. An exception of a callback is raised by the spin of its program.  Nodes that a program has
    returned have no such spin: their exceptions end the run.
 
-Differences from a process of its own: callbacks also run between two ``spin_once``; the arguments
-and the domain that a program gives to ``rclpy.init`` are not used; ``sys.argv`` is right only
+Differences from a separate process: callbacks also run between two ``spin_once``; the arguments
+and the domain that a program passes to ``rclpy.init`` are ignored; ``sys.argv`` is right only
 until the next program starts.
 """
 
@@ -62,11 +62,11 @@ _ENTITIES = ('timers', 'subscriptions', 'services', 'clients', 'guards', 'waitab
 @dataclass(eq=False)
 class Guest:
     """
-    A program that runs.
+    A running program.
 
-    :ivar nodes: those that are on the executor.
-    :ivar settled: whether these are all that it has at first, or it has ended.
-    :ivar ended: whether it wants nothing to run any more.
+    :ivar nodes: its nodes on the executor.
+    :ivar settled: whether ``nodes`` holds all initial nodes, or the program has ended.
+    :ivar ended: whether its nodes run no more callbacks.
     :ivar returned: whether its main has returned nodes.
     :ivar uses_ros: whether it has initialised rclpy.
     :ivar error: the exception that has ended its main.
@@ -93,13 +93,13 @@ class Host:
     def __init__(self) -> None:
         self.executor: Any = None
         self.guests: list[Guest] = []
-        self.global_executor: Any = None  # of callbacks, which belong to no program's thread
+        self.global_executor: Any = None  # of callbacks: they belong to no program's thread
         self.end_run: Callable[[], None] = lambda: None
         self.guest_of: Any = weakref.WeakKeyDictionary()  # by thread
         self._is_ending: Callable[[], bool] = lambda: False
         self._lend: Callable[[], Any] = nullcontext
         self._all_started = self._ended = self._loading = False
-        self._lock = threading.RLock()  # a handler of a signal may interrupt its holder
+        self._lock = threading.RLock()  # reentrant: a signal handler may interrupt its owner
         self._node_of: Any = weakref.WeakKeyDictionary()  # by entity
         self._executors: Any = weakref.WeakSet()
         self._signals = GuestSignals(self)
@@ -122,7 +122,7 @@ class Host:
         replace(Executor, '__init__', self._executor_init)
         replace(threading.Thread, 'start', self._thread_start)
         for package in ('rclpy.experimental', 'rclpy.experimental.events_executor'):
-            with suppress(ImportError, KeyError):  # not every version has it
+            with suppress(ImportError, KeyError):  # some versions do not have it
                 replace(import_module(package), 'EventsExecutor', instead(SingleThreadedExecutor))
         context.on_shutdown(self._context_ended)
         return self
@@ -137,7 +137,7 @@ class Host:
     # --- programs --------------------------------------------------------------------------------
 
     def load(self, specs: Iterable[str], ros_arguments: Iterable[str] = ()) -> list[Program]:
-        """Find programs; what their modules do while they are imported is hosted, too."""
+        """Find programs; their modules are imported under the host's replacements, too."""
         self._loading = True
         try:
             return [resolve(spec, ros_arguments) for spec in specs]
@@ -149,16 +149,17 @@ class Host:
         end_run: Callable[[], None] = lambda: None, is_ending: Callable[[], bool] = lambda: False,
     ) -> None:
         """
-        Run programs, the next one as soon as the nodes of the last one are on the executor.
+        Run programs, each as soon as the nodes of the previous one are on the executor.
 
         A program that takes longer than ``START_TIMEOUT_S`` is not waited for.
 
         :param executor: runs all nodes; the caller spins it.
-        :param arguments: end each program's command line.
+        :param arguments: appended to each program's command line.
         :param end_run: called, from any thread, when a callback calls ``rclpy.shutdown``, or all
             programs have ended.
         :param is_ending: whether the run ends; no program or node is added then.
-        :raises LoadingError: when a program fails before, or ends without any use of ROS.
+        :raises LoadingError: when a program fails during its start, or ends without any use of
+            ROS.
         """
         self.executor, self.end_run, self._is_ending = executor, end_run, is_ending
         self._lend = getattr(executor, 'lend', nullcontext)
@@ -229,7 +230,7 @@ class Host:
             self.program_failed(guest, guest.error)
 
     def program_failed(self, guest: Guest, error: BaseException) -> None:
-        """Report at once what a program has raised, if others go on without it."""
+        """Report a program's exception at once, if other programs continue."""
         if not all(each.ended for each in self.guests):
             get_logger('mddag_executor').error(
                 f'--node {guest.program.spec}: its main has raised {describe(error)}: its nodes '
@@ -308,9 +309,9 @@ class Host:
         guest: Guest | None,
     ) -> None:
         """
-        Wait until something is true, the run or the program ends, or the time is over.
+        Wait until a condition is true, the run or the program ends, or the timeout is over.
 
-        The worker of a callback that waits runs other callbacks.
+        The worker of a waiting callback runs other callbacks.
 
         :param changed: is notified when ``until`` may have become true.
         """
@@ -320,11 +321,11 @@ class Host:
                 None if timeout_s is None or timeout_s < 0 else timeout_s)
 
     def is_over(self, guest: Guest | None) -> bool:
-        """Return whether the run has ended, or the program."""
+        """Return whether the run or the program has ended."""
         return self._ended or guest is not None and guest.ended
 
     def wake(self) -> None:
-        """Have all waiting threads check again what they wait for."""
+        """Let all waiting threads check their conditions again."""
         with self._lock:
             executors = list(self._executors)
         for executor in executors:
@@ -334,7 +335,7 @@ class Host:
         self._ended = True
         self.wake()
 
-    # --- what rclpy and Python do meanwhile ------------------------------------------------------
+    # --- replacements in rclpy and Python --- ----------------------------------------------------
 
     def current_guest(self) -> Guest | None:
         """Return the program that the calling thread belongs to, or None."""
@@ -374,7 +375,7 @@ class Host:
     def _executor_init(self, original: Callable[..., None]) -> Callable[..., None]:
         def init(executor: Executor, *args: Any, **more: Any) -> None:
             original(executor, *args, **more)
-            # before that, the caller of ``start`` makes the one that runs the nodes
+            # before that, the caller of ``start`` makes the executor that runs the nodes
             if (self.executor is not None or self._loading) and executor.context is self.context:
                 make_guest(executor, self, self.current_guest())
                 with self._lock:
@@ -383,7 +384,7 @@ class Host:
         return init
 
     def _global_executor(self) -> Any:
-        """Return the executor of ``rclpy.spin`` and its kind."""
+        """Return the executor of ``rclpy.spin`` and its variants."""
         owner: Any = self.current_guest() or self
         with self._lock:
             if owner.global_executor is None:
@@ -394,9 +395,9 @@ class Host:
 
 def nodes_of(specs: Iterable[str], arguments: Iterable[str] = ()) -> list[list[str]]:
     """
-    Run programs until their nodes are there; return the names of the nodes of each program.
+    Run programs until their nodes exist; return the names of the nodes of each program.
 
-    No callback runs.  The process is to be ended after that.
+    No callback runs.  The process must be ended afterwards.
 
     :raises LoadingError: as ``Host.load`` and ``start``, or when a program makes no node in time.
     """

@@ -1,35 +1,30 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A run of several processes: starting, watching and ending them, and the result of all.
+A run of several processes: start, watch and end them, and combine their results.
 
 Theory of operation
 -------------------
-The processes put themselves into groups of their own, so that Ctrl-C reaches the supervisor only,
-which passes it on, and they end when the supervisor does, even if that was killed
-(``belong_to_parent``).  They stay in its session, which has its share of the CPUs.
-
-What they print is passed on line by line, each line with the name of its process before it.  An
-error line of one that then ends with status 2 is the supervisor's error.
-
-A process that ends ahead of the run's end has *died*, unless its status is 0.  Then all end, or
-the others go on (``goes_on``).  The run ends when nothing runs any more.
-
-It does end: what does not end ``END_TIMEOUT_S`` after another one has ended in order, because the
-run was over, is asked to end (SIGTERM); what has not ended as long after it was asked is killed.
-Both are said, in one line that names the process.
-
-The run makes a folder with the declaration as all processes are to have it.  Each process leaves
-there, under its process id, what came of it.  Sinks are judged where they are, so the run's
-verdicts are put together by the core (``core.tally.of_processes``); callbacks are counted where
-they are; rules that need all of them (drift, what the synthetic nodes measured) get the sum of
-what was observed.
-
-Synthetic nodes start together in all processes, as they do in one.  So each process notes in the
-folder that its nodes are *made*; when those of all are, it waits until publishers and
-subscriptions have met; then it notes when it is *ready*, and starts ``LEAD_NS`` after the last of
-these times.  However long another process takes for that, it is waited for; but not if it has
-*ended*, which the run notes: then nobody is waited for any more.
+1. *Signals.*  Each process puts itself into its own process group.  So Ctrl-C reaches only the
+   supervisor, which passes it on.  The processes end when the supervisor does, even if it was
+   killed (``belong_to_parent``).  They stay in its session, which has its share of the CPUs.
+2. *Output* is passed on line by line, each prefixed with the name of its process.  If a process
+   ends with status 2, its error line becomes the supervisor's error.
+3. *Ends.*  A process that ends before the run does has *died*, unless its status is 0.  Then all
+   processes end, or the others continue (``goes_on``).  The run ends when no process runs any
+   more.
+4. *Timeouts.*  When a process has ended in order because the run was over, each process that still
+   runs ``END_TIMEOUT_S`` later receives SIGTERM.  After the same time again it is killed.  Both
+   are reported in one line with the name of the process.
+5. *Results.*  The run makes a folder with the declaration for all processes.  Each process leaves
+   its result there, under its process id.  Sinks are judged and callbacks are counted where they
+   run.  The core combines the verdicts (``core.tally.of_processes``).  Rules that need all
+   processes (drift, measurements of the synthetic nodes) get the sum of the observations.
+6. *Common start.*  Synthetic nodes start at the same time in all processes.  Each process notes in
+   the folder that its nodes are *made*.  When all have, it waits until publishers and
+   subscriptions have discovered each other, and notes that it is *ready*.  The start is
+   ``LEAD_NS`` after the last of these times.  Processes wait for each other without a
+   timeout; but once the run has noted that a process has *ended*, none is waited for any more.
 """
 
 from __future__ import annotations
@@ -62,15 +57,15 @@ _BAD_INPUT = 2
 LEAD_NS = 100_000_000
 
 Results = Sequence[tuple[str, Mapping[str, Any]]]
-"""The name of each process that has left a result, and that."""
+"""The name and the result of each process that has left a result."""
 
 
 class ProcessError(MddagError):
-    """What a process of the run found wrong with its input."""
+    """A process of the run has found an error in its input."""
 
 
 def belong_to_parent(parent: int) -> None:
-    """Leave Ctrl-C to the process that started this one, and end when it ends (on Linux)."""
+    """Ignore Ctrl-C, which the parent passes on, and end when the parent ends (on Linux)."""
     os.setpgrp()
     signal_at_end_of(parent, signal.SIGTERM)
 
@@ -82,7 +77,7 @@ class Run:
 
     :ivar name: of the process in the declaration.
     :ivar status: its exit status, negative for a signal; None while it runs.
-    :ivar asked: it was asked to end; ``killed``: it did not, and was killed.
+    :ivar asked: it was sent SIGTERM; ``killed``: it did not end, and was killed.
     """
 
     name: str
@@ -97,7 +92,7 @@ class Run:
     @property
     def died(self) -> bool:
         """Return whether it ended by an exception, a signal or an error."""
-        # asked to end while it started: ahead of its own handler, or its nodes cannot start then
+        # SIGTERM during its start: before its handler was installed, or its nodes could not start
         as_asked = self.asked and self.status in (-signal.SIGTERM, _BAD_INPUT)
         return self.status not in (None, 0) and not as_asked
 
@@ -126,9 +121,9 @@ class Supervisor:
     Runs processes.
 
     :param command: returns the command line of a process, by its name.
-    :param goes_on: whether the others go on when one ends by itself.
-    :param out: where standard output goes; ``err``: standard error.
-    :param on_end: called with each that has ended.
+    :param goes_on: whether the others continue when one ends by itself.
+    :param out: the target of standard output; ``err``: of standard error.
+    :param on_end: called with each process that has ended.
     """
 
     def __init__(
@@ -146,16 +141,16 @@ class Supervisor:
         self._over_at: float | None = None
 
     def stop(self, hurried: bool = False) -> None:
-        """Let the run end; from any thread, also from a signal's handler."""
+        """End the run; from any thread, also from a signal handler."""
         self._stop = True
 
     def run(self, names: Sequence[str], seconds: float | None) -> None:
         """
         Run processes until all have ended.
 
-        :param seconds: so long they run by themselves: one that ends in order later takes no other
-            along; None: for ever.
-        :raises ProcessError: when one finds its input wrong.
+        :param seconds: how long they run by themselves: a process that ends in order after that
+            does not end the others; None: for ever.
+        :raises ProcessError: when a process finds an error in its input.
         """
         begin = time.monotonic()
         try:
@@ -190,7 +185,7 @@ class Supervisor:
             thread.start()
 
     def _pass_on(self, run: Run, source: BinaryIO, target: TextIO) -> None:
-        """Pass on what a process prints."""
+        """Pass on the output of a process."""
         for raw in source:
             line = raw.decode(errors='replace').rstrip('\r\n')
             if target is self._err:
@@ -206,12 +201,12 @@ class Supervisor:
                 target.write(f'{line}\n')
                 target.flush()
             except (OSError, ValueError):
-                pass  # nobody reads it any more: the process goes on
+                pass  # the reader has closed the output: the process continues
 
     def _reap(self, run: Run) -> None:
         run.status = run.process.wait()
         for thread in run._threads:
-            thread.join(1.0)  # what it has started itself may hold its output open
+            thread.join(1.0)  # a subprocess may keep its output open
         if run.status != _BAD_INPUT:
             for line in run._errors:
                 self._print(f'[{run.name}] {line}', self._err)
@@ -227,7 +222,7 @@ class Supervisor:
             self._stop = True
 
     def _end_if_asked(self, now: float) -> None:
-        """Ask all to end, once, also those that should have ended; kill what then does not."""
+        """Send SIGTERM to all processes once the run is over; kill those that do not end then."""
         running = [run for run in self.runs if run.status is None]
         late = self._over_at is not None and now - self._over_at > END_TIMEOUT_S
         if (self._stop or late) and self._asked_at is None:
@@ -268,11 +263,11 @@ class Part:
 
     @classmethod
     def read(cls, folder: str) -> Part:
-        """Return what a process is to know."""
+        """Return this process's part from the folder of its run."""
         return cls(Path(folder), **json.loads(Path(folder, 'run.json').read_text()))
 
     def leave(self, result: Any) -> None:
-        """Leave what came of this process."""
+        """Store the result of this process in the folder."""
         path = self.folder / f'{os.getpid()}.json'
         part = path.with_suffix('.part')
         part.write_text(json.dumps(result, default=list))
@@ -280,7 +275,7 @@ class Part:
 
     @staticmethod
     def ended(folder: str, name: str) -> None:
-        """Note, in the run, that a process has ended."""
+        """Note in the folder that a process has ended."""
         Path(folder, f'{name}.ended').touch()
 
     def start_together(
@@ -288,13 +283,13 @@ class Part:
         unmatched: Callable[[], list[str]], patience_s: float = MATCH_TIMEOUT_S,
     ) -> int:
         """
-        Wait for the instant at which all processes start, and return it (monotonic ns).
+        Wait for the common start of all processes, and return it (monotonic ns).
 
-        Not if the run is to end.
+        Returns early if the run is to end.
 
-        :param unmatched: returns the topics where publishers and subscriptions have not met yet;
-            ``patience_s``: for how long to wait until more of them have.
-        :raises mddag_executor.hosting.session.SessionError: when they do not meet.
+        :param unmatched: returns the topics on which publishers and subscriptions have not
+            discovered each other; ``patience_s``: how long to wait for progress.
+        :raises mddag_executor.hosting.session.SessionError: when discovery fails.
         """
         self._come_to('made', name, names, session)
         session.wait_until_matched(
@@ -307,7 +302,7 @@ class Part:
         return any(self.folder.glob('*.ended'))
 
     def _come_to(self, step: str, name: str, names: Sequence[str], session: Session) -> int:
-        """Wait until all processes have come to a step; return when the last one did."""
+        """Wait until all processes have reached a step; return when the last one did."""
         own = self.folder / f'{name}.{step}'
         part = own.with_suffix('.part')
         part.write_text(str(time.monotonic_ns()))
@@ -320,7 +315,7 @@ class Part:
 
 
 def left(folder: str, pid: int) -> Any:
-    """Return what a process has left, None where that is nothing."""
+    """Return the result of a process, None if it has none."""
     try:
         return json.loads(Path(folder, f'{pid}.json').read_text())
     except FileNotFoundError:
@@ -329,9 +324,9 @@ def left(folder: str, pid: int) -> Any:
 
 def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) -> dict[str, Any]:
     """
-    Return the result of a run from those of its processes.
+    Return the result of a run, combined from those of its processes.
 
-    :param plan: of the synthetic nodes, where they are such.
+    :param plan: of the synthetic nodes, if the run has such.
     """
     parts = [result for _, result in results]
     callbacks = _callbacks(parts)
@@ -349,7 +344,7 @@ def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) ->
                          for key in ('unknown', 'doubtful')},
         'never_ran': [c.key for c in task_set.callbacks
                       if not callbacks.get(c.key, {'ran': 0})['ran']],
-        # only what all of them measured has a window
+        # the window that all of them measured
         'measured': None if plan is None or {
             name for name, part in results if part['ledger'] is not None} != every else measure(
                 Ledger.of_processes(task_set, ledgers), plan),
@@ -357,7 +352,7 @@ def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) ->
 
 
 def _callbacks(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the counts of all callbacks; some of the executors' own have the same names."""
+    """Return the counts of all callbacks; executors' internal ones may share a name."""
     callbacks: dict[str, Any] = {}
     for part in parts:
         for name, counts in part['callbacks'].items():
@@ -374,7 +369,7 @@ def _callbacks(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _observed(task_set: TaskSet, results: Results) -> Observed:
-    """Return what was observed of the whole system: releases, where they happened."""
+    """Return the observations of the whole system: releases, where they happened."""
     whole = Observed()
     homes = {dag.vertices[dag.source].callback.key: task_set.process_of(
         dag.vertices[dag.source].callback.node) for dag in task_set.dags}
