@@ -1,31 +1,32 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What the executors of one machine announce to each other of their publications.
+Announcements of publications between the executors of one machine.
 
 Theory of operation
 -------------------
-A message says when it was published and its publication sequence number, and nothing else
-of its job.  Within a process the window of time of each publication is noted (``jobs``).  So the
-process that publishes for another one announces just that, right behind the message: topic,
-window, sequence number, and the job, on a topic of its own.  Both have the same system clock.
+A message carries its source timestamp and publication sequence number, but not its job.  Within a
+process the time window of each publication is noted (``jobs``).  A process that publishes for
+another one announces the same, right after the message, on a separate topic: topic, window,
+sequence number, and job.  Both processes have the same system clock.
 
 1.  *Announced* is each publication on a topic by which a DAG leaves the process, for the DAGs that
-    ``processes:`` divides and whose jobs no header stamp identifies (``other_processes``); also
-    one of no job, so that nobody waits for it.
-2.  A job is called by the executor that released it first and its number there, wherever it goes,
-    and has one release, by the steady clock that all processes of a machine share.
-    Those of a topic that overlap in time are announced together, when the last of them has
-    returned: a message may lie in the windows of all.  Between processes nobody could say when
-    that is so; so what several processes publish on one topic is a doubt (``contested``).
-3.  A message that may come from another process and belongs to no publication that is known waits
-    for its announcement, which is under way: for ``WAIT_NS`` at least, and until the check after
-    that, as the process may just have been stopped.  Then it runs as undeclared, and is counted.
-    Publications of one publisher are announced in their order, so its messages stay in order.
+    ``processes:`` divides and whose jobs no header stamp identifies (``other_processes``).  A
+    publication of no job is announced, too, so that no message waits for it.
+2.  A job has one name everywhere: the executor that released it first, and its number there.  It
+    has one release, by the steady clock that all processes of a machine share.  Publications of a
+    topic that overlap in time are announced together, when the last of them has returned, because
+    a message may lie in the windows of all.  This cannot be decided across processes.  So messages
+    on a topic that several processes publish are ambiguous (``contested``).
+3.  A message that may come from another process and fits no known publication waits for its
+    announcement: for ``WAIT_NS`` at least, and until the next check, as the process may just have
+    been stopped.  Then it runs as undeclared, and is counted.  Publications of one publisher are
+    announced in order, so its messages stay in order.
 4.  Announced publications are looked up with those of this process, by one rule (``Jobs.find``):
     window and sequence number.
-5.  Only executors with the same declaration understand each other: its digest is in the name of
-    the topic.  Each process has a topic of its own, so that nobody hears itself.
+5.  Executors understand each other only if they have the same declaration: its digest is in the
+    name of the topic.  Each process has its own topic, so that it does not receive its own
+    announcements.
 """
 
 from __future__ import annotations
@@ -62,16 +63,16 @@ WAIT_NS, CHECK_NS = 100_000_000, 50_000_000
 """How long a message waits for its announcement, and how often that is checked."""
 _QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1000)
-# whose, publisher, sequence, begin, end; home, number and release of the job; DAG, vertex, topic
+# sender, publisher, sequence, begin, end; home, number and release of the job; DAG, vertex, topic
 _ENTRY = struct.Struct('<QQQqqQQqiiI')
 
 
 class Announcements:
     """
-    Announces publications to the other processes, and receives what these announce.
+    Announces publications to the other processes, and receives their announcements.
 
-    :param process: which of the declared ones this is.
-    :param pool: whose engine it is; all but ``unmatched`` and ``close`` happens under its lock.
+    :param process: the declared process that this is.
+    :param pool: its engine is used; all but ``unmatched`` and ``close`` needs its lock.
     """
 
     def __init__(
@@ -87,13 +88,13 @@ class Announcements:
         self._contested = contested(task_set)
         self._token = int.from_bytes(os.urandom(8), 'little')
         self._publishers: dict[tuple[int, int], PublisherNumbers] = {}
-        # until when (trace's clock) each message waits, and what the middleware says of it
+        # until when (trace's clock) each message waits, and its info from the middleware
         self._waiting: list[tuple[int, Work, dict[str, Any]]] = []
         self._checked_at = 0
         digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
         names = [each.name for each in task_set.processes]
         own = names.index(process)
-        # Its own arguments go before those of the process, which name the process' nodes.
+        # Its own arguments precede those of the process, which name the process' nodes.
         name = f'mddag_jobs_{os.getpid()}_{own}'
         self.node = Node(
             name, context=context, enable_rosout=False, start_parameter_services=False,
@@ -110,7 +111,7 @@ class Announcements:
         self._jobs.announce = self._announce
 
     def unmatched(self) -> list[str]:
-        """Return the topics on which the processes have not met yet."""
+        """Return the topics on which the processes have not discovered each other."""
         publisher = self._publisher
         if publisher is None:
             return []
@@ -120,7 +121,7 @@ class Announcements:
         return found
 
     def close(self) -> None:
-        """Announce nothing more."""
+        """Stop announcing."""
         self._jobs.announce = None
         self._publisher = None
         self.node.destroy_node()
@@ -145,7 +146,7 @@ class Announcements:
             publication.end, home, number, release, dag, origin.vertex, self._number[topic])
 
     def _job(self, origin: Origin) -> tuple[tuple[int, int], int] | None:
-        """Return name and release of a job; None for none, and one that has ended meanwhile."""
+        """Return name and release of a job; None: no job, or it has ended meanwhile."""
         others = self._engine.other_processes
         if origin is NO_ORIGIN or others is None:
             return None
@@ -160,7 +161,7 @@ class Announcements:
         return name, release - self._clock.offset_ns
 
     def _hear(self, message: UInt8MultiArray) -> None:
-        """Handle what another process announces, and pass on what has waited for it."""
+        """Handle announcements of another process; pass on the messages that waited for them."""
         if len(message.data) % _ENTRY.size:
             return
         for entry in _ENTRY.iter_unpack(message.data):
@@ -175,7 +176,7 @@ class Announcements:
         self, whose: int, of: int, sequence: int, begin: int, end: int, home: int, number: int,
         release: int, dag: int, vertex: int, topic: int,
     ) -> None:
-        if topic < len(self._topics) and dag < len(self._engine.dag_names):  # else of a stranger
+        if topic < len(self._topics) and dag < len(self._engine.dag_names):  # else unknown
             publisher = self._publishers.setdefault((whose, of), PublisherNumbers())
             self._jobs.take_in(self._topics[topic], Publication(
                 begin, publisher, Announced((home, number), dag, vertex, release), sequence, end))
@@ -188,7 +189,7 @@ class Announcements:
             info.get('publication_sequence_number'), counted)
 
     def take(self, work: Work, info: dict[str, Any], now: int) -> None:
-        """Handle a message that may come from another process; pass it on when it is known."""
+        """Handle a message that may be of another process; pass it on when its job is known."""
         if work.entity.topic in self._contested:
             self._jobs.doubtful += 1
             self._give(work, None)
@@ -206,7 +207,7 @@ class Announcements:
             time.monotonic_ns() + CHECK_NS, lambda: self._pool.report(self._check))
 
     def _check(self, now: int) -> None:
-        """Pass on what has waited for too long (rule 3)."""
+        """Pass on messages that have waited for too long (rule 3)."""
         late = [entry for entry in self._waiting if entry[0] <= self._checked_at]
         self._checked_at = now
         for entry in late:

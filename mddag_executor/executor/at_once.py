@@ -1,11 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What is done at once, where it is taken: it completes something that callbacks may wait for.
+Arrivals that are handled at once: they complete something that callbacks may wait for.
 
 Responses complete futures, ``/clock`` sets simulated time, and the timer of a ``Rate`` ends a
-sleep. All of these are rclpy's own code, which only takes note of something.  The thread that
-spins does them, from an epoll of its own, so they come through though all workers wait for them.
+sleep.  All of this is short code of rclpy.  The spinning thread runs it, from a separate epoll, so
+that it runs even if all workers wait for it.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from mddag_executor.executor.work import Work
 
 class AtOnce:
     """
-    The sources of what is done at once; all methods but ``ring`` belong to the spinning thread.
+    The sources handled at once; all methods but ``ring`` belong to the spinning thread.
 
     :param lock: that of the engine.
-    :param fail: gets what a take raises.
+    :param fail: receives exceptions of takes.
     """
 
     def __init__(
@@ -40,11 +40,11 @@ class AtOnce:
         self._has_run = False
 
     def ring(self) -> None:
-        """End the present wait, or the next one; from any thread, also in a signal handler."""
+        """End the current wait, or the next one; from any thread, also in a signal handler."""
         self.loop.wake()
 
     def handle(self, events: Events) -> bool:
-        """Do what has arrived; return whether anything was done."""
+        """Handle arrivals; return whether there were any."""
         self._has_run = False
         sources, _, expired = self.loop.sources(events)
         for source in sources:
@@ -70,7 +70,7 @@ class AtOnce:
         self._ran(entity)
 
     def request(self, work: Work) -> None:
-        """Handle a request: services are not among these sources."""
+        """Handle a request: never called, as services are not among these sources."""
         raise NotImplementedError
 
     def note_run(self) -> None:

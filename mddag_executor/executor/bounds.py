@@ -1,10 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The times and numbers that the executor is tuned with.
+Tuning constants of the executor, each with its reason and the measured figure, if any.
 
-Each has its reason and, if it was measured, the figure.  What has to do with the GIL only is in
-``gil`` and ``core.queues``.
+Those about the GIL only are in ``gil`` and ``core.queues``.
 """
 
 from __future__ import annotations
@@ -13,31 +12,32 @@ BRIEF_NS = 300_000
 """
 While a callback runs that usually takes no longer than this, no other thread is woken.
 
-Waking a thread costs 60 to 140 us next to a callback that computes.
+Waking a thread costs 60 to 140 us while a callback computes.
 """
 
 GUARD_NS = 2_000_000
 """
-The longest that something ready waits because a callback was expected to end.
+The longest that a ready callback waits because another one was expected to end.
 
-Each time it is set costs 9 us, and about 25 us when it has come, whatever was found then.
+Setting the time costs 9 us, its expiry about 25 us.
 """
 
 STOP_NS = 5_000_000
-"""A wake-up that is late by this, while the process computes nothing, is a stop of the machine."""
+"""A wake-up that is late by this, in a process that computes nothing, is a stop of the machine."""
 
 AGAIN_NS = 5_000_000
 """
-How often something is checked that is not announced.
+How often unannounced changes are checked.
 
-A callback group that has refused an execution, and the end of a context.
+These are a callback group that has refused an execution, and the end of a context.
 """
 
 YIELD_STEP_NS, MOST_YIELD_NS = 1_000, 2_000_000
 """
-A coroutine that yields continues in the next turn, each time in a row this much later, up to 2 ms.
+A coroutine that yields continues in the next turn: each time in a row this much later, up to 2 ms.
 
-So one that yields a few times loses nothing, and one that polls does not compute all the time.
+So a coroutine that yields a few times loses nothing, and one that polls does not compute all the
+time.
 """
 
 END_S = 1.0
@@ -45,14 +45,15 @@ END_S = 1.0
 
 MOST = 64
 """
-The bound of what is usually less than ten.
+The bound of numbers that are usually less than ten.
 
-Messages taken from one entity before others have their turn, messages of a profile that keeps all
-that wait in Python, publications of a topic, callbacks that wait in ``Client.call``.
+These are the messages taken from one entity before the next entity, the messages of a keep-all
+profile that wait in Python, the publications of a topic, and the callbacks that wait in
+``Client.call``.
 """
 
 REMEMBERED = 4096
-"""So many past items of a kind are remembered: aborted jobs, stamps of jobs, undeclared names."""
+"""How many past items of a kind are remembered: aborted jobs, stamps of jobs, undeclared names."""
 
 LOG_EVERY_S = 10.0
-"""How often the same kind of warning is logged at most."""
+"""The minimum time between two logged warnings of the same kind."""

@@ -1,14 +1,14 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-All that this program uses of rclpy beyond its documented interface.
+All uses of rclpy beyond its documented interface.
 
-Nobody else uses a private name of rclpy, or what is behind a handle: ``test/test_layers.py`` holds
-that. Each entry says in which versions it was seen. *7.1* is Jazzy: 7.1.5, which the package index
-has, to 7.1.11. *9.1* is Kilted: 9.1.2. Where nothing else is said, it is in both, and the executor
-cannot do without it. ``test/executor/test_compat.py`` tries each on the rclpy that is installed.
+No other module uses a private name of rclpy, or what is behind a handle; ``test/test_layers.py``
+checks that. Each entry lists the versions in which it was seen. *7.1* is Jazzy: 7.1.5, the version
+in the package index, to 7.1.11. *9.1* is Kilted: 9.1.2. Entries without a version are in both, and
+the executor needs them. ``test/executor/test_compat.py`` tries each on the installed rclpy.
 
-Two adapters have modules of their own: ``listeners`` (``handle.pointer``) and ``waitsets``.
+Two adapters are separate modules: ``listeners`` (``handle.pointer``) and ``waitsets``.
 """
 
 from __future__ import annotations
@@ -35,31 +35,31 @@ from rclpy.time_source import TimeSource
 import rclpy.timer
 
 RCLError: type[Exception] = _rclpy.RCLError
-"""What rcl reports. From 7.1.8 on it is ``rclpy.subscription.RCLError``, too."""
+"""The error of rcl. From 7.1.8 on it is also ``rclpy.subscription.RCLError``."""
 
 RCL_ERRORS = (InvalidHandle, RCLError)
-"""What rclpy raises of anything whose context has ended, among others."""
+"""Errors that rclpy raises for objects whose context has ended, among others."""
 
 
 # --- taking --------------------------------------------------------------------------------------
 
 def message_taker(subscription: Any) -> Callable[[], tuple[Any, dict[str, Any]] | None]:
-    """Return what takes a message (bytes of a raw subscription) with its info, or None."""
+    """Return a function that takes a message (bytes if raw) with its info, or returns None."""
     return partial(subscription.handle.take_message, subscription.msg_type, subscription.raw)
 
 
 def request_taker(service: Any) -> Callable[[], tuple[Any, Any]]:
-    """Return what takes a request with its header; that is None where there is none."""
+    """Return a function that takes a request with its header, which is None if there is none."""
     return partial(service.handle.service_take_request, service.srv_type.Request)
 
 
 def response_taker(client: Any) -> Callable[[], tuple[Any, Any]]:
-    """Return what takes the header of a response and that; None where there is none."""
+    """Return a function that takes a response's header and the response; None if there is none."""
     return partial(client.handle.take_response, client.srv_type.Response)
 
 
 callback_type: Callable[[Any], Any] = attrgetter('_callback_type')
-"""Says whether a subscription's callback takes a message's info, too: then ``WITH_INFO``."""
+"""Whether a subscription's callback takes a message's info, too: then ``WITH_INFO``."""
 
 WITH_INFO = Subscription.CallbackType.WithMessageInfo
 
@@ -67,17 +67,17 @@ WITH_INFO = Subscription.CallbackType.WithMessageInfo
 # --- timers --------------------------------------------------------------------------------------
 
 TimerInfo: Any = getattr(rclpy.timer, 'TimerInfo', None)
-"""What a timer's callback can ask for by an annotation. Public in 9.1; 7.1 has no such thing."""
+"""The type by which a timer's callback asks for its info. Public in 9.1; absent in 7.1."""
 
 
 def timer_functions(timer: Any) -> tuple[
     Callable[[], int | None], Callable[[], dict[str, int] | None], Callable[[], int],
 ]:
     """
-    Return what asks how long it is until a timer's next call, calls it, and asks for its period.
+    Return functions that read the time until a timer's next call, call it, and read its period.
 
     Unlike the timer's own methods they do not enter its handle each time. In 9.1 a call returns
-    what a ``TimerInfo`` says; in 7.1 None.
+    the data of a ``TimerInfo``; in 7.1 None.
     """
     handle = timer.handle
     call = getattr(handle, 'call_timer_with_info', handle.call_timer)
@@ -88,7 +88,7 @@ _info_parameters: weakref.WeakKeyDictionary[Any, str | None] = weakref.WeakKeyDi
 
 
 def with_timer_info(timer: Any, callback: Any, call: dict[str, int] | None) -> Any:
-    """Return a timer's callback with the ``TimerInfo`` of a call, where it asks for that (9.1)."""
+    """Return a timer's callback with the ``TimerInfo`` of a call, if it asks for that (9.1)."""
     if call is None or callback is None:
         return callback
     function = getattr(callback, '__func__', callback)
@@ -96,7 +96,7 @@ def with_timer_info(timer: Any, callback: Any, call: dict[str, int] | None) -> A
         name = _info_parameters[function]
     except KeyError:
         name = _info_parameters[function] = _info_parameter(callback)
-    except TypeError:  # there are no weak references to it
+    except TypeError:  # it supports no weak references
         name = _info_parameter(callback)
     if name is None:
         return callback
@@ -130,7 +130,7 @@ def complete_request(client: Any, number: int, response: Any, executor: Any) -> 
 
 
 def attach_futures(waitable: Any, executor: Any) -> None:
-    """Have the callbacks of a waitable's futures run in an executor."""
+    """Let the callbacks of a waitable's futures run in an executor."""
     for future in waitable._futures:
         future._set_executor(executor)
 
@@ -154,10 +154,10 @@ def sender_is_behind(waitable: Any, data: Any) -> bool:
     """
     Return whether an action client has taken a response to a request that it does not know yet.
 
-    In 7.1.5 it sends a request before it notes its number, and throws away what comes in between:
-    the future would never be done (rclpy issue 1123). From 7.1.6 on it has a lock for that.
+    In 7.1.5 it sends a request before it notes its number, and discards responses that come in
+    between: the future would never be done (rclpy issue 1123). From 7.1.6 on a lock prevents that.
 
-    :param data: what the waitable has taken.
+    :param data: the data that the waitable has taken.
     """
     if type(data) is not dict or hasattr(waitable, '_lock'):
         return False
@@ -168,16 +168,16 @@ def sender_is_behind(waitable: Any, data: Any) -> bool:
 
 def feedback_taken(waitable: Any, data: Any, most: int) -> list[tuple[Callable[..., Any], Any]]:
     """
-    Return the feedback that an action client has taken, each with the callback that it is for.
+    Return the feedback that an action client has taken, each with its callback.
 
-    It is removed from what was taken. A client takes one feedback at a time. So with a result, all
-    that is there is taken, too: another thread may have the result in its hands soon, and then
-    the client has forgotten the callback. Other waitables have none.
+    It is removed from the taken data. A client takes one feedback at a time. Together with a
+    result, all remaining feedback is taken, because another thread may handle the result and the
+    client then forgets the callback. Other waitables have no feedback.
 
     From 7.1.6 on a client has a lock for its handle.
     """
     callbacks = getattr(waitable, '_feedback_callbacks', None)
-    if callbacks is None:  # without a look at the type: rclpy.action loads much
+    if callbacks is None:  # without a check of the type: rclpy.action loads much
         return []
     messages = [data['feedback']] if 'feedback' in data else []
     if 'result' in data and callbacks:
@@ -205,7 +205,7 @@ _TASK_CODE = Task.__call__.__code__.co_filename
 
 class BareTask(Task):
     """
-    A task that does not go on by itself when what it waits for is done.
+    A task that does not continue by itself when the future it waits for is done.
 
     :ivar waits_for: the future that its coroutine waits for, if rclpy reports it (7.1.9).
     """
@@ -218,17 +218,17 @@ class BareTask(Task):
         self.waits_for = future
 
     def unfetched(self) -> BaseException | None:
-        """Return what the task has raised, if nobody has asked for it yet (``exception``)."""
+        """Return the task's exception, unless it has been fetched (``exception``)."""
         error: BaseException | None = None if self._exception_fetched else self._exception
         return error
 
     def mark_fetched(self) -> None:
-        """Take note that somebody takes care of what it has raised: else that is printed."""
+        """Mark the task's exception as handled: otherwise it is printed."""
         self._exception_fetched = True
 
 
 def forget_task_frames(error: BaseException) -> None:
-    """Remove from a traceback the frames in which a task caught it: they refer to the task."""
+    """Remove the frames in which a task caught its exception: they refer to the task."""
     trace = error.__traceback__
     while trace is not None and trace.tb_frame.f_code.co_filename == _TASK_CODE:
         trace.tb_frame.clear()
@@ -240,11 +240,11 @@ HAS_NEXT_SPIN = hasattr(Executor, '_call_task_in_next_spin')
 """Whether tasks are those of 7.1.9 and later; 9.1.2 does not have them yet."""
 
 NEXT_TURN = object()
-"""What a coroutine waits for that yields None: it continues in the next turn of the executor."""
+"""The awaited object of a coroutine that yields None: it continues in the executor's next turn."""
 
 
 def adopt_awaited(future: Any, executor: Any) -> None:
-    """Have the done callbacks of an awaited future run in the executor, as from 7.1.9 on."""
+    """Let the done callbacks of an awaited future run in the executor, as from 7.1.9 on."""
     if HAS_NEXT_SPIN and isinstance(future, Future):
         reference: Any = future._executor
         if reference() is None:
@@ -255,8 +255,8 @@ def awaited(coroutine: Any) -> Any:
     """
     Return the rclpy future that a suspended coroutine waits for, or NEXT_TURN.
 
-    From 7.1.9 on, the coroutine says it itself. In 7.1.5 and 9.1 ``Future.__await__`` is a
-    generator that yields nothing. So the future is looked up where the chain of awaits ends.
+    From 7.1.9 on, the coroutine reports it. In 7.1.5 and 9.1 ``Future.__await__`` is a generator
+    that yields nothing. So the future is looked up at the end of the chain of awaits.
     """
     inner = coroutine
     while True:
@@ -276,7 +276,7 @@ def awaited(coroutine: Any) -> Any:
 # --- executors and nodes -------------------------------------------------------------------------
 
 TASKS_NEWEST_FIRST = TimerInfo is None and not HAS_NEXT_SPIN
-"""Whether waiting tasks run in the reverse of their order: in 7.1 before 7.1.9."""
+"""Whether waiting tasks run in reverse order: in 7.1 before 7.1.9."""
 
 
 def _nothing() -> None:
@@ -284,13 +284,13 @@ def _nothing() -> None:
 
 
 class BareExecutor(Executor):
-    """rclpy's executor, without its own way of running things."""
+    """rclpy's executor without its own scheduling."""
 
-    _sigint_gc: Any = None  # for its finalizer, where construction fails
+    _sigint_gc: Any = None  # for its finalizer, if construction fails
 
     def __init__(self, *, context: Any = None) -> None:
-        # The context keeps a WeakMethod of ``wake``. When that goes first, as at Python 3.11's
-        # exit, its end is an exception that is printed. See ``shutdown.call_at_shutdown``.
+        # The context keeps a WeakMethod of ``wake``. If the executor is collected first, as at
+        # Python 3.11's exit, an exception is printed. See ``shutdown.call_at_shutdown``.
         self.wake = _nothing  # type: ignore[method-assign]
         super().__init__(context=context)
         del self.wake
@@ -300,7 +300,7 @@ class BareExecutor(Executor):
         return self._sigint_gc
 
     def is_gone(self) -> bool:
-        """Return whether ``shutdown`` has let go of everything."""
+        """Return whether ``shutdown`` has released everything."""
         return self._guard is None
 
     def create_future(self) -> Future:
@@ -316,11 +316,11 @@ class BareExecutor(Executor):
         self._is_shutdown = True
 
     def _call_task_in_next_spin(self, task: Task) -> None:
-        """Leave a task (7.1.9) to whoever runs it, who asks it again by himself."""
+        """Do nothing: the executor calls a task (7.1.9) again by itself."""
 
 
 class _FirstNode:
-    """Stands first among a context's nodes, to notice that they are destroyed."""
+    """The first of a context's nodes: it notices that they are being destroyed."""
 
     def __init__(self, call: Callable[[], None]) -> None:
         self.destroy_node = call
@@ -328,12 +328,12 @@ class _FirstNode:
 
 def on_end(context: Any, call: Callable[[], None]) -> object:
     """
-    Have a function called when a context is shut down, before its nodes are gone.
+    Call a function when a context is shut down, before its nodes are destroyed.
 
-    In 9.1 a context first destroys its nodes, which it has in a list, and only then does what it
-    was given by ``on_shutdown``. There, the function is called twice.
+    In 9.1 a context first destroys the nodes in its list, and only then calls the functions of
+    ``on_shutdown``. There, the function is called twice.
 
-    :return: what is to be kept for as long as that is wanted.
+    :return: an object to keep as long as the call is wanted.
     """
     context.on_shutdown(call)
     first = _FirstNode(call)
@@ -345,16 +345,16 @@ def on_end(context: Any, call: Callable[[], None]) -> object:
 
 def is_called_by_spin() -> bool:
     """
-    Return whether the method that asks was called by ``rclpy.spin``.
+    Return whether the calling method was called by ``rclpy.spin``.
 
-    That runs one callback at a time, in every version.
+    ``rclpy.spin`` runs one callback at a time, in every version.
     """
     return sys._getframe(2).f_code is rclpy.spin.__code__
 
 
 @contextmanager
 def executor_kept(node: Any) -> Iterator[None]:
-    """Have another executor run a node, as it is added to that; ``node.executor`` stays."""
+    """Let another executor run a node when it is added to that; ``node.executor`` stays."""
     before, node._Node__executor_weakref = node._Node__executor_weakref, None
     try:
         yield
@@ -363,15 +363,15 @@ def executor_kept(node: Any) -> Iterator[None]:
 
 
 def keeps_time(subscription: Any) -> bool:
-    """Return whether it is the one through which rclpy gets a node's simulated time."""
+    """Return whether it is the subscription to a node's simulated time."""
     return getattr(subscription.callback, '__func__', None) is TimeSource.clock_callback
 
 
 def is_of_wait_for_message(entity: Any) -> bool:
     """
-    Return whether it is a subscription that ``rclpy.wait_for_message`` makes for a moment.
+    Return whether it is the temporary subscription of ``rclpy.wait_for_message``.
 
-    That takes from it itself, and would wait in vain for what an executor has taken before.
+    That function takes the message itself, and would wait in vain if an executor had taken it.
     """
     callback = getattr(entity, 'callback', None)
     return getattr(callback, '__module__', None) == 'rclpy.wait_for_message'

@@ -3,11 +3,11 @@
 """
 Checks of the engine at the end of every section under its lock.
 
-``MDDAG_DEBUG=1`` switches them on, and the tracebacks of errors (``cli.main``);
-``MDDAG_DEBUG=engine`` switches on these checks only.
+``MDDAG_DEBUG=1`` switches on these checks and the tracebacks of errors (``cli.main``);
+``MDDAG_DEBUG=engine`` only these checks.
 
-A check costs time for each execution that waits and each job that is open.  So if there are more
-than ``CHECKED_PER_SECTION`` of these, only some sections are followed by one.
+A check costs time for each waiting execution and each open job.  So if there are more than
+``CHECKED_PER_SECTION`` of these, only some sections are followed by a check.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from mddag_executor.errors import MddagError
 
 VARIABLE = 'MDDAG_DEBUG'
 CHECKED_PER_SECTION = 100
-"""At least this many jobs and executions may be checked after each section: about 0.1 ms."""
+"""How many jobs and executions may be checked after each section: about 0.1 ms."""
 
 
 class InvariantError(MddagError):
-    """The engine is in a state that it must never be in; the text says all that is wrong."""
+    """The engine is in an invalid state; the text lists all violations."""
 
     def __init__(self, broken: list[str]) -> None:
         super().__init__(
@@ -36,10 +36,10 @@ class InvariantError(MddagError):
 
 class CheckedLock:
     """
-    A reentrant lock; a check follows each section, unless that raises.
+    A reentrant lock; a check follows each section, unless the section raises.
 
-    :param check: raises when something is wrong; after that it is not called any more.
-    :param size: returns how much there is to check.
+    :param check: raises when an invariant is violated; it is not called again then.
+    :param size: returns how many items there are to check.
     """
 
     def __init__(self, check: Callable[[], None], size: Callable[[], int]) -> None:

@@ -16,7 +16,7 @@ class LocalDelivery:
     """
     The subscriptions on one topic that publishing threads of this process take from.
 
-    :param sources: theirs.
+    :param sources: their sources.
     """
 
     __slots__ = ('sources', '_pool', '_is_held')
@@ -27,23 +27,23 @@ class LocalDelivery:
         self._is_held = False
 
     def hold(self) -> None:
-        """Announce nothing for now, if a thread waits in the epoll that it would wake."""
+        """Pause announcements, if they would wake a thread that waits in the epoll."""
         if self._pool.polling:
             self._pool.loop.hold(self.sources)
-            self._is_held = True  # after that: a thread that ends it meanwhile may be too early
+            self._is_held = True  # set last: a thread that ends it meanwhile may be too early
 
     def listen_again(self, subscription: Any) -> None:
-        """Have a subscription announced again whose reader the middleware has replaced."""
+        """Announce a subscription again after the middleware has replaced its reader."""
         for source in self.sources:
             if source.entity.rclpy is subscription:
                 source.listen()
 
     def collect_published(self, publication: Publication | None) -> None:
-        """Take what was announced since ``hold``, and announce again."""
+        """Collect arrivals announced since ``hold``, and resume announcements."""
         pool = self._pool
         running = current.running
         if running is None or running.pool is not pool:
-            publication = None  # of another executor, whose jobs are others
+            publication = None  # of another executor, with other jobs
         if not pool.is_inside():
             with pool.lock:
                 pool.tick()

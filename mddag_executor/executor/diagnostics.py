@@ -1,23 +1,22 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What an executor reports on ``/diagnostics``, the topic that ROS's own tools look at.
+An executor's reports on ``/diagnostics``, the topic of ROS's own tools.
 
 Theory of operation
 -------------------
-Once a period a thread of its own reads the executor's counters and publishes one
+Once a period a separate thread reads the executor's counters and publishes one
 ``DiagnosticArray``: a status for each DAG that has a callback in this process, and one for the
-pool.  It takes no lock and touches nothing on a callback's way: counters are read
-as they stand (a count that moves on while others are read shows one period later), so no
-worker ever waits for it.
+pool.  The thread takes no lock, so it never delays a worker.  It reads counters while they change;
+a change that it misses shows one period later.
 
-A DAG's status says what came of its results (jobs of its sinks) lately.  STALE: nothing has been
-released for a while.  ERROR, WARN: see ``Thresholds``.  The pool's status says WARN when something
-was lost: messages beyond a queue's depth, releases of timers, messages whose job was not found,
-events of the trace, misses that ``on_deadline_miss`` was too slow for.
+A DAG's status is about its recent results (jobs of its sinks).  STALE: no job has been released
+for a while.  ERROR, WARN: see ``Thresholds``.  The pool's status is WARN when data was lost:
+messages beyond a queue's depth, releases of timers, messages whose job was not found, events of
+the trace, misses for which ``on_deadline_miss`` was too slow.
 
 By the conventions of diagnostics names are ``NAME: DAG`` and ``NAME: workers``, the hardware_id is
-the host's name and the process, and values are texts whose units stand in their keys.
+the host's name and the process, and values are texts with the unit in their keys.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ class Status(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """The counters of a DAG at one time, as they stood."""
+    """The counters of a DAG at one time."""
 
     results: Counts
     jobs: int
@@ -77,7 +76,7 @@ class DagWatch:
     Judges the state of one DAG, period by period.
 
     :param every_ns: the period of the diagnostics.
-    :param in_stops: by DAG, how many misses stops of the machine explain.
+    :param in_stops: by DAG, the number of misses explained by stops of the machine.
     """
 
     def __init__(
@@ -90,7 +89,7 @@ class DagWatch:
         self._in_stops = in_stops
         self._sinks = {tally.vertex_name(v): sink for v, sink in tally.sinks_of(dag).items()}
         self._stale_after = max(thresholds.stale_periods * dag.period_ns, every_ns)
-        # what was seen in each period of the window, and before it
+        # the counters at the end of each period of the window, and before it
         self._seen = deque([self._look()], maxlen=thresholds.window + 1)
         self._released_at: int | None = None
 
@@ -101,7 +100,7 @@ class DagWatch:
             [sink.completed for sink in sinks], self._in_stops[self._dag.index])
 
     def status(self, now: int) -> Status:
-        """Return the state of things; to be called once a period (``now``: monotonic ns)."""
+        """Return the status; called once a period (``now``: monotonic ns)."""
         last, seen = self._seen[-1], self._look()
         self._seen.append(seen)
         if seen.jobs != last.jobs:
@@ -148,7 +147,7 @@ class DagWatch:
         used: list[float] = []
         margins: dict[str, int] = {}
         for (name, sink), before, now in zip(self._sinks.items(), last.completed, seen.completed):
-            # while others are added, one may be there twice
+            # a copy made while others are added may contain one of them twice
             kept = sink.responses
             found = [kept[-i] for i in range(1, min(now - before, len(kept)) + 1)]
             times += found
@@ -170,7 +169,7 @@ def _ms(nanoseconds: int) -> str:
 
 
 class PoolWatch:
-    """Judges the state of the workers and of what everybody shares, period by period."""
+    """Judges the state of the workers and of shared resources, period by period."""
 
     def __init__(
         self, pool: WorkerPool, registry: Registry, recorder: Recorder | None,
@@ -193,7 +192,7 @@ class PoolWatch:
             'unreported_misses': 0 if self._notifier is None else self._notifier.unreported}
 
     def status(self, now: int) -> Status:
-        """Return the state of things; to be called once a period (``now``: monotonic ns)."""
+        """Return the status; called once a period (``now``: monotonic ns)."""
         counts = self._read()
         step = {key: max(0, n - self._last[key]) for key, n in counts.items()}
         cpu = time.process_time_ns()
@@ -228,10 +227,10 @@ class PoolWatch:
 
 class Diagnostics:
     """
-    Publishes the state of an executor, from a thread of its own.
+    Publishes the state of an executor, from a separate thread.
 
-    :param period_ns: how often.
-    :param process: which of the declared processes this is.
+    :param period_ns: the period, ns.
+    :param process: the declared process that this is.
     """
 
     def __init__(
@@ -246,7 +245,7 @@ class Diagnostics:
         verdicts = pool.engine.verdicts
         self._dags = []
         for dag in task_set.dags if task_set is not None else ():
-            # one that several processes share is reported where its source and its sinks are
+            # a DAG shared by several processes is reported by those with its source or sinks
             reported_by = dag.vertices if process is None else [
                 dag.vertices[i] for i in (dag.source, *dag.sinks)]
             self._dags.append((
@@ -257,14 +256,14 @@ class Diagnostics:
         self._thread: threading.Thread | None = None
 
     def statuses(self) -> list[Status]:
-        """Return a status for each DAG that is here, and the pool's."""
+        """Return a status for each DAG with a callback here, and the pool's."""
         now = time.monotonic_ns()
         hosted = self._registry.hosted()
         found = [watch.status(now) for keys, watch in self._dags if not keys.isdisjoint(hosted)]
         return [*found, self._pool.status(now)]
 
     def start(self) -> None:
-        """Begin to publish; nothing happens when it has begun before."""
+        """Begin to publish; further calls do nothing."""
         if self._thread is None:
             stop_at_exit(self)
             self._thread = threading.Thread(
@@ -272,7 +271,7 @@ class Diagnostics:
             self._thread.start()
 
     def stop(self) -> None:
-        """End publishing; nothing happens when it has never begun."""
+        """Stop publishing; does nothing if it has not begun."""
         self._ending.set()
         if self._thread is not None:
             join(self._thread, END_S)
@@ -288,8 +287,8 @@ class Diagnostics:
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.node import Node
         from rclpy.parameter import Parameter
-        # No executor runs the node, since it has nothing to run.
-        # Its own arguments go before those of the process, which name the process' nodes.
+        # No executor runs the node, since it has no callbacks. Its own arguments precede those of
+        # the process, which name the process' nodes.
         node = Node(
             NODE_NAME, context=self._context, enable_rosout=False, start_parameter_services=False,
             cli_args=['--ros-args', '-r', f'__node:={NODE_NAME}_{os.getpid()}'],
@@ -301,7 +300,7 @@ class Diagnostics:
                 if is_over(self._context):
                     return
                 publisher.publish(self._message())
-                # a period that was missed (the machine slept) is not made up for
+                # a missed period (the machine slept) is skipped
                 due = max(due + self._period_ns, time.monotonic_ns())
         finally:
             with suppress(Exception):  # the context has ended meanwhile
@@ -310,7 +309,7 @@ class Diagnostics:
     def _message(self) -> DiagnosticArray:
         from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
         message = DiagnosticArray()
-        # of the system's clock: simulated time may stand still, and this is about the process
+        # system time: simulated time may stand still, and this is about the process
         stamp = message.header.stamp
         stamp.sec, stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
         for status in self.statuses():

@@ -1,10 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What is to be done at a time: timers, deadlines of open jobs, checks, and calls.
+Actions at a due time: timers, deadlines of open jobs, checks, and calls.
 
-One timerfd (``EventLoop.timer``) is set to the earliest of these times.  While there is something
-to run, it may expire too early, but not too late.
+One timerfd (``EventLoop.timer``) is set to the earliest due time.  While there are executions to
+run, it may expire too early, but not too late.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 class DueTimes:
     """
-    The times at which a worker pool has to do something; all methods under the engine's lock.
+    The times at which a worker pool has to act; all methods need the engine's lock.
 
-    Times are monotonic ns, if nothing else is said.
+    Times are monotonic ns, unless noted otherwise.
 
     :param context_ended: whether the context has ended.
     """
@@ -43,30 +43,30 @@ class DueTimes:
         self._calls: list[tuple[int, int, Callable[[], None]]] = []
         self._n_calls = 0
         self._gil_check = GilCheck()
-        # whether the timerfd is set to something that may not have to be done
+        # whether the timerfd may be set to a time at which nothing is due
         self._may_expire_early = False
         self._seen = monotonic_ns(), process_time_ns()
 
     def begin(self, now: int) -> None:
-        """Set the timerfd, as a spin begins."""
+        """Set the timerfd at the beginning of a spin."""
         self._seen = now, process_time_ns()
         self.arm(now)
 
     def call_at(self, at: int, function: Callable[[], None]) -> None:
-        """Have a function called at a time, without the lock; the caller arms."""
+        """Call a function at a time, without the lock; the caller arms the timerfd."""
         self._n_calls += 1
         heappush(self._calls, (at, self._n_calls, function))
 
     def handle(self, now: int, since: int) -> list[Callable[[], None]]:
         """
-        Handle what is due by now; return what is to be called without the lock.
+        Handle everything due by now; return the functions to call without the lock.
 
         :param now: the time on the trace's clock.
         :param since: since when the calling thread has waited in the epoll, on the trace's clock.
         """
         pool, monotonic = self._pool, now - self._offset
         self._notice_stop(monotonic, since - self._offset)
-        if monotonic > self._check_context_at:  # nothing reports it if it was only destroyed
+        if monotonic > self._check_context_at:  # a context that was only destroyed is not reported
             self._check_context_at = monotonic + AGAIN_NS
             if self._context_ended():
                 pool.context_ended()
@@ -86,16 +86,16 @@ class DueTimes:
 
     def update(self, now: int, has_expired: bool, has_found: bool) -> None:
         """
-        Set the timerfd if that is necessary, at the end of a turn.
+        Set the timerfd if necessary, at the end of a turn.
 
         :param has_expired: the timerfd has expired.
-        :param has_found: there is something to run.
+        :param has_found: there is an execution to run.
         """
         if has_expired or self._may_expire_early and not has_found or self._is_due_earlier(now):
             self.arm(now)
 
     def _is_due_earlier(self, now: int) -> bool:
-        """Return whether something may be due before the timerfd expires."""
+        """Return whether anything may be due before the timerfd expires."""
         at = self._timer.at or NEVER
         engine = self._engine
         deadline = engine.deadlines.next
@@ -107,7 +107,7 @@ class DueTimes:
             and at > now + self._check_after(engine.holders[0]) + FIRST_CHECK_NS)
 
     def arm(self, now: int) -> None:
-        """Set the timerfd to when something is to be done next."""
+        """Set the timerfd to the next due time."""
         pool = self._pool
         if not pool.running:
             self._timer.arm(0)
@@ -135,7 +135,7 @@ class DueTimes:
     # --- the GIL ---------------------------------------------------------------------------------
 
     def check_holder(self, now: int) -> None:
-        """Check whether what holds the GIL computes, as something else waits for the GIL."""
+        """Check whether the execution that holds the GIL computes, as another one waits for it."""
         self._watch_holder(now)
         at = self._gil_check.at
         if at and not 0 < self._timer.at <= at:
@@ -149,13 +149,13 @@ class DueTimes:
 
     @staticmethod
     def _check_after(holder: Work) -> int:
-        """Return after how long to check first whether what holds the GIL computes, ns."""
+        """Return the time until the first check of an execution that holds the GIL, ns."""
         if holder.entity.wall_ns <= BRIEF_NS:
             return LAST_CHECK_NS
         return max(FIRST_CHECK_NS, 2 * holder.entity.habit.mean_ns)
 
     def _check_gil(self, now: int) -> None:
-        """Take the GIL from an execution that waits for something else."""
+        """Take the GIL from an execution that waits for anything else."""
         holder = self._engine.interpreter_holder()
         thread = None if holder is None else self._pool.thread_of(holder)
         if holder is None or thread is None:
@@ -170,7 +170,7 @@ class DueTimes:
         """
         Notice that no thread of the process ran since the timerfd was to expire.
 
-        If no thread waited for the timerfd, as all ran callbacks, its being late says nothing.
+        If no thread waited for the timerfd, because all ran callbacks, its delay proves nothing.
         """
         at, cpu = self._timer.at, process_time_ns()
         seen, used = self._seen

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What the executor keeps for each entity of rclpy: timer, subscription, service, …."""
+"""The executor's record of each entity of rclpy: timer, subscription, service, …."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
     'timer', 'subscription', 'service', 'client', 'guard', 'waitable', 'task')
 
 UNKNOWN_NS = 100_000_000
-"""A callback is expected to take this long at first."""
+"""The expected duration of a callback that has not run yet, ns."""
 
 COUNTS = ('ready', 'ran', 'failed', 'dropped', 'skipped', 'unattributed', 'busy_ns')
 _HAVE_HANDLES = (TIMER, SUBSCRIPTION, SERVICE)
@@ -31,9 +31,9 @@ class Entity:
     An entity as the executor sees it.
 
     :param rclpy: rclpy's own object.
-    :param callback: the declared callback that it is, or None.
+    :param callback: its declared callback, or None.
     :param group: the number of its mutually exclusive callback group in the core, or -1.
-    :param depth: how many of its executions may wait; 0 stands for any number.
+    :param depth: how many of its executions may wait; 0: any number.
     """
 
     __slots__ = (
@@ -57,59 +57,59 @@ class Entity:
         self.depth = depth
         self.label = label
         self.topic = ''
-        # global vertex of the source that this starts, or -1
+        # global vertex of the source that it starts, or -1
         self.source = -1
         # publishing vertex -> (vertex that its message starts, leg)
         self.targets: dict[int, tuple[int, int]] = {}
         # the vertices in other processes whose messages enter here
         self.remote_publishers: list[int] = []
-        # whether other processes announce publications for it; whether it is what hears of these
+        # whether other processes announce publications for it; whether it receives announcements
         self.awaits = False
         self.is_own = False
-        # its executions that wait, the oldest first
+        # its waiting executions, the oldest first
         self.waiting: dict[int, None] = {}
         self.ready = 0
         self.ran = 0
-        # how many times its callback let an exception out
+        # how many times its callback raised an exception
         self.failed = 0
         self.dropped = 0
         self.skipped = 0
         self.busy_ns = 0
         self.unattributed = 0
-        # how long its callback takes, and goes on after it has published first, lately
+        # recent averages: duration of its callback, and time from its first publication to its end
         self.wall_ns = UNKNOWN_NS
         self.tail_ns = 0
-        # of a subscription: the policy for which a publisher's messages do not come
+        # of a subscription: the policy because of which a publisher's messages do not arrive
         self.incompatible_qos: str | None = None
         # the topics that its callback has published on
         self.publishes: set[str] = set()
-        # whether it was destroyed; whether that, or a timer's end, is to be looked for first
+        # whether it was destroyed; whether that, or a timer's end, must be checked first
         self.removed = False
         self.may_be_gone = kind == TIMER
-        # whether it holds the interpreter while it runs
-        # (one entity stands for all tasks, whatever they do)
+        # whether it holds the interpreter while it runs (one entity represents all tasks, whatever
+        # they do)
         self.habit = GilHabit(
             False if kind == TASK else None if callback is None else callback.holds_interpreter)
-        # when the executor began to look after it, on the trace's clock: no job is due before
+        # when the executor began to manage it, on the trace's clock: no job is due before
         self.since = 0
-        # whether it runs where it is taken (see ``at_once``)
+        # whether it is handled at once (see ``at_once``)
         self.at_once = False
-        # so many may wait in Python, the rest stays in the middleware; 0: any number
+        # how many may wait in Python, the rest stays in the middleware; 0: any number
         self.most_waiting = 0
-        # called when less of it waits again: more may be left in the middleware
+        # called when fewer of its executions wait: the middleware may have more
         self.collect_more: Callable_[[], None] | None = None
-        # called when it is known, or has changed, whether it holds the GIL; whether it did then
+        # called when the answer whether it holds the GIL is known or changes; the last answer
         self.classify: Callable_[[], None] | None = None
         self.is_nested = 0
-        # its callback group, where that is to be asked whether it may run
+        # its callback group, if that must be asked whether it may run
         self.gate: Gate | None = None
         self.address = id(self)
-        # taken from before a callback runs: it raises once the entity is destroyed
+        # entered before a callback runs: it raises once the entity is destroyed
         self.handle = rclpy.handle if kind in _HAVE_HANDLES else None
 
     @property
     def symbol(self) -> str:
-        """Return module and name of what it calls, as ``rclcpp_callback_register`` has it."""
+        """Return module and name of its callback, in the form of ``rclcpp_callback_register``."""
         function: Any = getattr(self.rclpy, 'callback', None)
         while isinstance(function, functools.partial):
             function = function.func
@@ -121,20 +121,20 @@ class Entity:
 
     @property
     def name(self) -> str:
-        """Return the key of its declared callback, or what an undeclared one is called."""
+        """Return the key of its declared callback, or the name of an undeclared one."""
         if self.callback is not None:
             return self.callback.key
         return entity_name(self.node, self.symbol, f'{self.kind} {self.label}'.rstrip())
 
     def is_through(self) -> bool:
-        """Return whether nothing of it waits or runs."""
+        """Return whether none of its executions waits or runs."""
         return self.ready <= self.ran + self.dropped
 
     def count_into(self, counts: dict[str, dict[str, Any]]) -> None:
         """
-        Add what there is to count to the counts of this entity's callback.
+        Add the counts of this entity to those of its callback.
 
-        What nobody uses (the many services and events of every node) is left out.
+        Unused entities (the many services and events of every node) are left out.
         """
         if self.callback is None and not self.ready + self.skipped + self.dropped:
             return

@@ -5,13 +5,13 @@ The executor: rclpy's contract on top of engine and workers.
 
 Theory of operation
 -------------------
-``spin`` lets the workers wait for what happens and run callbacks (``workers``).  The calling
-thread waits, too, for what ends the spin (an exception, a shutdown, a done future, a timeout),
-for entities that come and go (``upkeep``), and for what is done at once (``at_once``).
+``spin`` lets the workers wait for events and run callbacks (``workers``).  Meanwhile the calling
+thread waits for the end of the spin (an exception, a shutdown, a done future, a timeout), for new
+and destroyed entities (``upkeep``), and for arrivals that are handled at once (``at_once``).
 
 ``spin_once`` is one turn of a worker in the calling thread.
 
-What has been taken and not run yet stays with the core and runs with the next spin.
+Collected messages that have not run yet stay in the core and run with the next spin.
 """
 
 from __future__ import annotations
@@ -77,23 +77,23 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 MOST_SELECTED = 1024
-"""``select`` takes descriptors below this."""
+"""``select`` supports descriptors below this."""
 SETTLE_S, SETTLE_CHECK_S = 0.1, 0.00005
-"""How long, and how often, to check whether the callback has ended that completed a future."""
+"""How long, and how often, to check whether the callback that completed a future has ended."""
 QUIET_TURNS, MOST_TURNS = 3, 20
 """
-A spin that has handled actions ends after so many milliseconds without anything to do.
+A spin that has handled actions ends after this many idle milliseconds.
 
-That is, after ``MOST_TURNS`` of them in any case.
+It ends after ``MOST_TURNS`` milliseconds in any case.
 """
 
 
 def deadline_of(timeout_sec: float | None) -> float | None:
     """
-    Return the monotonic time at which a time-out is over; None for never.
+    Return the monotonic time (s) at which a timeout expires; None: never.
 
     :param timeout_sec: seconds; None or negative: for ever.
-    :raises TypeError: when it is no number.
+    :raises TypeError: when it is not a number.
     """
     if timeout_sec is None or timeout_sec < 0:
         return None
@@ -102,41 +102,40 @@ def deadline_of(timeout_sec: float | None) -> float | None:
 
 class MultiDeadlineExecutor(BareExecutor):
     """
-    Run callbacks in the order that their deadlines need, on a bounded pool of workers.
+    Run callbacks in the order of their deadlines, on a bounded pool of workers.
 
-    What works with ``rclpy.executors.MultiThreadedExecutor`` works with it.  Callbacks of declared
-    DAG tasks get the priority RAD, the reference absolute deadline of the multi-deadline DAG
-    model (Yano and Azumi, RTSS 2024 WiP); others that of ``default_deadline`` after they became
-    ready.
+    It replaces ``rclpy.executors.MultiThreadedExecutor``.  Callbacks of declared DAG tasks get the
+    priority RAD, the reference absolute deadline of the multi-deadline DAG model (Yano and Azumi,
+    RTSS 2024 WiP).  Other callbacks get that of ``default_deadline`` after they became ready.
 
     :param graph: a declaration (path of a YAML file), a ``msg_graph.TaskSet``, or None.
-    :param num_workers: threads of the pool; by default what the declaration says, else seven.
+    :param num_workers: threads of the pool; by default the declared number, else seven.
     :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
-    :param on_late: what is done with late jobs of a DAG that does not declare it: ``demote``,
+    :param on_late: the treatment of late jobs of a DAG that does not declare it: ``demote``,
         ``continue`` or ``abort``.
-    :param context: the context that the executor belongs to, or None for the default one.
-    :param trace: path of an MCAP file to record to, or None. A file that is there already is kept:
-        the constructor raises, unless ``overwrite`` is true.
-    :param on_deadline_miss: called with each ``DeadlineMiss``, in a thread of its own; what it
-        raises comes out of the spin.  If it takes too long, misses are counted and not reported
+    :param context: the context of the executor, or None for the default one.
+    :param trace: path of an MCAP file to record to, or None. If the file exists, the constructor
+        raises, unless ``overwrite`` is true.
+    :param on_deadline_miss: called with each ``DeadlineMiss``, in a separate thread; its
+        exceptions come out of the spin.  If it is too slow, misses are counted but not reported
         (``unreported_misses`` in ``statistics()``).
-    :param default_deadline: relative deadline of undeclared callbacks: ns, text as ``100ms``, or
-        an rclpy ``Duration``.
+    :param default_deadline: relative deadline of undeclared callbacks: ns, text such as ``100ms``,
+        or an rclpy ``Duration``.
     :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
     :param worker_priority: their priority under it.
     :param worker_cpus: the CPUs that they may use.
-    :param freeze_gc: when the first spin begins, collect garbage and have the collector leave
-        alone what there is by then (``gc.freeze``): for programs that make their nodes first.
-    :param diagnostics_period: how often to publish on ``/diagnostics`` while it spins: as
-        ``default_deadline``; None or 0: not at all.
-    :param thresholds: what makes a status of the diagnostics worse than OK.
-    :param process: which of the declared ``processes`` this is; what runs in the others is not
-        counted as missing.
-    :param num_threads: ``num_workers`` under the name that ``MultiThreadedExecutor`` has for it.
+    :param freeze_gc: when the first spin begins, collect garbage and exempt all existing objects
+        from later collections (``gc.freeze``): for programs that make their nodes first.
+    :param diagnostics_period: how often to publish on ``/diagnostics`` during a spin: as
+        ``default_deadline``; None or 0: never.
+    :param thresholds: the limits beyond which a status of the diagnostics is worse than OK.
+    :param process: the declared process (of ``processes``) that this is; callbacks of the others
+        are not reported as missing.
+    :param num_threads: the name of ``num_workers`` in ``MultiThreadedExecutor``.
     :param overwrite: whether ``trace`` may replace a file.
-    :raises msg_graph.GraphError: when the declaration is not right.
-    :raises mddag_executor.errors.MddagError: on an unknown policy or thread setting, a
-        value of the wrong kind, and when the trace cannot be written.
+    :raises msg_graph.GraphError: when the declaration is invalid.
+    :raises mddag_executor.errors.MddagError: on an unknown policy or thread setting, a value of
+        the wrong kind, and when the trace cannot be written.
     :raises rclpy.exceptions.NotInitializedException: when ``rclpy.init`` was not called before.
     """
 
@@ -174,7 +173,7 @@ class MultiDeadlineExecutor(BareExecutor):
         settings.check_context(context)
         settings.check_process(process, task_set)
         thresholds = settings.check_thresholds(thresholds)
-        # All is checked by now: nothing below leaves a trace or a thread of what can't be made.
+        # All parameters are checked by now: an error leaves no trace and no thread behind.
         publishing.install()
         self._trace_clock = TraceClock()
         self._recorder = None if trace is None else Recorder(
@@ -186,7 +185,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._spinning = threading.Lock()
         self._finished = False
         self._ended_by_callback = False
-        # reentrant: a signal's handler may end the run in the thread that ends it
+        # reentrant: a signal handler may end the run in the thread that is ending it
         self._ending = threading.RLock()
         self._freeze_gc = freeze_gc
         self._notifier = None if on_deadline_miss is None else MissNotifier(
@@ -234,7 +233,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._announcements = Announcements(task_set, process, self.context, self._pool)
             inbox.announcements = self._announcements
             self._registry.own = {*self._announcements.subscriptions}
-        # What is ready still would run before the spin notices.
+        # Otherwise ready callbacks would run before the spin notices.
         call_at_shutdown(self.context, self._pool.start_no_more)
         call_at_shutdown(self.context, self._context_ends)
         halt_at_exit(self)
@@ -259,9 +258,9 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def add_node(self, node: Node) -> bool:
         """
-        Add a node whose callbacks this executor runs; False when it has it already.
+        Add a node, whose callbacks this executor runs; return False if it was added before.
 
-        :raises TypeError: when it is no node.
+        :raises TypeError: when it is not a node.
         :raises RuntimeError: when the executor was shut down.
         """
         if not hasattr(node, 'executor'):
@@ -275,10 +274,10 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def remove_node(self, node: Node) -> None:
         """
-        Stop running a node's callbacks; another executor may then have it.
+        Stop running a node's callbacks; another executor may run them then.
 
-        What was taken of its messages and not run yet is dropped and counted; if nothing spins,
-        not before the next spin, as the node may be back then (``rclpy.spin_once``).
+        Its collected messages that have not run yet are dropped and counted: without a spin, not
+        before the next spin, because the node may have been added again (``rclpy.spin_once``).
         """
         super().remove_node(node)
         self._upkeep.change()
@@ -288,12 +287,12 @@ class MultiDeadlineExecutor(BareExecutor):
             self._upkeep.stop_listening()
 
     def wake(self) -> None:
-        """Take note of entities that were created or destroyed, or of a change of state."""
+        """Note that entities were created or destroyed, or that a state has changed."""
         self._upkeep.change()
         self._at_once.ring()
 
     def _signalled(self) -> None:
-        """Take note that rclpy has got a signal: the context ends soon."""
+        """Note that rclpy has received a signal: the context ends soon."""
         self._checks.begin()
         self._at_once.ring()
 
@@ -301,7 +300,7 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
         """Run a function or coroutine in this executor; return its task, which is a future."""
-        # A callback that ends a Client.call needs no worker: all of them may wait in such calls.
+        # A callback that ends a Client.call needs no worker: all workers may wait in such calls.
         if type(callback) is QuickCallback or ends_call(callback):
             task = Task(callback, args, kwargs)
             task()
@@ -318,26 +317,26 @@ class MultiDeadlineExecutor(BareExecutor):
         return task
 
     def _submit_tasks(self) -> None:
-        """Have the tasks run that were created while nobody spun, in rclpy's order."""
+        """Post the tasks that were created outside of a spin, in rclpy's order."""
         take = self._new_tasks.pop if TASKS_NEWEST_FIRST else self._new_tasks.popleft
         while self._new_tasks:
             self._pool.report(self._engine.ready, take())
 
-    # --- what a host of programs needs -----------------------------------------------------------
+    # --- interface for a host of programs --- ----------------------------------------------------
 
     def on_callback_ended(
         self, listener: Callable[[Any, BaseException | None], bool]
     ) -> None:
         """
-        Have a function called after each callback, in its thread.
+        Call a function after each callback, in its thread.
 
-        :param listener: gets rclpy's entity (None: a task), and what its callback raised, or None;
-            returns whether it takes care of that, so that it does not end ``spin``.
+        :param listener: receives rclpy's entity (None: a task), and the exception of its callback,
+            or None; returns whether it handles the exception, which then does not end ``spin``.
         """
         self._pool.callback_ended = listener
 
     def lend(self) -> AbstractContextManager[None]:
-        """Return what lends the worker of the calling callback, if it is one, while entered."""
+        """Return a context manager that lends the worker of the calling callback, if it is one."""
         running = current.running
         return nullcontext() if running is None else running.lend()
 
@@ -352,24 +351,24 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Run callbacks on the pool until shutdown.
 
-        It returns also when a callback ends the context (``rclpy.shutdown``), and at once when
-        that has ended before.
+        It also returns when a callback ends the context (``rclpy.shutdown``), and at once when the
+        context has already ended.
 
-        :raises ExternalShutdownException: when something else ends the context.
+        :raises ExternalShutdownException: when anything else ends the context.
         :raises RuntimeError: when the executor spins already.
-        :raises Exception: what a callback raised.
+        :raises Exception: the exception of a callback.
         """
         with short_switch_interval():
             self._spin(lambda: False, None)
-        self._raise_error()  # of the callback that has ended the context, after that
+        self._raise_error()  # of the callback that has ended the context, raised after that
 
     def spin_until_future_complete(
         self, future: Future, timeout_sec: float | None = None
     ) -> None:
         """
-        Run callbacks on the pool until a future is done or the time is over.
+        Run callbacks on the pool until a future is done or the timeout is over.
 
-        The callback that completes the future has ended then, unless it takes much longer.
+        The callback that completes the future has ended on return, unless it takes much longer.
 
         :param timeout_sec: seconds; None or negative: for ever; 0: run one callback at most.
         """
@@ -411,7 +410,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._freeze_gc = False
                 gc.collect()
                 gc.freeze()
-            self._submit_tasks()  # as in rclpy, before what else is ready
+            self._submit_tasks()  # as in rclpy, before other ready callbacks
             self._upkeep.refresh()
             self._wait_sets.start()
             if self._notifier is not None:
@@ -421,7 +420,7 @@ class MultiDeadlineExecutor(BareExecutor):
             while not self.is_ending():
                 self._raise_error()
                 if done():
-                    self._raise_error()  # of what ran before it was done
+                    self._raise_error()  # of callbacks that ran before the future was done
                     return
                 if self._was_ended():
                     return
@@ -452,7 +451,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._spinning.release()
 
     def _patience_s(self, deadline: float | None, rest: float | None) -> float | None:
-        """Return for how long the spinning thread may wait; None: until something rings."""
+        """Return for how long the spinning thread may wait; None: until a wake-up."""
         times = [rest, self._unclaimed.rest_s(), self._names.rest_s()]
         if self._checks.at is not None:
             self._checks.due()
@@ -465,13 +464,14 @@ class MultiDeadlineExecutor(BareExecutor):
         self, completed_by: list[tuple[Any, Work | None] | None], handled: int
     ) -> None:
         """
-        Wait a moment for what would have ended before a future is done, if one thread ran all.
+        Wait briefly for callbacks that a single thread would have ended before the future is done.
 
-        That is the callback that has completed the future, and what belongs to an action: its
-        feedback was published before its result, but may arrive later.
+        These are the callback that has completed the future, and the feedback of an action: it was
+        published before the result, but may arrive later.
 
-        :param completed_by: gets the pool's thread in which the future was completed, with its
-            execution, or None for another thread; not necessarily before the future is done.
+        :param completed_by: holds the pool's thread in which the future was completed, with its
+            execution, or None for another thread; possibly only some time after the future is
+            done.
         :param handled: ``Upkeep.handled_waitables`` when the spin began.
         """
         end = time.monotonic() + SETTLE_S
@@ -492,7 +492,7 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Return whether a callback has ended the context.
 
-        :raises ExternalShutdownException: when something else has.
+        :raises ExternalShutdownException: when anything else has.
         """
         if not is_over(self.context):
             return False
@@ -507,13 +507,13 @@ class MultiDeadlineExecutor(BareExecutor):
             raise ExternalShutdownException()
 
     def _stopped(self, begin: int, end: int) -> None:
-        """Take note that no thread of the process ran from ``begin`` to ``end`` (monotonic)."""
+        """Note that no thread of the process ran from ``begin`` to ``end`` (monotonic ns)."""
         with self._pool.lock:
             self._engine.verdicts.stopped(
                 begin + self._trace_clock.offset_ns, end + self._trace_clock.offset_ns)
 
     def _fail(self, error: BaseException) -> None:
-        """Take an exception from another thread; it comes out of the spin."""
+        """Store an exception of another thread; the spin raises it."""
         self._errors.append(error)
         self._at_once.ring()
 
@@ -521,13 +521,13 @@ class MultiDeadlineExecutor(BareExecutor):
         self._unclaimed.look()
         while self._errors:
             error = self._errors.popleft()
-            # what others raised just because a callback has ended their context
+            # else it was raised only because a callback has ended the context
             if not (self._ended_by_callback and isinstance(error, RCL_ERRORS)):
                 raise error
 
     @contextmanager
     def _serve_meanwhile(self) -> Iterator[None]:
-        """Have other threads do everything while the callback of a ``spin_once`` waits."""
+        """Let other threads do all work while the callback of a ``spin_once`` waits."""
         ended = False
 
         def serve() -> None:
@@ -553,8 +553,8 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Wait for one callback and run it in the calling thread.
 
-        Called by ``rclpy.spin``, which would otherwise run one callback at a time, it does what
-        ``spin`` does.
+        If ``rclpy.spin`` calls this method, which would run one callback at a time, it does the
+        same as ``spin``.
 
         :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
         """
@@ -594,11 +594,11 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _step(self, deadline: float | None, done: Callable[[], bool]) -> bool:
         """
-        Handle what is ready, waiting where nothing is; run one callback if there is one.
+        Handle ready events, waiting for one if there is none; run one callback if there is one.
 
-        :param deadline: when to wait no longer (monotonic, s); None: never.
-        :param done: whether there is nothing to wait for any more.
-        :return: whether one ran.
+        :param deadline: when to stop waiting (monotonic, s); None: never.
+        :param done: whether to stop waiting.
+        :return: whether a callback ran.
         """
         if self._stepping is None:
             self._stepping = select.epoll()
@@ -611,13 +611,13 @@ class MultiDeadlineExecutor(BareExecutor):
             self._notifier.start()
         if self._handle_once():
             return True
-        if done():  # what it woke up for has just been handled
+        if done():  # the event that woke it has just been handled
             return False
         self._wait_stepping(self._patience_s(deadline, None))
         return self._handle_once()
 
     def _handle_once(self) -> bool:
-        """Handle what is ready; run one callback if there is one, and return whether one ran."""
+        """Handle ready events; run one callback if there is one, and return whether one ran."""
         self._upkeep.refresh()
         ran = self._at_once.handle(self._at_once.loop.wait(0))
         self._wait_sets.poll()
@@ -625,22 +625,22 @@ class MultiDeadlineExecutor(BareExecutor):
         return self._pool.run_one(self._pool.loop.wait(0)) or ran
 
     def _wait_stepping(self, left: float | None) -> None:
-        """Wait until something arrives or becomes due; at most so many seconds, None: for ever."""
+        """Wait for an arrival or a due time; at most ``left`` seconds, None: for ever."""
         assert self._stepping is not None
         fd = self._stepping.fileno()
         if left is None or fd >= MOST_SELECTED:
             self._stepping.poll(-1 if left is None else left)
         else:
-            select.select([fd], [], [], left)  # to the microsecond; an epoll waits whole ms
+            select.select([fd], [], [], left)  # resolution 1 us; that of an epoll is 1 ms
 
     # --- the end ---------------------------------------------------------------------------------
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """
-        Stop running callbacks and wait for those that run.
+        Start no more callbacks and wait for the running ones.
 
         :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
-        :return: whether everything has finished.
+        :return: whether all have finished.
         """
         if timeout_sec is not None and timeout_sec < 0:
             timeout_sec = None
@@ -652,13 +652,13 @@ class MultiDeadlineExecutor(BareExecutor):
         self._end_run()
         reported = self._notifier is None or self._notifier.stop(timeout_sec)
         finished: bool = super().shutdown(timeout_sec)
-        if self._spinning.acquire(blocking=False):  # else the spin does that when it ends
+        if self._spinning.acquire(blocking=False):  # else the spin does that at its end
             self._close()
             self._spinning.release()
         return finished and reported
 
     def _close(self) -> None:
-        """Close what an executor waits in, once it has ended."""
+        """Close the executor's descriptors, once it has ended."""
         with self._ending:
             if self._finished and self.is_ending():
                 if self._stepping is not None:
@@ -668,7 +668,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._pool.guard.close()
 
     def _end_run(self) -> None:
-        """Judge what is open and close the trace, once; a second thread waits for that."""
+        """Judge open jobs and close the trace, once; a second thread waits for the first."""
         with self._ending:
             if not self._finished:
                 self._finished = True
@@ -689,31 +689,31 @@ class MultiDeadlineExecutor(BareExecutor):
             self._recorder.close(now, end)
 
     def halt(self) -> None:
-        """Start nothing more, since the interpreter ends; see ``wait_halted``."""
+        """Start no more callbacks, as the interpreter ends; see ``wait_halted``."""
         self.begin_end()
         self._pool.pause()
         self.wake()
 
     def wait_halted(self, seconds: float) -> None:
-        """Wait until what runs has ended and nobody spins, at most for a time."""
+        """Wait until no callback runs and no thread spins, at most ``seconds``."""
         end = time.monotonic() + seconds
         self._pool.close(seconds)
-        # Not by taking the lock: a thread that steps once more meanwhile would get an exception.
+        # Without taking the lock: a thread that steps once more meanwhile would get an exception.
         while self._spinning.locked() and time.monotonic() < end:
             time.sleep(0.001)
 
     def set_judging(self, judging: bool, since: int | None = None) -> None:
         """
-        Give verdicts about jobs that are released from now on, or about none until called again.
+        Judge jobs that are released from now on, or none until the next call.
 
-        :param since: a time to judge from (monotonic ns), if that is not now.
+        :param since: the time to judge from (monotonic ns); None: now.
         """
         if since is not None:
             since += self._trace_clock.offset_ns
         self._pool.report(self._engine.set_judging, judging, since)
 
     def unmatched(self) -> list[str]:
-        """Return the topics on which it has not met the other processes of its DAGs yet."""
+        """Return the topics on which other processes of its DAGs have not been discovered."""
         self._upkeep.refresh()
         found = [] if self._announcements is None else self._announcements.unmatched()
         others = self._engine.other_processes
@@ -731,6 +731,6 @@ class MultiDeadlineExecutor(BareExecutor):
         return self
 
     def statistics(self) -> Statistics:
-        """Return a snapshot of what has happened so far: see ``Statistics`` for its keys."""
+        """Return a snapshot of the counts so far: see ``Statistics`` for its keys."""
         return statistics(
             self._pool, self._registry, self._recorder, self._process, self._notifier)
