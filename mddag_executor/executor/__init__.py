@@ -22,7 +22,7 @@ class Job(NamedTuple):
 
     :ivar dag: name of its DAG.
     :ivar job: its index, from 0.
-    :ivar release_ns: when its source became due, ns since the epoch.
+    :ivar release_ns: its release, ns since the epoch.
     """
 
     dag: str
@@ -34,9 +34,9 @@ def current_job() -> Job | None:
     """
     Return the job whose callback runs in the calling thread.
 
-    None outside of callbacks of this executor, and in callbacks that no DAG declares.
+    None outside of callbacks of this executor, and in undeclared callbacks.
     """
-    work = sys.modules.get('mddag_executor.executor.work')  # not imported: there is no executor
+    work = sys.modules.get('mddag_executor.executor.work')  # not imported: no executor
     running: Any = work.current.running if work is not None else None
     job = running.job if running is not None else None
     return None if job is None else Job(*job)

@@ -1,18 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Callback groups of a user's own class.
+Callback groups of a user-defined class.
 
 Theory of operation
 -------------------
-Of rclpy's two kinds of callback groups the core knows what they allow.  Any other is asked, as
-rclpy's executors do: ``can_execute`` and ``beginning_execution`` before a callback, and
-``ending_execution`` after it.  That is code of the user's, which may wait for a lock.  So the
-worker that is to run the callback asks, without the engine's lock.
+The core implements rclpy's two kinds of callback groups.  Any other group is asked, as by rclpy's
+executors: ``can_execute`` and ``beginning_execution`` before a callback, and ``ending_execution``
+after it.  This is user code, which may wait for a lock.  So the worker that is to run the callback
+asks, without the engine's lock.
 
-Each entity of such a group is a group of one in the core (rule 4), which it leaves as soon as it
-may run: so its messages are asked about one at a time, in their order.  What is refused waits,
-and is asked about again after each callback that ends, and every few milliseconds in a spin.
+Each entity of such a group is a group of one in the core (rule 4).  Its execution leaves that
+group as soon as it may run.  So the group is asked about an entity's messages one at a time, in
+their order.  A refused execution waits; the group is asked again after each callback that ends,
+and every few milliseconds during a spin.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Refused(Exception):
 
 
 def decides_itself(group: Any) -> bool:
-    """Return whether a callback group is of neither of rclpy's kinds, or changes one of them."""
+    """Return whether a callback group is of neither of rclpy's kinds, or overrides one of them."""
     return not any(
         all(getattr(getattr(group, name), '__func__', None) is getattr(kind, name)
             for name in _METHODS)
@@ -42,7 +43,7 @@ def decides_itself(group: Any) -> bool:
 
 class Gate:
     """
-    An entity's callback group that decides itself.
+    The user-defined callback group of an entity.
 
     :param passed: called with an execution that may run, before it does.
     """
@@ -54,9 +55,9 @@ class Gate:
 
     def step(self, work: Work) -> Any:
         """
-        Run a step of an execution as ``Work.step`` does, if it may begin.
+        Run a step of an execution as ``Work.step`` does, if the group lets it.
 
-        :raises Refused: where it may not.
+        :raises Refused: if the group does not.
         """
         group, entity = self._group, self._entity
         if work.coroutine is None:

@@ -1,11 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What wakes a thread when a callback that was expected to end soon has not.
+Wakes a thread when a callback runs longer than expected.
 
-The guard has a timerfd of its own, which the spinning thread waits for.  To set and clear a time
+The guard has a separate timerfd, which the spinning thread waits for.  Setting and clearing a time
 for each callback would cost more than the callback (9 us on a virtual machine).  So the time is
-set once, and neither changed nor cleared until it has come.
+set once, and neither changed nor cleared until it expires.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from mddag_executor.executor.listeners import TimerFd
 
 class Guard:
     """
-    A time by which a thread is to be woken; all methods but ``collect`` under the engine's lock.
+    A time at which to wake a thread; all methods but ``collect`` need the engine's lock.
 
-    :param expired: called when the time has come; it calls ``end``.
+    :param expired: called when the time expires; it calls ``end``.
     """
 
     urgency = -1
@@ -42,7 +42,7 @@ class Guard:
             self._timer.arm(at)
 
     def end(self) -> None:
-        """Note that the time has come."""
+        """Note that the time has expired."""
         self._timer.at = 0
 
     def close(self) -> None:
@@ -52,5 +52,5 @@ class Guard:
             os.close(fd)
 
     def __del__(self) -> None:
-        """Close what an executor that was never shut down has left open."""
+        """Close the descriptor of an executor that was never shut down."""
         self.close()

@@ -1,9 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What is done with something that was taken: it is given its job, and that its release.
+Finds job and release of collected messages, and passes them to the engine.
 
-All of it happens under the engine's lock, at the time ``now`` that whoever has the lock has set.
+All of it happens under the engine's lock, at the time ``now``, set by the owner of the lock.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from mddag_executor.executor.work import Work
 
 class Inbox:
     """
-    Hands what was taken to the engine (``sources.Arrivals``).
+    Passes collected messages, requests and timers to the engine (``sources.Arrivals``).
 
-    :param fail: gets the exception of a take.
+    :param fail: receives the exception of a take.
     :ivar now: the time, on the trace's clock.
-    :ivar announcements: what other processes announce; None: nothing.
+    :ivar announcements: of other processes; None: there are none.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Inbox:
         self, entity: Entity, args: tuple[Any, ...], info: dict[str, Any],
         publication: Publication | None,
     ) -> None:
-        """Handle a message; ``publication``: that which has just sent it, if that is certain."""
+        """Handle a message; ``publication``: the one that has just sent it, if certain."""
         if entity.is_own:
             entity.rclpy.callback(*args)
             return
@@ -82,7 +82,7 @@ class Inbox:
         engine.arrived(work, origin, release, stamp, self.now)
 
     def announced(self, work: Work, origin: Origin | Announced | None) -> None:
-        """Handle a message that has waited, or could have, for its announcement."""
+        """Handle a message after a possible wait for its announcement."""
         release = stamp = -1
         if isinstance(origin, Announced):
             release = origin.release + self._clock.offset_ns
@@ -111,5 +111,5 @@ class Inbox:
             try:
                 period = source.period()
             except RCL_ERRORS:
-                return  # destroyed meanwhile
+                return  # it was destroyed meanwhile
             self._engine.timer_missed(source.entity, due, period, missed, self.now)

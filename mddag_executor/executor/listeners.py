@@ -1,18 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Descriptors that one epoll can wait for: eventfds that the middleware writes to, and a timerfd.
+Descriptors for an epoll: eventfds that the middleware writes to, and a timerfd.
 
 Theory of operation
 -------------------
 rcl calls a listener ``callback(const void * user_data, size_t number_of_events)`` for each
 message, request, response or event that arrives, and for each reset of a timer.  libc's
-``eventfd_write(int fd, eventfd_t value)`` fits this call on the ABIs of x86-64 and aarch64, so the
-middleware writes to an eventfd itself: without Python, without the GIL, and without a thread of
-this package.  Setting and clearing a listener is synchronous.
+``eventfd_write(int fd, eventfd_t value)`` fits this call on the ABIs of x86-64 and aarch64.  So
+the middleware writes to an eventfd directly: without Python, without the GIL, and without a thread
+of this package.  Setting and clearing a listener is synchronous.
 
-An eventfd counts what has arrived.  epoll reports each write once (edge-triggered), so nobody has
-to read the count.
+An eventfd counts arrivals.  epoll reports each write once (edge-triggered), so the count need not
+be read.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from typing import Any
 
 from mddag_executor.errors import MddagError
 
-_libc = ctypes.PyDLL(None, use_errno=True)  # none of its calls blocks, so the GIL is kept
+_libc = ctypes.PyDLL(None, use_errno=True)  # no call blocks, so the GIL is kept
 _rcl = ctypes.CDLL('librcl.so')  # rclpy has loaded it
 _WRITE = ctypes.cast(_libc.eventfd_write, ctypes.c_void_p)
 
 MANY = 1 << 20
-"""Stands for all that is there, where nobody has counted it."""
+"""The count for all messages present, if they were not counted."""
 
 _SETTERS = {
     'subscription': 'rcl_subscription_set_on_new_message_callback',
@@ -62,17 +62,17 @@ _timer_settime.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c
 
 
 class ListenerError(MddagError):
-    """The middleware cannot announce what arrives at an entity."""
+    """The middleware cannot announce arrivals at an entity."""
 
 
 def set_listener(kind: str, address: int, fd: int) -> None:
     """
-    Have the middleware write to an eventfd whenever something arrives at an entity.
+    Let the middleware write to an eventfd at each arrival at an entity.
 
-    What has arrived before counts, too: the descriptor becomes readable at once, with ``MANY``.
+    Earlier arrivals count, too: the descriptor becomes readable at once, with ``MANY``.
 
     :param kind: ``subscription``, ``service``, ``client``, ``event`` or ``timer``.
-    :param address: that of the rcl entity, which must not be destroyed meanwhile.
+    :param address: of the rcl entity, which must not be destroyed meanwhile.
     :raises ListenerError: when the middleware has no listener for such an entity.
     """
     if _SET[kind](address, _WRITE, fd) != 0:
@@ -82,20 +82,20 @@ def set_listener(kind: str, address: int, fd: int) -> None:
 
 
 def clear_listener(kind: str, address: int) -> None:
-    """Have the middleware write nothing more for an entity; it never does once this returns."""
+    """Stop the middleware from writing for an entity; it does not write after this returns."""
     _SET[kind](address, None, None)
 
 
 def new_eventfd() -> int:
-    """Return a new eventfd that nobody is blocked by."""
+    """Return a new non-blocking eventfd."""
     return os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
 
 class NextCall:
     """
-    When rcl is to call a timer next, on the timer's clock.
+    The time of a timer's next call by rcl, on the timer's clock.
 
-    :param address: that of the rcl timer.
+    :param address: of the rcl timer.
     """
 
     __slots__ = ('_address', '_value', '_reference')
@@ -112,7 +112,7 @@ class NextCall:
         return self._value.value
 
     def until(self) -> int | None:
-        """Return in how many ns that is, below zero if it is due; None when it is cancelled."""
+        """Return the time until then in ns, negative if it is due; None when it is cancelled."""
         if _until_next_call(self._address, self._reference) != 0:
             return None
         return self._value.value
@@ -122,7 +122,7 @@ class TimerFd:
     """
     A timerfd on the monotonic clock.
 
-    :ivar fd: becomes readable at the time that was set.
+    :ivar fd: becomes readable at the set time.
     :ivar at: that time, monotonic ns; 0: none is set.
     """
 
@@ -136,7 +136,7 @@ class TimerFd:
         self._time = (ctypes.c_long * 4)()  # interval, then time: seconds, nanoseconds
 
     def arm(self, at: int) -> None:
-        """Set the time; 0 for none."""
+        """Set the time (monotonic ns); 0: none."""
         self.at = at
         self._time[2], self._time[3] = divmod(at, 1_000_000_000)
         _timer_settime(self.fd, 1, self._time, None)  # 1: TFD_TIMER_ABSTIME

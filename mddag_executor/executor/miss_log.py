@@ -3,8 +3,8 @@
 """
 Writes missed deadlines to the log.
 
-The log gets the first miss at once, and after that a line every ``LOG_EVERY_S`` at most, with how
-many there have been since.
+The first miss is logged at once.  After that there is at most one line every ``LOG_EVERY_S``, with
+the number of misses since the last line.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class MissLog:
-    """Writes missed deadlines to the log, a line now and then."""
+    """Writes missed deadlines to the log, at a limited rate."""
 
     def __init__(self, verdicts: Verdicts) -> None:
         self._verdicts = verdicts
@@ -32,7 +32,7 @@ class MissLog:
         self._at = 0.0
 
     def write(self) -> None:
-        """Log the misses since the last line, if any; from any thread, and not under a lock."""
+        """Log the misses since the last line, if any; from any thread, without a lock."""
         if self._verdicts.missed == self._logged or not self._lock.acquire(blocking=False):
             return
         try:

@@ -1,18 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Reports missed deadlines to the user's handler, in a thread of its own.
+Reports missed deadlines to the user's handler, in a separate thread.
 
 Theory of operation
 -------------------
-1.  A worker that finds a miss only appends it to a queue: the handler may log, sleep, publish or
-    call a service, and a worker that waits for it would run no callbacks meanwhile.
+1.  A worker that finds a miss only appends it to a queue.  The handler may log, sleep, publish or
+    call a service, and a worker that waited for it would run no callbacks meanwhile.
 2.  The queue is bounded. A miss that does not fit is counted and never reported: the counts are in
     ``statistics()`` and ``/diagnostics``, and a warning in the log names them.
-3.  What the handler raises, also ``SystemExit``, comes out of ``spin``; later misses are reported.
-4.  At the end the waiting misses are still reported, but the handler is called no more after
-    ``END_S``, and not waited for after twice that: it may call a service that is no longer
-    answered.
+3.  An exception of the handler, including ``SystemExit``, comes out of ``spin``; later misses are
+    still reported.
+4.  At the end the queued misses are reported.  But the handler is not called after ``END_S``, and
+    not waited for after twice that: it may call a service that is no longer answered.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from mddag_executor.executor.verdicts import DeadlineMiss
 
 MOST_WAITING = 256
-"""So many misses wait for the handler: at 10 ms each it is 2.5 s late by then."""
+"""The most misses queued for the handler: at 10 ms each, the last one is reported 2.5 s late."""
 
 
 class MissNotifier:
@@ -40,7 +40,7 @@ class MissNotifier:
     Calls a handler with each miss, in the order in which they were found.
 
     :param handler: the user's ``on_deadline_miss``.
-    :param fail: gets what the handler raises.
+    :param fail: receives the handler's exceptions.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class MissNotifier:
         return self._did_not_fit + self._too_late
 
     def post(self, miss: DeadlineMiss) -> None:
-        """Have a miss reported; it never waits, and the caller may hold a lock."""
+        """Queue a miss; never waits, and the caller may hold a lock."""
         if self._queue.qsize() < MOST_WAITING:
             self._queue.put(miss)
         else:
@@ -78,14 +78,14 @@ class MissNotifier:
                 self._thread.start()
 
     def is_calling(self) -> bool:
-        """Return whether the calling thread is the one that calls the handler."""
+        """Return whether the calling thread is the handler's."""
         return threading.current_thread() is self._thread
 
     def stop(self, timeout: float | None = None) -> bool:
         """
-        Report what waits, and end; further calls wait again.
+        Report the queued misses, and end; further calls wait again.
 
-        Called by the handler itself, it returns at once, and the rest is reported after that.
+        If the handler calls this, it returns at once, and the rest is reported after that.
 
         :param timeout: seconds to wait for the handler, if that is less than twice ``END_S``.
         :return: whether the handler has returned.
@@ -116,7 +116,7 @@ class MissNotifier:
         self._warn()
 
     def _warn(self) -> None:
-        """Write to the log how many misses were not reported since it was written last."""
+        """Log how many misses were not reported since the last warning."""
         new = self.unreported - self._warned
         if new:
             self._warned += new

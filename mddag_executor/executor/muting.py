@@ -1,12 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Muting: while a callback holds the GIL for long, what cannot start anyway wakes no thread.
+Muting: while a callback holds the GIL for long, callbacks that cannot start wake no thread.
 
-Waking a thread costs 60 to 140 us next to a callback that computes.  What could start is known
-beforehand: a callback that does not hold the GIL, or whose relative deadline is below a bound (see
+Waking a thread costs 60 to 140 us while a callback computes.  The callbacks that could start are
+known beforehand: those that do not hold the GIL, or whose relative deadline is below a bound (see
 ``Engine.overtaking_bound``).  The sources of all others are switched off (``loop``), and their
-timers do not count for the timerfd.  What arrived meanwhile is collected when muting ends.
+timers do not count for the timerfd.  Their arrivals are collected when muting ends.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mddag_executor.executor.timers import TimerQueue
 
 class Muting:
     """
-    Which sources are muted; all methods under the engine's lock.
+    The muted sources; all methods need the engine's lock.
 
     :ivar until: when to stop muting, on the trace's clock; 0: nothing is muted.
     """
@@ -37,7 +37,7 @@ class Muting:
         self._inbox = inbox
 
     def update(self, now: int, is_running: bool) -> None:
-        """Mute what could not start while the callback that was just dispatched holds the GIL."""
+        """Mute sources whose callbacks cannot start while the dispatched one holds the GIL."""
         bound, until = self._engine.overtaking_bound(now)
         if bound:
             self.until, self._bound = until, bound
@@ -46,7 +46,7 @@ class Muting:
             self.end(is_running)
 
     def end(self, is_running: bool) -> None:
-        """Mute nothing, and collect what has arrived; timers only if callbacks may start."""
+        """End muting, and collect arrivals; timers only if callbacks may start."""
         if not self.until:
             return
         self.until = self._bound = 0
@@ -57,7 +57,7 @@ class Muting:
                 self._inbox.timer(fired)
 
     def classify(self, source: SubscriptionSource) -> None:
-        """Register a source by what is known of its callback."""
+        """Register a source according to its callback's GIL habit and deadline."""
         entity = source.entity
         habit = entity.habit
         if not habit.is_known:
@@ -67,7 +67,7 @@ class Muting:
         self._loop.move(source, urgency)
 
     def next_timer(self) -> int:
-        """Return when the next timer is due that could start (monotonic ns), 0 for never."""
+        """Return when the next timer that could start is due (monotonic ns); 0: never."""
         return self._timers.next_due_of(self._could_start) if self.until else (
             self._timers.next_due())
 

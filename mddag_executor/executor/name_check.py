@@ -1,16 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Warns once of declared callbacks that no node has, and asks what may be meant.
+Warns once of declared callbacks that no node has, and suggests the ones that may be meant.
 
 Theory of operation
 -------------------
-A declaration names nodes and topics; a program that calls one of them differently (a namespace, a
-remapping, a typing error) runs without any verdict.  Two periods after the executor began to
-judge, and ``LEAST_S`` at the least, the declared callbacks are listed that no entity is bound to,
-with the question which undeclared one is meant (``msg_graph.binding.meant``), and the undeclared
-callbacks that have run.  Nothing is said while the executor has no nodes, nor of callbacks that
-may run in another process (``msg_graph.drift``).
+A declaration names nodes and topics.  If a program uses different names (a namespace, a remapping,
+a typing error), its callbacks run without any verdict.  Two periods after the executor began to
+judge, but not before ``LEAST_S``, a warning lists the declared callbacks that no entity is bound
+to, each with the undeclared one that may be meant (``msg_graph.binding.meant``), and the
+undeclared callbacks that have run.  There is no warning while the executor has no nodes, and none
+of callbacks that may run in another process (``msg_graph.drift``).
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ if TYPE_CHECKING:
     from mddag_executor.executor.registry import Registry
 
 LEAST_S = 1.0
-"""Programs may make their nodes for so long while they spin."""
+"""How long programs may take to make their nodes during a spin."""
 
 
 class NameCheck:
     """
     Compares the names of the nodes with those of the declaration, once.
 
-    :param process: which of the declared processes this is.
-    :param warn: takes a warning; None: it goes to the log.
+    :param process: the declared process that this is.
+    :param warn: receives the warning; None: it is logged.
     """
 
     def __init__(
@@ -56,11 +56,11 @@ class NameCheck:
         self._done = task_set is None
 
     def rest_s(self) -> float | None:
-        """Return after how many seconds to ``check`` again; None: never."""
+        """Return the seconds until the next ``check``; None: never."""
         return None if self._done else LEAST_S
 
     def check(self, is_judging: bool) -> None:
-        """Warn if it is time to; to be called now and then by the thread that spins."""
+        """Warn if it is time to; the spinning thread calls this repeatedly."""
         if self._done or not is_judging or not self._registry.by_id:
             return
         now = self._clock()

@@ -5,36 +5,36 @@ DAGs over several processes: find the job that a message from another process be
 
 Theory of operation
 -------------------
-In a process of its own every executor sees only the publications of its own callbacks.  Across
-processes and machines the message itself must say which job it belongs to, and it does where the
-DAG's source declares ``release_from: header_stamp``: nodes pass the stamp of the sensor's message
-on from the source to the sinks, and that stamp is the release of the job.  Of other DAGs that the
-declared ``processes`` divide, the executors of one machine announce to each other which
-publication is of which job (``announcements``).  These are the rules, for such DAGs only:
+An executor sees only the publications of its own process.  Across processes and machines the
+message itself must identify its job.  It does if the DAG's source declares ``release_from:
+header_stamp``: nodes pass the stamp of the sensor's message on from the source to the sinks, and
+that stamp is the release of the job.  For other DAGs that the declared ``processes`` divide, the
+executors of one machine announce the job of each publication to each other (``announcements``).
+For such DAGs only:
 
 1.  A vertex is *here* when an entity of this executor is bound to its callback now.  A job has in
-    this process the vertices that are here when it is released here; its sinks elsewhere are
-    judged there (rule 10 of ``core.rules``).
-2.  A message whose publication is known here belongs to that publication's job, as always.
+    this process the vertices that are here when it is released here; its other sinks are judged
+    elsewhere (rule 10 of ``core.rules``).
+2.  A message whose publication is known here belongs to that publication's job.
 3.  Any other message on a topic *enters* when exactly one vertex that is not here publishes the
     topic to it (or several do to one sync, which waits for as many messages), and its header has a
     stamp that is not zero.  It belongs to the open job of that stamp; if there is none yet, it
-    starts one, whose release is the stamp.  Where publications are announced, it belongs to the
-    job and comes from the vertex that were announced with its own.
+    starts one, whose release is the stamp.  If publications are announced, the announcement gives
+    its job and vertex.
 4.  The job of a stamp is the one that a source's message or an entering message with that stamp
-    has started here, or one of whose callbacks here has published a message with that stamp; that
-    of an announced name the one that was released here or has entered by that name.  So a DAG may
-    leave a process and come back.
-5.  Whatever leaves a doubt (two vertices elsewhere that publish the topic, no stamp, a job that
-    has ended, a second message for the same vertex of the same job) runs as undeclared, and is
-    counted as unattributed.
+    has started here, or one of whose callbacks here has published a message with that stamp.  The
+    job of an announced name is the one that was released here or has entered by that name.  So a
+    DAG may leave a process and come back.
+5.  An ambiguous message (two vertices elsewhere that publish the topic, no stamp, a job that has
+    ended, a second message for the same vertex of the same job) runs as undeclared, and is counted
+    as unattributed.
 
-A stamp is a time of the system's clock: between machines these have to be synchronised (PTP,
-NTP), and what they differ by shows in the response times.  A timer that is a source has its
-nominal due time as release where it runs, and elsewhere the stamp that its node gave the message:
-with a stamp taken from the clock in the callback it is later there by the dispatch latency.
+A stamp is a time of the system clock.  Machines must synchronise it (PTP, NTP); the difference
+adds to the response times.  A timer that is a source has its nominal due time as release in its
+own process, and elsewhere the stamp that its node gave the message: a stamp taken from the clock
+in the callback is later by the dispatch latency.
 
-Two executors in one process that share a graph are to each other as two processes.
+Two executors in one process that share a graph are treated as two processes.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ from msg_graph import Dag, TaskSet, Vertex
 
 class OtherProcesses:
     """
-    The DAGs that may reach beyond this process, and the jobs of their stamps.
+    The DAGs that may extend beyond this process, and the jobs of their stamps.
 
-    ``update`` and ``find`` are called under the engine's lock; ``note`` from any thread.
+    ``update`` and ``find`` need the engine's lock; ``note`` may be called from any thread.
 
-    :param dags: those that may by stamps; None: whose source declares ``release_from:
+    :param dags: those identified by stamps; None: those whose source declares ``release_from:
         header_stamp``.
     :param announced: the indices of those whose publications are announced.
     """
@@ -77,7 +77,7 @@ class OtherProcesses:
         self._job_notes = jobs
         self._callbacks = [v.callback.key for d in task_set.dags for v in d.vertices]
         self._here: dict[int, list[int]] = {}
-        # on which topics messages go to other processes
+        # the topics on which messages go to other processes
         self._leaving: set[str] = set()
         # by DAG and stamp, or DAG and name; the names of jobs that have entered
         self._jobs: dict[tuple[int, Hashable], Origin] = {}
@@ -90,9 +90,9 @@ class OtherProcesses:
         process: str | None = None,
     ) -> OtherProcesses | None:
         """
-        Return what is kept for a declaration; None: no DAG reaches beyond the process.
+        Return the object for a declaration; None: no DAG extends beyond the process.
 
-        :param process: which of the declared ones this is; None: publications are not announced.
+        :param process: the declared process that this is; None: publications are not announced.
         """
         announced = divided(task_set) if task_set is not None and process is not None else set()
         if task_set is None or not announced and all(
@@ -138,7 +138,7 @@ class OtherProcesses:
         return changes
 
     def unmatched(self, entities: Iterable[Entity], nodes: Iterable[Any]) -> list[str]:
-        """Return the topics by which jobs leave or enter, and nobody else has been met on."""
+        """Return the topics of leaving or entering jobs without an endpoint of another process."""
         here = Counter(entity.label for entity in entities)
         found = [e.label for e in entities if (e.awaits or e.remote_publishers)
                  and not e.rclpy.get_publisher_count()]
@@ -150,7 +150,7 @@ class OtherProcesses:
 
     @staticmethod
     def _leaves(dag: Dag, vertex: Vertex, here: list[int], topic: str) -> bool:
-        """Return whether a topic of a vertex starts one that is not here."""
+        """Return whether a topic of a vertex starts a vertex that is not here."""
         return any(not here[after] and topic in dag.vertices[after].callback.topics
                    for after in vertex.successors)
 
@@ -200,12 +200,12 @@ class OtherProcesses:
         return self._jobs.get((dag, name))
 
     def name(self, name: tuple[int, int], origin: Origin) -> None:
-        """Note the name of a job: that of one that enters, or is announced (rule 4)."""
+        """Note the name of a job that enters, or is announced (rule 4)."""
         self._names[origin.dag, origin.job] = name
         self._keep(name, origin)
 
     def name_of(self, origin: Origin) -> tuple[int, int] | None:
-        """Return the name of a job, None for one that has none yet."""
+        """Return the name of a job, None if it has none yet."""
         return self._names.get((origin.dag, origin.job))
 
 
@@ -219,6 +219,6 @@ def contested(task_set: TaskSet) -> set[str]:
 
 
 def divided(task_set: TaskSet) -> set[int]:
-    """Return the DAGs that the declared processes divide, and no header stamp joins."""
+    """Return the DAGs that the declared processes divide, without a header stamp."""
     return {dag.index for dag in task_set.dags if dag.release_from != 'header_stamp' and len(
         {task_set.process_of(vertex.callback.node) for vertex in dag.vertices}) > 1}

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Three places in rclpy at which the executor must know what a program does.
+Wraps three methods of rclpy, so that the executor knows when a program calls them.
 
 Theory of operation
 -------------------
@@ -10,19 +10,19 @@ the process, when the first executor is made.
 
 1.  *A callback in* ``Client.call`` lends its worker to a spare thread (``workers``).
 2.  *A publication on a trigger topic* is noted, so that its messages find their job (``jobs``).
-3.  *Delivery within the process.*  A middleware that delivers within a process does so inside of
-    ``publish``: when that returns, the message can be taken.  The publishing thread has just made
-    it, so it takes the message itself instead of waking a worker: the descriptors of this
-    process's subscriptions on the topic are switched off while it publishes; then it takes what
-    was announced, and switches them on again.  Nothing depends on who else publishes: whatever
-    arrives otherwise, or later, wakes a worker.
-4.  A thread that publishes while it has the engine's lock (a signal handler can) leaves the
+3.  *Delivery within the process.*  A middleware that delivers within a process does so inside
+    ``publish``: the message can be taken when that returns.  The publishing thread takes the
+    message itself instead of waking a worker.  The descriptors of this process's subscriptions on
+    the topic are switched off while it publishes.  Then it takes the announced messages, and
+    switches the descriptors on again.  Other publishers have no effect: any other arrival wakes a
+    worker.
+4.  A thread that publishes while it owns the engine's lock (a signal handler can) leaves the
     message to a worker.
-5.  *A new content filter* makes rmw_fastrtps replace the subscription's reader, and the listener
-    is lost with the old one (rclpy from 7.1.8 on).  So it is set again.
+5.  *A new content filter* makes rmw_fastrtps replace the subscription's reader, which loses the
+    listener (rclpy from 7.1.8 on).  So the listener is set again.
 
-Outside of callbacks of this executor, on topics that no executor here subscribes to, the methods
-do what they always did.
+The methods are unchanged outside of callbacks of this executor, on topics without a subscription
+of an executor here.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from rclpy.subscription import Subscription
 
 
 class Delivery(Protocol):
-    """The subscriptions of one executor on a topic, that publishing threads take from."""
+    """The subscriptions of one executor on a topic that publishing threads take from."""
 
     def hold(self) -> None:
-        """Announce nothing for now."""
+        """Pause announcements."""
 
     def collect_published(self, publication: Publication | None) -> None:
-        """Take what was announced since ``hold``, and announce again."""
+        """Collect arrivals announced since ``hold``, and resume announcements."""
 
     def listen_again(self, subscription: Any) -> None:
-        """Have a subscription announced again whose reader the middleware has replaced."""
+        """Announce a subscription again after the middleware has replaced its reader."""
 
 
 _STATE = '_mddag_publisher_state'
@@ -57,7 +57,7 @@ _installed = False
 
 
 def replace_delivery(topic: str, old: Delivery | None, new: Delivery | None) -> None:
-    """Have publishing threads take by ``new`` what they have taken by ``old``; None: nothing."""
+    """Replace the ``Delivery`` of publishing threads on a topic; None: there is none."""
     with _lock:
         several = [each for each in _deliveries.get(topic, ()) if each is not old]
         if new is not None:
@@ -69,7 +69,7 @@ def replace_delivery(topic: str, old: Delivery | None, new: Delivery | None) -> 
 
 
 def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Publication | None:
-    """Publish; return the publication if it is of a trigger topic, by a callback."""
+    """Publish; return the publication if a callback published on a trigger topic."""
     running = current.running
     topic = None
     if running is not None:

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What the executor writes into a trace besides its hot path: who is who, and what was taken."""
+"""The executor's trace apart from its hot path: entities, and messages taken."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class Recorder:
     """
     The trace of one executor.
 
-    Addresses are those of Python objects: the node, the entity, and, for callbacks, what is kept
-    for the entity (``Entity``).
+    Addresses are those of Python objects: the node, the rclpy entity, and for callbacks the
+    ``Entity``.
 
-    :param writer: writes the file, as a ``TraceWriter``; None: one that keeps nobody waiting.
-    :param overwrite: whether the file may replace one that is there.
-    :param cpus: that there are, 0: nobody knows; None: the machine's.
+    :param writer: writes the file, as a ``TraceWriter``; None: one that does not block.
+    :param overwrite: whether an existing file may be replaced.
+    :param cpus: their number, 0: unknown; None: the machine's.
     :raises mddag_executor.trace.TraceError: when the file cannot be written.
     """
 
@@ -45,7 +45,7 @@ class Recorder:
         self.record = self.writer.record
         self.path = path
         self._clock = clock
-        # by themselves: another one may have the address of one that is gone
+        # the objects themselves: an address may be used again
         self._known: weakref.WeakSet[Any] = weakref.WeakSet()
         self._say(
             'task_set', task_set.text if task_set else '', task_set.file if task_set else '',
@@ -67,7 +67,7 @@ class Recorder:
                 by_name[node.get_fully_qualified_name()] = id(node)
                 self._node(node)
             except InvalidHandle:
-                continue  # destroyed meanwhile
+                continue  # it was destroyed meanwhile
         for entity in added:
             if entity.is_own:
                 continue
@@ -115,7 +115,7 @@ class Recorder:
             self._say(f'callback_group_add_{entity.kind}', id(group), handle)
 
     def taken(self, entity: Entity, message: Any, source_timestamp: int, now: int) -> None:
-        """Record that a message was taken; ``now``: when, which is not after it became ready."""
+        """Record that a message was taken at ``now``, which is not after it became ready."""
         self.record(
             'rmw_take', now, threading.get_native_id(), id(entity.rclpy), id(message),
             source_timestamp, True)
@@ -124,9 +124,9 @@ class Recorder:
         """
         Record the run's end and complete the file.
 
-        Where it could not be written, the run has gone on without it; this says so in the log.
+        If the file could not be written, the run has continued without it, and this logs an error.
 
-        :param end: up to when deadlines are judged, if that is before now; in the trace's clock.
+        :param end: until when deadlines are judged, if that is before now; on the trace's clock.
         """
         self.record(
             'shutdown', now, threading.get_native_id(), now if end is None else end)

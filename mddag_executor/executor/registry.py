@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Which entities there are: the declared callback of each, its callback group in the core."""
+"""The registry of entities: the declared callback of each, and its callback group in the core."""
 
 from __future__ import annotations
 
@@ -42,14 +42,13 @@ KINDS = (TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE)
 
 class Registry:
     """
-    What is kept for all entities of the executor's nodes.
+    The records of all entities of the executor's nodes.
 
-    It is refreshed under the engine's lock; other threads find entities in it, and ask for counts
-    at any time.
+    It is refreshed under the engine's lock; other threads may look entities up and read counts at
+    any time.
 
-    :ivar by_id: what is kept for each entity of rclpy, by the ``id`` of that.
-    :param passed: called with each execution that a callback group has let through (see
-        ``groups``).
+    :ivar by_id: the ``Entity`` of each rclpy entity, by the ``id`` of the latter.
+    :param passed: called with each execution that a callback group has let run (see ``groups``).
     """
 
     def __init__(
@@ -60,15 +59,15 @@ class Registry:
         self._engine = engine
         self._passed = passed
         self._binder = binding.Binder(task_set) if task_set is not None else None
-        # the core's numbers of callback groups (where a group decides itself, of its entities),
-        # and all that are not given back yet
+        # the core's numbers of callback groups (of user-defined groups: of their entities), and
+        # all that are not freed yet
         self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
         self._numbers: set[int] = set()
         self._counting = threading.Lock()
         self.by_id: dict[int, Entity] = {}
         # the executor's own subscriptions
         self.own: set[Any] = set()
-        # destroyed entities whose last executions are not done yet, and the counts of those before
+        # destroyed entities with unfinished executions, and the counts of earlier ones
         self._retired: list[Entity] = []
         self._past: dict[str, dict[str, Any]] = {}
         self._published: dict[str, set[str]] = {}
@@ -82,10 +81,10 @@ class Registry:
 
     def refresh(self, found: EntitySet) -> tuple[list[Entity], list[Entity]]:
         """
-        Take over which entities the nodes have now.
+        Update the entities of the nodes.
 
-        :param found: what the nodes have.
-        :return: those that are new, and those that are gone.
+        :param found: the entities that the nodes have now.
+        :return: new entities, and removed ones.
         """
         present: dict[int, Entity] = {}
         new: list[tuple[str, Any, str]] = []
@@ -93,7 +92,7 @@ class Registry:
             try:
                 name = self._name(node)
             except InvalidHandle:
-                continue  # destroyed between being listed and looked at
+                continue  # destroyed after it was listed
             for kind, some in zip(KINDS, lists):
                 for rclpy_entity in some:
                     key = id(rclpy_entity)
@@ -104,7 +103,7 @@ class Registry:
                     else:
                         present[key] = entity
         gone = [each for key, each in self.by_id.items() if key not in present]
-        for each in gone:  # first, as what is new may be their callback's next entity
+        for each in gone:  # first: a new one may be their callback's next entity
             self._unbind(each)
         made = [self._new_entity(*each) for each in new]
         added = [each for each in made if each is not None]
@@ -118,10 +117,10 @@ class Registry:
 
     def is_stale(self) -> bool:
         """
-        Return whether `refresh` would change something though no entity has come or gone.
+        Return whether `refresh` would change anything though no entity has come or gone.
 
-        An undeclared timer has another period: it may be declared. Or what still ran of an entity
-        that had gone is through.
+        This is the case if the period of an undeclared timer has changed, which may make it
+        declared, or if the last execution of a removed entity has ended.
         """
         return (any(self._retimed(entity) for entity in self.timers())
                 or any(entity.is_through() for entity in self._retired))
@@ -132,17 +131,17 @@ class Registry:
         try:
             return entity.label != exact_duration(entity.rclpy.timer_period_ns)
         except InvalidHandle:
-            return False  # destroyed meanwhile
+            return False  # it was destroyed meanwhile
 
     def _name(self, node: Any) -> str:
-        """Return a node's name, also when it has been destroyed since and not removed."""
+        """Return a node's name, also if it has been destroyed but not removed."""
         name: str | None = self._names.get(node)
         if name is None:
             name = self._names[node] = node.get_fully_qualified_name()
         return name
 
     def _fold(self) -> None:
-        """Keep of retired entities that are through only their counts: memory is bounded."""
+        """Keep only the counts of retired entities without executions: memory is bounded."""
         retired, self._retired = self._retired, []
         for entity in retired:
             if entity.is_through():
@@ -163,7 +162,7 @@ class Registry:
         return found
 
     def counts(self) -> dict[str, dict[str, Any]]:
-        """Return the counts of all entities there have been, by callback (see ``Entity``)."""
+        """Return the counts of all entities, also removed ones, by callback (see ``Entity``)."""
         with self._counting:
             counts = {name: dict(past) for name, past in self._past.items()}
             for entity in (*self._retired, *self.by_id.values()):
@@ -171,14 +170,14 @@ class Registry:
         return counts
 
     def computing(self) -> int:
-        """Return how many callbacks that have run hold the interpreter while they run."""
+        """Return how many of the callbacks that have run hold the interpreter."""
         return sum(bool(e.ran and e.habit.holds) for e in list(self.by_id.values()))
 
     def totals(self) -> dict[str, int]:
         """
-        Return the counts of all callbacks together, from any thread.
+        Return the sums of the counts of all callbacks, from any thread.
 
-        Unlike ``counts`` this costs next to nothing for an entity that nobody uses.
+        Unlike ``counts``, an unused entity costs almost nothing.
         """
         totals = dict.fromkeys(COUNTS, 0)
         with self._counting:
@@ -198,7 +197,7 @@ class Registry:
             if entity.callback is not None}
 
     def elsewhere(self, process: str | None) -> set[str]:
-        """Return the declared callbacks that run in other processes than this one."""
+        """Return the declared callbacks that run in other processes."""
         if self._task_set is None or process is None:
             return set()
         return {c.key for c in self.declared if self._task_set.process_of(c.node) != process}
@@ -208,15 +207,15 @@ class Registry:
         return [] if self._binder is None else self._binder.unbound()
 
     def undeclared(self) -> list[binding.Entity]:
-        """Return the timers, subscriptions and services there were that are not declared."""
+        """Return all undeclared timers, subscriptions and services, including removed ones."""
         return list(self._undeclared)
 
     def subscriptions(self) -> list[Entity]:
-        """Return the subscriptions that there are now."""
+        """Return the current subscriptions."""
         return [entity for entity in self.by_id.values() if entity.kind == SUBSCRIPTION]
 
     def note_event(self, handler: EventHandler, status: Any) -> None:
-        """Take note of a QoS event: of the policy for which a subscription gets nothing."""
+        """Note a QoS event: the policy because of which a subscription gets no messages."""
         if status is None or handler.event_type != _INCOMPATIBLE:
             return
         for entity in self.subscriptions():
@@ -224,7 +223,7 @@ class Registry:
                 entity.incompatible_qos = qos_policy_name_from_kind(status.last_policy_kind)
 
     def timers(self) -> list[Entity]:
-        """Return the timers that there are now."""
+        """Return the current timers."""
         return [entity for entity in self.by_id.values() if entity.kind == TIMER]
 
     def _new_entity(self, kind: str, rclpy_entity: Any, node: str) -> Entity | None:
@@ -243,7 +242,7 @@ class Registry:
                 label = 'condition'
         except Exception as error:
             if type(error).__name__ == 'InvalidHandle':
-                return None  # destroyed between being listed and looked at
+                return None  # destroyed after it was listed
             raise
         bindable = binding.Entity(node, kind, '' if kind == TIMER else label, period)
         if kind in (TIMER, SUBSCRIPTION, SERVICE) and self._binder is not None:
@@ -284,7 +283,7 @@ class Registry:
         return number
 
     def _free_groups(self) -> None:
-        """Give the numbers back of groups that are gone, as memory is bounded."""
+        """Free the numbers of destroyed groups: memory is bounded."""
         if len(self._groups) < len(self._numbers):
             for number in self._numbers.difference(list(self._groups.values())):
                 self._numbers.remove(number)

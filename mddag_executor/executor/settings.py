@@ -1,9 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The settings with which an executor is made: checked, and brought into one form.
+The settings of an executor: checked, and converted to one form.
 
-What makes no sense, or is impossible on this machine or for this process, is a ``UsageError``.
+Settings that are invalid, or impossible on this machine or for this process, raise ``UsageError``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MOST_JOBS = 1_000_000
 
 
 def whole_number(name: str, value: Any, most: int, unit: str = '') -> int:
-    """Return a whole number from 1 up."""
+    """Return a positive integer."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -48,13 +48,13 @@ def whole_number(name: str, value: Any, most: int, unit: str = '') -> int:
 
 
 def check_callable(name: str, value: Any) -> None:
-    """Look at something that is to be called, or None."""
+    """Check a value that must be callable, or None."""
     if value is not None and not callable(value):
         raise UsageError(f'{name}: {value!r} cannot be called: give a function or None')
 
 
 def check_thresholds(value: Any) -> Thresholds:
-    """Return the thresholds of the diagnostics, the usual ones for None."""
+    """Return the thresholds of the diagnostics, the defaults for None."""
     if value is not None and not isinstance(value, Thresholds):
         raise UsageError(f'thresholds: {value!r} are none: give Thresholds(...), or None')
     return value or Thresholds()
@@ -62,7 +62,7 @@ def check_thresholds(value: Any) -> Thresholds:
 
 def check_context(context: Any) -> None:
     """
-    Look at the context that an executor is to belong to, None for the default one.
+    Check the context of an executor, None for the default one.
 
     :raises NotInitializedException: when it has not been initialised.
     """
@@ -73,7 +73,7 @@ def check_context(context: Any) -> None:
 
 
 def check_process(name: str | None, task_set: TaskSet | None) -> None:
-    """Look at the name of a declared process, or None."""
+    """Check the name of a declared process, or None."""
     names = [process.name for process in task_set.processes] if task_set is not None else []
     if name is not None and name not in names:
         remedy = did_you_mean(name, names, f'give one of {listed(names)}') if names else (
@@ -84,16 +84,16 @@ def check_process(name: str | None, task_set: TaskSet | None) -> None:
 @dataclass(frozen=True)
 class Thresholds:
     """
-    What makes a status of ``/diagnostics`` worse than OK.
+    The limits beyond which a status of ``/diagnostics`` is worse than OK.
 
     :ivar warn_ratio: WARN when this share of the window's results missed their deadlines.
-    :ivar warn_burst: WARN when so many misses came in one period of the diagnostics.
-    :ivar error_ratio: ERROR when this share of the window's results missed them, and they are
-        ``warn_burst`` or more (two results of which one is late are no proof).
-    :ivar window: how many periods of the diagnostics the window has.
-    :ivar stale_periods: STALE when a source has released nothing for so many of its periods, and
+    :ivar warn_burst: WARN when there were this many misses in one period of the diagnostics.
+    :ivar error_ratio: ERROR when this share of the window's results missed their deadlines, and at
+        least ``warn_burst`` did (one miss in two results proves nothing).
+    :ivar window: length of the window in periods of the diagnostics.
+    :ivar stale_periods: STALE when a source has released no job for this many of its periods, and
         for a period of the diagnostics.
-    :ivar name: what stands before the names of the statuses, for robots with several processes.
+    :ivar name: prefix of the names of the statuses, for robots with several processes.
     """
 
     warn_ratio: float = 0.01
@@ -114,7 +114,7 @@ class Thresholds:
 
 
 def _nanoseconds(time: Any) -> Any:
-    """Return the ns of a text as ``1s`` or of rclpy's ``Duration``; else what it is."""
+    """Return the ns of a text like ``1s`` or of rclpy's ``Duration``; other values unchanged."""
     if isinstance(time, str):
         return parse_duration(time)
     return time.nanoseconds if isinstance(time, Duration) else time
@@ -122,9 +122,9 @@ def _nanoseconds(time: Any) -> Any:
 
 def diagnostics_period_ns(period: int | str | Duration | None) -> int | None:
     """
-    Return the period of the diagnostics in ns, None for none.
+    Return the period of the diagnostics in ns, None: no diagnostics.
 
-    :param period: ns, text as ``1s``, or a ``Duration``; None or 0: no diagnostics.
+    :param period: ns, text such as ``1s``, or a ``Duration``; None or 0: no diagnostics.
     """
     period = _nanoseconds(period)
     if period is None or period == 0:
@@ -144,8 +144,8 @@ def resolve(
     """
     Return the task set, the number of workers and the default deadline (ns) of an executor.
 
-    :param num_threads: what ``MultiThreadedExecutor`` calls ``num_workers``.
-    :raises msg_graph.GraphError: when the declaration is not right.
+    :param num_threads: the name of ``num_workers`` in ``MultiThreadedExecutor``.
+    :raises msg_graph.GraphError: when the declaration is invalid.
     """
     task_set = load(graph) if isinstance(graph, (str, os.PathLike)) else graph
     if task_set is not None and not isinstance(task_set, TaskSet):
@@ -166,9 +166,9 @@ def resolve(
 
 def check_on_late(on_late: object) -> None:
     """
-    Check what is to be done with late jobs.
+    Check the treatment of late jobs.
 
-    :raises UsageError: when it is not known.
+    :raises UsageError: when it is unknown.
     """
     if on_late not in [*ON_LATE]:
         raise UsageError(
@@ -178,7 +178,7 @@ def check_on_late(on_late: object) -> None:
 def thread_setting(
     policy: str | None, priority: int | None, cpus: Iterable[int] | None
 ) -> Callable[[], None] | None:
-    """Return what each worker thread calls first, None where nothing is to be set."""
+    """Return a function that each worker thread calls first; None: there is nothing to set."""
     if policy is None and cpus is None:
         if priority is not None:
             raise UsageError(
@@ -189,7 +189,7 @@ def thread_setting(
             f"worker_policy: '{policy}' is unknown: give one of {', '.join(THREAD_POLICIES)}")
     if not hasattr(os, 'sched_setscheduler'):
         raise UsageError('worker_policy: this system has none: leave it out')
-    if priority is not None and priority != 0:  # 0: the one of SCHED_OTHER
+    if priority is not None and priority != 0:  # 0: that of SCHED_OTHER
         whole_number('worker_priority', priority, 99)
     if cpus is not None:
         cpus = _cpus(cpus)
@@ -210,7 +210,7 @@ def thread_setting(
 
 
 def _cpus(cpus: Any) -> set[int]:
-    """Return a set of CPUs that this process may use, and has one at least."""
+    """Return a set of CPUs that this process may use, at least one."""
     mine = os.sched_getaffinity(0)
     try:
         found = set(cpus)

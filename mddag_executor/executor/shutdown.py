@@ -1,11 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What ends or wakes executors when a context, or the interpreter, comes to its end.
+Ends or wakes executors at the end of a context or of the interpreter.
 
-A daemon thread that wants the interpreter back while that ends is ended by it.  Where it is in
-native code then (in a wait of rcl, a sleep of a clock), C++ calls ``terminate``: the process
-aborts after its work was done.  (rclpy's own executors do so when a daemon thread spins one.)
+A daemon thread that waits for the GIL while the interpreter ends is ended by it.  If the thread is
+in native code then (in a wait of rcl, a sleep of a clock), C++ calls ``terminate``: the process
+aborts after its work was done.  (rclpy's own executors cause this if a daemon thread spins one.)
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ _executors: _Kept = {}
 _by_context: weakref.WeakKeyDictionary[Context, _Kept] = weakref.WeakKeyDictionary()
 _kept: weakref.WeakKeyDictionary[Context, object] = weakref.WeakKeyDictionary()
 _ended: weakref.WeakSet[Context] = weakref.WeakSet()
-"""Contexts that are shut down, or just going to be."""
+"""Contexts that are shut down, or are just being shut down."""
 
 
 def _keep(kept: _Kept, owner: Any, value: Any = None) -> None:
     """
-    Keep something of an object for as long as that lives.
+    Keep a value of an object as long as the object lives.
 
-    What forgets it is no Python code: in there a KeyboardInterrupt would be printed and lost,
-    and executors die right when a program is interrupted.
+    It is removed without Python code: a KeyboardInterrupt in Python code there would be printed
+    and lost, and executors are destroyed just when a program is interrupted.
     """
     kept[weakref.ref(owner, kept.pop)] = value
 
@@ -52,7 +52,7 @@ def _living(kept: _Kept) -> list[tuple[Any, Any]]:
 
 
 def is_over(context: Context) -> bool:
-    """Return whether a context has ended: that it was shut down, or destroyed."""
+    """Return whether a context has ended: was shut down, or destroyed."""
     try:
         return context in _ended or not context.ok()
     except InvalidHandle:
@@ -61,7 +61,7 @@ def is_over(context: Context) -> bool:
 
 def stop_at_exit(thing: Any) -> None:
     """
-    Have what has threads stopped before the interpreter and the middleware end, if they run then.
+    Stop a running object with threads before the interpreter and the middleware end.
 
     A thread that is in the middleware meanwhile can crash the process.
     """
@@ -69,17 +69,17 @@ def stop_at_exit(thing: Any) -> None:
 
 
 def join(thread: threading.Thread, seconds: float | None = None) -> None:
-    """Wait for the end of a thread that has been asked to end; never for the calling one."""
+    """Wait for the end of a thread that was asked to end; returns at once in that thread."""
     if thread is threading.current_thread():
         return
     try:
         thread.join(seconds)
     except RuntimeError:
-        pass  # it is just being started, or that was interrupted; it finds out by itself
+        pass  # it is just being started, or its start was interrupted; it will find out itself
 
 
 def halt_at_exit(executor: Any) -> None:
-    """Have an executor stopped before the interpreter ends, in whichever thread it spins."""
+    """Stop an executor before the interpreter ends, whichever thread spins it."""
     _keep(_executors, executor)
 
 
@@ -96,7 +96,7 @@ def _stop_all() -> None:
 
 
 def _forget() -> None:
-    """Forget all in a forked child: it has none of the threads, and locks may be held for ever."""
+    """Forget everything in a forked child: it has no other threads, and locks may stay locked."""
     _executors.clear()
     _started.clear()
 
@@ -106,13 +106,13 @@ os.register_at_fork(after_in_child=_forget)
 
 def call_at_shutdown(context: Context, method: Any) -> None:
     """
-    Have a method called when a context is shut down, as long as its object is alive.
+    Call a method when a context is shut down, as long as its object is alive.
 
     A context never forgets a callback whose object is alive, and a program can make many
-    executors; so the context gets only one callback for all.
+    executors.  So the context gets one callback for all.
 
-    :param method: must not wait for a lock: the thread that ends the context may hold it.  Of an
-        object it can be only one.
+    :param method: must not wait for a lock: the thread that ends the context may own it.  Only one
+        method of each object is called.
     """
     methods = _by_context.get(context)
     if methods is None:
@@ -131,10 +131,10 @@ def _call_all(reference: weakref.ref[Context], methods: _Kept) -> None:
 
 class ContextChecks:
     """
-    When to look again whether a context has ended, after something could have been a signal.
+    When to check again whether a context has ended, after a possible signal.
 
-    On a signal rclpy wakes everybody first and shuts the contexts down then, in another thread:
-    who is quick still finds the context well, and nobody wakes him again.
+    On a signal rclpy first wakes all waiting threads, and shuts the contexts down later, in
+    another thread.  A thread that checks early finds the context valid, and is not woken again.
     """
 
     def __init__(self) -> None:
@@ -142,12 +142,12 @@ class ContextChecks:
         self._step = 0
 
     def begin(self) -> None:
-        """Look again, in steps that grow from 5 ms to half a second."""
+        """Check again, at intervals that grow from 5 ms to half a second."""
         self._step = AGAIN_NS
         self.at = _now() + self._step
 
     def due(self) -> bool:
-        """Return whether it is time to; if so, the next time is the next step's."""
+        """Return whether it is time for a check; if so, the next one is an interval later."""
         if self.at is None or _now() < self.at:
             return False
         self._step *= 4
@@ -155,5 +155,5 @@ class ContextChecks:
         return True
 
     def seconds(self) -> float:
-        """Return how long it is until the next look."""
+        """Return the seconds until the next check."""
         return 0.0 if self.at is None else max(0.0, (self.at - _now()) / 1e9)

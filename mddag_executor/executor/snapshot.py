@@ -1,10 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What an executor's nodes have to wait for.
+The entities of an executor's nodes.
 
-Nodes notify an executor that *something* has changed (``Executor.wake``) but not what, so the set
-is taken again and compared.
+Nodes notify an executor that their entities have changed (``Executor.wake``), but not how.  So the
+snapshot is made again and compared.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from rclpy.node import Node
 from rclpy.waitable import Waitable
 
 LISTS = ('timers', 'subscriptions', 'services', 'clients', 'guards', 'waitables')
-"""What a node has, by the names of its properties."""
+"""The entities of a node, by the names of its properties."""
 
 
 EntitySet = dict[Node, tuple[list[Any], ...]]
-"""What each node has, for each of ``LISTS``, in the order of creation."""
+"""The entities of each node, for each of ``LISTS``, in the order of creation."""
 
 
 def snapshot(nodes: Iterable[Node]) -> EntitySet:
     """
-    Return what these nodes have to wait for now.
+    Return the entities that these nodes have now.
 
-    :param nodes: the nodes; may be changed by other threads meanwhile (who must see to it that a
-        further snapshot is taken, as rclpy's nodes do by waking their executor).
+    :param nodes: may be changed by other threads meanwhile, which must cause another snapshot, as
+        rclpy's nodes do by waking their executor.
     """
     return {node: tuple(_listed(node, name) for name in LISTS) for node in nodes}
 
 
 def _listed(node: Node, name: str) -> list[Any]:
-    """List what a node has, until nothing changes meanwhile: else a removal hides the next one."""
+    """List entities until the list is unchanged: a concurrent removal may hide the next entity."""
     before: list[Any] | None = None
     found = list(getattr(node, name))
     while found != before:
@@ -45,7 +45,7 @@ def _listed(node: Node, name: str) -> list[Any]:
 
 
 def alive(entity: Any) -> bool:
-    """Return whether a node, or what belongs to one, has not been destroyed."""
+    """Return whether a node or an entity has not been destroyed."""
     try:
         with entity.handle:
             return True

@@ -1,10 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What an executor has done: a snapshot in plain dictionaries (``statistics_types``), and drift.
+Statistics of an executor: a snapshot in plain dictionaries (``statistics_types``), and drift.
 
-The rules of drift are in ``msg_graph.drift``. What they need to know of a live run the executor
-keeps anyway, but for the releases: ``Watch`` gets each of them.
+The rules of drift are in ``msg_graph.drift``. Their input comes from the executor's counts, and
+the releases from ``Watch``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def statistics(
     pool: WorkerPool, registry: Registry, recorder: Recorder | None, process: str | None = None,
     notifier: MissNotifier | None = None,
 ) -> Statistics:
-    """Return the counts of a run; ``statistics_types`` says what each means."""
+    """Return the counts of a run; see ``statistics_types`` for their meaning."""
     engine = pool.engine
     with pool.lock:
         result = engine.verdicts.tally.result()
@@ -42,7 +42,7 @@ def statistics(
     never_ran = [c.key for c in registry.declared
                  if c.key not in elsewhere
                  and (c.key not in callbacks or not callbacks[c.key]['ran'])]
-    for dag in result['dags'].values():  # their sinks are judged where they are
+    for dag in result['dags'].values():  # their sinks are judged in their own processes
         dag['sinks'] = {name: sink for name, sink in dag['sinks'].items()
                         if name.partition('@')[0] not in elsewhere or counts(sink).due}
     return {
@@ -66,9 +66,9 @@ def statistics(
 
 class Watch:
     """
-    Watches an executor from here on.
+    Watches an executor from now on.
 
-    :param task_set: the declaration that the executor was made with.
+    :param task_set: the declaration of the executor.
     """
 
     def __init__(self, executor: MultiDeadlineExecutor, task_set: TaskSet) -> None:
@@ -84,11 +84,11 @@ class Watch:
             self._releases[dag].add(release)
 
     def drift(self, statistics: Statistics) -> list[Drift]:
-        """Return where the run and the declaration disagree; ``statistics`` are its counts."""
+        """Return the differences between run and declaration; ``statistics`` are its counts."""
         return drift(self._task_set, self.observed(statistics))
 
     def observed(self, statistics: Statistics) -> Observed:
-        """Return what was seen; ``statistics`` are the counts of the run."""
+        """Return the observations; ``statistics`` are the run's counts."""
         first = min((r.first for r in self._releases if r.count), default=self._begin)
         counts = statistics['callbacks']
         sources = (dag.vertices[dag.source].callback.key for dag in self._task_set.dags)

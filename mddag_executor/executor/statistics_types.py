@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What ``MultiDeadlineExecutor.statistics()`` returns: plain dictionaries, with their keys.
+The dictionaries that ``MultiDeadlineExecutor.statistics()`` returns, with their keys.
 
 ``dags``, ``deadline_missed`` and ``first_miss`` have the form of ``replay --json``. Times are in
 ns; names of callbacks and sinks are ``/node:callback``.
@@ -18,12 +18,12 @@ ResponseTimes = TypedDict(  # noqa: UP013 - a class would shadow min and max
 
 class SinkCounts(TypedDict):
     """
-    What came of the jobs at a sink.
+    The results of a sink.
 
     ``late`` counts completions after the deadline and, at the end of the run, jobs that were
-    ``overdue``. ``dropped`` counts jobs that made place for a newer one (``keep: newest``),
-    ``demoted`` those that could no longer be in time and went behind others. Jobs of which none
-    completed have no ``response_ns``.
+    ``overdue``. ``dropped`` counts jobs replaced by a newer one (``keep: newest``), ``demoted``
+    jobs that could no longer be in time and were put behind others. ``response_ns`` is missing if
+    no job completed.
     """
 
     relative_deadline_ns: int
@@ -75,7 +75,7 @@ class Stop(TypedDict):
 
 
 class Stops(TypedDict):
-    """All stops: how many, how long together, how many misses they explain, and the last."""
+    """The stops: number, total duration, the number of misses they explain, and the last ones."""
 
     count: int
     total_ns: int
@@ -87,12 +87,12 @@ class CallbackCounts(TypedDict):
     """
     A callback, declared or not.
 
-    ``ready`` counts what became ready, ``ran`` executions (``failed``: they raised),
-    ``dropped`` what did not run (QoS depth, destroyed, aborted), ``skipped`` releases of a timer
-    that was too slow, ``unattributed`` messages of a declared callback whose job was not found.
-    ``interpreter_share`` is the part of its time in which it needs the interpreter, None: not
-    known yet. ``incompatible_qos`` is the policy for which a subscription gets nothing from a
-    publisher.
+    ``ready`` counts what became ready: messages, requests, releases of timers. ``ran`` counts
+    executions (``failed``: they raised an exception), ``dropped`` those that did not run (QoS
+    depth, destroyed, aborted), ``skipped`` releases of a timer that was too slow, ``unattributed``
+    messages of a declared callback whose job was not found. ``interpreter_share`` is the fraction
+    of its time in which it needs the interpreter, None: not known yet. ``incompatible_qos`` is the
+    policy because of which a subscription gets nothing from a publisher.
     """
 
     kind: str
@@ -111,14 +111,14 @@ class CallbackCounts(TypedDict):
 
 
 class Unattributed(TypedDict):
-    """Messages of declared callbacks that ran without a job: publication unknown, or doubtful."""
+    """Messages of declared callbacks that ran without a job: publication unknown, or ambiguous."""
 
     unknown: int
     doubtful: int
 
 
 class TraceState(TypedDict):
-    """The trace: its path, how many events were lost, and why recording ended early."""
+    """The trace: its path, the number of lost events, and why recording ended early."""
 
     path: str
     lost: int
@@ -129,11 +129,10 @@ class Statistics(TypedDict):
     """
     A snapshot of a run.
 
-    ``never_due`` lists sinks without a job that was due, ``never_ran`` declared callbacks that
-    have not run. ``unreported_misses`` counts misses that ``on_deadline_miss`` was not called
-    with, because it had not returned from earlier ones in time. ``undeclared`` counts
-    executions of undeclared callbacks; ``queue`` is what is ready and waits; ``lent`` counts
-    how often a callback that waits has lent its worker to others.
+    ``never_due`` lists sinks without a due job, ``never_ran`` declared callbacks that have not
+    run. ``unreported_misses`` counts misses that ``on_deadline_miss`` was too slow for.
+    ``undeclared`` counts executions of undeclared callbacks; ``queue`` counts ready executions
+    that wait; ``lent`` counts how often a waiting callback has lent its worker.
     """
 
     policy: str

@@ -1,17 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Tasks of the executor: futures that know whether somebody takes care of their exception.
+Tasks of the executor: futures that know whether their exception is handled.
 
 Theory of operation
 -------------------
-What a task raises comes out of spin, as with rclpy's executors, unless somebody else takes care of
-it: who awaits the task, or has asked for a callback at its end, before it fails (it is
-*observed*).
+The exception of a task comes out of the spin, as with rclpy's executors, unless it is handled: the
+task was awaited, or got a done callback, before it failed (it is *observed*).
 
-With several workers a task that a callback creates may have failed before that callback gets to
-its ``await``, or to ``result()``.  So such an exception is put by for as long as that callback is
-under way and somebody holds on to the task; who fetches it meanwhile takes care of it.
+With several workers a task may fail before the callback that created it reaches its ``await`` or
+``result()``.  So the exception of such a task is deferred while that callback runs and a reference
+to the task exists.  If the exception is fetched meanwhile, it is handled.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ from mddag_executor.executor.work import current, QuickCallback, TaskWork, Work
 from rclpy.task import Future
 
 LOOK_S = 0.05
-"""How often to check whether a callback still runs that has created a task which failed."""
+"""How often to check whether a callback still runs that has created a failed task."""
 
 
 class ObservedTask(BareTask):
     """
-    A task that knows whether somebody waits for it, and so takes care of its exception.
+    A task that knows whether it is observed, so that its exception is handled.
 
     :ivar maker: the execution whose callback has created it, or None.
-    :ivar put_by: gets its exception where nobody took care of that, once it was put by.
+    :ivar put_by: receives a deferred exception that was not handled.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -48,17 +47,17 @@ class ObservedTask(BareTask):
         super().__init__(*args, **kwargs)
 
     def __del__(self) -> None:
-        """Report an exception that was put by: nobody can take care of it any more."""
+        """Report a deferred exception: it cannot be handled any more."""
         if self.put_by is not None:
             self.give_out()
         super().__del__()  # type: ignore[no-untyped-call]
 
     def unclaimed(self) -> BaseException | None:
-        """Return its exception if nobody takes care of that."""
+        """Return the exception if it is not handled."""
         return None if self.observed else self.unfetched()
 
     def give_out(self) -> None:
-        """Report an exception that was put by, unless somebody has taken care of it."""
+        """Report a deferred exception, unless it has been handled."""
         report, self.put_by = self.put_by, None
         error = self.unclaimed()
         if error is not None and report is not None:
@@ -66,17 +65,17 @@ class ObservedTask(BareTask):
             report(error)
 
     def add_done_callback(self, callback: Callable[[Future], None]) -> None:
-        """Add a callback for when the task is done."""
+        """Add a callback for the end of the task."""
         self.observed = True
         super().add_done_callback(callback)  # type: ignore[no-untyped-call]
 
 
 class Unclaimed:
     """
-    The exceptions of tasks that nobody takes care of so far.
+    The exceptions of tasks that are not handled yet.
 
-    :param fail: gets those that nobody will take care of.
-    :param ring: called when there is something to ``look`` at.
+    :param fail: receives those that remain unhandled.
+    :param ring: called when there is a task to ``look`` at.
     """
 
     def __init__(
@@ -84,14 +83,14 @@ class Unclaimed:
     ) -> None:
         self._fail = fail
         self._ring = ring
-        # weakly, so that a task can go that nobody holds on to: it reports its exception then
+        # weak references, so that an unreferenced task is destroyed and reports its exception
         self._tasks: deque[weakref.ref[ObservedTask]] = deque()
 
     def ended(self, task: ObservedTask) -> None:
         """
         Note that a task has ended.
 
-        :raises BaseException: what it has raised, if nobody can take care of that.
+        :raises BaseException: its exception, if that cannot be handled.
         """
         error = task.unclaimed()
         if error is None:
@@ -100,13 +99,13 @@ class Unclaimed:
         if task.maker is None or task.maker.x < 0:
             task.mark_fetched()
             raise error
-        forget_task_frames(error)  # else the task holds on to itself
+        forget_task_frames(error)  # else the task refers to itself
         task.put_by = self._fail
         self._tasks.append(weakref.ref(task))
         self._ring()
 
     def rest_s(self) -> float | None:
-        """Return after how many seconds to ``look`` again; None: there is nothing to look at."""
+        """Return the seconds until the next ``look``; None: there are no tasks."""
         return LOOK_S if self._tasks else None
 
     def look(self) -> None:
@@ -130,7 +129,7 @@ def make_task(
     Make a task of a function, a coroutine function or a coroutine, and the work that runs it.
 
     :param resume: makes the work ready again; called when the task is cancelled.
-    :param unclaimed: where its exception goes if nobody takes care of that.
+    :param unclaimed: receives the task with its exception when it has ended.
     """
     coroutine = None
     if inspect.iscoroutinefunction(callback):

@@ -1,21 +1,21 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-When timers are due: a heap by due time behind the timerfd, instead of an rcl wait set.
+Due times of timers: a heap behind the timerfd, instead of an rcl wait set.
 
 Theory of operation
 -------------------
-1.  rcl keeps a timer's state (next call time, period, cancelled) and stays the authority: a timer
-    runs only if rcl says that it is due, and ``call_timer`` moves it on; rcl skips missed periods
-    and keeps the phase.  Kept here is only when to ask.
+1.  rcl has the authority over a timer's state (next call time, period, cancelled).  A timer runs
+    only if rcl reports it due, and ``call_timer`` advances it; rcl skips missed periods and keeps
+    the phase.  This module only stores when to ask.
 2.  *Nominal due time.*  rcl's next call time is exact, on the timer's clock.  The offset to the
-    monotonic clock is measured once for each timer and kept as long as it is right within
+    monotonic clock is measured once for each timer and kept while it is right within
     ``TOLERANCE_NS``, so due times are points of an exact grid.
-3.  *Changes.*  A timer that is due later than expected shows when it is asked.  One that is due
-    earlier (it was cancelled and is reset, or its period was shortened and it is reset) is
-    announced by rcl's listener for resets.
+3.  *Changes.*  A timer that is due later than expected is found when rcl is asked.  One that is
+    due earlier (reset after it was cancelled or its period was shortened) is announced by rcl's
+    listener for resets.
 4.  *Simulated time.*  A timer whose clock is overridden has no due time on the monotonic clock.
-    It is asked after each jump of its clock.
+    rcl is asked after each jump of its clock.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ ZERO_PERIOD_NS = 1_000_000
 """A timer without a period is always due; it runs this often."""
 
 Fired = tuple['TimerSource', Work, int, int]
-"""A timer that is due, its execution, nominal due time (monotonic ns), periods missed after it."""
+"""A due timer, its execution, nominal due time (monotonic ns), periods missed after it."""
 
 _now = time.monotonic_ns
 
@@ -82,13 +82,13 @@ class TimerSource:
         self.simulated = False
 
     def listen(self) -> None:
-        """Have rcl announce resets, and begin to ask when it is due."""
+        """Let rcl announce resets, and begin to ask when it is due."""
         with self.handle:
             set_listener('timer', self.handle.pointer, self.fd)
         self._queue.add(self)
 
     def ignore(self) -> bool:
-        """End what ``listen`` has begun; return False if the timer is just being destroyed."""
+        """End ``listen``; return False if the timer is just being destroyed."""
         self._queue.remove(self)
         try:
             with self.handle:
@@ -98,11 +98,11 @@ class TimerSource:
             return False
 
     def collect(self) -> None:
-        """Ask when it is due, as it was reset."""
+        """Ask rcl when it is due, as it was reset."""
         self._queue.look_at(self)
 
     def next_due(self) -> int | None:
-        """Return when rcl is to call it next, monotonic ns; None while it is cancelled."""
+        """Return the time of its next call by rcl, monotonic ns; None while it is cancelled."""
         at = self._next_call.read()
         if at is None:
             return None
@@ -114,16 +114,16 @@ class TimerSource:
         return at - self._offset
 
     def is_simulated(self) -> bool:
-        """Return whether the time of its clock is simulated now."""
+        """Return whether its clock shows simulated time now."""
         return self.may_be_simulated and bool(self._clock.ros_time_is_active)
 
     def is_due(self) -> bool:
-        """Return whether rcl says that it is due."""
+        """Return whether rcl reports it due."""
         until = self._until()
         return until is not None and until <= 0
 
     def call(self) -> Work | None:
-        """Have rcl move it on; return its execution, None if it has no callback."""
+        """Let rcl advance it; return its execution, None if it has no callback."""
         info = self._call()
         callback = self.timer.callback
         if callback is None:
@@ -137,13 +137,13 @@ class TimerSource:
 
 class TimerQueue:
     """
-    Timers by due time; all methods under one lock.
+    Timers by due time; all methods need one lock.
 
-    :param on_jump: called, from any thread, when the clock of a timer has jumped: ``fire`` is to
-        be called soon.
-    :param on_retimed: called when a timer has another period than before.
-    :param on_error: gets what rcl raises.
-    :ivar has_new: whether there are new due times since that was set to False.
+    :param on_jump: called, from any thread, when the clock of a timer has jumped: call ``fire``
+        soon.
+    :param on_retimed: called when the period of a timer has changed.
+    :param on_error: receives errors of rcl.
+    :ivar has_new: whether there are new due times since it was set to False.
     :ivar has_jumped: whether the clock of a timer has jumped since ``fire``.
     """
 
@@ -160,17 +160,17 @@ class TimerQueue:
         self._jumps: dict[int, tuple[Clock, JumpHandle]] = {}
         self.has_jumped = self.has_new = False
 
-    # --- which timers there are ------------------------------------------------------------------
+    # --- timers --- ------------------------------------------------------------------------------
 
     def add(self, source: TimerSource) -> None:
-        """Begin to ask for a timer."""
+        """Add a timer."""
         self._timers[id(source)] = source
         if source.may_be_simulated:
             self._watch(source.timer.clock)
         self.look_at(source)
 
     def remove(self, source: TimerSource) -> None:
-        """Ask for a timer no more."""
+        """Remove a timer."""
         self._timers.pop(id(source), None)
         source.entry = 0
         clock = source.timer.clock
@@ -179,7 +179,7 @@ class TimerQueue:
             self._watch_no_more(clock)
 
     def _watch(self, clock: Clock) -> None:
-        """Notice jumps of a clock.  A clock only borrows its jump callbacks, so this must end."""
+        """Watch a clock for jumps.  A clock only borrows its jump callbacks, so this must end."""
         if id(clock) not in self._jumps:
             threshold = JumpThreshold(
                 min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1),
@@ -211,19 +211,19 @@ class TimerQueue:
     # --- time ------------------------------------------------------------------------------------
 
     def next_due(self) -> int:
-        """Return when to ``fire`` next (monotonic ns), 0 for never."""
+        """Return when to ``fire`` next (monotonic ns); 0: never."""
         heap = self._heap
         while heap and heap[0][2].entry != heap[0][1]:
             heappop(heap)
         return heap[0][0] if heap else 0
 
     def next_due_of(self, wanted: Callable[[Entity], bool]) -> int:
-        """Return when to ``fire`` next for those timers that are wanted, 0 for never."""
+        """Return when to ``fire`` next for the wanted timers (monotonic ns); 0: never."""
         return min((due for due, entry, source in self._heap
                     if source.entry == entry and wanted(source.entity)), default=0)
 
     def look_at(self, source: TimerSource) -> None:
-        """Ask rcl when a timer is due: it is new, or was reset."""
+        """Ask rcl when a timer is due that is new or was reset."""
         try:
             with source.handle:
                 self._look_at(source)
@@ -248,12 +248,12 @@ class TimerQueue:
         source.due, source.entry = due, self._entries
         heappush(self._heap, (due, self._entries, source))
         self.has_new = True
-        if len(self._heap) > 2 * len(self._timers) + 8:  # timers that are reset again and again
+        if len(self._heap) > 2 * len(self._timers) + 8:  # after many resets
             self._heap = [each for each in self._heap if each[2].entry == each[1]]
             heapify(self._heap)
 
     def fire(self) -> Iterator[Fired]:
-        """Yield the timers that are due, each once, also those that come due meanwhile."""
+        """Yield the due timers, each once, including those that become due meanwhile."""
         if self.has_jumped:
             self.has_jumped = False
             for source in list(self._timers.values()):
@@ -276,8 +276,8 @@ class TimerQueue:
                 yield fired
 
     def _fire(self, source: TimerSource) -> Fired | None:
-        """Call a timer if rcl says that it is due, and push its next due time."""
-        if source.simulated:  # as of the last jump of its clock, which ``fire`` looks at first
+        """Call a timer if rcl reports it due, and push its next due time."""
+        if source.simulated:  # since the last jump of its clock, which ``fire`` checks first
             return self._fire_simulated(source)
         due, now = source.next_due(), _now()
         if due is None:
@@ -289,7 +289,7 @@ class TimerQueue:
         period = source.period()
         after: int | None = due + period
         if period <= 0 or due + period <= now or period != source.last_period:
-            after = source.next_due()  # rcl leaves out what was missed
+            after = source.next_due()  # rcl skips missed periods
         if period != source.last_period:
             source.last_period = period
             self._on_retimed()
@@ -306,15 +306,15 @@ class TimerQueue:
         if not source.is_due():
             return None
         work = source.call()
-        if source.is_due():  # several periods in one jump: rcl has skipped all but a last one
+        if source.is_due():  # several periods in one jump: rcl has skipped all but the last
             self._push(source, 0)
         return None if work is None else (source, work, _now(), 0)
 
     def _failed(self, source: TimerSource, error: Exception) -> None:
-        """Sort an exception of rcl out: the timer is gone or cancelled, or it is an error."""
+        """Classify an exception of rcl: the timer is destroyed or cancelled, or it is an error."""
         source.entry = 0
         try:
-            with source.handle:  # what is read of rcl's memory is there
+            with source.handle:  # keeps rcl's memory valid
                 is_cancelled = source.next_due() is None
         except InvalidHandle:
             self._timers.pop(id(source), None)

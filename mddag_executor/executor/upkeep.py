@@ -1,11 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Keeps registry, sources and trace up to date with what the nodes have.
+Keeps registry, sources and trace up to date with the nodes' entities.
 
-Nodes notify the executor that something has changed (``Executor.wake``), not what.  So everything
-is brought up to date at once, by the thread that spins; if entities are made in a row, not again
-for each of them.
+Nodes notify the executor that their entities have changed (``Executor.wake``), but not how.  So
+the spinning thread refreshes everything at once; when many entities are made in a row, not for
+each of them.
 """
 
 from __future__ import annotations
@@ -44,18 +44,18 @@ from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 
 REFRESH_REST = 3
-"""After a refresh, rest for so many times what it took."""
+"""The pause after a refresh, as a multiple of its duration."""
 
 AnySource = SubscriptionSource | ServiceSource | ClientSource | TimerSource
 
 
 class Upkeep:
     """
-    What the executor's nodes have, as sources.
+    The entities of the executor's nodes, as sources.
 
     :param nodes: returns the nodes.
-    :param executor: in which futures run their callbacks.
-    :ivar changed: whether there may be something new (see ``change``).
+    :param executor: runs the callbacks of futures.
+    :ivar changed: whether there may be new or removed entities (see ``change``).
     """
 
     def __init__(
@@ -80,35 +80,35 @@ class Upkeep:
         self._deliveries: dict[str, LocalDelivery] = {}
         self._events: WaitableSource | None = None
         self._unlistened: list[Entity] = []
-        # whose listeners were cleared though they may be back at the next refresh
+        # entities without listener which the next refresh may find again
         self._silent: list[Entity] = []
 
     def change(self) -> None:
-        """Take note that entities may have come or gone."""
+        """Note that entities may have been created or destroyed."""
         self.changed = True
         self._pool.is_current = False
 
     def rest_s(self) -> float | None:
-        """Return after how many seconds to ``refresh``; None: nothing has changed."""
+        """Return the seconds until the next ``refresh``; None: nothing has changed."""
         return max(0.0, self._refresh_at - time.monotonic()) if self.changed else None
 
     def refresh(self) -> None:
-        """Bring all up to date if anything may have changed."""
+        """Update everything if anything may have changed."""
         with self._lock:
             if not self.changed:
                 return
             start = time.monotonic()
             self.changed = False
             self._refresh()
-            self._pool.is_current = not self.changed  # meanwhile
+            self._pool.is_current = not self.changed  # it may have changed meanwhile
             end = time.monotonic()
             self._refresh_at = end + REFRESH_REST * (end - start)
 
     def stop_listening(self) -> None:
         """
-        Clear the listeners of what the nodes do not have any more; an entity has only one.
+        Clear the listeners of removed entities; an entity has only one.
 
-        The rest is left to the next ``refresh``.
+        The rest is done by the next ``refresh``.
         """
         with self._lock:
             present = {id(entity) for lists in snapshot(self._nodes()).values()
@@ -152,7 +152,7 @@ class Upkeep:
     # --- sources ---------------------------------------------------------------------------------
 
     def _listen(self, entity: Entity) -> None:
-        """Make the source of an entity; the caller has the engine's lock."""
+        """Make the source of an entity; the caller holds the engine's lock."""
         pool, loop, inbox = self._pool, self._pool.loop, self._pool.inbox
         source: AnySource
         if entity.kind == TIMER:
@@ -194,14 +194,14 @@ class Upkeep:
             entity.classify = lambda: pool.muting.classify(source)
 
     def _deliver(self, topic: str, sources: tuple[SubscriptionSource, ...]) -> None:
-        """Have publishing threads of this process take for these subscriptions of a topic."""
+        """Let publishing threads of this process collect for these subscriptions of a topic."""
         new = LocalDelivery(sources, self._pool) if sources else None
         publishing.replace_delivery(topic, self._deliveries.pop(topic, None), new)
         if new is not None:
             self._deliveries[topic] = new
 
     def _forget(self, entity: Entity) -> None:
-        """Let go of the source of an entity; the caller has the engine's lock."""
+        """Remove the source of an entity; the caller holds the engine's lock."""
         source = self._sources.pop(entity, None)
         delivery = self._deliveries.get(entity.label)
         if delivery is not None and source in delivery.sources:
@@ -218,7 +218,7 @@ class Upkeep:
                 loop.remove(source)
 
     def handled_waitables(self) -> int:
-        """Return how many executions of actions and a user's waitables have been made ready."""
+        """Return how many executions of actions and user-defined waitables became ready."""
         if not self._has_waitables:
             return 0
         return sum(
@@ -228,7 +228,7 @@ class Upkeep:
     # --- waitables -------------------------------------------------------------------------------
 
     def _refresh_waitables(self, added: list[Entity], gone: list[Entity]) -> None:
-        """Make and forget what asks code of others, without the engine's lock."""
+        """Make and remove sources that call foreign code, without the engine's lock."""
         if not any(each.kind in (WAITABLE, GUARD) for each in (*added, *gone)):
             return
         for entity in gone:
@@ -298,7 +298,7 @@ class Upkeep:
             self._pool.loop.remove(source)
 
     def clear(self) -> None:
-        """Let go of everything, at the end."""
+        """Remove everything, at the end."""
         with self._lock:
             with self._pool.lock:
                 for entity in list(self._sources):

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What is done with the core's decisions: counted, reported to the user, written to the trace."""
+"""The core's decisions: counted, reported to the user, written to the trace."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class DeadlineMiss:
     """
     A sink that missed its deadline; times in ns since the epoch.
 
-    ``kind`` is ``overdue`` if it had not completed at its deadline: that is reported then,
-    whatever comes of it later.  It is ``late`` if the executor learnt of the completion first, at
-    the time ``completed_ns`` (else None).  Before the deadline it is ``expired``, ``aborted``, or
-    ``failed`` (a callback of the job raised) if the job can no longer complete, or ``dropped``
-    for a newer job (``keep: newest``).
+    ``kind`` is ``overdue`` if it had not completed at its deadline, which is reported at once.  It
+    is ``late`` if the executor learnt of the completion first, at the time ``completed_ns`` (else
+    None).  A miss that is certain before the deadline is ``expired``, ``aborted`` or ``failed`` (a
+    callback of the job raised) if the job can no longer complete, or ``dropped`` for a newer job
+    (``keep: newest``).
     """
 
     dag: str
@@ -56,7 +56,7 @@ class DeadlineMiss:
 
 
 class Record(Protocol):
-    """Where trace events go (see ``mddag_executor.trace.TraceWriter.record``)."""
+    """Writes trace events (see ``mddag_executor.trace.TraceWriter.record``)."""
 
     def __call__(self, event: str, timestamp: int, vtid: int, /, *fields: Any) -> None:
         """Record one event."""
@@ -66,8 +66,8 @@ class Verdicts:
     """
     The run's counts, misses and mddag trace events.
 
-    :param record: where trace events go; None records nothing.
-    :param on_miss: gets every miss under the engine's lock, so it must not wait.
+    :param record: receives trace events; None: they are not recorded.
+    :param on_miss: receives every miss under the engine's lock, so it must not wait.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Verdicts:
         self._aborted: dict[tuple[int, int], None] = {}
 
     def add(self, decisions: list[Decision], now: int) -> list[int]:
-        """Count decisions of a core; return the executions that it dropped."""
+        """Count decisions of the core; return the executions that it dropped."""
         dropped = []
         for kind, dag, vertex, job, deadline, time in decisions:
             if kind == DROP:
@@ -101,7 +101,7 @@ class Verdicts:
                 self._report(kind, dag, vertex, job, deadline, None)
             elif kind not in (SINK_IN_TIME, SINK_DEMOTED):
                 self._missed(kind, dag, vertex, job, deadline, time, now)
-        self.tally.add(decisions)  # last: it knows what was overdue before
+        self.tally.add(decisions)  # last: it knows which sinks were overdue before
         return dropped
 
     def _ended(self, dag: int, job: int, end: int, now: int) -> None:
@@ -125,7 +125,7 @@ class Verdicts:
                 'deadline', now, threading.get_native_id(), dag,
                 self._tables.index_in_dag[vertex], job, deadline, time)
         completed = time if kind == SINK_LATE else None
-        # what failed is its callback's doing
+        # a failure is caused by its callback
         if kind != SINK_FAILED:
             release = deadline - self._tables.sink_deadline[vertex]
             self.in_stops[dag] += self.stops.missed(release, deadline, time, dag)
@@ -144,7 +144,7 @@ class Verdicts:
                 VERDICTS[kind]))
 
     def last_missed(self) -> tuple[str, str, int, int]:
-        """Return DAG, sink, job and relative deadline of the last miss; there has been one."""
+        """Return DAG, sink, job and relative deadline of the last miss; there must be one."""
         vertex, job = self._last_missed
         return (self._dags[self._tables.dag_of[vertex]].name, self.tally.vertex_name(vertex), job,
                 self._tables.sink_deadline[vertex])
@@ -159,7 +159,7 @@ class Verdicts:
             self.record('job_release', now, threading.get_native_id(), dag, job, release)
 
     def stopped(self, begin: int, end: int) -> None:
-        """Note that no thread of the process ran for a while, which has just ended."""
+        """Note a time in which no thread of the process ran, which has just ended."""
         for dag in self.stops.stopped(begin, end) if end - begin >= LEAST_NS else ():
             self.in_stops[dag] += 1
         if self.record is not None:

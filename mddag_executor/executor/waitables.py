@@ -1,21 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Waitables: actions, QoS events, and those of a user's own; and guard conditions.
+Waitables (actions, QoS events, and user-defined ones), and guard conditions.
 
 Theory of operation
 -------------------
-1.  A waitable consists of rcl entities, which a wait set shows when the waitable has been added to
-    it.  Each of these gets the listener of its kind, so a waitable is a source like others
-    (``WaitableSource``).  When something has arrived, the waitable is asked with a wait set of its
-    own that does not wait.  The QoS events of all nodes share one such source, as hardly ever
-    anything happens to them.  To set the listener of an event marks what happened before as known,
-    so a wait set does not show it any more: all events are taken, and those whose counts are what
-    they were are dropped.
-2.  A timer within a waitable (the expiry of an action's goals) is asked for when it is due next.
-3.  rcl has no listener for guard conditions.  For these, for a user's waitables that consist of
-    any, and for rclpy's condition that a signal triggers, one thread waits in a wait set
-    (``WaitSetThread``).
+1.  A waitable consists of rcl entities, which a wait set contains after the waitable has been
+    added to it.  Each entity gets the listener of its kind, so a waitable is a source like others
+    (``WaitableSource``).  After an arrival the waitable is asked with its own wait set, which does
+    not wait.  The QoS events of all nodes share one such source, as they are rare.  Setting the
+    listener of an event marks earlier events as known, so a wait set does not report them any
+    more.  Therefore all events are taken, and those with unchanged counts are dropped.
+2.  A timer within a waitable (the expiry of an action's goals) is checked when it is due next.
+3.  rcl has no listener for guard conditions.  One thread waits in a wait set (``WaitSetThread``)
+    for these, for user-defined waitables that contain any, and for rclpy's signal condition.
 """
 
 from __future__ import annotations
@@ -41,20 +39,20 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.waitable import Waitable
 
 SENDER_CHECKS, SENDER_CHECK_NS = 500, 1_000_000
-"""How often and after what time a response is posted whose request is not noted yet (7.1.5)."""
+"""How often and at what interval to post a response whose request is not noted yet (7.1.5)."""
 POLL_CHECKS, POLL_CHECK_S = 5, 0.1
-"""How often and how long ``WaitSetThread.poll`` waits if what it waits for is being destroyed."""
+"""How often and how long ``WaitSetThread.poll`` waits if an entity is being destroyed."""
 
 Post = Callable[[list[Work]], None]
-"""Makes executions ready; not to be called under the engine's lock."""
+"""Makes executions ready; must be called without the engine's lock."""
 
 
 def executions_of(entity: Entity, executor: Any) -> list[Work]:
     """
-    Take what a waitable has ready; return the executions that handle it.
+    Take the ready data of a waitable; return the executions that handle them.
 
     An action client forgets the callback of a goal's feedback when the goal's result has come.  So
-    each feedback is an execution of its own, with the callback that it is for.
+    each feedback is a separate execution, with its callback.
     """
     waitable = entity.rclpy
     data = waitable.take_data()
@@ -68,12 +66,12 @@ def executions_of(entity: Entity, executor: Any) -> list[Work]:
 
 class WaitableSource:
     """
-    Some waitables that share a descriptor.
+    Waitables that share a descriptor.
 
     :param entities: those of the waitables.
-    :param post: gets their executions.
-    :param at: has ``collect`` called at a time (monotonic ns).
-    :raises ListenerError: when they consist of something that has no listener.
+    :param post: receives their executions.
+    :param at: lets ``collect`` be called at a time (monotonic ns).
+    :raises ListenerError: when they contain an entity that has no listener.
     :raises InvalidHandle: when one of them has been destroyed.
     """
 
@@ -94,7 +92,7 @@ class WaitableSource:
         self._has_parts = False
         self._set.parts(self._add_part)
         if not self._has_parts:
-            raise ListenerError('nothing has no listener')  # it is ready when something else is
+            raise ListenerError('nothing has no listener')  # it is ready when another one is
         self._lock = threading.Lock()
         self._has_more = False
         self._ignored = False
@@ -108,28 +106,28 @@ class WaitableSource:
 
     def listen(self) -> None:
         """
-        Have the middleware announce what arrives.
+        Let the middleware announce arrivals.
 
         :raises ListenerError: when it cannot.
         :raises InvalidHandle: when one of them has been destroyed.
         """
-        with self._lock:  # what is announced meanwhile must not fill the wait set, too
+        with self._lock:  # announcements meanwhile must not fill the wait set, too
             self._set.parts(lambda kind, address: set_listener(kind, address, self.fd))
         if self._has_more:
             self.collect()
 
     def ignore(self) -> bool:
-        """End what ``listen`` has begun, and wait until nobody collects from it."""
+        """End ``listen``, and wait until no thread collects from it."""
         self._ignored = True
         with self._lock:
             try:
                 self._set.parts(clear_listener)
             except InvalidHandle:
-                pass  # those destroyed write no more
+                pass  # destroyed ones write no more
         return True
 
     def collect(self) -> None:
-        """Take what is there; not to be called under the engine's lock."""
+        """Collect arrivals; must be called without the engine's lock."""
         self._has_more = True
         while self._has_more and not self._ignored and self._lock.acquire(blocking=False):
             try:
@@ -153,7 +151,7 @@ class WaitableSource:
             self._set.wait(0, take)
             if len(found) == before:
                 break
-        else:  # there may be more, after the others have had their turn
+        else:  # there may be more, after the other sources
             self._at(time.monotonic_ns(), self.collect)
         if found:
             self._post_noted(found)
@@ -164,7 +162,7 @@ class WaitableSource:
                 self._at(time.monotonic_ns() + until, self.collect)
 
     def _post_noted(self, found: list[Work], checks: int = 0) -> None:
-        """Post executions; a response only when the thread that sent the request has noted it."""
+        """Post executions; a response only after the sending thread has noted the request."""
         early = [] if checks >= SENDER_CHECKS else [
             work for work in found if compat.sender_is_behind(work.entity.rclpy, work.args[0])]
         if len(early) < len(found):
@@ -175,14 +173,14 @@ class WaitableSource:
 
 
 _known: weakref.WeakKeyDictionary[Entity, list[int]] = weakref.WeakKeyDictionary()
-"""The counts of each QoS event when it was taken last."""
+"""The counts of each QoS event at the last take."""
 
 
 class EventsSource(WaitableSource):
     """
-    Some QoS events (rclpy's ``EventHandler``) that share a descriptor.
+    QoS events (rclpy's ``EventHandler``) that share a descriptor.
 
-    :ivar note: called with each event that has happened, and its status.
+    :ivar note: called with each event and its status.
     """
 
     note: Callable[[Any, Any], None]
@@ -209,10 +207,10 @@ class EventsSource(WaitableSource):
 
 class WaitSetThread:
     """
-    A thread that waits for what has no listener.
+    A thread that waits for entities without a listener.
 
-    :param post: gets the executions.
-    :param on_signal: called when rclpy's condition for signals is triggered.
+    :param post: receives the executions.
+    :param on_signal: called when rclpy's signal condition is triggered.
     """
 
     def __init__(
@@ -239,7 +237,7 @@ class WaitSetThread:
         """
         Set the guard conditions and waitables to wait for.
 
-        Returns when nothing is taken any more of those that it waited for before.
+        Returns when no data of the earlier ones are being taken any more.
         """
         if entities == self._entities:
             return
@@ -252,7 +250,7 @@ class WaitSetThread:
                 pass
 
     def poll(self) -> None:
-        """Have posted what is ready by now, for a thread that steps; not for several at once."""
+        """Post ready executions, for a stepping thread; not for several at the same time."""
         thread = self._thread
         if self._entities and thread is not None:
             self._has_answered.clear()
@@ -265,14 +263,14 @@ class WaitSetThread:
                 self._has_answered.clear()
 
     def wake(self) -> None:
-        """End the present wait."""
+        """End the current wait."""
         try:
             self._guard.trigger()
         except InvalidHandle:
             pass
 
     def start(self) -> None:
-        """Begin to wait; nothing happens when it has begun before."""
+        """Begin to wait; further calls do nothing."""
         if self._thread is None or not self._thread.is_alive() and not self._ending:
             stop_at_exit(self)
             self._changed = True
@@ -294,7 +292,7 @@ class WaitSetThread:
             try:
                 if self._changed or waiting is None:
                     self._changed = False
-                    waiting = None  # lets go of those before
+                    waiting = None  # releases the earlier ones
                     by_id = {id(each.rclpy): each for each in self._entities}
                     waiting = self._build(self._entities)
                     self._applied.set()
@@ -308,7 +306,7 @@ class WaitSetThread:
                     break
                 if not isinstance(error, InvalidHandle):
                     self._fail(error)
-                time.sleep(0.001)  # something is being destroyed; no busy loop if it stays
+                time.sleep(0.001)  # an entity is being destroyed; avoids a busy loop if it stays
         self._applied.set()
         self._on_signal()
 

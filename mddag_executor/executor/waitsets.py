@@ -3,7 +3,7 @@
 """
 An rcl wait set that is made once, and filled again for each wait.
 
-Used of ``_rclpy.WaitSet``: the constructor with the number of each kind, ``pointer``,
+Uses of ``_rclpy.WaitSet``: the constructor with the number of each kind, ``pointer``,
 ``clear_entities``, ``add_guard_condition``, ``wait`` and ``get_ready_entities``; of handles:
 ``pointer``.  Seen in 7.1 and 9.1.  ``rcl_wait_set_t`` is public (``rcl/wait.h``).
 """
@@ -25,7 +25,7 @@ _KINDS = ('subscription', 'guard_condition', 'timer', 'client', 'service', 'even
 
 
 class _RclWaitSet(ctypes.Structure):
-    """The public fields of ``rcl_wait_set_t``: for each kind an array of pointers, its size."""
+    """The public fields of ``rcl_wait_set_t``: for each kind an array of pointers and its size."""
 
     _fields_ = [
         field for kind in _KINDS
@@ -36,7 +36,7 @@ class FilledSet:
     """
     A wait set over waitables and guard conditions.
 
-    They are held while it waits, so that they are not destroyed.
+    Their handles are entered during a wait, so that they are not destroyed.
 
     :raises InvalidHandle: when one of them has been destroyed.
     """
@@ -64,15 +64,15 @@ class FilledSet:
 
     def held(self) -> AbstractContextManager[None]:
         """
-        Keep all of it from being destroyed while entered.
+        Protect all of them from being destroyed while entered.
 
-        :raises InvalidHandle: when one of all has been destroyed.
+        :raises InvalidHandle: when one of them has been destroyed.
         """
         return _Held(self._held)
 
     def parts(self, call: Callable[[str, int], None]) -> None:
         """
-        Call a function with kind and address of each rcl entity that the waitables consist of.
+        Call a function with kind and address of each rcl entity in the waitables.
 
         Kinds are ``subscription``, ``guard_condition``, ``timer``, ``client``, ``service``,
         ``event``.
@@ -99,16 +99,16 @@ class FilledSet:
         self, timeout_ns: int | None, take: Callable[[Waitable], None],
     ) -> list[GuardCondition]:
         """
-        Wait until something is ready, or for a time (negative: for ever).
+        Wait until an entity is ready, or for a time (negative: for ever).
 
-        With None it does not wait, and everything counts as ready.
+        With None it does not wait, and all entities count as ready.
 
-        A waitable keeps in itself what ``is_ready`` has found, for ``take_data``; so the one is
-        called right after the other.
+        A waitable stores the findings of ``is_ready`` for ``take_data``, so these are called one
+        right after the other.
 
         :param take: called with each waitable that is ready.
         :return: the guard conditions that were triggered.
-        :raises InvalidHandle: when one of all has been destroyed.
+        :raises InvalidHandle: when one of them has been destroyed.
         """
         with _Held(self._held):
             self._fill()
@@ -122,7 +122,7 @@ class FilledSet:
 
 
 class _Held(AbstractContextManager[None]):
-    """Keeps several handles from being destroyed while it is entered."""
+    """Protects several handles from being destroyed while entered."""
 
     def __init__(self, handles: Iterable[Any]) -> None:
         self._handles = handles

@@ -17,7 +17,7 @@ from rclpy.exceptions import InvalidHandle
 
 
 class RunningThread(Protocol):
-    """A thread in which a callback runs, as far as rclpy's wrapped methods need it."""
+    """A thread in which a callback runs, as used by rclpy's wrapped methods."""
 
     work: Work | None
     engine: Any
@@ -28,14 +28,14 @@ class RunningThread(Protocol):
         """Note that the callback publishes."""
 
     def is_brief(self) -> bool:
-        """Return whether a callback runs in it that probably ends soon."""
+        """Return whether it runs a callback that will probably end soon."""
 
     def lend(self) -> AbstractContextManager[None]:
         """Lend its worker while entered: the callback waits."""
 
     @property
     def job(self) -> tuple[str, int, int] | None:
-        """Return DAG, index and release of the job whose callback runs; None for no job."""
+        """Return DAG, index and release of the job whose callback runs; None: no job."""
 
 
 class _Current(threading.local):
@@ -43,14 +43,14 @@ class _Current(threading.local):
 
 
 current = _Current()
-"""Of the calling thread: ``running``, the thread's own object while a callback runs in it."""
+"""Of the calling thread: ``running``, its ``RunningThread`` while a callback runs in it."""
 
 
 class QuickCallback:
     """
     A future's done callback that takes no time, and never fails.
 
-    A future hands its callbacks to its executor as tasks; this one is called at once instead.
+    A future passes its callbacks to its executor as tasks; this one is called at once instead.
     """
 
     __slots__ = ('_function',)
@@ -67,23 +67,23 @@ class Destroyed(Exception):
     """
     The entity was destroyed after its execution had become ready: it must not run.
 
-    Or it is a timer that was cancelled.
+    Also raised for a timer that was cancelled.
     """
 
 
 class Work:
     """
-    One execution of a callback: what to call, for which job, and where it is.
+    One execution of a callback: its function, job, and state.
 
-    :ivar entity: what the executor keeps for the timer, subscription, service, …
-    :ivar function: what is to be called for it, with ``args``.
-    :ivar then: what is to be called with its result, or None: a service's response is sent so.
+    :ivar entity: the executor's record of the timer, subscription, service, …
+    :ivar function: the function to call for it, with ``args``.
+    :ivar then: called with its result, or None: sends a service's response.
     :ivar x: the execution in the core; -1 before it is ready and after it has ended.
-    :ivar origin: the vertex and job that it executes; None if no DAG declares it.
-    :ivar worker: the worker that runs it, or has run it last.
+    :ivar origin: its vertex and job; None if it is undeclared.
+    :ivar worker: its current or last worker.
     :ivar must_check: whether the entity may be destroyed, or its timer cancelled, by now.
     :ivar ready_ns: when it became ready, on the trace's clock.
-    :ivar cpu_ns: how long it has computed.
+    :ivar cpu_ns: its CPU time.
     :ivar yields: how many times in a row its coroutine has yielded without awaiting a future.
     """
 
@@ -107,10 +107,10 @@ class Work:
 
     def step(self) -> Any:
         """
-        Run, or go on running; return None when it has finished, else what it waits for.
+        Run, or continue; return None when it has finished, else what it waits for.
 
-        :raises Destroyed: where it must not run any more.
-        :raises BaseException: whatever the callback raises.
+        :raises Destroyed: if it must not run any more.
+        :raises BaseException: the exception of the callback.
         """
         if self.coroutine is None:
             if self.must_check:
@@ -135,7 +135,7 @@ class Work:
             return
         try:
             with entity.handle:
-                # One more may have become due before it was cancelled in its callback.
+                # It may have become due once more before its callback cancelled it.
                 if entity.kind == TIMER and entity.rclpy.is_canceled():
                     raise Destroyed
         except InvalidHandle:
@@ -157,7 +157,7 @@ class TaskWork(Work):
         task.waits_for = None
         task()
         if task.done() or task.cancelled():
-            self.function = _nothing  # whoever else holds on to the task does so: see ``tasks``
+            self.function = _nothing  # other references to the task may remain: see ``tasks``
             if self.then is not None:
                 self.then(task)
             del task
