@@ -1,17 +1,17 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A part of a recording, by time.
+Cuts a time range out of a recording.
 
 Theory of operation
 -------------------
-1. The jobs that were released within the range are judged, the first time included and the last
-   one not.  They keep all that belongs to them, also what happened after the range, so each has
-   the verdict and the response times that it has in the whole recording.
-2. The part ends when the last of these jobs was done or given up, but not before the range does.
-   What ran until then is kept as well, as far as it ended within the part: it may be why a job
-   was late.  Other jobs of which something is kept are not judged.
-3. Rows are whole.  An execution that had begun before the range and ended in it is in the part.
+1. Judged are the jobs that were released in the range, begin included, end excluded.  They keep
+   all their rows, also later ones, so their verdicts and response times equal those in the whole
+   recording.
+2. The part ends when the last of these jobs ended, but not before the end of the range.  Other
+   executions that ended within the part are kept, too, because they may have delayed a job; their
+   jobs are not judged.
+3. Rows are not cut.  An execution that began before the range and ended in it is in the part.
 4. Times stay on the clock of the recording; ``start`` becomes the begin of the range.
 """
 
@@ -33,15 +33,15 @@ import numpy as np
 
 def cut(recording: Recording, begin: int, end: int) -> Recording:
     """
-    Return what happened in a range of time.
+    Return a time range of a recording.
 
-    :param begin: of the range, ns after the start of the recording; ``end``: likewise.
-    :raises ValueError: when the range is empty or begins before the recording.
-    :raises mddag_executor.replay.ReplayError: when it begins after the recording.
+    :param begin: begin of the range, ns after the start of the recording; ``end``: likewise.
+    :raises ValueError: if the range is empty or begins before the recording.
+    :raises mddag_executor.replay.ReplayError: if it begins after the recording.
     """
     if not 0 <= begin < end:
         raise ValueError(f'from {begin} to {end} ns is no range of time')
-    if recording.start is None:     # nothing happened
+    if recording.start is None:     # empty recording
         return recording
     length = recording.end - recording.start
     if begin > length:
@@ -58,7 +58,7 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
     until = max(
         min(end, recording.end), *(int(times.max(initial=begin)) for times in (
             table['end'][own], ends['time'][judged[jobs.of(ends)]])))
-    last = max(until, end)      # what no DAG declares may run after the end of the recording
+    last = max(until, end)      # undeclared callbacks may run after the end of the recording
 
     begun = np.where(table['ready'] >= 0, table['ready'], table['start'])
     begun = np.where(begun >= 0, begun, table['end'])
@@ -93,7 +93,7 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
 
 
 def _withdrawn(recording: Recording, jobs: JobNumbers, judged: Mask) -> dict[int, int]:
-    """Return by DAG how many of the judged jobs were withdrawn."""
+    """Return by DAG the number of judged jobs that were withdrawn."""
     ends = recording.job_ends
     mine = ends[(ends['reason'] == WITHDRAWN) & judged[jobs.of(ends)]]
     dags, counts = np.unique(mine['dag'], return_counts=True)

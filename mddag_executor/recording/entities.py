@@ -1,28 +1,26 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Who is who in a recording: nodes, publishers, callbacks and their groups, by address.
+Identifies nodes, publishers, callbacks and callback groups of a recording by their addresses.
 
 Theory of operation
 -------------------
-The events of the initialisation say which address is what.
-
-1. Addresses belong to a process, and one may be used again after what it named is gone.  As CARET
-   does it: an event at run time means what was registered last under the address before it (or,
-   where nothing was, the first after it); an event of the initialisation that refers to another
-   one means what was registered under the address nearest in time, and of the same kind.
-2. CARET repeats what was initialised before the recording began, as `ros2_caret:<event>` with the
+1. Addresses belong to a process and may be reused.  An event at run time means the last object
+   registered under the address before it or, if there is none, the first one after it.  An event
+   of the initialisation means the object of the right kind that was registered under the address
+   at the nearest time.  CARET uses the same rules.
+2. CARET repeats initialisation events from before the recording as `ros2_caret:<event>`, with the
    original time on the monotonic clock (`init_timestamp`); `caret_init` has the offset to the
-   recording's clock.  They stand for the `ros2:` events, wherever they are in the file; what is
-   there twice counts once.
-3. A subscription's callback is the one that was added to the rclcpp subscription of its handle;
-   for communication within a process rclcpp adds a second one.  Both are the same callback here.
-4. A callback is described by its node and what starts it: timer and period, subscription and
-   topic, service and its name.  Several in one node that look the same are distinguished by the
-   order in which they were made.
-5. In an imported recording these events may be anywhere, so all of them are read first
-   (``read``), and callbacks are numbered.  This executor records them before it refers to them:
-   there they are taken one by one (``take``), and a callback's number is its address.
+   recording's clock.  They are treated as `ros2:` events, wherever they are in the file;
+   duplicates count once.
+3. The callback of a subscription is the one added to the rclcpp subscription of its handle.  For
+   communication within a process rclcpp adds a second one; both are one callback here.
+4. A callback is described by its node and its trigger: timer and period, subscription and topic,
+   service and name.  Callbacks of a node with the same description are numbered in the order of
+   creation.
+5. In an imported recording initialisation events may be anywhere, so they are all read first
+   (``read``), and callbacks are numbered.  This executor records them before it refers to them, so
+   they are processed one by one (``take``), and a callback's number is its address.
 """
 
 from __future__ import annotations
@@ -49,7 +47,7 @@ _GROUPS = (
     'callback_group_to_executor_entity_collector',
     *(f'callback_group_add_{kind}' for kind in KINDS))
 _CARET_INIT = 'ros2_caret:caret_init'
-#: Full names of the events that say who is who, as this executor records them; and all of them.
+#: Full names of the initialisation events that this executor records, and of all of them.
 OWN_INIT_EVENTS = frozenset([
     *(f'ros2:{name}' for name in _INIT), *(f'ros2_caret:{name}' for name in _GROUPS)])
 INIT_EVENTS = OWN_INIT_EVENTS | {
@@ -70,7 +68,7 @@ class Node(NamedTuple):
 
 
 class Publisher(NamedTuple):
-    """A publisher; `node` is None where its node is not in the recording."""
+    """A publisher; `node` is None if its node is not recorded."""
 
     number: int
     node: Node | None
@@ -81,15 +79,15 @@ class Callback:
     """
     A timer, subscription or service of a recording, with its callback.
 
-    :ivar number: identifies the callback; 0: it has none that is recorded.
+    :ivar number: identifies the callback; 0: no callback is recorded.
     :ivar kind: ``timer``, ``subscription``, ``service`` or ``unknown``.
-    :ivar start: topic or name of the service; empty for the others.
-    :ivar period: of its timer, ns; 0 for the others.
-    :ivar made: when its timer, subscription or service was made, ns.
-    :ivar grid: from when on its timer's periods count, ns; None where that is not recorded.
-    :ivar group: number of its mutually exclusive group; -1 for another one, None: not known.
-    :ivar symbol: of its function; empty where that is not recorded.
-    :ivar address: process and address of its callback, of several the last one.
+    :ivar start: topic or name of the service; empty for timers.
+    :ivar period: of its timer, ns; 0 for others.
+    :ivar made: when its timer, subscription or service was created, ns.
+    :ivar grid: origin of its timer's periods, ns; None: not recorded.
+    :ivar group: number of its mutually exclusive group; -1: reentrant, None: unknown.
+    :ivar symbol: of its function; empty if not recorded.
+    :ivar address: process and address of its callback; of several the last one.
     """
 
     __slots__ = ('number', 'node', 'kind', 'start', 'period', 'made', 'grid', 'group', 'symbol',
@@ -112,12 +110,12 @@ class Callback:
 
     @property
     def node_name(self) -> str:
-        """Return the name of its node, empty where that is not known."""
+        """Return the name of its node; empty if not recorded."""
         return '' if self.node is None else self.node.name
 
     @property
     def description(self) -> str:
-        """Return its node and what starts it."""
+        """Return its node and trigger."""
         node = self.node_name or 'a node that is not recorded'
         if self.kind == 'timer':
             return f'{node} timer {format_duration(self.period)}'
@@ -125,27 +123,27 @@ class Callback:
 
     @property
     def entity(self) -> Entity | None:
-        """Return what a declaration may bind to it; None: nothing, as its node is not known."""
+        """Return the entity that a declaration may bind to it; None if its node is unknown."""
         return None if self.node is None else Entity(
             self.node.name, self.kind, self.start, self.period or None)
 
 
 class Addresses(Generic[_T]):
-    """What is under the addresses of all processes, over time (rule 1)."""
+    """Objects by process, address and time (rule 1)."""
 
     def __init__(self) -> None:
         self._times: dict[Address, list[int]] = {}
         self._things: dict[Address, list[_T]] = {}
 
     def add(self, pid: int, address: int, time: int, thing: _T) -> None:
-        """Register a thing; times may come in any order."""
+        """Register an object; times may come in any order."""
         times = self._times.setdefault((pid, address), [])
         place = bisect_right(times, time)
         times.insert(place, time)
         self._things.setdefault((pid, address), []).insert(place, thing)
 
     def latest(self, pid: int, address: int, time: int) -> _T | None:
-        """Return what an event at run time means."""
+        """Return the object that an event at run time means."""
         things = self._things.get((pid, address))
         if things is None:
             return None
@@ -154,7 +152,7 @@ class Addresses(Generic[_T]):
         return things[max(0, bisect_right(self._times[(pid, address)], time) - 1)]
 
     def nearest(self, pid: int, address: int, time: int) -> _T | None:
-        """Return what an event of the initialisation refers to."""
+        """Return the object that an event of the initialisation refers to."""
         things = self._things.get((pid, address))
         if things is None:
             return None
@@ -165,7 +163,7 @@ class Addresses(Generic[_T]):
 
 class Entities:
     """
-    Who is who.
+    The nodes, publishers, callbacks and groups of a recording.
 
     :param by_address: whether callbacks and publishers are numbered by their addresses.
     :ivar every: the callbacks; ``made``: all timers, subscriptions and services.
@@ -176,40 +174,40 @@ class Entities:
         self.nodes: Addresses[Node] = Addresses()
         self.publishers: Addresses[Publisher] = Addresses()
         self.callbacks: Addresses[Callback] = Addresses()
-        #: By the handle that `rmw_take` names: the subscription's callbacks.
+        #: By the handle in `rmw_take`: the subscription's callbacks.
         self.taken: Addresses[list[Callback]] = Addresses()
         self.every: list[Callback] = []
         self.made: list[Callback] = []
         self.every_publisher: dict[int, Publisher] = {}
         #: The names of the nodes.
         self.names_of_nodes: dict[str, None] = {}
-        #: When the first of the events was recorded, ns.
+        #: Time of the first of these events, ns.
         self.begin = 0
-        #: Events that lack what they should say, and are left out.
+        #: Number of ignored events that lack a field.
         self.incomplete = 0
-        #: By a callback's number its mutually exclusive group, or -1 for another one.
+        #: By a callback's number its mutually exclusive group; -1: reentrant.
         self.groups: dict[int, int] = {}
         self._entities: dict[str, Addresses[Callback]] = {kind: Addresses() for kind in KINDS}
         self._holders: Addresses[Callback] = Addresses()
         self._groups: Addresses[tuple[int, bool]] = Addresses()
         self._n_groups = 0
         self._by_number: dict[int, Callback] = {}
-        self._symbols: dict[int, str] = {}      # of callbacks of which nothing else is known
+        self._symbols: dict[int, str] = {}      # of otherwise unknown callbacks
 
     # --- reading ---------------------------------------------------------------------------------
 
     def take(self, event: Event) -> None:
-        """Note what an event says, as ``TraceReader.events`` has it."""
+        """Note an event of ``TraceReader.events``."""
         self.note(event[0], _as_dict([field for field, _ in EVENTS[event[0]].fields], event))
 
     def note(self, name: str, fields: Fields) -> None:
-        """Note what an event says, as ``read_events`` has it."""
+        """Note an event of ``read_events``."""
         name = name.partition(':')[2]
         if _complete(name, fields):
             self._one(name, fields)
 
     def read(self, events: Iterable[Event]) -> None:
-        """Note what all events of a recording say, as ``TraceReader.layout_events`` has them."""
+        """Note all events of a recording, from ``TraceReader.layout_events``."""
         by_kind: dict[str, list[Fields]] = {}
         seen: set[tuple[Any, ...]] = set()
         waiting: list[tuple[str, Fields]] = []
@@ -240,7 +238,7 @@ class Entities:
         self._label()
 
     def _one(self, name: str, f: Fields) -> None:
-        """Note what an event says, which lacks nothing."""
+        """Note a complete event."""
         pid, time = f['_vpid'], f['_timestamp']
         if name == 'rcl_node_init':
             node = Node(pid, f'{f["namespace"].rstrip("/")}/{f["node_name"]}', time)
@@ -321,7 +319,7 @@ class Entities:
             self.groups[callback.number] = callback.group
 
     def _label(self) -> None:
-        """Give callbacks labels that are different."""
+        """Give callbacks unique labels."""
         used: dict[str, int] = {}
         for callback in sorted(self.every, key=lambda c: (c.made, c.number)):
             description = callback.description
@@ -331,7 +329,7 @@ class Entities:
     # --- looking up ------------------------------------------------------------------------------
 
     def callback(self, pid: int, address: int, time: int) -> Callback:
-        """Return the callback that an event at run time means, if need be a new, unknown one."""
+        """Return the callback that an event at run time means; create an unknown one if needed."""
         found = self.callbacks.latest(pid, address, time)
         if found is None:
             found = Callback(None, 'unknown', made=time)
@@ -341,12 +339,12 @@ class Entities:
         return found
 
     def topic(self, number: int) -> str:
-        """Return the topic that a callback subscribes to, empty for others."""
+        """Return the topic of a subscription's callback; empty for others."""
         callback = self._by_number.get(number)
         return callback.start if callback is not None and callback.kind == 'subscription' else ''
 
     def name(self, number: int) -> str:
-        """Return what a callback is called that no declaration names."""
+        """Return the name of an undeclared callback."""
         callback = self._by_number.get(number)
         if callback is None:
             return self._symbols.get(number, 'a callback whose start is not recorded')
@@ -357,7 +355,7 @@ class Entities:
 
 
 def signed(address: int) -> int:
-    """Return an address as columns have it: with a sign."""
+    """Return an address as a signed 64-bit number, as in columns."""
     return address - 2 ** 64 if address >= 2 ** 63 else address
 
 
@@ -371,7 +369,7 @@ _NEEDED = {
 
 
 def _complete(name: str, fields: Fields) -> bool:
-    """Return whether an event has all fields that are needed of it, with values of their kind."""
+    """Return whether an event has all needed fields, with values of the right types."""
     needed = _NEEDED.get(name)
     if needed is None:
         event = EVENTS.get(f'ros2:{name}') or EVENTS.get(f'ros2_caret:{name}')

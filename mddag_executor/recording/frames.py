@@ -1,12 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Tables of a recording for data frames: Arrow, Parquet, pandas.
+Tables of a recording as data frames: Arrow, Parquet, pandas.
 
-Names stand in place of numbers (as dictionaries), and no value in place of ``UNKNOWN``.  Times and
-durations are whole nanoseconds; the metadata of a column says so (``unit``).  The metadata of the
-schema has the version of the tables (``mddag.tables``), which changes when the meaning of a column
-does.
+Numbers with names become dictionary-encoded names; ``UNKNOWN`` becomes null.  Times and durations
+are integer nanoseconds; the column's metadata says so (``unit``).  The schema's metadata has the
+version of the tables (``mddag.tables``), which changes when the meaning of a column changes.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ FILES = frozenset(f'{name}.parquet' for name in TABLES)
 _TIMES = {'release', 'noticed', 'ready', 'began', 'start', 'end', 'busy', 'cpu', 'time',
           'source_timestamp', 'deadline', 'completed'}
 _COMPLETES = {NOTHING: 'nothing', LEG: 'leg', VERTEX: 'vertex'}
-# What is used only to put tables together.
+# Columns that are only used to build tables.
 _INNER = {'order'}
 
 
@@ -65,7 +64,7 @@ def arrow_table(recording: Recording, name: str) -> Any:
 
 
 def _names(recording: Recording, table: str, column: str, values: Any) -> Any:
-    """Return a column of numbers that stand for names; None for another one."""
+    """Return the names of a column of numbers; None if its numbers have no names."""
     import pyarrow
     task_set = recording.task_set
     if column in ('dag', 'vertex'):
@@ -106,7 +105,7 @@ def pandas_frame(recording: Recording, name: str) -> Any:
 
 
 def write_tables(recording: Recording, folder: Path) -> list[str]:
-    """Write each table as a Parquet file into a folder that is there; return their names."""
+    """Write each table as a Parquet file into an existing folder; return the file names."""
     import pyarrow.parquet
     for name in TABLES:
         pyarrow.parquet.write_table(

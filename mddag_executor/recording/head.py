@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The head of a trace: whether it is of this executor, and with what it was recorded."""
+"""The head of a trace: whether this executor wrote it, its declaration and settings."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from msg_graph import GraphError, loads, TaskSet
 
 TASK_SET = 'mddag:task_set'
 _RENAMED = re.compile(r'\bon_miss(?=[\'"]?\s*:)')
-"""The key that versions before 2.0 wrote for ``on_late``: their recordings stay readable."""
+"""Older name of ``on_late``, written before version 2.0."""
 _RECORD = 'record a run with mddag run GRAPH … --trace'
 
 
 class ReplayError(InputError):
-    """A trace that holds nothing to replay; its text is `FILE: what is wrong: what to do`."""
+    """A trace without anything to replay; its text is `FILE: what is wrong: what to do`."""
 
 
 class Head(NamedTuple):
     """
-    What the executor wrote when it began to record: its declaration and its settings.
+    The declaration and settings that the executor wrote at the beginning of the recording.
 
-    :ivar cpus: how many the process might use; 0: not known.
+    :ivar cpus: number of CPUs that the process could use; 0: unknown.
     """
 
     time: int
@@ -43,7 +43,7 @@ class Head(NamedTuple):
 
 
 def read_head(reader: TraceReader) -> Head | None:
-    """Return what the executor wrote at the beginning; None where it did not write the trace."""
+    """Return the head of a trace; None if this executor did not write it."""
     if not reader.may_have(TASK_SET):
         return None
     of_this = False
@@ -51,7 +51,7 @@ def read_head(reader: TraceReader) -> Head | None:
         if event[4] is None and not of_this:
             return None
         of_this = True
-        if None not in event:       # else written by something else: fields are missing
+        if None not in event:       # None: another program wrote it, fields are missing
             return Head(event[1], *event[4:])
     if of_this:
         raise no_run(reader)
@@ -64,7 +64,7 @@ def is_declared(head: Head) -> bool:
 
 
 def declared(head: Head, name: str) -> TaskSet:
-    """Return the declaration that a run was recorded with."""
+    """Return the declaration of a recorded run."""
     if not is_declared(head):
         raise ReplayError(
             name, 'it was recorded without a declaration, so there are no jobs',
@@ -78,13 +78,13 @@ def declared(head: Head, name: str) -> TaskSet:
 
 
 def no_end(name: str) -> str:
-    """Return the line about a run whose end is not recorded."""
+    """Return the warning for a run without recorded end."""
     return (f'{name}: the end of the run is not recorded (the process was killed, or the trace is '
             'cut): what was open is judged at the last recorded instant')
 
 
 def no_run(reader: TraceReader) -> ReplayError:
-    """Return the error for a trace, read to its end, without a run of this executor."""
+    """Return the error for a completely read trace without a run of this executor."""
     what = f'no run of this executor is recorded in it (it has no event {TASK_SET})'
     if reader.warnings:
         damage = reader.warnings[0].removeprefix(f'{reader.path}: ').partition(': ')[0]
@@ -94,7 +94,7 @@ def no_run(reader: TraceReader) -> ReplayError:
 
 @contextmanager
 def named_errors(path: str, name: str) -> Iterator[None]:
-    """Let errors about a file call it by its name."""
+    """Use the given name in errors about a file."""
     try:
         yield
     except TraceError as error:

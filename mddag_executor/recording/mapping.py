@@ -1,29 +1,29 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What a recording has, in the terms of the declaration that judges.
+Maps the callbacks of a recording to the declaration that judges it.
 
 Theory of operation: recorded with a declaration
 ------------------------------------------------
-Events name DAGs and vertices by their index in the declaration that was recorded.  The one that
-judges may be another: other deadlines, another order, more or fewer callbacks.
+Events name DAGs and vertices by their index in the recorded declaration.  The judging declaration
+may differ: other deadlines, another order, more or fewer callbacks.
 
-* A recorded DAG stands for the one whose source is the same callback (``/node:callback``).
-* Within it a vertex stands for the one of the same name, or, because names have ``@dag`` only
-  where several DAGs hold a callback, for the only one of the same callback.
-* The legs of a sync vertex are matched by their topics; with other topics it is another vertex.
+* A recorded DAG matches the DAG with the same source callback (``/node:callback``).
+* Within it a vertex matches the vertex of the same name.  Names have ``@dag`` only if several DAGs
+  contain the callback; so otherwise it matches the only vertex of the same callback.
+* The legs of a sync vertex are matched by their topics; different topics mean different vertices.
 
-What stands for nothing ran as a callback that no DAG declares.  What nothing stands for has never
+A recorded vertex without match counts as undeclared.  A declared vertex without match has never
 run: its jobs were not released, its sinks not completed.
 
 Theory of operation: imported
 -----------------------------
-Callbacks are matched by node and by what starts them; ``msg_graph.binding`` has the rules.  A
-node that was started more than once, or in several processes, is matched each time; of several
-callbacks that look the same the first one declared is the first one made.
+Callbacks are matched by node and trigger; ``msg_graph.binding`` has the rules.  A node that was
+started several times, or in several processes, is matched each time.  Of several callbacks with
+the same trigger the first declared one matches the first created one.
 
-Nothing in a recording of CARET or ros2_tracing says more.  There, where a node's timers have other
-periods than declared, but there are as many of them, they are matched by order, and that is said.
+A CARET or ros2_tracing recording has no other information.  If a node's timers have other periods
+than declared, but the same number, they are matched by order; a warning reports it.
 """
 
 from __future__ import annotations
@@ -46,26 +46,26 @@ import numpy as np
 
 class Mapping:
     """
-    Where the recorded DAGs and vertices are in the declaration that judges.
+    Maps recorded DAGs and vertices to the judging declaration.
 
-    :param recorded: the declaration that it was recorded with.
-    :param judge: the declaration that judges; None: the recorded one.
+    :param recorded: the recorded declaration.
+    :param judge: the judging declaration; None: the recorded one.
     """
 
     def __init__(self, name: str, recorded: TaskSet, judge: TaskSet | None) -> None:
         self.task_set = recorded if judge is None else judge
-        #: Whether the declaration that judges is the one that the run itself was judged by.
+        #: Whether the run itself was judged by the judging declaration.
         self.same = judge is None or judge.text == recorded.text
         self.warnings: list[str] = []
         first = _first_vertices(self.task_set)
         if judge is not None and not self.same:
             self._compare(name, recorded, judge)
         by_source = {dag.vertices[dag.source].callback.key: dag for dag in self.task_set.dags}
-        #: By recorded DAG: the DAG that it stands for, or -1.
+        #: By recorded DAG: its DAG, or -1.
         self.dag: list[int] = []
-        #: By recorded DAG and vertex: the global vertex that it stands for, or -1.
+        #: By recorded DAG and vertex: its global vertex, or -1.
         self.vertex: list[list[int]] = []
-        #: By recorded DAG, vertex and leg: the leg that it stands for.
+        #: By recorded DAG, vertex and leg: its leg.
         self.leg: list[list[list[int]]] = []
         for dag in recorded.dags:
             target = by_source.get(dag.vertices[dag.source].callback.key)
@@ -90,7 +90,7 @@ class Mapping:
         self.leg.append(legs)
 
     def _compare(self, name: str, recorded: TaskSet, judge: TaskSet) -> None:
-        """Find out which callbacks of the graph the trace does not have."""
+        """Find the callbacks of the graph that the trace lacks."""
         known = [callback.key for callback in recorded.callbacks]
         wanted = {callback.key for callback in judge.callbacks}
         self.warnings += report_missing(name, judge, set(known), known, [
@@ -109,10 +109,10 @@ class Mapping:
 
 def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
     """
-    Return a recording in terms of the declaration that judges.
+    Return a recording in terms of the judging declaration.
 
     :param judge: None: the recorded one.
-    :raises ReplayError: when the recording has none of its callbacks.
+    :raises ReplayError: if the recording has none of its callbacks.
     """
     mapping = Mapping(recording.name, recording.recorded_set, judge)
     warnings = [*recording.warnings, *mapping.warnings]
@@ -166,7 +166,7 @@ def _first_vertices(task_set: TaskSet) -> list[int]:
 
 
 def _match(vertex: Vertex, dag: Dag, target: Dag) -> Vertex | None:
-    """Return the vertex of a DAG that a vertex of a recorded one stands for."""
+    """Return the vertex of a DAG that matches a recorded vertex."""
     for other in target.vertices:
         if other.name == vertex.name:
             return other
@@ -177,7 +177,7 @@ def _match(vertex: Vertex, dag: Dag, target: Dag) -> Vertex | None:
 
 
 def _legs(vertex: Vertex, dag: Dag, other: Vertex, target: Dag) -> list[int]:
-    """Return for each leg of a vertex the leg of the other with its topic; none: no match."""
+    """Return for each leg of a vertex the other vertex's leg with its topic; empty: no match."""
     topics, theirs = (
         [each.callback.topics[place] for place, _ in legs_of(each, of.vertices)]
         for each, of in ((vertex, dag), (other, target)))
@@ -195,11 +195,11 @@ def report_missing(
     name: str, judge: TaskSet, found: Set[str], known: Sequence[str], others: Sequence[Entity]
 ) -> list[str]:
     """
-    Return the line about callbacks of a declaration that are not in a recording, if any.
+    Return the warning about declared callbacks that are not recorded, if any.
 
-    :param found: the keys of those that are.
-    :param known: what is called how in the recording; ``others``: what stands for nothing.
-    :raises ReplayError: when it has none of them.
+    :param found: keys of the recorded ones.
+    :param known: names in the recording; ``others``: entities without match.
+    :raises ReplayError: if none is recorded.
     """
     absent = [callback for callback in judge.callbacks if callback.key not in found]
     if not absent:
@@ -217,7 +217,7 @@ def report_missing(
 
 
 class Target(NamedTuple):
-    """A declared callback that a recorded one stands for, and the leg of it that it is."""
+    """The declared callback that a recorded one matches, and its leg."""
 
     callback: Declared
     leg: int
@@ -225,7 +225,7 @@ class Target(NamedTuple):
 
 
 def nodes_of(who: Entities) -> list[list[Callback]]:
-    """Return the timers, subscriptions and services of each node, as they were made."""
+    """Return the timers, subscriptions and services of each node, in the order of creation."""
     found: dict[Node, list[Callback]] = {}
     for each in sorted(who.made, key=lambda c: (c.made, c.number)):
         if each.node is not None:
@@ -234,7 +234,7 @@ def nodes_of(who: Entities) -> list[list[Callback]]:
 
 
 def match(callbacks: list[Callback], declared: TaskSet) -> dict[int, Target]:
-    """Return by number which declared callbacks those of a node are."""
+    """Match the callbacks of a node with declared ones; return the latter by number."""
     binder = Binder(declared)
     found: dict[int, Target] = {}
     for each in callbacks:
@@ -246,18 +246,18 @@ def match(callbacks: list[Callback], declared: TaskSet) -> dict[int, Target]:
 
 
 def declared_keys(who: Entities, declared: TaskSet) -> dict[int, str]:
-    """Return by callback's number the key of the declared one that it is."""
+    """Return by callback number the key of the declared callback."""
     return {number: target.callback.key for callbacks in nodes_of(who)
             for number, target in match(callbacks, declared).items()}
 
 
 class Matching:
     """
-    Which declared callbacks those of an imported recording are.
+    Maps the callbacks of an imported recording to declared ones.
 
-    :param who: is who in it.
+    :param who: the nodes and callbacks of the recording.
     :param threads: the processes and threads that ran callbacks.
-    :param judge: the declaration that judges; None: there is none.
+    :param judge: the judging declaration; None: none.
     """
 
     def __init__(

@@ -1,24 +1,24 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A trace of this executor as a recording.
+Reads a trace of this executor into a recording.
 
 Theory of operation
 -------------------
 1. The file is read chunk by chunk, in the order of the file.  Whole chunks before damage are used.
-   No event is left out because its time looks strange.
-2. The executor writes an execution as four events next to each other: ``dispatch``,
-   ``callback_start``, ``callback_end`` and, unless it was suspended or no DAG declares it,
-   ``complete``.  Where they stand like that they are one row at once.
-3. What is left (traces of simulations have the events in the order of time) is joined thread by
-   thread in the order of the file: an end belongs to the dispatch before it, a ``complete`` to the
-   execution that ended last in its thread, if DAG, vertex and job agree.
-4. A ``complete`` without an execution is a row without a start; a dispatch without an end is a
-   row without an end.
-5. Rows of one vertex, job and readiness up to the one that completes are pieces of one execution.
+   No event is dropped because of its time.
+2. The executor writes an execution as four adjacent events: ``dispatch``, ``callback_start``,
+   ``callback_end`` and, unless it was suspended or is undeclared, ``complete``.  Adjacent events
+   become one row directly.
+3. The remaining events (simulations write events in the order of time) are joined by thread in the
+   order of the file.  An end belongs to the last dispatch; a ``complete`` belongs to the last
+   ended execution of its thread, if DAG, vertex and job agree.
+4. A ``complete`` without execution is a row without start; a dispatch without end is a row without
+   end.
+5. Rows with the same vertex, job and ready time, up to the completing one, are pieces of one
+   execution.
 6. A publication belongs to the execution that ran in its thread at that time.
-7. The core saw its events in the order of their times; events of equal time are in the order of
-   the file.
+7. The core processed events in the order of their times, equal times in the order of the file.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ _NUMBERS = (_DISPATCH, _START, _END, _COMPLETE, _PUBLISH, _RELEASE, _DEADLINE, _
             _ABORT, _OUTDATE, _LOST, _STOP, _JUDGE_FROM, _SHUTDOWN)
 _JOB_ENDS = {_EXPIRE: EXPIRED, _ABORT: ABORTED, _FAIL: FAILED, _OUTDATE: OUTDATED}
 _CORE = (_RELEASE, _COMPLETE, _DEADLINE, *_JOB_ENDS)
-"""Events at which the executor's core saw something: the run lasts at least until there."""
+"""Events that the executor's core processed: the run lasts at least until the last of them."""
 
 Progress = Callable[[int], None]
 
@@ -86,17 +86,17 @@ def read_own(
     reader: TraceReader, name: str, head: Head, progress: Progress | None = None
 ) -> Recording:
     """
-    Return the recording that a trace of this executor holds.
+    Return the recording of a trace of this executor.
 
-    :param name: what messages call the trace.
-    :param head: of the trace.
-    :param progress: called now and then with the number of events read so far.
+    :param name: the trace's name in messages.
+    :param head: head of the trace.
+    :param progress: called regularly with the number of events read.
     """
     with named_errors(reader.path, name):
         source = _Source(reader, name, head, Entities(by_address=True))
         found = source.read(progress)
         found.warnings = [*source.doubts(), *end_lines(found)]
-    del source      # what it holds is more than the tables
+    del source      # it holds more than the tables
     give_back()
     return found
 
@@ -106,10 +106,10 @@ def read_process(
     progress: Progress | None = None,
 ) -> tuple[Recording, Ints]:
     """
-    Return what the trace of one of several processes holds.
+    Return the recording of one of several processes.
 
-    :param who: gets to know who is who in it; ``edit``: changes the events that say so.
-    :return: the recording; and the times of what the core saw, by place in the order.
+    :param who: receives the nodes and callbacks; ``edit``: changes initialisation events.
+    :return: the recording; and the times of the core's events, by position in the order.
     """
     with named_errors(reader.path, name):
         source = _Source(reader, name, head, who, edit)
@@ -119,7 +119,7 @@ def read_process(
 
 
 def end_lines(found: Recording) -> list[str]:
-    """Return what is missing of a run as a whole, one line each."""
+    """Return missing data of the run as a whole, one line each."""
     name, lines = found.name, []
     if not found.shut_down:
         lines.append(no_end(name))
@@ -133,7 +133,7 @@ def end_lines(found: Recording) -> list[str]:
 
 
 class _Kind:
-    """The rows of one kind of event, and their places in the file."""
+    """The rows of one kind of event, and their positions in the file."""
 
     def __init__(self) -> None:
         self.rows: list[Table] = []
@@ -144,7 +144,7 @@ class _Kind:
         self.places.append(places)
 
     def joined(self) -> tuple[Table | None, Ints]:
-        """Return them, as the first ones are typed; None: there are none."""
+        """Return the rows as one table with the type of the first part; None: no rows."""
         if not self.rows:
             return None, np.empty(0, dtype=np.int64)
         names = self.rows[0].dtype.names
@@ -171,10 +171,10 @@ class _Source:
         self._task_set = declared(head, name)
         self._numbering = _Numbering(self._task_set)
         self._who = who
-        #: The times of what the core saw, by place in the order.
+        #: The times of the core's events, by position in the order.
         self.seen_at = np.empty(0, dtype=np.int64)
         self._kinds: dict[str, _Kind] = {}
-        # executions, where their dispatches, ends and completions are, and when these were seen
+        # executions; positions of their dispatches, ends and completions; times of the latter
         self._executions = Growing(EXECUTIONS)
         self._dispatch_at: list[Ints] = []
         self._end_at: list[Ints] = []
@@ -192,13 +192,13 @@ class _Source:
             count += len(batch)
             if progress is not None:
                 progress(count)
-        give_back()     # what the batches needed
+        give_back()     # memory of the batches
         return self._recording()
 
     # --- batches ---------------------------------------------------------------------------------
 
     def _take(self, batch: Batch) -> None:
-        """Keep the events of a batch, executions as rows."""
+        """Store the events of a batch, executions as rows."""
         columns: dict[str, Column] = {}
         for column in batch.columns:
             kind = column.fixed.head[0]
@@ -206,7 +206,7 @@ class _Source:
                 _, found, places = batch.table(column)
                 self._others += [(place, (kind, *row)) for place, row in zip(
                     places.tolist(), found.tolist())]
-            elif kind in columns:       # a second channel of that kind
+            elif kind in columns:       # a second channel of the same kind
                 self._keep(batch, column)
             else:
                 columns[kind] = column
@@ -231,7 +231,7 @@ class _Source:
         return self._kinds.setdefault(name, _Kind())
 
     def _adjacent(self, batch: Batch, columns: dict[str, Column]) -> None:
-        """Take out the events that are next to each other as they were recorded (rule 2)."""
+        """Remove adjacent events of executions (rule 2)."""
         kinds = [_DISPATCH, _START, _END]
         at = columns[_DISPATCH].at
         start_at = at + columns[_DISPATCH].size
@@ -240,7 +240,7 @@ class _Source:
         fits = _is_in(start_at, columns[_START].at) & _is_in(end_at, columns[_END].at)
         complete = columns.get(_COMPLETE)
         if complete is not None and complete.size:
-            # several legs at once are put together later
+            # several legs at once are joined later
             whole = fits & _is_in(complete_at, complete.at) & ~_is_in(
                 complete_at + complete.size, complete.at)
             if whole.any():
@@ -252,7 +252,7 @@ class _Source:
     def _add_adjacent(
         self, batch: Batch, columns: dict[str, Column], kinds: list[str], at: Ints
     ) -> None:
-        """Make rows of executions whose events are next to each other, if they fit together."""
+        """Make rows of executions from adjacent events that match."""
         offsets = np.cumsum([0, *(columns[kind].size for kind in kinds)]).tolist()
         row = np.dtype({
             'names': kinds, 'formats': [columns[kind].fixed.kind for kind in kinds],
@@ -287,7 +287,7 @@ class _Source:
             columns[kind] = column._replace(at=rest)
 
     def _rows(self, dispatch: Table, start: Any, end: Any) -> Table:
-        """Return rows of executions that were dispatched."""
+        """Return rows of dispatched executions."""
         table = np.zeros(len(dispatch), dtype=EXECUTIONS)
         dag, vertex = self._numbering.of(dispatch['dag'], dispatch['vertex'])
         table['callback'], table['thread'] = dispatch['callback'], dispatch['vtid']
@@ -350,7 +350,7 @@ class _Source:
                 self._strange[f'{TASK_SET} with another declaration'] += 1
 
     def _all_executions(self) -> tuple[Table, Ints, Ints]:
-        """Return all executions; where completions stand in the file, and when they were seen."""
+        """Return all executions; positions of completions in the file, and their times."""
         rest, began_at, rest_at = self._by_thread()
         none = np.full(len(rest), UNKNOWN)
         self._executions.add(rest)
@@ -363,7 +363,7 @@ class _Source:
         more, more_at, more_seen = self._completions(table, dispatch_at, complete_at, seen)
         _pieces(table, end_at)
         if len(more):
-            del table       # which is in the memory that grows
+            del table       # frees memory
             self._executions.add(more)
             table = self._executions.table()
             complete_at = np.concatenate([complete_at, more_at])
@@ -371,7 +371,7 @@ class _Source:
         return table, complete_at, seen
 
     def _by_thread(self) -> tuple[Table, Ints, Ints]:
-        """Return executions whose events do not stand together, and where begins and ends are."""
+        """Return executions of events that are not adjacent, and positions of begins and ends."""
         found = [self._kind(kind).joined() for kind in (_DISPATCH, _START, _END)]
         dispatch = found[0][0]
         if dispatch is None:
@@ -405,12 +405,12 @@ class _Source:
     def _completions(
         self, table: Table, dispatch_at: Ints, complete_at: Ints, seen: Ints
     ) -> tuple[Table, Ints, Ints]:
-        """Give executions the completions that do not follow them; return those of none."""
+        """Assign the other completions to executions; return those without execution."""
         complete, at = self._kind(_COMPLETE).joined()
         if complete is None:
             return rows(EXECUTIONS), at, at
         ended = np.flatnonzero((table['end'] >= 0) & (complete_at < 0))
-        # the execution that was dispatched last in the thread
+        # the last dispatched execution in the thread
         thread = np.r_[table['thread'][ended], complete['vtid'].astype(np.int64)]
         place = np.r_[dispatch_at[ended], at]
         order = sort_by(thread, place)
@@ -425,7 +425,7 @@ class _Source:
         good = (of >= 0) & (dag >= 0)
         for column, values in (('dag', dag), ('vertex', vertex), ('job', complete['job'])):
             good[good] = table[column][of[good]] == values[good]
-        # one execution may complete several legs, one after the other
+        # one execution may complete several legs
         mine = np.flatnonzero(good)
         mine = mine[np.argsort(of[mine], kind='stable')]
         begins, until = groups(of[mine])
@@ -526,7 +526,7 @@ class _Source:
                     deadline=found['deadline'], completed=found['completed'])
 
     def _set_end(self, found: Recording) -> None:
-        """Find out when the run ended, and take in the events that come singly."""
+        """Find the end of the run, and process events that are not in tables."""
         last = 0
         for kind in _CORE:
             each, _ = self._kind(kind).joined() if kind != _COMPLETE else (None, None)
@@ -562,7 +562,7 @@ class _Source:
                 else:
                     self._strange[f'{_JUDGE_FROM} an impossible time'] += 1
         self._changes, self._hosting = sorted(changes), sorted(hosted, key=lambda h: h[:2])
-        last = min(last, NEVER - 1)     # a run that never ends cannot be rescheduled
+        last = min(last, NEVER - 1)     # a run without end cannot be rescheduled
         found.end = found.judged_until = last
         self._shutdown_at: tuple[int, int] | None = None
         shutdown, shutdown_at = self._kind(_SHUTDOWN).joined()
@@ -590,7 +590,7 @@ class _Source:
         self, found: Recording, core: list[tuple[Table, Any, Ints]], seen: Ints,
         complete_at: Ints,
     ) -> None:
-        """Give what the core saw its places in the order (rule 7)."""
+        """Assign positions in the order to the core's events (rule 7)."""
         done = np.flatnonzero(complete_at >= 0)
         single = [(time, place) for time, place, *_ in (*self._changes, *self._hosting)]
         if self._shutdown_at is not None:
@@ -617,7 +617,7 @@ class _Source:
             found.judged_order = next(ranks)
 
     def doubts(self) -> list[str]:
-        """Return what is wrong with the trace, one line each."""
+        """Return defects of the trace, one line each."""
         name, path = self._name, self._reader.path
         lines = [renamed(text, path, name) for text in self._reader.warnings]
         if self._strange:
@@ -629,18 +629,18 @@ class _Source:
 
 
 def _joined(parts: list[Ints], last: Ints) -> Ints:
-    """Return parts in one piece; they are taken out of their list."""
+    """Return all parts as one array; empties the list, to free memory."""
     found: Ints = np.concatenate([*parts, last])
     parts.clear()
     return found
 
 
 def _is_in(places: Ints, known: Ints) -> Mask:
-    """Return which places are among known ones; both ascend."""
+    """Return which positions are among known ones; both ascend."""
     found = np.zeros(len(places), dtype=np.bool_)
     if not len(places) or not len(known):
         return found
-    # in most batches they are the same, but for the first or last one
+    # in most batches they are equal except for the first or last one
     first = int(np.searchsorted(known, places[0]))
     part = known[first:first + len(places)]
     found[:len(part)] = part == places[:len(part)]
@@ -651,31 +651,31 @@ def _is_in(places: Ints, known: Ints) -> Mask:
 
 
 class _Numbering:
-    """Turns a DAG and the place of a vertex in it to the vertex's number over all DAGs."""
+    """Converts a DAG and the local number of a vertex to the global vertex."""
 
     def __init__(self, task_set: TaskSet) -> None:
         self._sizes = np.array([*(len(dag.vertices) for dag in task_set.dags), 0])
         self._first = np.r_[0, np.cumsum(self._sizes)[:-1]]
-        #: By vertex how many legs it has.
+        #: By vertex the number of its legs.
         self.n_legs = [max(1, len(legs_of(vertex, dag.vertices)))
                        for dag in task_set.dags for vertex in dag.vertices] + [1]
 
     def of(self, dag: Any, vertex: Any) -> tuple[Ints, Ints]:
-        """Return DAGs and vertices, -1 where there is no such vertex."""
+        """Return DAGs and global vertices; -1 for unknown vertices."""
         known = (dag >= 0) & (dag < len(self._sizes) - 1)
         at = np.where(known, dag, -1)
         known &= (vertex >= 0) & (vertex < self._sizes[at])
         return np.where(known, dag, -1), np.where(known, self._first[at] + vertex, -1)
 
     def one(self, dag: int, vertex: int) -> int:
-        """Return a vertex, -1 where there is none."""
+        """Return a global vertex; -1 if unknown."""
         if not 0 <= dag < len(self._sizes) - 1 or not 0 <= vertex < self._sizes[dag]:
             return -1
         return int(self._first[dag]) + vertex
 
 
 class _Line:
-    """Events of threads, thread by thread and in the order of the file."""
+    """Events by thread, each thread in the order of the file."""
 
     def __init__(self, tables: list[Table | None], places: list[Ints]) -> None:
         parts = [(number, table, at) for number, (table, at) in enumerate(zip(tables, places))
@@ -694,12 +694,12 @@ class _Line:
         self._begin = np.maximum.accumulate(np.where(begins, self._numbers, 0))
 
     def latest(self, which: Mask) -> Ints:
-        """Return by event the last one so far of its thread that is one of these, or -1."""
+        """Return by event the last event of its thread, up to itself, in ``which``; -1: none."""
         found = np.maximum.accumulate(np.where(which, self._numbers, -1))
         return np.where(found >= self._begin, found, -1)
 
     def before(self, which: Mask) -> Ints:
-        """Return the same of those before the event."""
+        """Return by event the last earlier event of its thread in ``which``; -1: none."""
         found = np.r_[-1, np.maximum.accumulate(np.where(which, self._numbers, -1))[:-1]]
         return np.where(found >= self._begin, found, -1)
 
@@ -708,7 +708,7 @@ def _pieces(table: Table, end_at: Ints) -> None:
     """
     Count the pieces of executions that were suspended (rule 5).
 
-    :param end_at: where their ends stand in the file.
+    :param end_at: positions of their ends in the file.
     """
     suspended = (table['completes'] == NOTHING) & (table['vertex'] >= 0)
     undeclared = table['vertex'] < 0
@@ -727,7 +727,7 @@ def _hashed(vertex: Any, job: Any, ready: Any) -> Ints:
 
 
 def _number_pieces(table: Table, mine: Ints, of: str, end_at: Ints) -> None:
-    """Count pieces among some rows; those of one agree in vertex, readiness and a column."""
+    """Count pieces among rows; pieces of an execution agree in vertex, ready time and a column."""
     columns = [table[name][mine] for name in (of, 'vertex', 'ready')]
     order = sort_by(*columns, end_at[mine])
     mine = mine[order]
@@ -742,13 +742,13 @@ def _number_pieces(table: Table, mine: Ints, of: str, end_at: Ints) -> None:
     table['piece'][mine] = np.arange(len(mine)) - begin
     table['began'][mine] = table['start'][mine[begin]]
     total = np.cumsum(table['busy'][mine])
-    ended = table['end'][mine] >= 0     # what runs is the last piece
+    ended = table['end'][mine] >= 0     # a running piece is the last one
     table['busy'][mine[ended]] = (total - total[begin] + table['busy'][mine[begin]])[ended]
 
 
 def running_at(executions: Table, thread: Ints, time: Ints) -> Ints:
     """
-    Return the rows of the executions that ran in threads at some times, -1 where none did.
+    Return the rows of the executions that ran in threads at given times; -1: none.
 
     :param time: ascending.
     """
@@ -764,7 +764,7 @@ def running_at(executions: Table, thread: Ints, time: Ints) -> Ints:
             order = sort_by(start, -end)
             mine, start, end = mine[order], start[order], end[order]
         at = np.searchsorted(start, time[asked], 'right') - 1
-        # what ran inside another may have ended before
+        # a nested execution may have ended before
         for _ in range(32):
             outer = (at >= 0) & (end[np.maximum(at, 0)] < time[asked])
             if not outer.any():
@@ -776,7 +776,6 @@ def running_at(executions: Table, thread: Ints, time: Ints) -> Ints:
 
 
 def _one_row(event: Event) -> Table:
-    """Return an event as a table of one row."""
     from mddag_executor.trace.schema import EVENTS, PREAMBLE
     names = [name for name, _ in PREAMBLE] + [name for name, _ in EVENTS[event[0]].fields]
     table = np.empty(1, dtype=[(name, 'i8') for name in names])

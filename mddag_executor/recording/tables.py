@@ -1,26 +1,23 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A recording: tables with named columns, and who is who.
+A recording: tables with named columns, and the nodes and callbacks that they refer to.
 
 Theory of operation
 -------------------
-1. A recording of any kind is the same few numpy structured arrays.  A source (``own``,
-   ``collected``, …) builds them once; an analysis is a function of them and never learns which
-   source they come from.
+1. Every recording has the same numpy structured arrays.  A reader (``own``, ``collected``, …)
+   builds them once; an analysis is a function of them and does not depend on the reader.
 2. Times are int64 nanoseconds on the clock of the recording.  ``UNKNOWN`` (-1) is a time or number
    that is not recorded.
-3. DAGs and vertices are those of ``Recording.task_set``.  A vertex is numbered over all DAGs; -1
-   is a callback that no DAG declares.  ``mapping.judged_by`` returns the same recording in terms
-   of another task set.
-4. A row of ``executions`` is one run of a callback on a thread.  A coroutine that was suspended
-   has several rows: ``piece`` counts them, ``began`` is the start of the first, ``busy`` the time
-   of all rows so far.  The row that completes a vertex therefore has the values of the whole
-   execution.
-5. ``leg`` is which message of a sync callback the execution was for, ``ALL_LEGS`` if one execution
-   stands for all.  ``completes`` says whether it ended a leg or made the vertex whole.
-6. ``order`` is the place in the sequence in which the executor's core learned of releases,
-   completions and ends of jobs.  It breaks ties between equal times.
+3. DAGs and vertices are those of ``Recording.task_set``.  Vertices are numbered over all DAGs; -1
+   is an undeclared callback.  ``mapping.judged_by`` converts a recording to another task set.
+4. A row of ``executions`` is one run of a callback on a thread.  A suspended coroutine has several
+   rows: ``piece`` counts them, ``began`` is the start of the first, ``busy`` the total time up to
+   this row.  So the row that completes a vertex has the values of the whole execution.
+5. ``leg`` is the message of a sync callback that the execution processed; ``ALL_LEGS`` if it
+   processed all.  ``completes`` says whether it completed a leg or the vertex.
+6. ``order`` is the position in the sequence in which the executor's core processed releases,
+   completions and ends of jobs.  It decides between equal times.
 """
 
 from __future__ import annotations
@@ -90,14 +87,14 @@ def rows(kind: np.dtype[Any], length: int = 0, **columns: Any) -> Table:
 
 
 def pick(table: Table, which: Any) -> Table:
-    """Return some rows; numpy itself copies them column by column, which is slow."""
+    """Return the chosen rows; numpy's own indexing copies column by column, which is slow."""
     plain = table.view(f'V{table.dtype.itemsize}')
     found: Table = plain[which].view(table.dtype)
     return found
 
 
 class Growing:
-    """A table that grows by many rows at a time, in one piece of memory."""
+    """A table that grows by many rows at a time, in contiguous memory."""
 
     def __init__(self, kind: np.dtype[Any]) -> None:
         self._rows = np.empty(0, dtype=f'V{kind.itemsize}')
@@ -113,7 +110,7 @@ class Growing:
         self._count = count
 
     def table(self) -> Table:
-        """Return the table; no more rows are to come."""
+        """Return the table; no rows can be added afterwards."""
         self._rows.resize(self._count, refcheck=False)
         found: Table = self._rows.view(self._kind)
         return found
@@ -123,7 +120,7 @@ class Rows:
     """
     Rows of a table while it grows.
 
-    :param names: of the columns that are filled, in the order of the values of ``add``.
+    :param names: names of the filled columns, in the order of the values of ``add``.
     """
 
     def __init__(self, kind: np.dtype[Any], *names: str) -> None:
@@ -132,7 +129,7 @@ class Rows:
         self._add = [column.append for column in self.columns.values()]
 
     def __len__(self) -> int:
-        """Return how many rows there are."""
+        """Return the number of rows."""
         return len(self.columns[self._names[0]])
 
     def add(self, *values: int) -> int:
@@ -153,32 +150,32 @@ class Recording:
     """
     A recording in memory.
 
-    :ivar name: what messages call it.
-    :ivar head: with what it was recorded: policy, workers, …
-    :ivar task_set: what DAGs and vertices are numbered by.
-    :ivar recorded_set: the DAG tasks that it was recorded with.
-    :ivar declared: whether the recording itself has a declaration.
+    :ivar name: its name in messages.
+    :ivar head: settings of the recorded run: policy, workers, …
+    :ivar task_set: numbers DAGs and vertices.
+    :ivar recorded_set: the recorded DAG tasks.
+    :ivar declared: whether the recording contains a declaration.
     :ivar imported: whether another executor ran it.
-    :ivar same: whether ``task_set`` is what the recorded run itself was judged by.
+    :ivar same: whether the run itself was judged by ``task_set``.
     :ivar start: the first release, or when the first execution became ready, ns; None: neither.
     :ivar end: the end of the run, ns.
-    :ivar judged_until: when the run was judged, ns: what was open then and past its deadline has
+    :ivar judged_until: when the run was judged, ns: what was open then and past its deadline
         missed it.
-    :ivar judge_from: from which place in the order on which releases are judged.
-    :ivar judged_releases: from when on releases are judged, and until when, ns; None: all are.
-    :ivar hosted: from which place in the order on which vertices of a DAG the process has.
+    :ivar judge_from: changes of the first judged release, by position in the order.
+    :ivar judged_releases: range of judged releases, ns; None: all.
+    :ivar hosted: changes of the vertices of a DAG that the process runs, by position in the order.
     :ivar drop_reasons: names of the values of ``drops['reason']``.
-    :ivar lost: events that the recorder or tracer lost.
+    :ivar lost: number of events that the recorder or tracer lost.
     :ivar notices_stops: from this time on stops are recorded, ns; None: they are not.
-    :ivar processes: how many processes it is of, each with ``workers_each`` workers.
-    :ivar placed: which nodes ran in which process; empty: all in one.
-    :ivar worker_names: what workers are called, where that is more than a number.
-    :ivar links: whether ``message`` says which publication started an execution; else the job
-        does.
-    :ivar callback_vertex: by callback a vertex of the declared callback that it is, for executions
-        that belong to no job.
-    :ivar unjudged: by DAG how many jobs were withdrawn; None: not known of this source.
-    :ivar warnings: what is missing or doubtful, one line each.
+    :ivar processes: number of processes, each with ``workers_each`` workers.
+    :ivar placed: nodes of each process; empty: one process.
+    :ivar worker_names: names of workers, if they are more than a number.
+    :ivar links: whether ``message`` is the publication that started an execution; otherwise the
+        job links them.
+    :ivar callback_vertex: by callback a vertex of its declared callback, for executions without
+        job.
+    :ivar unjudged: by DAG the number of withdrawn jobs; None: unknown.
+    :ivar warnings: missing or doubtful data, one line each.
     """
 
     name: str
@@ -222,13 +219,13 @@ class Recording:
 
     @property
     def dropped(self) -> Counter[str]:
-        """Return how many executions were dropped for which reason."""
+        """Return the number of dropped executions by reason."""
         counts = np.bincount(self.drops['reason'], minlength=len(self.drop_reasons))
         return Counter({
             name: n for name, n in zip(self.drop_reasons, counts.tolist()) if n})
 
     def callbacks(self) -> tuple[Ints, Ints]:
-        """Return the numbers of the callbacks that ran, and by execution the index of its."""
+        """Return the numbers of the callbacks that ran, and by execution the callback's index."""
         if self._callbacks is None:
             numbers, index = np.unique(self.executions['callback'], return_inverse=True)
             self._callbacks = numbers, index.astype(np.int32)
@@ -236,7 +233,7 @@ class Recording:
 
     def vertices_of_callbacks(self, which: Any = slice(None)) -> Ints:
         """
-        Return by index of a callback the vertex that it ran as last; -1: it ran as none.
+        Return by index of a callback the vertex that it ran as last; -1: none.
 
         :param which: the executions to consider.
         """
@@ -248,7 +245,7 @@ class Recording:
         return found
 
     def callback_name(self, number: int) -> str:
-        """Return what a callback is called: as declared, or by its node and what starts it."""
+        """Return the declared name of a callback, otherwise its node and trigger."""
         if self._keys is None:
             numbers, _ = self.callbacks()
             self._keys = {
@@ -259,28 +256,28 @@ class Recording:
 
     def cut(self, begin: int, end: int) -> Recording:
         """
-        Return what happened in a range of time; see ``recording.cut``.
+        Return a time range; see ``recording.cut``.
 
-        :param begin: of the range, ns after the start of the recording; ``end``: likewise.
-        :raises ValueError: when the range is empty or begins before the recording.
+        :param begin: begin of the range, ns after the start of the recording; ``end``: likewise.
+        :raises ValueError: if the range is empty or begins before the recording.
         """
         from mddag_executor.recording.cut import cut
         return cut(self, begin, end)
 
     def to_arrow(self, name: str) -> Any:
-        """Return one of ``TABLES`` as an Arrow table, with names in place of numbers."""
+        """Return one of ``TABLES`` as an Arrow table, with names instead of numbers."""
         from mddag_executor.recording.frames import arrow_table
         return arrow_table(self, name)
 
     def to_pandas(self, name: str) -> Any:
-        """Return one of ``TABLES`` as a pandas data frame, with names in place of numbers."""
+        """Return one of ``TABLES`` as a pandas data frame, with names instead of numbers."""
         from mddag_executor.recording.frames import pandas_frame
         return pandas_frame(self, name)
 
 
 class JobNumbers:
     """
-    Numbers jobs over all DAGs; the last number is for what belongs to none.
+    Numbers jobs over all DAGs; the last number is for rows without job.
 
     :param released: the releases of the jobs.
     """
@@ -292,7 +289,7 @@ class JobNumbers:
         self.none = self._dags * len(self._numbers)
 
     def of(self, table: Table) -> Ints:
-        """Return the numbers of the jobs that rows belong to."""
+        """Return the job numbers of rows."""
         if not self.none:
             return np.zeros(len(table), dtype=np.int64)
         dag = table['dag'].astype(np.int64)
@@ -302,7 +299,7 @@ class JobNumbers:
         return np.where(known, dag * len(self._numbers) + at, self.none)
 
     def marked(self, which: Mask) -> Mask:
-        """Return by number whether it is a job of some of the releases."""
+        """Return by number whether the job is one of the chosen releases."""
         found = np.zeros(self.none + 1, dtype=np.bool_)
         found[self.of(self._released)[which]] = True
         return found
@@ -310,16 +307,16 @@ class JobNumbers:
 
 class RowNumbers:
     """
-    New numbers of rows of which some are left out.
+    New row numbers after some rows were dropped.
 
-    :param kept: which are not.
+    :param kept: the rows that are not dropped.
     """
 
     def __init__(self, kept: Mask) -> None:
         self._new = np.append(np.where(kept, np.cumsum(kept) - 1, UNKNOWN), UNKNOWN)
 
     def new(self, rows: Any) -> Ints:
-        """Return the new numbers, ``UNKNOWN`` for rows that are left out or not known."""
+        """Return the new numbers; ``UNKNOWN`` for dropped or unknown rows."""
         found: Ints = self._new[rows]
         return found
 
@@ -337,7 +334,7 @@ def sort_by(*columns: Any) -> Ints:
 
 
 def groups(values: Any) -> tuple[Ints, Ints]:
-    """Return where each run of equal values begins in a sorted column, and where it ends."""
+    """Return the begin and end of each run of equal values in a sorted column."""
     if not len(values):
         none = np.empty(0, dtype=np.int64)
         return none, none

@@ -1,13 +1,13 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Traces: recorded by a live run, written by importers and simulations, read by the replayer.
+Traces: recorded by live runs, written by importers and simulations, read by replay.
 
-A trace is one MCAP file with a channel for each kind of event, as CARET and ros2_tracing name
-them, in CDR; every MCAP and rosbag2 tool reads it. `TraceWriter` records from many threads,
-`TraceFile` writes event by event, `TraceReader` and `read_events` read, `import_ctf` brings CARET
-and ros2_tracing recordings in. The names are looked up on first use: a robot that does not record
-loads no compression and no importer.
+A trace is one MCAP file with a CDR channel for each kind of event, named as in CARET and
+ros2_tracing; every MCAP and rosbag2 tool reads it. `TraceWriter` records from many threads,
+`TraceFile` writes event by event, `TraceReader` and `read_events` read, `import_ctf` imports CARET
+and ros2_tracing recordings. Names are imported on first use: a robot that does not record loads no
+compression and no importer.
 """
 
 from __future__ import annotations

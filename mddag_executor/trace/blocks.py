@@ -1,24 +1,23 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Where the data of an MCAP file is, and whether it is sound.
+Finds the data blocks of an MCAP file and checks them.
 
 Theory of operation
 -------------------
-A file is a sequence of records.  ``scan`` reads their headers and finds the blocks: each is a
-chunk with its message indexes, or a run of plain messages and definitions.  ``load`` reads one
-block and checks its sizes and its CRC.  The first unsound byte ends both with ``Damage``.  Nothing
-behind it is used.
+A file is a sequence of records.  ``scan`` reads their headers and finds the blocks: a chunk with
+its message indexes, or a run of plain messages and definitions.  ``load`` reads one block and
+checks its sizes and its CRC.  The first defect ends both with ``Damage``; later data is not used.
 
-1. No length is believed before it is compared with what is there.  No memory is allocated for a
-   length.
-2. The lengths inside a chunk or a message index must add up to the length of its record.  Else the
-   record's length might lead past the next chunk.
-3. Message indexes follow their chunk.  If one follows anything else, the record before it was a
-   chunk whose opcode has changed.
-4. A file has its messages in chunks or outside them, not both.  A plain message after a chunk is
+1. Every length is compared with the available bytes before it is used.  No memory is allocated for
+   an unchecked length.
+2. The lengths inside a chunk or a message index must add up to the length of its record.
+   Otherwise a wrong length could skip the next chunk.
+3. Message indexes follow their chunk.  A message index after another record shows that the opcode
+   of a chunk has changed.
+4. A file has its messages inside or outside of chunks, not both.  A plain message after a chunk is
    a record whose opcode has changed.
-5. The CRC of a chunk may be 0: it has none (MCAP specification).  Plain messages have no CRC.
+5. A chunk's CRC of 0 means no CRC (MCAP specification).  Plain messages have no CRC.
 """
 
 from __future__ import annotations
@@ -41,16 +40,15 @@ import zstandard
 MAX_CHUNK = 256 * 1024 * 1024
 """Bytes before compression; a larger chunk is damage."""
 _PLAIN_BLOCK = 256 * 1024
-_CHUNK_HEAD = 1024              # bytes; more than a chunk's head needs
+_CHUNK_HEAD = 1024              # bytes; more than the head of a chunk
 _FOOTER_SIZE = records.RECORD.size + records.FOOTER_CONTENT.size + len(records.MAGIC)
 _REMEDY = 'give a trace written by this program or another MCAP recording'
 
 
 class Damage(Exception):
-    """What is wrong with a file's data, and at which byte; used inside this package only."""
+    """A defect of a file's data, and its byte position; used inside this package only."""
 
     def __init__(self, what: str, offset: int) -> None:
-        """Keep both."""
         super().__init__(what)
         self.what = what
         self.offset = offset
@@ -60,7 +58,7 @@ class Content(ReadDataStream):
     """
     The content of a record, for mcap's readers.
 
-    Reading past the end raises ValueError, so no length in a file is trusted.
+    Reading past the end raises ValueError, so wrong lengths are harmless.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -80,11 +78,11 @@ class Block:
     """
     A chunk with its message indexes, or a run of plain records; not yet read.
 
-    :ivar offset: of its first byte in the file; ``end``: of the first byte behind its records.
-    :ivar after: of the first byte behind its message indexes.
-    :ivar start_time: the earliest log_time of its messages, as its head says; ns.
-    :ivar data_offset: of its (compressed) records in the file.
-    :ivar size: of its records, uncompressed; ``crc``: of these, 0: there is none.
+    :ivar offset: position of its first byte in the file; ``end``: position after its records.
+    :ivar after: position after its message indexes.
+    :ivar start_time: the earliest log_time of its messages, according to its head, ns.
+    :ivar data_offset: position of its (compressed) records in the file.
+    :ivar size: size of its records, uncompressed; ``crc``: CRC of these, 0: none.
     """
 
     offset: int
@@ -99,7 +97,7 @@ class Block:
 
 
 class Summary(NamedTuple):
-    """What the summary section of a file says that there is."""
+    """The contents of a file according to its summary section."""
 
     messages: int
     chunks: int
@@ -107,7 +105,7 @@ class Summary(NamedTuple):
 
 
 def open_data(stream: BinaryIO, path: str) -> tuple[int, str]:
-    """Check the beginning of a file; return where its data section starts, and what wrote it."""
+    """Check the beginning of a file; return the start of its data section, and its writer."""
     magic = stream.read(len(records.MAGIC))
     if not magic:
         raise TraceError(path, 'is empty', _REMEDY)
@@ -121,7 +119,7 @@ def open_data(stream: BinaryIO, path: str) -> tuple[int, str]:
             library: str = Header.read(content).library
         except ValueError:
             opcode = 0
-        # A wrong length might lead past the first chunk.
+        # A wrong length could skip the first chunk.
         if opcode == Opcode.HEADER and content.count == length:
             return len(magic) + len(head) + int(length), library
     raise TraceError(path, 'ends or is damaged before its first event', _REMEDY)
@@ -129,9 +127,9 @@ def open_data(stream: BinaryIO, path: str) -> tuple[int, str]:
 
 def scan(stream: BinaryIO, start: int, size: int) -> tuple[list[Block], Damage | None]:
     """
-    Return the blocks of the data section, in the order of the file, and what ends them early.
+    Return the blocks of the data section, in the order of the file, and the first damage.
 
-    :param start: of the data section; ``size``: of the file.
+    :param start: start of the data section; ``size``: size of the file.
     """
     blocks: list[Block] = []
     try:
@@ -142,7 +140,7 @@ def scan(stream: BinaryIO, start: int, size: int) -> tuple[list[Block], Damage |
 
 
 def _scan(file: int, position: int, size: int, blocks: list[Block]) -> None:
-    previous = 0            # opcode of the record before
+    previous = 0            # opcode of the previous record
     chunks_seen = False
     while True:
         head = os.pread(file, records.RECORD.size + 6, position)
@@ -179,7 +177,7 @@ def _scan(file: int, position: int, size: int, blocks: list[Block]) -> None:
 
 
 def _chunk(file: int, position: int, end: int) -> Block:
-    """Return the chunk whose record starts at a position, from its head only."""
+    """Return the chunk whose record starts at a position; reads only its head."""
     start = position + records.RECORD.size
     content = Content(os.pread(file, min(end - start, _CHUNK_HEAD), start))
     try:
@@ -201,7 +199,7 @@ def _plain(file: int, position: int, size: int, messages: bool) -> Block:
     while True:
         head = os.pread(file, records.RECORD.size + records.MESSAGE_HEAD.size, end)
         if len(head) < records.RECORD.size:
-            break       # ``scan`` says what is wrong here
+            break       # ``scan`` reports the damage
         opcode, length = records.RECORD.unpack_from(head)
         after = end + records.RECORD.size + length
         if opcode not in allowed or after > size:
@@ -221,7 +219,7 @@ def load(stream: BinaryIO, block: Block, room: memoryview) -> bytes:
     """
     Read the records of a block into a buffer of its size; return its message indexes.
 
-    :raises Damage: when the records are not what the block's head says.
+    :raises Damage: if the records do not match the block's head.
     """
     read = os.pread(stream.fileno(), block.after - block.data_offset, block.data_offset)
     length = block.end - block.data_offset
@@ -244,7 +242,7 @@ def _decompress(data: bytes, compression: str, room: memoryview) -> bool:
     """Decompress data into a buffer; return whether it fills the buffer exactly."""
     size = len(room)
     if compression == 'zstd' and (size or data):
-        # the size that the frame claims is compared before memory is allocated for it
+        # compare the frame's size before memory is allocated for it
         if zstandard.frame_content_size(data) not in (size, -1):
             return False
         with zstandard.ZstdDecompressor().stream_reader(data) as reader:
@@ -260,10 +258,10 @@ def _decompress(data: bytes, compression: str, room: memoryview) -> bool:
 
 def read_summary(stream: BinaryIO, size: int) -> tuple[bool, Summary | None]:
     """
-    Return whether a file ends as a finished one, and its summary if it has one.
+    Return whether the file is finished, and its summary if it has one.
 
-    A summary whose CRC is wrong does not count.  It is wrong, too, if bytes were put into the data
-    or taken out: then the summary is not where the footer says.
+    A summary with a wrong CRC is ignored.  The CRC is also wrong if bytes were inserted or
+    removed, because the summary is then not at the position in the footer.
     """
     footer_start = size - _FOOTER_SIZE
     if footer_start < 0:

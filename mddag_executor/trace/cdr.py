@@ -1,17 +1,17 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-CDR encoding of flat ROS messages, and the ros2msg text that describes them.
+CDR encoding of flat ROS messages, and their definition as ros2msg text.
 
-Theory of operation: a flat message is a row of fields, each a primitive, a string, or an array or
-sequence of these. Plain CDR (XCDR1, little endian, what ROS 2 puts on the wire and into bags) puts
-a 4-byte encapsulation header first; offsets count from its end. Every primitive is aligned to its
-own size. A string is its length in bytes with the closing NUL as uint32, the UTF-8 bytes, the NUL.
-A sequence is its number of elements as uint32, then the elements; an array has no number. An
-empty sequence does not align for elements that are not there (as Fast CDR and rosbags do).
+Theory of operation: a flat message is a sequence of fields, each a primitive, a string, or an
+array or sequence of these. Plain CDR (XCDR1, little endian, used by ROS 2 on the wire and in bags)
+begins with a 4-byte encapsulation header; offsets count from its end. Every primitive is aligned
+to its own size. A string is its length in bytes with the closing NUL as uint32, the UTF-8 bytes,
+the NUL. A sequence is its number of elements as uint32, then the elements; an array has no number.
+An empty sequence has no padding for elements (as in Fast CDR and rosbags).
 
-A message of single primitives has one fixed layout, so one `struct.Struct` with its padding
-written out does the whole message; anything else is done field by field.
+A message of single primitives has a fixed layout, so one `struct.Struct` with padding encodes it;
+other messages are encoded field by field.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ _CONSTANT = re.compile(r'\S+\s+[A-Za-z][A-Za-z0-9_]*\s*=.*')
 @dataclass(frozen=True)
 class FieldType:
     """
-    The type of one field: its base, and how many of it.
+    The type of one field: base type and count.
 
-    `count` is None for a single value, -1 for a sequence, else the length of an array.
+    `count` is None for a single value, -1 for a sequence, otherwise the length of an array.
     """
 
     base: str
@@ -51,11 +51,11 @@ class FieldType:
     @classmethod
     def parse(cls, text: str) -> FieldType:
         """
-        Return the type that a ros2msg type name means.
+        Return the type of a ros2msg type name.
 
-        Bounds (`string<=10`, `uint8[<=4]`) do not change the encoding and are left out.
+        Bounds (`string<=10`, `uint8[<=4]`) do not change the encoding and are ignored.
 
-        :raises ValueError: for a nested message, a wstring or anything else that is not flat
+        :raises ValueError: for a nested message, a wstring or any other type that is not flat
         """
         match = _TYPE.fullmatch(text)
         if match is None:
@@ -69,7 +69,7 @@ class FieldType:
 
     @property
     def kind(self) -> str:
-        """Return what values of this type are in Python: int, float, bool, str or tuple."""
+        """Return the Python type of values: int, float, bool, str or tuple."""
         if self.count is not None:
             return 'tuple'
         return {'string': 'str', 'bool': 'bool', 'float32': 'float',
@@ -90,7 +90,7 @@ class FieldType:
     def _write_values(self, out: bytearray, values: Sequence[Any]) -> None:
         if self.base == 'string':
             for value in values:
-                # Text that is no valid Unicode (a path, say) must not cost the event.
+                # Text that is not valid Unicode (a path, for example) must not lose the event.
                 text = value.encode('utf-8', 'backslashreplace')
                 _align(out, 4)
                 out += _UINT32.pack(len(text) + 1) + text + b'\0'
@@ -102,7 +102,7 @@ class FieldType:
         """
         Return the value at a position and the position after it.
 
-        :raises ValueError, struct.error: where the data is too short for it
+        :raises ValueError, struct.error: if the data is too short
         """
         if self.count is None:
             values, position = self._read_values(data, position, 1)
@@ -119,14 +119,15 @@ class FieldType:
             return (), position
         if self.base == 'string':
             texts = []
-            for _ in range(count):      # ends soon: each takes 4 bytes or raises
+            # ends early for a wrong count: each element needs 4 bytes or raises
+            for _ in range(count):
                 text, position = _read_string(data, position)
                 texts.append(text)
             return tuple(texts), position
         size = _SIZES[self.base]
         position += -position % size
         end = position + count * size
-        if end > len(data):             # before struct makes room for what a length claims
+        if end > len(data):             # checked before struct allocates memory for the length
             raise ValueError('the message is shorter than its fields')
         return struct.unpack_from(f'<{count}{_CODES[self.base]}', data, position), end
 
@@ -164,7 +165,7 @@ def encode(types: Sequence[FieldType], values: Sequence[Any]) -> bytes:
     """
     Return the message without its encapsulation header.
 
-    :raises ValueError, struct.error, TypeError, AttributeError: where a value does not fit
+    :raises ValueError, struct.error, TypeError, AttributeError: if a value does not fit
     """
     if len(values) != len(types):
         raise ValueError(f'{len(values)} values for {len(types)} fields')
@@ -176,9 +177,9 @@ def encode(types: Sequence[FieldType], values: Sequence[Any]) -> bytes:
 
 def decode(types: Sequence[FieldType], data: bytes) -> tuple[Any, ...]:
     """
-    Return the values of a message given without its encapsulation header.
+    Return the values of a message without encapsulation header.
 
-    :raises ValueError, struct.error: where the data is too short for the types
+    :raises ValueError, struct.error: if the data is too short for the types
     """
     values = []
     position = 0
@@ -192,10 +193,10 @@ def parse_ros2msg(text: str) -> list[tuple[str, FieldType]]:
     """
     Return the fields of a flat message definition.
 
-    Comments, constants and default values are passed over, and so are the definitions of further
-    messages that may follow after a line of `=`.
+    Comments, constants, default values, and further message definitions after a line of `=` are
+    ignored.
 
-    :raises ValueError: where a field is not flat or a line is no field
+    :raises ValueError: if a field is not flat or a line is not a field
     """
     fields = []
     for line in text.splitlines():

@@ -1,19 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What the channels of a trace hold: decoders made from the schemas in the file.
+The channels of a trace, and decoders made from the schemas in the file.
 
 Theory of operation:
 
-1. A channel is an event's where its topic is `/trace/<provider>/<event>`. All others (an ordinary
-   recording has many) are passed over.
-2. The schema in the file says how to decode, not this program's table: another version, another
-   writer or an importer may have other fields. A channel whose schema is not a flat CDR message
-   with the preamble cannot be decoded; its messages are left out and counted.
-3. An event of the table comes out with the table's fields in the table's order, whatever the file
-   has: fields that the file does not have are None, or what the table says of optional ones;
-   others are left out. A field of another kind
-   than the table's (text for a number) makes the channel one that cannot be decoded.
+1. A channel with topic `/trace/<provider>/<event>` holds events. Other channels (common in
+   ordinary recordings) are skipped.
+2. Messages are decoded by the schema in the file, not by this program's table, because other
+   versions, writers and importers may have other fields. If a schema is not a flat CDR message
+   with the preamble, the messages of its channel are skipped and counted.
+3. An event of the table is returned with the table's fields in the table's order. Fields missing
+   in the file are None, or the table's default of optional ones; other fields are dropped. A
+   channel with a field of another kind than the table's (text instead of a number) cannot be
+   decoded.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ DEFINITIONS_LIMIT = 64 * 1024 * 1024        # bytes of all schemas and channels
 
 
 class Topic(NamedTuple):
-    """A channel: its topic, how its messages are encoded, and their type with its definition."""
+    """A channel: topic, message encoding, message type and its definition."""
 
     name: str
     encoding: str
@@ -61,14 +61,14 @@ class Layout:
 
 class Channels:
     """
-    The schemas and channels of a file, as they come along.
+    The schemas and channels of a file, added as they are read.
 
-    With `as_table` the events of the table have the table's fields, and an event starts with its
-    full name. Without it they have those of the file, and an event starts with its `Layout`.
+    With `as_table` events of the table have the table's fields, and an event starts with its full
+    name. Without it events have the fields of the file, and an event starts with its `Layout`.
     """
 
     def __init__(self, names: set[str] | None, as_table: bool) -> None:
-        """Keep what to decode: the named events, or all."""
+        """Choose the events to decode: the named ones, or all."""
         self._names = names
         self._as_table = as_table
         self._schemas: dict[int, Schema] = {}
@@ -76,12 +76,12 @@ class Channels:
         self._size = 0
         #: The topics of the channels.
         self.topics: dict[int, Topic] = {}
-        #: Channels whose messages are not wanted.
+        #: Channels whose messages are skipped.
         self.passed_over: set[int] = set()
-        #: Channels whose messages have one fixed layout: the beginning of their events, the
-        #: structure of the rest, and what the fields are that it does not have.
+        #: Channels whose messages have a fixed layout: begin of their events, structure of the
+        #: rest, and values of missing fields.
         self.fixed: dict[int, Fixed] = {}
-        #: The fields of the events met, by full name.
+        #: The fields of the events read so far, by full name.
         self.fields: dict[str, tuple[str, ...]] = {}
         self._decoders: dict[int, Decoder | str] = {}       # or the reason why there is none
 
@@ -89,7 +89,7 @@ class Channels:
         """
         Add the content of a schema record.
 
-        :raises ValueError: where it is malformed, or defines a known schema anew
+        :raises ValueError: if it is malformed, or redefines a known schema
         """
         schema = Schema.read(Content(content))
         self._keep(self._schemas, schema, content)
@@ -98,7 +98,7 @@ class Channels:
         """
         Add the content of a channel record.
 
-        :raises ValueError: where it is malformed, or defines a known channel anew
+        :raises ValueError: if it is malformed, or redefines a known channel
         """
         channel = Channel.read(Content(content))
         self._keep(self._channels, channel, content)
@@ -121,9 +121,9 @@ class Channels:
 
     def decoder(self, number: int) -> Decoder:
         """
-        Return the beginning of a channel's events and what returns the rest from a message.
+        Return the begin of a channel's events, and the function that decodes the rest.
 
-        :raises ValueError: where the channel cannot be decoded
+        :raises ValueError: if the channel cannot be decoded
         """
         decoder = self._decoders.get(number, 'the channel is not defined')
         if isinstance(decoder, str):
@@ -138,7 +138,7 @@ class Channels:
             raise ValueError('the schemas are too large')
 
     def _decode(self, number: int, name: str, fields: dict[str, FieldType]) -> None:
-        """Make the decoder of a channel of events; raise ValueError if there can be none."""
+        """Make the decoder of a channel of events; raise ValueError if impossible."""
         table = dict(EVENTS[name].fields) if name in EVENTS else {}
         _check(fields, table)
         preamble = [field for field, _ in PREAMBLE]
@@ -184,7 +184,7 @@ def _fields_of(topic: Topic) -> dict[str, FieldType]:
 
 
 def _check(fields: Mapping[str, FieldType], table: Mapping[str, str]) -> None:
-    """Raise ValueError where the file's fields cannot stand for those of the table."""
+    """Raise ValueError if the file's fields do not fit those of the table."""
     for field, _ in PREAMBLE:
         if field not in fields:
             raise ValueError(f'there is no field {field}')

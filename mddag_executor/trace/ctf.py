@@ -1,28 +1,29 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Importing CARET and ros2_tracing recordings: sessions of LTTng in the Common Trace Format (CTF).
+Imports CARET and ros2_tracing recordings: LTTng sessions in the Common Trace Format (CTF).
 
 Theory of operation:
 
-1. babeltrace2 reads the session, through its Python bindings in a process of their own
-   (`ctf_helper`): they usually belong to the system's Python, and they abort on some damage. The
-   Pythons are tried one after the other, this one first, until one has the bindings.
-2. All traces of a session (processes, kernel, rotated chunks) come as one stream in the order of
-   time.  LTTng writes into the metadata of each trace which session it is of.  A folder that holds
-   several sessions is refused, because they may be of different runs.  Sessions of one run on
-   several computers are named one by one.  CARET's cache beside them, `caret_converted`, is a
-   Python pickle of the same events and is not read: a pickle runs whatever code is in it.
+1. babeltrace2 reads the session, through its Python bindings in a separate process (`ctf_helper`),
+   because the bindings usually belong to the system's Python and abort on some damage. Python
+   interpreters are tried one after the other, the running one first, until one has the bindings.
+2. All traces of a session (processes, kernel, rotated chunks) are read as one stream in the order
+   of time.  The metadata of each trace names its session.  A folder with several sessions is
+   refused, because they may be of different runs.  Sessions of one run on several computers are
+   given one by one.  CARET's cache `caret_converted` in the session's folder is a Python pickle of
+   the same events. It is not read, because unpickling can run any code.
 3. Every event becomes one event of the trace, with all fields of its payload. An event of the
-   table (`schema.EVENTS`) has the table's types for the table's fields: flags that C has as
-   integers become bool, unsigned times int64 of the same bits. Any other event, and any other
-   fields, come with the types that they have in the session. A name that ROS does not allow is
-   changed; one that the preamble or the table has for something else gets `_` at its end.
-4. Contexts `vpid` and `vtid` are the preamble.  If sessions of several computers or containers
-   have the same numbers, those of later ones are changed (`numbers`).  Before the first event of a
-   thread, and where its name changes, stands an event `mddag:process` with its `procname`.
-5. What the tracer discarded is an event `mddag:lost` at the end of the gap; a packet that was
-   lost counts as one event at least, and a warning says so.
+   table (`schema.EVENTS`) has the table's types for the table's fields: integer flags become bool,
+   unsigned times become int64 of the same bits. Other events and fields keep their types. A name
+   that ROS does not allow is changed; a name that the preamble or the table uses otherwise gets
+   `_` appended.
+4. The contexts `vpid` and `vtid` become the preamble.  If sessions of several computers or
+   containers have the same ids, those of later sessions are changed (`numbers`).  An event
+   `mddag:process` with `procname` precedes the first event of a thread, and each change of its
+   name.
+5. Events discarded by the tracer become an event `mddag:lost` at the end of the gap; a lost packet
+   counts as at least one event, and a warning reports it.
 """
 
 from __future__ import annotations
@@ -60,16 +61,16 @@ Row = list[Any]
 
 @dataclass
 class Imported:
-    """What an import has brought."""
+    """The result of an import."""
 
     events: int = 0
     kinds: int = 0
     processes: set[int] = field(default_factory=set)
-    #: Events that the tracer discarded, as far as it counted them.
+    #: Number of events that the tracer discarded, as far as it counted them.
     discarded: int = 0
-    #: How many events there are of providers that replay does not know.
+    #: Number of events by provider that replay does not know.
     unread: Counter[str] = field(default_factory=Counter)
-    #: What is missing or was changed, one line each.
+    #: Missing or changed data, one line each.
     warnings: list[str] = field(default_factory=list)
 
 
@@ -81,12 +82,12 @@ def import_ctf(
     """
     Write the events of a CTF session into a trace file.
 
-    :param session: the folder of the session; traces are looked for in all folders below it.
-        Several sessions are one run that was recorded on several computers.
-    :param output: the trace; there is none after an exception
-    :param progress: called now and then with the number of events so far
-    :param overwrite: whether the trace may replace a file that is there
-    :raises TraceError: where the session or the file cannot be used, or babeltrace2 is missing
+    :param session: the folder of the session, searched recursively for traces. Several sessions
+        are one run that was recorded on several computers.
+    :param output: the trace; removed after an exception
+    :param progress: called regularly with the number of events
+    :param overwrite: whether an existing file may be replaced
+    :raises TraceError: if the session or the file cannot be used, or babeltrace2 is missing
     """
     paths = [os.fspath(path) for path in (
         [session] if isinstance(session, (str, os.PathLike)) else session)]
@@ -120,7 +121,7 @@ def _metadata_of(path: str) -> list[str]:
     """
     Return the metadata files of the traces below a folder.
 
-    :raises TraceError: where there is none, before babeltrace2 says so in its own words.
+    :raises TraceError: if there is none; babeltrace2's own message would be unclear
     """
     remedy = 'name the folder that LTTng recorded to, such as ~/.ros/tracing/SESSION'
     if '\0' in path or not os.path.exists(path):
@@ -139,12 +140,12 @@ def _metadata_of(path: str) -> list[str]:
 
 def _check_sessions(path: str, found: Sequence[str]) -> tuple[bool, set[tuple[str, ...]]]:
     """
-    Return whether one of the traces of a session is CTF 2, and what they say of the session.
+    Return whether a trace of the session is CTF 2, and the identities of its sessions.
 
     :param found: the metadata files below the folder.
-    :raises TraceError: where the folder holds several sessions, or metadata is damaged.
+    :raises TraceError: if the folder holds several sessions, or metadata is damaged
     """
-    # What the metadata says may differ between the traces of a session's folder: the first counts.
+    # Metadata of the traces in a session's folder may differ: the first one counts.
     sessions: dict[str, tuple[str, ...]] = {}
     every: set[tuple[str, ...]] = set()
     is_ctf_2 = False
@@ -166,19 +167,19 @@ def _check_sessions(path: str, found: Sequence[str]) -> tuple[bool, set[tuple[st
 
 
 def _session_folder(metadata: str) -> str:
-    """Return the folder of the session that a trace is of: LTTng's parts of it lie below."""
+    """Return the session folder of a trace: LTTng's subfolders are below it."""
     folder = os.path.dirname(metadata)
     parts = folder.split(os.sep)
     below = next((place for place, part in enumerate(parts) if part in _PARTS), len(parts))
     return os.sep.join(parts[:below])
 
 
-# What LTTng says of a session in the environment of the metadata, in CTF 1.8 and CTF 2, and how
-# the folders in that of a session are called.
+# LTTng's entries in the metadata's environment, in CTF 1.8 and CTF 2, and the names of subfolders
+# of a session.
 _ENVIRONMENT = re.compile(
     r'"?\b(trace_name|trace_creation_datetime|hostname)\b"?\s*[=:]\s*"((?:[^"\\]|\\.)*)"')
 _PARTS = {'ust', 'kernel', 'archives'}
-# A sequence of JSON texts (RFC 7464) begins with this character.
+# CTF 2 metadata, a sequence of JSON texts (RFC 7464), begins with this character.
 _CTF_2 = '\x1e'
 _READS_CTF_2 = (2, 1)
 
@@ -190,9 +191,9 @@ _MAGIC = 0x75D11D57
 
 def _metadata_text(path: str) -> str:
     """
-    Return the text of metadata, which comes in packets or as it is.
+    Return the text of metadata, which is stored in packets or as plain text.
 
-    :raises TraceError: where a packet is cut: babeltrace2 2.0 never ends on it.
+    :raises TraceError: if a packet is truncated: babeltrace2 2.0 hangs on it
     """
     try:
         with open(path, 'rb') as stream:
@@ -223,7 +224,7 @@ def _metadata_text(path: str) -> str:
 
 
 def interpreters() -> list[str]:
-    """Return the Pythons that may have babeltrace2's bindings, this one first."""
+    """Return the Python interpreters that may have babeltrace2's bindings, this one first."""
     system = sorted(str(path) for path in Path('/usr/bin').glob('python3.[0-9]*')
                     if re.fullmatch(r'python3\.\d+', path.name))
     found = [sys.executable, '/usr/bin/python3', shutil.which('python3'), *reversed(system)]
@@ -231,7 +232,7 @@ def interpreters() -> list[str]:
 
 
 def _rows(name: str, paths: Sequence[str], is_ctf_2: bool) -> Iterator[Row]:
-    """Yield the rows of the first Python that has bindings which read the format."""
+    """Yield the rows from the first Python interpreter with bindings that read the format."""
     too_old = None
     for interpreter in interpreters():
         rows = _rows_of(interpreter, name, paths)
@@ -258,7 +259,7 @@ def _rows_of(
     interpreter: str, name: str, paths: Sequence[str]
 ) -> Generator[Row, None, None]:
     """Yield the rows of a helper process."""
-    # A home that is set for one Python breaks another. Bytecode would be the only thing written.
+    # PYTHONHOME of one interpreter breaks another. Without bytecode nothing is written.
     environment = {name: value for name, value in os.environ.items() if name != 'PYTHONHOME'}
     environment['PYTHONDONTWRITEBYTECODE'] = '1'
     try:
@@ -266,7 +267,7 @@ def _rows_of(
             [interpreter, str(_HELPER), *map(os.path.abspath, paths)], env=environment,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     except OSError:
-        return      # the next one, then
+        return      # try the next interpreter
     assert process.stdout is not None
     ready = False
     try:
@@ -286,7 +287,7 @@ def _rows_of(
 
 
 def _read(stream: IO[bytes]) -> Iterator[Row]:
-    """Yield all rows, up to where the stream ends or has a line that is none of the helper's."""
+    """Yield all rows, up to the end of the stream or the first line that is not the helper's."""
     for line in stream:
         try:
             row = json.loads(line)
@@ -320,7 +321,7 @@ class _Kind(NamedTuple):
     How the events of a class are written.
 
     :ivar unread: a provider that replay does not know.
-    :ivar place: of the session that they are of.
+    :ivar place: number of their session.
     """
 
     key: str
@@ -333,7 +334,7 @@ class _Importer:
     """
     Writes the rows of the sessions of a run as events.
 
-    :param places: by what a trace says of its session, which one of them that is.
+    :param places: by identity the number of a session.
     """
 
     def __init__(
@@ -345,7 +346,8 @@ class _Importer:
         self._places = places
         self._processes, self._threads = Numbers(), Numbers()
         self._kinds: dict[int, _Kind] = {}
-        self._originals: dict[str, str] = {}        # full name in the trace: that in the session
+        # full name in the session, by full name in the trace
+        self._originals: dict[str, str] = {}
         self._changed: dict[str, str] = {}
         self._procnames: dict[tuple[int, int], str] = {}
         self._nameless = 0                          # events without process or thread
@@ -353,7 +355,7 @@ class _Importer:
         self._time = 0
 
     def take(self, row: Row) -> None:
-        """Write what a row says."""
+        """Write a row."""
         if row[0] == 'event':
             self._event(*row[1:])
         elif row[0] == 'class':
@@ -402,7 +404,7 @@ class _Importer:
             self._places.get(tuple(session), 0))
 
     def _name(self, original: str) -> str:
-        """Return the full name of an event; different ones stay different."""
+        """Return the full name of an event; different events keep different names."""
         provider, colon, name = original.partition(':')
         if not colon:
             provider, name = 'ctf', original
@@ -414,7 +416,7 @@ class _Importer:
         return key
 
     def finish(self) -> None:
-        """Write down what is missing or was changed."""
+        """Note what is missing or was changed."""
         result, path = self.result, self._path
         result.kinds = len(self._originals)
         if result.discarded:
@@ -438,7 +440,7 @@ class _Importer:
 
 
 def _legal(name: str) -> str:
-    """Return a name as ROS allows it."""
+    """Return a name that ROS allows."""
     name = re.sub(r'[^A-Za-z0-9_]', '_', name).lstrip('_') or 'unnamed'
     return name if name[0].isalpha() else f'n{name}'
 
@@ -447,10 +449,10 @@ def event_type(
     name: str, fields: Sequence[tuple[str, str]]
 ) -> tuple[EventType, list[Callable[[Any], Any] | None]]:
     """
-    Return how an event of a session is written, and what converts the values of its fields.
+    Return the type of a session's event in the trace, and the converters of its fields.
 
     :param name: its full name, legal in ROS
-    :param fields: names and types as the session has them; None stands for no conversion
+    :param fields: names and types in the session; a converter of None keeps the value
     """
     table = dict(EVENTS[name].fields) if name in EVENTS else {}
     preamble = {preamble_name for preamble_name, _ in PREAMBLE}
@@ -473,7 +475,7 @@ def event_type(
 
 
 def _fit(given: str, wanted: str) -> tuple[str, Callable[[Any], Any] | None] | None:
-    """Return the type for a field of the table and what converts to it, None where none can."""
+    """Return the type for a field of the table and its converter, None if there is none."""
     if given == wanted:
         return given, None
     have, want = FieldType.parse(given), FieldType.parse(wanted)
@@ -482,7 +484,7 @@ def _fit(given: str, wanted: str) -> tuple[str, Callable[[Any], Any] | None] | N
     if want.kind == 'int' and have.kind in ('int', 'bool'):
         bits = _bits(wanted)
         if have.kind == 'int' and _bits(given) > bits:
-            return given, None      # a reader takes any integer
+            return given, None      # a reader accepts any integer
         half = 0 if wanted.startswith('u') else 1 << bits - 1
         return wanted, lambda value: (value + half) % (1 << bits) - half
     return (given, None) if have.kind == want.kind else None

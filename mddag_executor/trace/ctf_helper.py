@@ -1,23 +1,22 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The process that reads a CTF session with babeltrace2 and streams its events to `ctf`.
+Reads a CTF session with babeltrace2 and streams its events to `ctf`; a separate process.
 
 Theory of operation:
 
-1. This file runs as a program of its own, in whichever Python has the module `bt2`; it imports
-   nothing of this project and runs from Python 3.9 on. babeltrace2 may also abort the process on
-   damaged input; that then ends this process only.
-2. Standard output has a row a line, in JSON:
+1. This file runs as a program in any Python that has the module `bt2`; it imports nothing of this
+   project and needs Python 3.9 or later. If babeltrace2 aborts on damaged input, only this process
+   ends.
+2. Standard output has one JSON row a line:
    `["missing", reason]` (no bt2 here; the only row), `["ready", version]` (the first row),
-   `["class", number, name, [[field, type], ...]]` (before the first event of it),
+   `["class", number, name, [[field, type], ...]]` (before its first event),
    `["event", number, timestamp, vpid, vtid, procname, [value, ...]]`,
-   `["discarded", timestamp, count]` (-1: not known how many),
-   `["error", reason]` and `["end"]`; one of these two is the last row. Whatever ends without is
-   incomplete.
-3. The types are those of ros2msg: integers by sign and size, `float32`, `float64`, `string`,
-   `bool`, arrays and sequences of these. A structure becomes its members, `outer_inner`. What has
-   no such type (variants, arrays of structures) is passed on as JSON text: nothing gets lost.
+   `["discarded", timestamp, count]` (-1: unknown count),
+   `["error", reason]` or `["end"]` (the last row). Output without a last row is incomplete.
+3. Types are those of ros2msg: integers by sign and size, `float32`, `float64`, `string`, `bool`,
+   arrays and sequences of these. A structure becomes its members, `outer_inner`. Other types
+   (variants, arrays of structures) become JSON text: nothing is lost.
 """
 
 from __future__ import annotations
@@ -30,23 +29,23 @@ import signal
 import sys
 from typing import Any, BinaryIO
 
-PATIENCE_S = 60     # for the next row; on some damage babeltrace2 2.0 never comes back
+PATIENCE_S = 60     # seconds until the next row; on some damage babeltrace2 2.0 hangs
 
-Member = tuple[str, str, Callable[[Any], Any]]      # name, type, and what gets it from the payload
+Member = tuple[str, str, Callable[[Any], Any]]      # name, type, getter from the payload
 
 
 def rows_to(stream: BinaryIO) -> Callable[..., None]:
-    """Return what writes a row to a binary stream."""
+    """Return a function that writes a row to a binary stream."""
     def add(*row: Any) -> None:
-        signal.alarm(0)             # the importer may take its time
+        signal.alarm(0)             # no limit while the importer reads
         stream.write(json.dumps(row, separators=(',', ':')).encode('ascii') + b'\n')
-        signal.alarm(PATIENCE_S)    # SIGALRM ends the process, whatever it is at
+        signal.alarm(PATIENCE_S)    # SIGALRM ends a hanging process
 
     return add
 
 
 def plain(field: Any) -> Any:
-    """Return any field as what JSON can hold."""
+    """Return any field as a value that JSON can hold."""
     kind = type(field).__name__
     if 'Structure' in kind:
         return {name: plain(value) for name, value in field.items()}
@@ -61,11 +60,11 @@ def plain(field: Any) -> Any:
 
 def scalar(kind: str, size: int = 64) -> tuple[str, Callable[[Any], Any]]:
     """
-    Return the type of a primitive and what converts it.
+    Return the type of a primitive and its converter.
 
     :param kind: the name of its class in bt2, of the field or of the field's class
     :param size: an integer's bits
-    :raises ValueError: for what is no primitive
+    :raises ValueError: if it is not a primitive
     """
     if 'String' in kind:
         return 'string', str
@@ -81,13 +80,13 @@ def scalar(kind: str, size: int = 64) -> tuple[str, Callable[[Any], Any]]:
 
 
 def primitive(cls: Any) -> tuple[str, Callable[[Any], Any]]:
-    """Return the type of a primitive's class and what converts it; raise ValueError otherwise."""
+    """Return the type of a primitive's class and its converter; raise ValueError otherwise."""
     kind = type(cls).__name__
     return scalar(kind, getattr(cls, 'field_value_range', 0) or getattr(cls, 'length', 64))
 
 
 def member(cls: Any) -> tuple[str, Callable[[Any], Any]]:
-    """Return the type that the fields of a class have in a message, and what converts them."""
+    """Return the message type of the fields of a class, and their converter."""
     kind = type(cls).__name__
     try:
         if 'Array' not in kind or 'BitArray' in kind:
@@ -104,7 +103,7 @@ def member(cls: Any) -> tuple[str, Callable[[Any], Any]]:
 
 
 def members(cls: Any, prefix: str = '') -> list[Member]:
-    """Return what a structure's class holds, structures within it flattened."""
+    """Return the members of a structure's class; nested structures are flattened."""
     found: list[Member] = []
     if cls is None:
         return found
@@ -127,14 +126,14 @@ class Session:
     """The events of a session, as rows."""
 
     def __init__(self, bt2: Any, add: Callable[..., None]) -> None:
-        """Give each row to `add`."""
+        """Pass each row to `add`."""
         self._bt2 = bt2
         self._add = add
-        # By the address of the event's class, which is kept so that none gets its address.
+        # By address of the event's class, which is kept so that its address is not reused.
         self._known: dict[int, tuple[int, Any, list[Callable[[Any], Any]]]] = {}
 
     def read(self, paths: list[str]) -> None:
-        """Write a row for each event below some folders, in the order of time."""
+        """Write a row for each event below the folders, in the order of time."""
         bt2 = self._bt2
         discarded = (bt2._DiscardedEventsMessageConst, bt2._DiscardedPacketsMessageConst)
         for message in bt2.TraceCollectionMessageIterator(paths):
@@ -156,7 +155,7 @@ class Session:
             *[_pick(context, names) for names in _IDENTITY], [get(payload) for get in getters])
 
     def _define(self, event: Any) -> tuple[int, Any, list[Callable[[Any], Any]]]:
-        cls = event.cls         # which belongs to one trace
+        cls = event.cls         # belongs to one trace
         environment = event.stream.trace.environment
         session = [str(environment[name]) if name in environment else '' for name in SESSION]
         fields = members(cls.payload_field_class)
@@ -167,7 +166,7 @@ class Session:
         return known
 
     def _discarded(self, message: Any) -> None:
-        """Say what the tracer discarded; a packet counts as an unknown number of events."""
+        """Report discarded events; a packet counts as an unknown number of events."""
         packets = isinstance(message, self._bt2._DiscardedPacketsMessageConst)
         count = None if packets else message.count
         try:
@@ -177,7 +176,7 @@ class Session:
         self._add('discarded', time, -1 if count is None else count)
 
 
-# What tells sessions apart in the environment of their traces.
+# Identity of a session in the environment of its traces.
 SESSION = ('hostname', 'trace_name', 'trace_creation_datetime')
 
 # Process, thread and name: of user space first, then of the kernel.
@@ -185,7 +184,7 @@ _IDENTITY = (('vpid', 'pid'), ('vtid', 'tid'), ('procname',))
 
 
 def _pick(context: Any, names: tuple[str, ...]) -> Any:
-    """Return the first of the named contexts that there is, None where there is none."""
+    """Return the first available context of these names, or None."""
     for name in names if context is not None else ():
         if name in context:
             return str(context[name]) if name == 'procname' else int(context[name])
@@ -200,14 +199,14 @@ def reason(error: BaseException) -> str:
 
 
 def main(sessions: list[str]) -> int:
-    """Read the sessions of a run; the outcome is the last row."""
-    # What a library prints must not come between the rows.
+    """Read the sessions of a run; the last row has the outcome."""
+    # Output of libraries must not mix with the rows.
     with os.fdopen(os.dup(1), 'wb') as stream:
         os.dup2(2, 1)
         add = rows_to(stream)
         try:
-            bt2 = import_module('bt2')      # which type checkers need not have
-        except Exception as error:      # also a binding that does not fit its library
+            bt2 = import_module('bt2')      # type checkers may not have it
+        except Exception as error:      # includes bindings that do not fit their library
             add('missing', f'{type(error).__name__}: {error}')
             return 0
         add('ready', str(getattr(bt2, '__version__', '')))
@@ -216,14 +215,14 @@ def main(sessions: list[str]) -> int:
             Session(bt2, add).read(sessions)
             add('end')
         except BrokenPipeError:
-            os._exit(1)     # the importer has gone
-        except Exception as error:      # whatever it is: the other side has to say it
+            os._exit(1)     # the importer has ended
+        except Exception as error:      # any error must be reported to the importer
             add('error', reason(error))
     return 0
 
 
 if __name__ == '__main__':
-    # The folder of this file is no place to import from: its modules are the project's.
+    # Don't import from this file's folder: it has modules of the project.
     _here = os.path.dirname(os.path.abspath(__file__))
     sys.path[:] = [_path for _path in sys.path if os.path.abspath(_path or '.') != _here]
     sys.exit(main(sys.argv[1:]))

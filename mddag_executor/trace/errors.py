@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What can go wrong with a trace."""
+"""Errors and warnings of traces."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ class TraceError(InputError):
 
 
 class TraceWarning(UserWarning):
-    """A trace of which something is missing; its text says what, with counts."""
+    """A trace with missing data; its text says which, with counts."""
 
 
 def renamed(text: str, path: str, name: str) -> str:
-    """Return a message with what the user calls a file in place of its path at the beginning."""
+    """Return a message with the user's name of a file instead of the path at its beginning."""
     return name + text[len(path):] if text.startswith(path) else text

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Many events of a trace at once, as columns of numbers and as tuples."""
+"""Batches of events of a trace, as columns of numbers or as tuples."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ FIELDS = 35
 
 class Fixed(NamedTuple):
     """
-    How numpy decodes the messages of a channel, which all have one layout.
+    How numpy decodes the messages of a channel with a fixed layout.
 
-    :ivar head: the beginning of the tuple of an event.
+    :ivar head: the begin of an event's tuple.
     :ivar kind: the type of a row, from ``timestamp`` on.
-    :ivar missing: fields that the file does not have, with their values.
+    :ivar missing: fields that the file lacks, with their values.
     """
 
     head: Event
@@ -34,8 +34,8 @@ class Column(NamedTuple):
     """
     The events of one channel in a batch.
 
-    :ivar at: where their records begin in the data, ascending.
-    :ivar size: how many bytes each record has; 0: not all have the same.
+    :ivar at: positions of their records in the data, ascending.
+    :ivar size: bytes of each record; 0: they differ.
     """
 
     fixed: Fixed
@@ -48,7 +48,7 @@ class Table(NamedTuple):
     The events of one kind.
 
     :ivar rows: a structured array with the event's fields, from ``timestamp`` on.
-    :ivar places: of each row, ascending in the order of the file over all batches.
+    :ivar places: positions of the rows in the order of the file over all batches, ascending.
     """
 
     head: Event
@@ -58,11 +58,11 @@ class Table(NamedTuple):
 
 class Batch:
     """
-    The events of some chunks; to be used before the next batch is read.
+    The events of some chunks; valid until the next batch is read.
 
     :param data: the records of the chunks.
-    :param base: the place of the first byte of the data in the order of the file.
-    :param others: the events that numpy cannot decode, with their places in the data.
+    :param base: position of the first byte of the data in the order of the file.
+    :param others: events that numpy cannot decode, with their positions in the data.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Batch:
         self.columns, self._others = columns, others
 
     def __len__(self) -> int:
-        """Return how many events there are."""
+        """Return the number of events."""
         return sum(len(column.at) for column in self.columns) + len(self._others)
 
     def table(self, column: Column) -> Table:
@@ -83,7 +83,7 @@ class Batch:
                      column.at + self.base)
 
     def others(self) -> list[tuple[int, Event]]:
-        """Return the other events with their places."""
+        """Return the other events with their positions."""
         return [(self.base + place, event) for place, event in self._others]
 
     def __iter__(self) -> Iterator[Event]:
@@ -100,7 +100,7 @@ class Batch:
 
 
 def with_fields(rows: Any, missing: dict[str, int]) -> Any:
-    """Return a structured array with more fields, each with one value in all rows."""
+    """Return a structured array with additional fields, each with the same value in all rows."""
     if not missing:
         return rows
     kinds = [(name, rows.dtype[name]) for name in rows.dtype.names]
@@ -113,7 +113,7 @@ def with_fields(rows: Any, missing: dict[str, int]) -> Any:
 
 
 def rows_at(data: bytearray, kind: Any, positions: Ints) -> Any:
-    """Return the structures of a type at some positions in data; raise IndexError beyond it."""
+    """Return the structures at positions in data; raise IndexError beyond its end."""
     room = len(data) - kind.itemsize + 1
     # as plain bytes: numpy copies structures field by field
     found = np.ndarray(max(room, 0), f'V{kind.itemsize}', data, strides=(1,))[positions]

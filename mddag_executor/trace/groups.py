@@ -5,10 +5,10 @@ Events that are always recorded together, as one entry.
 
 Theory of operation
 -------------------
-Nearly all that a live run records are the same few events for each callback.  To record and encode
-them one by one is most of what recording costs, so the executor records *one entry* for an
-execution and one for a publication, and the writer packs the messages of all their events at
-once.  In the file there is no difference: each event is a message of its own channel.
+A live run mostly records the same few events for each callback.  Recording and encoding them one
+by one would be the largest part of the cost of recording.  So the executor records *one entry* for
+an execution and one for a publication, and the writer packs the messages of all its events at
+once. The file is the same: each event is a message of its own channel.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ EXECUTION = 'execution'
 A declared callback has run: ``dispatch``, ``callback_start``, ``callback_end``, ``complete``.
 
 After the name: start, vtid, callback, dag, vertex, job, worker, ready, deadline, end, completed
-(the core's time of its completion), whole, leg, CPU time, whether it held the interpreter.
+(the core's time of its completion), whole, leg, CPU time, whether it held the GIL.
 """
 
 PUBLICATION = 'publication'
@@ -40,11 +40,11 @@ GROUPS = {
         'mddag:dispatch', 'ros2:callback_start', 'ros2:callback_end', 'mddag:complete'),
     PUBLICATION: ('ros2:rclcpp_publish', 'ros2:rcl_publish'),
 }
-"""The events that an entry stands for, in the order in which they are written."""
+"""The events of an entry, in the order in which they are written."""
 
 
 def events_of(entry: Sequence[Any]) -> int:
-    """Return how many events an entry stands for."""
+    """Return the number of events of an entry."""
     return len(GROUPS.get(entry[0], (0,)))
 
 
@@ -54,7 +54,7 @@ _E = cdr.ENCAPSULATION
 
 
 class Channel(Protocol):
-    """What is needed of a channel (see ``trace_file``)."""
+    """A channel (see ``trace_file``), as used here."""
 
     event: Any
     number: int
@@ -63,11 +63,11 @@ class Channel(Protocol):
 
 class Group:
     """
-    The channels of an entry's events, and what encodes them.
+    The channels of an entry's events, and their encoder.
 
     :ivar parts: the channels.
-    :ivar sizes: the size of each one's message record, in bytes.
-    :ivar encode: returns the records of an entry in one piece, and the time of each.
+    :ivar sizes: size of each message record, bytes.
+    :ivar encode: returns the records of an entry as one block, and the time of each.
     :ivar defined: whether all of the channels are in the file.
     """
 

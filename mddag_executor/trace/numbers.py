@@ -1,10 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The numbers of processes and threads of several computers or containers in one recording.
+Unique process and thread ids for several computers or containers in one recording.
 
-Linux numbers processes and threads anew on each computer and in each container, so two of them may
-have the same number.
+Linux assigns ids per computer and container, so two of them may have the same id.
 """
 
 from __future__ import annotations
@@ -13,14 +12,14 @@ _LINUX_IDS = 1 << 22    # Linux numbers processes and threads below this
 
 
 class Numbers:
-    """Numbers of processes, or of threads: each belongs to one place."""
+    """Ids of processes, or of threads: each belongs to one place."""
 
     def __init__(self) -> None:
         self._given: dict[tuple[int, int], int] = {}
         self._used: set[int] = set()
 
     def of(self, place: int, number: int) -> int:
-        """Return the number that stands for one of a place: the same if no other place has it."""
+        """Return the unique id for an id of a place: the same if no other place has it."""
         found = self._given.get((place, number))
         if found is None:
             found = number

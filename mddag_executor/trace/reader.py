@@ -1,9 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Reading traces as a stream.
+Reads traces as a stream of events.
 
-The reading itself, with its orders and what it does on damage, is in `reading`.
+The orders of reading and the handling of damage are in `reading`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def _opened(path: str) -> BinaryIO:
         mode = os.stat(path).st_mode
         if stat.S_ISDIR(mode):
             raise no_trace(path)
-        if not stat.S_ISREG(mode):      # a pipe would wait for its writer
+        if not stat.S_ISREG(mode):      # opening a pipe would wait for its writer
             raise TraceError(path, 'is no file', 'give the .mcap file itself')
         return open(path, 'rb')
     except OSError as error:
@@ -50,9 +50,9 @@ def _unreadable(path: str, error: OSError) -> TraceError:
 
 def no_trace(folder: str) -> TraceError:
     """
-    Return the error for a folder that was given instead of a trace: it says what is in it.
+    Return the error for a folder that was given instead of a trace; it lists the contents.
 
-    :raises OSError: where it cannot be looked into
+    :raises OSError: if the folder cannot be read
     """
     names = sorted(os.listdir(folder))
     traces = [name for name in names if name.endswith('.mcap')]
@@ -70,12 +70,11 @@ def no_trace(folder: str) -> TraceError:
 
 class TraceReader:
     """
-    Reads a trace file, which is opened once; every call of `events` reads it anew.
+    Reads a trace file, which is opened once; every call of `events` reads it again.
 
-    `warnings` has what was found to be missing or could not be decoded, one line each, once the
-    reading has come to its end. `fields` has the names of the fields of the events met so far,
-    `topics` all channels, and `times` the log times of all messages, once `messages` has been
-    read.
+    `warnings` has missing data and undecodable messages, one line each, after the reading has
+    ended. `fields` has the names of the fields of the events read so far, `topics` all channels,
+    and `times` the log times of all messages, after `messages` was read.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -99,11 +98,11 @@ class TraceReader:
 
     @property
     def message_count(self) -> int | None:
-        """Return how many messages there are to read; None: no sound summary counts them."""
+        """Return the number of messages; None without a valid summary."""
         return self._summary.messages if self._summary else None
 
     def may_have(self, name: str) -> bool:
-        """Return whether there may be an event of that full name: where the summary names none."""
+        """Return whether the file may have an event of that full name; True without a summary."""
         topic = '/trace/' + name.replace(':', '/')
         return self._summary is None or topic in self._summary.topics
 
@@ -118,12 +117,12 @@ class TraceReader:
         """
         Yield events as tuples: full name, timestamp (ns), process id, thread id, then the fields.
 
-        Fields are in the order of the table (`schema.EVENTS`), None where the file lacks one; for
-        events that are not in the table, in the order of the file (`fields`).
+        Fields are in the order of the table (`schema.EVENTS`), None if the file lacks one; events
+        that are not in the table have the order of the file (`fields`).
 
-        :param names: full names (`ros2:callback_start`) of the events wanted, None for all
+        :param names: full names (`ros2:callback_start`) of the wanted events, None for all
         :param sorted: whether to yield in the order of time instead of that of the file
-        :raises TraceError: where the file can no longer be read, or is too unordered to be sorted
+        :raises TraceError: if the file can no longer be read, or is too unordered to be sorted
         """
         return self._events(names, True, sorted)
 
@@ -131,7 +130,7 @@ class TraceReader:
         """
         Yield events in the order of time, with a `Layout` instead of the name.
 
-        They have the fields that the file has, not those of the table.
+        They have the fields of the file, not those of the table.
         """
         return self._events(names, False, True)
 
@@ -146,11 +145,11 @@ class TraceReader:
                 yield from batch
 
     def batches(self, names: Iterable[str]) -> Iterator[Batch]:
-        """Yield the named events in the order of the file, many at once."""
+        """Yield the named events in the order of the file, in batches."""
         return self._read(Channels(set(names), True), Reading.by_file)
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """Yield the messages of some topics, in the order of the file; they are not decoded."""
+        """Yield the undecoded messages of some topics, in the order of the file."""
         return self._read(Channels(set(), True), lambda reading, stream: reading.messages_of(
             stream, topics, self.times))
 
@@ -168,7 +167,7 @@ class TraceReader:
                 self.warnings.append(text)
 
     def _missing(self, reading: Reading) -> str | None:
-        """Return the line that says what is missing, None where nothing is."""
+        """Return the warning about missing data, None if nothing is missing."""
         damage, summary = reading.damage, self._summary
         found = _contents(reading.chunks, reading.messages)
         stated = (f'the file says that it holds {_contents(summary.chunks, summary.messages)}'
@@ -192,17 +191,17 @@ class TraceReader:
 def read_events(path: str | os.PathLike[str],
                 names: Iterable[str] | None = None) -> Iterator[dict[str, Any]]:
     """
-    Yield the events of a trace in the order of time, in the form that CARET's analysis takes.
+    Yield the events of a trace in the order of time, in the form that CARET's analysis reads.
 
-    It stops on events that it does not know.
+    CARET's analysis fails on unknown events; ``names`` selects the wanted ones.
 
-    Each is a dict of `_name` (as in `ros2:callback_start`), `_timestamp` (ns), `_vpid`, `_vtid`
-    and the event's fields as the file has them. In an imported recording it has `_procname`, too:
-    the events `mddag:process` that hold it are given out only where they are asked for by name. A
-    `TraceWarning` at the end says what is missing.
+    Each event is a dict of `_name` (as in `ros2:callback_start`), `_timestamp` (ns), `_vpid`,
+    `_vtid` and the event's fields in the file. In an imported recording it has `_procname`, too:
+    the events `mddag:process` that hold it are only yielded if they are named. A `TraceWarning` at
+    the end reports missing data.
 
-    :param names: full names of the events wanted, None for all
-    :raises TraceError: where the file cannot be read
+    :param names: full names of the wanted events, None for all
+    :raises TraceError: if the file cannot be read
     """
     reader = TraceReader(path)
     wanted = None if names is None else set(names)

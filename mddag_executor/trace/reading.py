@@ -1,23 +1,23 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-One pass over a trace file, in the order of the file or of time.
+Reads a trace file once, in the order of the file or of time.
 
 Theory of operation
 -------------------
-1. The file is read block by block (``blocks``), some megabytes at a time.  The message indexes say
-   where the messages of each channel begin.  They are used if they fit what is there: every
-   message has its channel, and together with the definitions the messages fill the data.  Else the
-   records are read one after the other.
-2. In the order of the file, the events of one thread are in order.  Those of different threads are
-   not: each thread appends an event after it took its time.
-3. In the order of time, an event is yielded once no later block can have an earlier one: the heads
-   of the blocks say from when on they have messages.  Memory is needed only for blocks that
-   overlap in time, and it is limited.  Events of equal time are in the order of the file.
-4. A block is used only if everything before it in the file is sound.  So damage leaves the
-   beginning of the recording.  It is kept in ``damage``, not raised.
-5. A message in a sound block that does not decode is left out and counted.  In the order of time,
-   so is an event before 1970 or after 2116: a simulation would never come to its end.
+1. The file is read block by block (``blocks``), some megabytes at a time.  Message indexes locate
+   the messages of each channel.  They are used if they match the data: every message has its
+   channel, and messages and definitions together fill the data.  Otherwise the records are read
+   one after the other.
+2. In the order of the file the events of one thread are ordered.  Those of different threads are
+   not: a thread appends an event after it has read its clock.
+3. In the order of time an event is yielded as soon as no later block can have an earlier one; the
+   heads of the blocks have their earliest times.  Only overlapping blocks need memory, which is
+   limited.  Events of equal time are in the order of the file.
+4. A block is used only if everything before it in the file is valid.  So the beginning of a
+   damaged recording is used.  ``damage`` has the damage; it is not raised.
+5. An undecodable message in a valid block is skipped and counted.  In the order of time, events
+   before 1970 or after 2116 are skipped, too: a simulation of them would never end.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ import numpy as np
 
 _BATCH_BYTES = 1 << 21
 _PENDING_LIMIT = 2_000_000
-"""Events in memory while they are put into the order of time."""
+"""Maximum number of events in memory while they are sorted."""
 _HEAD = np.dtype({
     'names': ['opcode', 'length', 'channel', 'log_time', 'publish_time', 'encapsulation'],
     'formats': ['u1', '<u8', '<u2', '<u8', '<u8', '<u2'], 'offsets': [0, 1, 9, 15, 23, 31],
     'itemsize': 33})
-"""The beginning of a message's record."""
+"""The begin of a message's record."""
 _CONTENT = records.RECORD.size
-_LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as _HEAD reads it
+_LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as read by _HEAD
 _INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, bytes of entries
 _INDEX_ENTRY = np.dtype([('time', '<u8'), ('offset', '<u8')])
 
@@ -66,9 +66,9 @@ class Message(NamedTuple):
 
 class _Loaded(NamedTuple):
     """
-    The data of some blocks, and where it begins for each, and ends.
+    The data of some blocks, the begin of each block, and the end.
 
-    The buffer is larger than the data, and it is used again for the next blocks.
+    The buffer is larger than the data and is reused for the next blocks.
     """
 
     blocks: list[Block]
@@ -78,36 +78,36 @@ class _Loaded(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Return where the data ends."""
+        """Return the end of the data."""
         return self.begins[-1]
 
     def block_at(self, position: int) -> Block:
-        """Return the block that a position in the data belongs to."""
+        """Return the block of a position in the data."""
         return self.blocks[bisect_right(self.begins, position) - 1]
 
     def until(self, offset: int) -> _Loaded:
-        """Return the same without the blocks from an offset in the file on."""
+        """Return the same without the blocks from a position in the file on."""
         count = sum(block.offset < offset for block in self.blocks)
         return _Loaded(self.blocks[:count], self.data, self.begins[:count + 1], self.indexes)
 
 
 _Places = dict[int, tuple[Ints, Any]]
-"""By channel where the records of its messages begin in the data, ascending, and their heads."""
+"""By channel the positions of its message records in the data, ascending, and their heads."""
 
 
 class Reading:
     """
-    One pass over a file: what it found, and what it could not use.
+    One pass over a file: its data, and the unusable parts.
 
-    :param channels: decides what becomes of the messages.
-    :param damage: what ends the blocks early.
+    :param channels: decides which messages are decoded.
+    :param damage: the damage that ends the blocks.
     """
 
     def __init__(
         self, path: str, channels: Channels, blocks: Sequence[Block], damage: Damage | None
     ) -> None:
         self.chunks = 0             # used
-        self.messages = 0           # in what was used, of all channels
+        self.messages = 0           # in used chunks, of all channels
         self.damage = damage
         self._path, self._channels, self._blocks = path, channels, blocks
         self._undecoded: Counter[str] = Counter()       # by topic and reason
@@ -172,7 +172,7 @@ class Reading:
     # --- where messages are ----------------------------------------------------------------------
 
     def _messages(self, stream: BinaryIO) -> Iterator[tuple[_Loaded, _Places]]:
-        """Yield the data of some blocks, and by channel where its messages are in it."""
+        """Yield the data of some blocks, and by channel the positions of its messages."""
         while self._used < len(self._blocks):
             loaded = self._load(stream)
             while loaded.blocks:
@@ -191,8 +191,8 @@ class Reading:
             self._place += loaded.end
 
     def _end(self, damage: Damage) -> None:
-        """Use nothing from some damage on."""
-        # these would keep the data in memory
+        """Ignore all data from the damage on."""
+        # the traceback would keep the data in memory
         self.damage, damage.__context__ = damage.with_traceback(None), None
         self._blocks = [block for block in self._blocks if block.offset < damage.offset]
 
@@ -204,7 +204,8 @@ class Reading:
                 break
             blocks.append(block)
             begins.append(begins[-1] + block.size)
-        room = begins[-1] + _HEAD.itemsize      # a head can be read at any record, however short
+        # a head can be read at any record, even a short one
+        room = begins[-1] + _HEAD.itemsize
         if len(self._buffer) < room:
             try:
                 self._buffer = bytearray(room)
@@ -223,9 +224,9 @@ class Reading:
 
     def _located(self, loaded: _Loaded) -> _Places:
         """
-        Return by channel where its messages are.
+        Return by channel the positions of its messages.
 
-        :raises Damage: when the records are not sound.
+        :raises Damage: if the records are invalid.
         """
         found = self._by_index(loaded)
         if found is not None:
@@ -238,7 +239,7 @@ class Reading:
         return {channel: (at, rows_at(loaded.data, _HEAD, at)) for channel, at in places.items()}
 
     def _by_index(self, loaded: _Loaded) -> _Places | None:
-        """Return it by the message indexes; None if these do not fit (rule 1)."""
+        """Return positions from the message indexes; None if these do not fit (rule 1)."""
         entries: dict[int, list[tuple[int, bytes]]] = {}
         for begin, index in zip(loaded.begins, loaded.indexes):
             end = 0
@@ -273,7 +274,7 @@ class Reading:
         return found if total < loaded.end and self._define_between(loaded, found) else None
 
     def _define_between(self, loaded: _Loaded, found: _Places) -> bool:
-        """Read what is between messages; return whether it is no message and all else fits."""
+        """Read definitions between messages; return whether only these are there and all fits."""
         starts, heads = _in_order(loaded, found)
         lengths = heads['length'].astype(np.int64)
         ends, begins = np.append(0, starts + _CONTENT + lengths), np.append(starts, loaded.end)
@@ -315,7 +316,7 @@ class Reading:
     # --- what they say ---------------------------------------------------------------------------
 
     def _decoded(self, loaded: _Loaded, found: _Places) -> Batch:
-        """Return the events of some blocks; count what cannot be decoded."""
+        """Return the events of some blocks; count undecodable ones."""
         columns, others = [], list[tuple[int, Event]]()
         for channel, (at, heads) in found.items():
             if channel in self._channels.passed_over:
@@ -350,14 +351,14 @@ class Reading:
             return None
 
     def impossible_times(self) -> str | None:
-        """Return the line about events at times that cannot be, None if there are none."""
+        """Return the warning about events with impossible times, None if there are none."""
         if not self._left_out:
             return None
         return (f'{self._path}: left out: {counted(len(self._left_out), "event")} at an '
                 f'impossible time, the first at {self._left_out[0]} ns')
 
     def undecoded(self) -> str | None:
-        """Return the line about messages that could not be decoded, None if all could."""
+        """Return the warning about messages that could not be decoded, None if all could."""
         if not self._undecoded:
             return None
         reason, count = self._undecoded.most_common(1)[0]
@@ -367,6 +368,6 @@ class Reading:
 
 
 def _in_order(loaded: _Loaded, found: _Places) -> tuple[Ints, Any]:
-    """Return where all messages are, in the order of the file, and their heads."""
+    """Return the positions of all messages, in the order of the file, and their heads."""
     at = np.sort(np.concatenate([*(at for at, _ in found.values()), np.empty(0, dtype=np.int64)]))
     return at, rows_at(loaded.data, _HEAD, at)

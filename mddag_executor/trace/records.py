@@ -1,10 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Building blocks of an MCAP file, beside those of the package mcap.
+Parts of the MCAP format in addition to the package mcap.
 
-mcap reads and writes all records but messages and their indexes, which are many. What is read may
-be damaged: no length in it is believed (``blocks.Content``).
+mcap reads and writes all records except messages and their indexes, which are many. Read data may
+be damaged: every length is checked (``blocks.Content``).
 
 Source: the MCAP format specification (https://mcap.dev/spec). A file is the magic, a header
 record, the data section (ended by a data-end record), the summary section, a footer and the magic
@@ -18,7 +18,7 @@ import struct
 
 MAGIC = b'\x89MCAP0\r\n'
 LIBRARY = 'mddag_executor'
-"""Stands in the header of files that this program wrote."""
+"""Library in the header of files that this program wrote."""
 
 RECORD = struct.Struct('<BQ')               # opcode, length of the content
 MESSAGE_HEAD = struct.Struct('<HIQQ')       # channel, sequence, log_time, publish_time

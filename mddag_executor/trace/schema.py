@@ -1,12 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The events of a trace: one table that the writer and the reader both go by.
+The events of a trace: the table that both writer and reader use.
 
 Names and fields are those of ros2_tracing (provider `ros2`) and CARET (`ros2_caret`), so that
-their tools understand them; provider `mddag` is this project's. Each event is a message
-`int64 timestamp`, `int32 vpid`, `int32 vtid`, then its fields: addresses are uint64, times are
-int64 nanoseconds.
+their tools understand them; provider `mddag` is this project's. Each event is a message `int64
+timestamp`, `int32 vpid`, `int32 vtid`, then its fields: addresses are uint64, times are int64
+nanoseconds.
 """
 
 from __future__ import annotations
@@ -26,9 +26,7 @@ class EventType:
     """
     One kind of event: its provider, its name, and its fields as pairs of name and ros2msg type.
 
-    :ivar optional: what the last fields are where a writer, or a file of an older version, does
-        not have them.
-
+    :ivar optional: defaults of the last fields, for writers and older files without them.
     :raises ValueError: for a name or type that a flat ROS message cannot have
     """
 
@@ -55,7 +53,7 @@ class EventType:
 
     @property
     def topic(self) -> str:
-        """Return the topic that the event is recorded as."""
+        """Return the topic of the event's channel."""
         return f'/trace/{self.provider}/{self.name}'
 
     @property
@@ -65,7 +63,7 @@ class EventType:
 
     @property
     def defaults(self) -> dict[str, int]:
-        """Return what the optional fields are by default."""
+        """Return the defaults of the optional fields."""
         first = len(self.fields) - len(self.optional)
         return {name: value for (name, _), value in zip(self.fields[first:], self.optional)}
 
@@ -76,7 +74,7 @@ class EventType:
 
 
 def camel_case(name: str) -> str:
-    """Return an event's name as that of a message: `callback_start` becomes `CallbackStart`."""
+    """Return an event's name as a message name: `callback_start` becomes `CallbackStart`."""
     return ''.join(part[:1].upper() + part[1:] for part in name.split('_'))
 
 
@@ -89,7 +87,7 @@ def _event(
 _U64, _I64, _I32, _STR, _BOOL = 'uint64', 'int64', 'int32', 'string', 'bool'
 
 _ALL = (
-    # ros2_tracing: what there is
+    # ros2_tracing: initialisation
     _event('ros2', 'rcl_node_init',
            node_handle=_U64, rmw_handle=_U64, node_name=_STR, namespace=_STR),
     _event('ros2', 'rcl_publisher_init', publisher_handle=_U64, node_handle=_U64,
@@ -105,7 +103,7 @@ _ALL = (
     _event('ros2', 'rclcpp_timer_callback_added', timer_handle=_U64, callback=_U64),
     _event('ros2', 'rclcpp_timer_link_node', timer_handle=_U64, node_handle=_U64),
     _event('ros2', 'rclcpp_callback_register', callback=_U64, symbol=_STR),
-    # ros2_tracing: what happens
+    # ros2_tracing: run time
     _event('ros2', 'callback_start', callback=_U64, is_intra_process=_BOOL),
     _event('ros2', 'callback_end', callback=_U64),
     _event('ros2', 'rclcpp_publish',
@@ -130,17 +128,17 @@ _ALL = (
     _event('ros2_caret', 'dds_bind_addr_to_stamp', addr=_U64, source_stamp=_I64),
     _event('ros2_caret', 'sim_time', stamp=_I64),
     # this project
-    # the CPUs that the process might use, 0 where that is not known
+    # the CPUs that the process could use, 0: unknown
     _event('mddag', 'task_set', (0,), yaml=_STR, file=_STR, policy=_STR, workers=_I32,
            default_deadline=_I64, max_active_jobs=_I32, preemptive=_BOOL, cpus=_I32),
-    # the boot of the machine that the steady clock counts from, '' where that is not known
+    # the boot of the machine that the steady clock counts from, '': unknown
     _event('mddag', 'host', name=_STR, boot=_STR),
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),
     _event('mddag', 'judge_from', release=_I64),
     _event('mddag', 'job_release', dag=_I32, job=_I64, release=_I64),
     _event('mddag', 'dispatch', callback=_U64, dag=_I32, vertex=_I32, job=_I64, worker=_I32,
            ready=_I64, reference_deadline=_I64),
-    # the CPU time of the execution, -1 where it is not known, and whether it held the interpreter
+    # the CPU time of the execution, -1: unknown, and whether it held the GIL
     _event('mddag', 'complete', (-1, False),
            callback=_U64, dag=_I32, vertex=_I32, job=_I64, last_leg=_BOOL, completed=_I64,
            leg=_I32, cpu_time=_I64, held_interpreter=_BOOL),
@@ -151,11 +149,11 @@ _ALL = (
     _event('mddag', 'expire', dag=_I32, job=_I64),
     _event('mddag', 'abort', dag=_I32, job=_I64),
     _event('mddag', 'outdate', dag=_I32, job=_I64),
-    # no thread of the process ran; of no length: from here on such stops are noticed
+    # no thread of the process ran; a stop of length 0: from here on stops are recorded
     _event('mddag', 'stop', begin=_I64, end=_I64),
     _event('mddag', 'lost', count=_I64),
     _event('mddag', 'shutdown', end=_I64),
-    # of imported recordings: what the event's thread is called from here on
+    # imported recordings: the name of the event's thread from here on
     _event('mddag', 'process', procname=_STR),
 )
 
@@ -164,5 +162,5 @@ EVENTS = {event.key: event for event in _ALL}
 
 PROCESS = 'mddag:process'
 
-#: The providers whose events replay goes by, also of other recorders.
+#: The providers whose events replay uses, including other recorders.
 PROVIDERS = frozenset({event.provider for event in _ALL} | {'dds', 'ros2_hook'})

@@ -1,25 +1,25 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Which times of a recording cannot be: the one rule for traces and ordinary bags.
+Finds impossible times in recordings; the only rule for traces and ordinary bags.
 
 Theory of operation
 -------------------
-One flipped bit makes a time that is years away; a program that believes it waits for years.
+One flipped bit can move a time by years; a program that uses it waits for years.
 
 1. A time before 1970 or at or after `NEVER` (2116) is impossible.
 
-The other rules are for bags, whose messages are in the order in which they were recorded.  In a
-trace an execution is recorded when it ends: its start may lie any time before the events around
-it.  Chunks of a trace have checksums.
+The other rules are for bags, whose messages are in the order of recording.  A trace records an
+execution at its end, so its start may be any time before neighbouring events; but chunks of a
+trace have checksums.
 
-2. The other times, in the order of the file, are put into groups: times that are `GAP_NS` or less
-   from the next are of one group.  Most recordings have one; a recorder that was paused, or one
-   of rare messages, makes several, one after the other.
-3. A group is stray if it is much smaller (`FEW`) than the largest and lies among the others in the
-   file, but not in time, or is `FAR_NS` or more from the largest.  Its times are impossible.
-4. Groups that are not stray but do not come in the order of the file are jumps of the clock: they
-   are used, and said.
+2. The remaining times, in the order of the file, are grouped: times at most `GAP_NS` from the next
+   belong to one group.  Most recordings have one group; pauses and rare messages cause several,
+   one after the other.
+3. A group is stray if it is much smaller (`FEW`) than the largest, and either is between others in
+   the file but not in time, or is `FAR_NS` or more from the largest.  Its times are impossible.
+4. Groups that are not stray but out of order in the file are jumps of the clock: they are used and
+   reported.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ FEW = 8         # times smaller
 
 class Times:
     """
-    Looks through times, and keeps what is odd about them.
+    Checks times, and counts odd ones.
 
-    :ivar left_out: how many are impossible.
-    :ivar jumps: how often the clock went back, and `furthest` by how much at most, ns.
+    :ivar left_out: number of impossible times.
+    :ivar jumps: number of backward jumps of the clock; `furthest`: the largest one, ns.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Times:
         self.left_out += len(times)
 
     def impossible(self, times: Sequence[int]) -> list[int]:
-        """Return the places, in ascending order, of what cannot be among times of one bag."""
+        """Return the positions of impossible times of one bag, ascending."""
         if not len(times) or _plain(min(times), max(times)):
             return []
         array = np.array([min(max(int(time), -1), NEVER) for time in times], dtype=np.int64)
@@ -74,7 +74,7 @@ class Times:
         return found
 
     def _stray(self, times: Any, places: Any) -> list[Any]:
-        """Return the stray groups, as places."""
+        """Return the stray groups, as positions."""
         groups = grouped(times, places)
         sizes = [len(group) for group in groups]
         if len(groups) < 2:
@@ -82,7 +82,7 @@ class Times:
         largest = groups[max(range(len(groups)), key=sizes.__getitem__)]
         before, after = int(times[largest[0]]) - FAR_NS, int(times[largest[-1]]) + FAR_NS
         stray = []
-        # those that come in the order of the file so far: number, first and last place
+        # groups in the order of the file so far: number, first and last position
         kept: list[tuple[int, int, int]] = []
         for number in sorted(range(len(groups)), key=lambda n: -sizes[n]):
             group = groups[number]
@@ -98,7 +98,7 @@ class Times:
         return stray
 
     def lines(self, noun: str) -> list[str]:
-        """Return what to say about it."""
+        """Return warnings about odd times."""
         found = []
         if self.left_out:
             found.append(f'left out: {counted(self.left_out, noun)} at an impossible time, the '
@@ -110,23 +110,23 @@ class Times:
 
 
 def credible(stamp: int, arrival: int) -> bool:
-    """Return whether a stamp can be that of what arrived at a time: not one of years before."""
+    """Return whether a stamp fits a time of arrival: not years before it."""
     return 0 < stamp and arrival - stamp < FAR_NS
 
 
 def _plain(least: int, greatest: int) -> bool:
-    """Return whether times between these two are all possible, and of one group."""
+    """Return whether all times in a range are possible, and of one group."""
     return 0 <= least and greatest < NEVER and greatest - least <= GAP_NS
 
 
 def grouped(times: Any, places: Any) -> list[Any]:
-    """Return the places of times as groups without a gap, in the order of time (rule 2)."""
+    """Return the positions of times as groups without a gap, in the order of time (rule 2)."""
     order = places[np.argsort(times[places], kind='stable')]
     return list(np.split(order, np.flatnonzero(np.diff(times[order]) > GAP_NS) + 1))
 
 
 def joined(several: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return stretches in the order of time, those without a gap between them as one."""
+    """Return ranges in the order of time, with adjacent ones joined."""
     found: list[tuple[int, int]] = []
     for start, end in sorted(several):
         if found and start - found[-1][1] <= GAP_NS:
@@ -136,7 +136,7 @@ def joined(several: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def stretches(times: Sequence[int]) -> list[tuple[int, int]]:
-    """Return from when to when there are times without a gap, in the order of time."""
+    """Return the ranges of times without a gap, in the order of time."""
     array = np.array(times, dtype=np.int64)
     if not len(array):
         return []

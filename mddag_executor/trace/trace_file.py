@@ -1,21 +1,21 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A trace file being written: events are encoded, gathered into chunks, and written.
+Writes a trace file: encodes events, collects them in chunks, and writes the chunks.
 
 Theory of operation:
 
-1. Everything that a reader needs stands inside chunks, where a CRC protects it: the schema and the
-   channel of an event are put into the chunk of its first message, just before that message.
-2. A chunk is at most 256 KiB before compression (a single larger event has a chunk of its own). It
-   goes to the operating system with its message indexes in one piece, so a process that is killed
-   leaves a file of whole chunks and at most one that is cut off.
-3. The summary (schemas, channels, statistics, chunk indexes) and the footer follow only when the
-   file is finished. They make seeking possible and show a reader what should be there; nothing
-   else depends on them.
-4. When writing fails the file is cut back to its last whole chunk.
+1. All data that a reader needs is inside chunks, which have a CRC: the schema and the channel of
+   an event are in the chunk of its first message, just before that message.
+2. A chunk is at most 256 KiB before compression (a larger event has its own chunk). It is written
+   with its message indexes in one piece, so a killed process leaves whole chunks and at most one
+   truncated chunk.
+3. The summary (schemas, channels, statistics, chunk indexes) and the footer are written when the
+   file is finished. They allow seeking and show what should be there; nothing else depends on
+   them.
+4. If writing fails, the file is truncated after its last whole chunk.
 
-All methods are for one thread; `TraceWriter` is what many threads may call.
+All methods must be called by one thread; `TraceWriter` is for many threads.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ import zstandard
 
 CHUNK_LIMIT = 256 * 1024
 KEPT = 'what was written before is there; '
-"""What the remedy begins with where events are in the file that failed."""
-_COMPRESSION_LEVEL = 1      # of zstd; higher levels cost more than they save on such data
+"""Begin of the remedy if the failed file has events."""
+_COMPRESSION_LEVEL = 1      # of zstd; higher levels cost more than they save for this data
 
 
 def written(what: McapRecord) -> bytes:
-    """Return one of mcap's records as it stands in a file."""
+    """Return one of mcap's records as bytes of the file."""
     builder = RecordBuilder()
     what.write(builder)
     data: bytes = builder.end()  # type: ignore[no-untyped-call]
@@ -63,7 +63,7 @@ def written(what: McapRecord) -> bytes:
 
 
 class _Channel:
-    """What the writer knows of one kind of event."""
+    """The writer's state of one kind of event."""
 
     __slots__ = ('channel', 'count', 'encode', 'event', 'index', 'number', 'schema',
                  'schema_name', 'undefined')
@@ -75,7 +75,7 @@ class _Channel:
         self.schema = written(
             Schema(number, event.text.encode(), 'ros2msg', schema_name))
         self.channel = written(Channel(number, event.topic, 'cdr', {}, number))
-        self.undefined = len(self.schema) + len(self.channel)   # 0 once they are in the file
+        self.undefined = len(self.schema) + len(self.channel)   # 0 after they were written
         self.count = 0                  # messages so far
         self.index: list[int] = []      # log_time and offset of each message in the open chunk
         self.encode = _encoder(event, number)
@@ -83,9 +83,9 @@ class _Channel:
 
 def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
     """
-    Return what makes a message record.
+    Return the function that encodes a message record.
 
-    It takes sequence, log_time, publish_time, encapsulation, then the values of the message.
+    Its arguments are sequence, log_time, publish_time, encapsulation, then the message's values.
     """
     layout = cdr.fixed_layout(event.types)
     if layout is not None:
@@ -105,7 +105,7 @@ def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
 
 
 def _completed(event: EventType, pack: Callable[..., bytes]) -> Callable[..., bytes]:
-    """Return a packer that also does without the optional fields of an event."""
+    """Return a packer that also accepts events without the optional fields."""
     if not event.optional:
         return pack
     whole = len(event.types)
@@ -132,7 +132,7 @@ def _channels(events: Iterable[EventType]) -> dict[str, _Channel]:
 
 
 def _schema_name(event: EventType, taken: Collection[str], number: int = 1) -> str:
-    """Return a name for an event's message: with its provider, then numbers, if it is taken."""
+    """Return a name for an event's message; used names get the provider, then numbers."""
     name = camel_case(event.name)
     stem = found = f'mddag_trace/msg/{name}'
     if found in taken:
@@ -145,10 +145,10 @@ def _schema_name(event: EventType, taken: Collection[str], number: int = 1) -> s
 
 class TraceFile:
     """
-    A trace file being written, event by event, by one thread.
+    A trace file that one thread writes, event by event.
 
-    For importers and simulations; what runs live uses `TraceWriter`. The file is complete after
-    `finish()`; leaving a `with` block does that, or gives the file up when an exception leaves it.
+    For importers and simulations; live runs use `TraceWriter`. The file is complete after
+    `finish()`; a `with` block finishes it, or abandons it after an exception.
     """
 
     def __init__(self, path: str | os.PathLike[str], *,
@@ -156,16 +156,17 @@ class TraceFile:
         """
         Open the file.
 
-        :param extra_events: events beyond the table, or other fields for one of the table
-        :param overwrite: whether it may replace a file that is there
-        :raises TraceError: when it cannot be written, or must not be replaced
+        :param extra_events: events that are not in the table, or with other fields than in the
+            table
+        :param overwrite: whether an existing file may be replaced
+        :raises TraceError: if the file cannot be written, or must not be replaced
         """
         self.path = os.fspath(path)
-        #: Events that are in the file, in whole chunks.
+        #: Number of events in the file, in whole chunks.
         self.written = 0
-        #: Events that `extend` was given, those that could not be encoded among them.
+        #: Number of events passed to `extend`, including those that could not be encoded.
         self.given = 0
-        #: Events that could not be encoded, and the reason of the first.
+        #: Number of events that could not be encoded, and the reason of the first.
         self.rejected = 0
         self.rejection: str | None = None
         events = {**EVENTS, **{event.key: event for event in extra_events}}
@@ -177,9 +178,9 @@ class TraceFile:
         self._zstd = zstandard.ZstdCompressor(level=_COMPRESSION_LEVEL)
         self._records: list[bytes] = []     # of the open chunk
         self._size = 0                      # their total size
-        self._offset = 0                    # what has been written of the file
+        self._offset = 0                    # bytes written so far
         self._chunk_indexes: list[bytes] = []
-        self._start: int | None = None      # least and greatest time of all messages
+        self._start: int | None = None      # minimum and maximum time of all messages
         self._end = 0
         try:
             self._stream = create_recording(self.path, overwrite)
@@ -193,12 +194,12 @@ class TraceFile:
 
     def define(self, event: EventType) -> str:
         """
-        Make a kind of event known while the file is being written.
+        Define a kind of event while the file is being written.
 
-        Where there are events of its name with other fields already, its own go to another channel
-        of the same topic.
+        If its name is already used with other fields, its events go to another channel of the same
+        topic.
 
-        :returns: the name that `add` and `extend` know it by
+        :returns: its name for `add` and `extend`
         """
         key, number = event.key, 1
         while key in self._channels and self._channels[key].event != event:
@@ -216,12 +217,12 @@ class TraceFile:
         """
         Write one event.
 
-        :param event: its full name (`ros2:callback_start`), or its short one where that is unique
+        :param event: its full name (`ros2:callback_start`), or its short one if that is unique
         :param timestamp: ns on the trace's clock
         :param vpid: process id
         :param vtid: native thread id
         :param fields: the values of its fields, in the order of its type
-        :raises TraceError: for an unknown event, unfit values, or where writing fails
+        :raises TraceError: for an unknown event, unfit values, or if writing fails
         """
         if self._stream.closed:
             raise TraceError(self.path, 'is closed', 'write events before finishing it')
@@ -234,11 +235,11 @@ class TraceFile:
 
     def extend(self, entries: Iterable[Sequence[Any]], vpid: int) -> None:
         """
-        Write events, given as name, timestamp, thread id and fields, or as entries of `groups`.
+        Write events: name, timestamp, thread id and fields; or entries of `groups`.
 
-        An event that is unknown or does not fit its type is left out and counted in `rejected`.
+        An event that is unknown or does not fit its type is skipped and counted in `rejected`.
 
-        :raises TraceError: where writing fails
+        :raises TraceError: if writing fails
         """
         channels, groups = self._channels, self._groups
         for entry in entries:
@@ -251,9 +252,9 @@ class TraceFile:
                 timestamp = entry[1]
                 message = channel.encode(channel.count & 0xFFFFFFFF, timestamp, timestamp,
                                          cdr.ENCAPSULATION, timestamp, vpid, *entry[2:])
-            except TraceError:              # of writing, on the way
+            except TraceError:              # writing failed
                 raise
-            except Exception as error:      # whatever a caller gave: it costs this event only
+            except Exception as error:      # wrong values of a caller lose only this event
                 self._reject(entry, error)
                 continue
             if self._size + len(message) + channel.undefined > CHUNK_LIMIT:
@@ -303,9 +304,9 @@ class TraceFile:
 
     def flush(self) -> None:
         """
-        Write what there is as a chunk and hand it to the operating system.
+        Write the collected events as a chunk to the operating system.
 
-        :raises TraceError: where writing fails
+        :raises TraceError: if writing fails
         """
         if not self._records:
             return
@@ -320,7 +321,7 @@ class TraceFile:
         offsets = {}
         for channel in used:
             offsets[channel.number] = self._offset + len(chunk) + len(indexes)
-            # not with mcap's MessageIndex: a live run's writer takes the interpreter for this
+            # mcap's MessageIndex would hold the GIL of a live run for longer
             entries = struct.pack(f'<{len(channel.index)}Q', *channel.index)
             indexes += records.record(
                 Opcode.MESSAGE_INDEX, struct.pack('<HI', channel.number, len(entries)) + entries)
@@ -342,7 +343,7 @@ class TraceFile:
         """
         Write the rest, the summary and the footer, and close the file; a second call does nothing.
 
-        :raises TraceError: where writing fails
+        :raises TraceError: if writing fails
         """
         if self._stream.closed:
             return
@@ -351,7 +352,7 @@ class TraceFile:
         summary_start = self._offset
         summary = self._summary()
         footer = written(Footer(summary_start, 0, 0))[:-4]
-        crc = zlib.crc32(summary + footer)      # of all from the summary's start to the CRC itself
+        crc = zlib.crc32(summary + footer)      # from the summary's start to the CRC itself
         self._write(summary + footer + records.UINT32.pack(crc) + records.MAGIC)
         self._stream.close()
 
@@ -370,14 +371,14 @@ class TraceFile:
             *self._chunk_indexes))
 
     def abandon(self) -> None:
-        """Close the file without what is not yet written, without summary and footer."""
+        """Close the file without unwritten events, summary and footer."""
         self._stream.close()
 
     def _write(self, data: bytes) -> None:
         rest = memoryview(data)
         try:
             while rest:
-                rest = rest[self._stream.write(rest):]      # a full disk may take only a part
+                rest = rest[self._stream.write(rest):]      # a full disk may accept only a part
         except (OSError, ValueError) as error:
             self._cut_back()
             reason = getattr(error, 'strerror', None) or str(error)
@@ -390,7 +391,7 @@ class TraceFile:
         try:
             self._stream.truncate(self._offset)
         except (OSError, ValueError):
-            pass        # not a plain file, or gone: a reader copes with a cut chunk
+            pass        # not a plain file, or removed: readers can handle a truncated chunk
         self._stream.close()
 
     def __enter__(self) -> TraceFile:
@@ -399,7 +400,7 @@ class TraceFile:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  traceback: TracebackType | None) -> None:
-        """Finish the file, or give it up when an exception leaves the block."""
+        """Finish the file, or abandon it after an exception."""
         if kind is None:
             self.finish()
         else:

@@ -5,15 +5,14 @@ The trace writer of a live run: many threads record, one thread writes.
 
 Theory of operation:
 
-1. `record()` is in the executor's hot path. It appends one tuple to a deque, which is atomic in
-   CPython, takes no lock and never waits. When the deque is full the event is counted as lost.
-2. The writer thread empties the deque every `flush_interval_s` and hands whole chunks to the
-   operating system, so a process that is killed loses that much and a little more.
-3. Encoding needs the interpreter lock, which the workers need too: the thread encodes a small
-   slice of events, then naps, so that no worker waits for more than one slice. When it falls
-   behind it skips the naps.
-4. Losses are written into the trace as `mddag:lost`, so that a reader knows of them.
-5. When writing fails, recording ends and the run goes on; `error` holds the reason and `close()`
+1. `record()` is on the executor's hot path. It appends one tuple to a deque, which is atomic in
+   CPython: no lock, no waiting. If the deque is full, the event is counted as lost.
+2. The writer thread empties the deque every `flush_interval_s` and passes whole chunks to the
+   operating system, so a killed process loses little more than that.
+3. Encoding needs the GIL, which the workers need, too: the thread encodes a small slice of events,
+   then sleeps, so no worker waits for more than one slice. If it falls behind, it does not sleep.
+4. Losses are written into the trace as `mddag:lost` for readers.
+5. If writing fails, recording ends and the run continues; `error` has the reason, and `close()`
    raises it.
 """
 
@@ -39,8 +38,8 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 _LOGGER = logging.getLogger(__name__)
-_SLICE = 128            # events encoded in one go: about 0.2 ms
-_NAP_S = 50e-6          # long enough for a waiting thread to take the interpreter lock
+_SLICE = 128            # events encoded at once: about 0.2 ms
+_NAP_S = 50e-6          # long enough for a waiting thread to get the GIL
 
 
 class TraceWriter:
@@ -56,47 +55,47 @@ class TraceWriter:
         """
         Open the file and start the writer thread.
 
-        :param clock_offset: ns between the trace's clock and `time.monotonic_ns()`; without it,
-            such that the trace's clock counts from the epoch
-        :param flush_interval_s: how often what was recorded goes to the operating system
-        :param capacity: how many events may wait for the writer thread
-        :param extra_events: events beyond the table
-        :param overwrite: whether it may replace a file that is there
+        :param clock_offset: ns between the trace's clock and `time.monotonic_ns()`; default: the
+            trace's clock counts from the epoch
+        :param flush_interval_s: interval at which events are written to the operating system
+        :param capacity: maximum number of events that wait for the writer thread
+        :param extra_events: events that are not in the table
+        :param overwrite: whether an existing file may be replaced
         """
         if clock_offset is None:
             clock_offset = epoch_offset_ns()
-        #: What to add to `time.monotonic_ns()` for a time on the trace's clock.
+        #: Offset from `time.monotonic_ns()` to the trace's clock.
         self.clock_offset = clock_offset
-        #: Why recording ended early, None while all is well.
+        #: Why recording ended early; None: no error.
         self.error: TraceError | None = None
         self._file = TraceFile(path, extra_events=extra_events, overwrite=overwrite)
         self._interval_s = flush_interval_s
         self._pending: deque[tuple[Any, ...]] = deque()
-        self._capacity = capacity       # 0: nothing is taken any more
+        self._capacity = capacity       # 0: recording has ended
         self._lost = 0
-        self._after_end = 0             # not in the trace, which ends before, and no loss of it
-        # Reentrant, for a finalizer or signal handler that records while its thread counts a loss.
+        self._after_end = 0             # recorded after the end of the trace: not a loss
+        # Reentrant: a finalizer or signal handler may record while its thread counts a loss.
         self._lost_lock = threading.RLock()
-        self._slice: list[tuple[Any, ...]] = []     # what went to the file object last,
-        self._given = 0                             # and how many events before that
+        self._slice: list[tuple[Any, ...]] = []     # the last slice passed to the file,
+        self._given = 0                             # and the number of events before it
         self._reported_lost = 0         # by `mddag:lost` events so far
         self._reported_rejection = False
         self._vpid = os.getpid()
         self._stop = threading.Event()
         self._close_lock = threading.Lock()
         self._ending = self._closed = False
-        # A daemon, so that a program that forgets close() ends; atexit completes its file.
+        # A daemon, so that a program without close() can end; atexit completes its file.
         self._thread = threading.Thread(target=self._run, name='mddag trace writer', daemon=True)
         self._thread.start()
         atexit.register(self._end)
 
-    # The tuple of all arguments is what is kept, so it is not taken apart: it is half the cost.
+    # The tuple of all arguments is stored as it is: unpacking it would double the cost.
     def record(self, *event: Unpack[tuple[str, int, int, Unpack[tuple[Any, ...]]]]) -> None:
         """
         Record one event: its name, its time, the native thread id, then its fields.
 
-        Or several at once, as an entry of `groups`. Never waits, never raises. An event that is
-        unknown or whose fields do not fit is left out by the writer thread, counted in `dropped`,
+        An entry of `groups` records several at once. Never waits, never raises. An event that is
+        unknown or whose fields do not fit is skipped by the writer thread, counted in `dropped`,
         and logged once.
 
         :param event: name (as in `callback_start`), ns on the trace's clock, native id of the
@@ -122,7 +121,7 @@ class TraceWriter:
 
     @property
     def dropped(self) -> int:
-        """Return how many recorded events are not in the file and will not be."""
+        """Return how many recorded events will not be in the file."""
         late = sum(map(events_of, self._pending)) if self._closed or self.error else 0
         return self._lost + self._after_end + self._file.rejected + late
 
@@ -130,14 +129,14 @@ class TraceWriter:
         """
         Write the rest and the summary, and end the writer thread; a second call does nothing.
 
-        :raises TraceError: (the first time) where writing failed, now or before
+        :raises TraceError: (the first time) if writing failed
         """
         if self._end() and self.error:
             raise self.error
 
     def _end(self) -> bool:
         with self._close_lock:
-            # In a forked child there is neither the thread nor a right to the parent's file.
+            # A forked child has no writer thread and must not write the parent's file.
             if self._closed or os.getpid() != self._vpid:
                 return False
             self._ending = True
@@ -157,14 +156,14 @@ class TraceWriter:
             self._file.finish()
         except TraceError as error:
             self._give_up(error)
-        except Exception as error:      # a defect here must not end the run that is being traced
+        except Exception as error:      # a defect here must not end the traced run
             self._file.abandon()
             self._give_up(TraceError(self._file.path, f'recording ended ({error!r})',
                                      'please report this; what was written before is there'))
 
     def _drain(self) -> None:
         pending = self._pending
-        # No more than what waits now: those who record must not keep this loop from its flush.
+        # Only the present number: recording threads must not delay the flush.
         waiting = len(pending)
         while waiting > 0:
             count = min(waiting, _SLICE)
@@ -204,7 +203,7 @@ class TraceWriter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  traceback: TracebackType | None) -> None:
-        """Close the writer; what a failed `close()` raises does not hide an exception."""
+        """Close the writer; an exception of the block has priority over one of `close()`."""
         if kind is None:
             self.close()
         else:
