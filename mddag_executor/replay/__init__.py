@@ -3,8 +3,8 @@
 """
 Replay of recorded runs: as recorded, and rescheduled through the core.
 
-``replay`` says which deadlines a recorded run held and where its time went, ``reschedule`` what
-the scheduler core would have done with its releases and execution times.
+``replay`` judges the deadlines of a recorded run and splits its response times; ``reschedule``
+runs the scheduler core with its releases and execution times.
 """
 
 from mddag_executor.recording.head import ReplayError

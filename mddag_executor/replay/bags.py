@@ -1,21 +1,21 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The stamps in ordinary rosbag2 recordings: when which message came, and what its header says.
+The stamps in ordinary rosbag2 recordings: arrival times and header stamps of messages.
 
 Theory of operation
 -------------------
-* A bag is a folder with `metadata.yaml` and the files that it names, or one such file.  What kind
-  a file is of its first bytes say, not its name: MCAP (read with ``trace.TraceReader``), SQLite
-  (read with rosbags) or zstd around one of them (a file-compressed bag; it is unpacked to a
-  temporary file).  A write-ahead log beside an SQLite file belongs to it.
-* Of each message there are its arrival (log time), its publication where the recorder kept that
-  apart, and the stamp at the beginning of its content, where its type begins with a
-  `std_msgs/Header` or a time.  Nothing else is decoded.
-* A topic that was recorded with a relative name (`AAA`) is that below the root (`/AAA`).
-* Messages at a time that cannot be (``trace.times``) are left out; so are stamps, of which the
-  message stays.
-* Damage costs what comes after it in that file, and is said.
+* A bag is a folder with `metadata.yaml` and the files that it names, or one such file.  The first
+  bytes of a file, not its name, say its kind: MCAP (read with ``trace.TraceReader``), SQLite (read
+  with rosbags) or zstd around one of them (a file-compressed bag, unpacked to a temporary file). A
+  write-ahead log next to an SQLite file belongs to it.
+* A message has its arrival (log time), its publication if the recorder stored it separately, and
+  the stamp at the beginning of its content, if its type begins with a `std_msgs/Header` or a time.
+  The rest is not decoded.
+* A topic with a relative name (`AAA`) is the same as in the root namespace (`/AAA`).
+* Messages at impossible times (``trace.times``) are dropped.  Impossible stamps are dropped, too,
+  but their messages stay.
+* Damage loses the rest of its file, and is reported.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ import zstandard
 _METADATA_LIMIT = 4 * 1024 * 1024
 _MCAP, _SQLITE, _ZSTD = b'\x89MCAP0\r\n', b'SQLite format 3\0', b'\x28\xb5\x2f\xfd'
 _REMEDY = 'give a folder with metadata.yaml that ros2 bag record wrote, or one of its files'
-_SPARE = 1 << 30            # bytes of the disk that unpacking leaves free
+_SPARE = 1 << 30            # bytes of disk space that unpacking leaves free
 _MOST_TIMES = 1000
 _PIECE = 1 << 20
 _BAG_FILE = re.compile(r'metadata\.yaml|.*\.(mcap|db3)(\.zstd)?')
@@ -55,7 +55,7 @@ _STAMPED = {
     'std_msgs/Header', 'std_msgs/msg/Header', 'Header', 'builtin_interfaces/Time',
     'builtin_interfaces/msg/Time'}
 UNKNOWN = -1
-"""Stands for a stamp that a message does not have."""
+"""A stamp that a message does not have."""
 
 
 class BagError(InputError):
@@ -63,7 +63,7 @@ class BagError(InputError):
 
 
 class Stamps:
-    """The messages of a topic, in the order of the bag: times in ns, `UNKNOWN` where none."""
+    """The messages of a topic, in the order of the bag: times in ns, `UNKNOWN` if missing."""
 
     def __init__(self) -> None:
         self.arrival = array('q')
@@ -72,7 +72,7 @@ class Stamps:
         self.type = ''
 
     def leave_out(self, never: Collection[int]) -> None:
-        """Forget the messages that came at these times."""
+        """Drop the messages that arrived at these times."""
         kept = [time not in never for time in self.arrival]
         for name in ('arrival', 'published', 'header'):
             setattr(self, name, array('q', compress(getattr(self, name), kept)))
@@ -80,14 +80,14 @@ class Stamps:
 
 class Bag:
     """
-    What a bag says about some topics.
+    Arrivals and stamps of some topics of a bag.
 
-    :param keep: called with each message of these topics: its topic with an absolute name, when
-        it came, when it was published (or `UNKNOWN`), and its bytes.
-    :ivar topics: every topic in it.
-    :ivar stamps: by topic that was asked for and is in it.
-    :ivar stretches: from when to when messages came, of any topic, without a gap (``times``).
-    :ivar warnings: what is missing or doubtful, one line each.
+    :param keep: called with each message of these topics: absolute name of the topic, arrival,
+        publication (or `UNKNOWN`), and its bytes.
+    :ivar topics: every topic in the bag.
+    :ivar stamps: by requested topic, if the bag has it.
+    :ivar stretches: time ranges without gaps in which messages of any topic arrived (``times``).
+    :ivar warnings: missing or doubtful data, one line each.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Bag:
         self._times = Times()
         self.warnings: list[str] = []
         self._stamped: dict[tuple[str, str], bool] = {}
-        self._stated: int | None = None     # messages that metadata.yaml counts
+        self._stated: int | None = None     # number of messages according to metadata.yaml
         files = self._files()
         for file in files:
             self._read(file, topics, len(files) == 1)
@@ -189,7 +189,7 @@ class Bag:
             finally:
                 reader.close()
                 self._look_through(_sqlite_times(unpacked))
-        except Exception as error:      # of SQLite, of rosbags, or of what a damaged file gave
+        except Exception as error:      # of SQLite, of rosbags, or caused by damaged data
             what = f'its SQLite storage cannot be read ({" ".join(str(error).split())})'
             if not used:
                 raise BagError(str(file), what, _REMEDY) from None
@@ -200,7 +200,7 @@ class Bag:
         return self.name if str(file) == self.path else str(file)
 
     def _look_through(self, times: Sequence[int]) -> None:
-        """Keep when the messages of a file came, and leave out those that cannot have."""
+        """Store the arrivals of a file's messages; drop those at impossible times."""
         wrong = self._times.impossible(times)
         if wrong:
             never = {times[place] for place in wrong}
@@ -210,7 +210,7 @@ class Bag:
         self.stretches = joined([*self.stretches, *stretches(times)])
 
     def _finish(self) -> None:
-        """Say what is odd about times, and forget stamps that cannot be."""
+        """Report odd times, and drop impossible stamps."""
         self.warnings += [f'{self.name}: {text}' for text in self._times.lines('message')]
         for topic, stamps in self.stamps.items():
             for column, noun in ((stamps.header, 'header stamp'),
@@ -270,19 +270,19 @@ class Bag:
 
 
 def _stray_stamps(arrivals: Sequence[int], stamps: Sequence[int]) -> list[int]:
-    """Return the places of stamps that are much earlier or later than others before arrival."""
+    """Return the positions of stamps that are much earlier or later than others before arrival."""
     known = [place for place, stamp in enumerate(stamps) if stamp > 0]
     if not known:
         return []
     lags = [stamps[place] - arrivals[place] for place in known]
     usual = sorted(lags)[len(lags) // 2]
-    # a usual one at both ends: what is odd there is between others, too
+    # a usual lag at both ends, so that odd ones there are between others, too
     around = [NEVER // 2 + lag - usual for lag in (usual, *lags, usual)]
     return [known[odd - 1] for odd in Times().impossible(around) if 0 < odd <= len(known)]
 
 
 def is_ordinary(path: str) -> bool:
-    """Return whether a path is a bag in which nothing was traced, so that it holds no jobs."""
+    """Return whether a path is a bag without traced events, so without jobs."""
     if not os.path.isdir(path):
         return _is_bag(path)
     names = [name for name in os.listdir(path) if _BAG_FILE.fullmatch(name)]
@@ -292,7 +292,7 @@ def is_ordinary(path: str) -> bool:
 
 
 def opened_trace(path: str) -> TraceReader | None:
-    """Return the trace that a file is, None for another one, and for damage."""
+    """Return the trace in a file; None for other files, and for damage."""
     reader = _mcap(path)
     return reader if reader is not None and _has_trace(reader) else None
 
@@ -309,7 +309,7 @@ def _mcap(path: str) -> TraceReader | None:
     try:
         return TraceReader(path)
     except (InputError, OSError):
-        return None     # of another kind, or damaged: then whoever reads it says why
+        return None     # another kind, or damaged: the reader reports the reason
 
 
 def _has_trace(reader: TraceReader) -> bool:
@@ -328,7 +328,7 @@ def _named_files(metadata: Path) -> tuple[list[str], int | None]:
     """
     Return the names of a bag's files and the number of messages in them.
 
-    Only what lies in its folder counts, whatever is written.
+    Names outside of its folder are ignored.
     """
     import yaml
     try:
@@ -350,9 +350,9 @@ def _named_files(metadata: Path) -> tuple[list[str], int | None]:
 @contextmanager
 def _unpacked(file: Path) -> Iterator[tuple[Path, bytes]]:
     """
-    Give a file as it can be read and the first bytes of its kind.
+    Yield a readable file and the first bytes of its kind.
 
-    A file in zstd is unpacked.  An SQLite file with a write-ahead log, which a killed recorder
+    A zstd file is unpacked.  An SQLite file with a write-ahead log, which a killed recorder
     leaves, is copied, because reading the log changes the file.
     """
     kind, log = _kind(file), Path(f'{file}-wal')
@@ -388,7 +388,7 @@ def _unpack(file: Path, target: Path) -> None:
 
 
 def _copy_with_log(file: Path, log: Path, target: Path) -> None:
-    """Copy a database, and write what its write-ahead log holds into the copy."""
+    """Copy a database, and apply its write-ahead log to the copy."""
     _check_space(file, target, file.stat().st_size + 2 * log.stat().st_size)
     shutil.copyfile(file, target)
     shutil.copyfile(log, f'{target}-wal')
@@ -418,7 +418,7 @@ def _kind(file: Path) -> bytes:
 
 
 def _unpacked_message(data: bytes, size: int) -> bytes:
-    """Return a compressed message, so many bytes of it at most; nothing where it is damaged."""
+    """Return a decompressed message, at most ``size`` bytes; empty if it is damaged."""
     try:
         packed = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
         return bytes(packed.stream_reader(io.BytesIO(data)).read(size))
@@ -427,14 +427,14 @@ def _unpacked_message(data: bytes, size: int) -> bytes:
 
 
 def _sqlite_times(file: Path) -> list[int]:
-    """Return when messages came, in the order in which they were stored, as far as that goes."""
+    """Return the arrivals of messages in the order of storage, as far as readable."""
     times: list[int] = []
     with closing(sqlite3.connect(f'{file.absolute().as_uri()}?mode=ro', uri=True)) as storage:
         try:
             for time, in storage.execute('SELECT timestamp FROM messages ORDER BY id'):
                 times.append(int(time))
         except (sqlite3.Error, TypeError, ValueError):
-            pass        # whoever reads the messages says why
+            pass        # the reader of the messages reports the reason
     return times
 
 
@@ -465,5 +465,5 @@ def _is_stamped(topic: Topic) -> bool:
         else:
             fields = get_typestore(Stores.ROS2_JAZZY).fielddefs[topic.message_type][1]
         return bool(fields) and fields[0][1][1] in _STAMPED
-    except Exception:   # a type that rosbags does not know, or a definition that it cannot read
+    except Exception:   # a type unknown to rosbags, or an unreadable definition
         return False

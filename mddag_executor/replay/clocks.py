@@ -1,20 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The clocks of the machines that the traces of one run come from.
+The clocks of the machines of one run.
 
 Theory of operation
 -------------------
-1. *Machines.*  A trace says in which boot of which machine it was recorded (``mddag:host``).  Of
-   older traces those are of one machine whose clocks differ by less than ``SAME_CLOCK``.
-2. *Messages* show how clocks differ: the publisher's says when one was sent (the source
-   timestamp), the receiver's when it was taken.  The least of these times from A to B is the
-   least transport plus the offset of B's clock, and that from B to A the least transport minus
-   it.  So half their difference is the offset, and half their sum how far that may be wrong.
-3. A message counts where one machine only publishes its topic, and has recorded a publication
-   at that time, to ``SAME_PUBLICATION``: else it may be a stranger's, or the clock was set
-   meanwhile.
-4. Machines between which messages do not go both ways are compared by way of others.
+1. *Machines.*  A trace names the boot of its machine (``mddag:host``).  Older traces belong to one
+   machine if their clocks differ by less than ``SAME_CLOCK``.
+2. *Messages* show how clocks differ: the publisher's clock has the time of sending (the source
+   timestamp), the receiver's clock the time of taking.  The minimum difference from A to B is the
+   minimum transport plus the offset of B's clock; from B to A it is the minimum transport minus
+   the offset.  So the offset is half their difference, and half their sum is its possible error.
+3. A message counts if only one machine publishes its topic, and has recorded a publication at that
+   time, within ``SAME_PUBLICATION``.  Otherwise it may be from elsewhere, or the clock was set.
+4. Machines without messages in both directions are compared through other machines.
 """
 
 from __future__ import annotations
@@ -34,11 +33,11 @@ _NODES = ('ros2:rcl_publisher_init', 'ros2:rcl_subscription_init')
 _PUBLISH, _TAKE = 'ros2:rclcpp_publish', 'ros2:rmw_take'
 
 Ways = dict[tuple[int, int], int]
-"""By two machines the least time of a message from one to the other, by their clocks."""
+"""By two machines the minimum time of a message from one to the other, by their clocks."""
 
 
 class Offset(NamedTuple):
-    """How far a clock is ahead of the first machine's, and how far that may be wrong, ns."""
+    """How far a clock is ahead of the first machine's, and the possible error, ns."""
 
     ahead: int
     uncertainty: int
@@ -48,8 +47,8 @@ def machines(clocks: Sequence[tuple[str, int]]) -> list[int]:
     """
     Return for each trace the first one that was recorded on the same machine (rule 1).
 
-    :param clocks: of each the boot of its machine, '' where that is not known, and what turns its
-        steady clock to its times.
+    :param clocks: by trace the boot of its machine, '': unknown, and the offset from its steady
+        clock to its times.
     """
     found: list[int] = []
     for boot, offset in clocks:
@@ -61,7 +60,7 @@ def machines(clocks: Sequence[tuple[str, int]]) -> list[int]:
 
 class Messages:
     """
-    What a trace says of messages, by topic.
+    The messages of a trace, by topic.
 
     :ivar sent: when they were published; ``taken``: source timestamps, and when they were taken.
     """
@@ -85,9 +84,9 @@ class Messages:
 
 def ways(traces: Sequence[Messages], machine: Sequence[int], shifts: Sequence[int]) -> Ways:
     """
-    Return the least times of messages from machine to machine (rules 2 and 3).
+    Return the minimum times of messages from machine to machine (rules 2 and 3).
 
-    :param machine: of each trace; ``shifts``: what puts each on its machine's clock.
+    :param machine: of each trace; ``shifts``: offset from each trace to its machine's clock.
     """
     publishers: dict[str, set[int]] = defaultdict(set)
     for trace, of in zip(traces, machine):
@@ -108,7 +107,7 @@ def ways(traces: Sequence[Messages], machine: Sequence[int], shifts: Sequence[in
 
 
 def _near(sent: np.ndarray, stamps: np.ndarray) -> np.ndarray:
-    """Return which stamps are near one of the times at which something was sent."""
+    """Return which stamps are near a publication."""
     after = np.searchsorted(sent, stamps)
     away = np.minimum(
         np.abs(stamps - sent[np.minimum(after, len(sent) - 1)]),
@@ -121,10 +120,10 @@ def offsets(
     of: Iterable[int], found: Ways, given: Mapping[int, int]
 ) -> dict[int, Offset]:
     """
-    Return the offsets of machines from machine 0: as given, or as messages show (rules 2 and 4).
+    Return the offsets of machines from machine 0, given or measured (rules 2 and 4).
 
-    :param given: those that are known, by machine.
-    :return: without those that are not known.
+    :param given: known offsets, by machine.
+    :return: without unknown offsets.
     """
     known = {0: Offset(0, 0), **{machine: Offset(ahead, 0) for machine, ahead in given.items()}}
     for _ in set(of):
@@ -140,9 +139,9 @@ def offsets(
 
 def said(offset: Offset | None, there: int | None, name: str) -> str:
     """
-    Return what there is to say of the clock of another machine.
+    Return the warning about the clock of another machine.
 
-    :param there: the least time of a message to it, None where there was none.
+    :param there: the minimum time of a message to it, None without messages.
     """
     if offset is None:
         early = '' if there is None or there >= 0 else (

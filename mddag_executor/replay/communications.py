@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What the callbacks of an imported recording did, declared or not, and how messages went."""
+"""Executions of callbacks and transport of messages in an imported recording."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def recorded_callbacks(recording: Recording) -> dict[str, dict[str, int]]:
 
 
 def communications(recording: Recording) -> list[dict[str, Any]]:
-    """Return for each pair of publisher and callback messages, and publication to start."""
+    """Return by publisher and callback the messages, and times from publication to start."""
     table, messages, found = recording.executions, recording.publications, []
     started = np.flatnonzero(table['message'] >= 0)
     message = messages[table['message'][started]]

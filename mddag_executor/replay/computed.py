@@ -1,20 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A schedule that was computed, as the recording of the run that it stands for.
+A computed schedule as the recording of a run.
 
 Theory of operation
 -------------------
-The simulator and the rescheduler keep a log: which worker began, ended or preempted what, and
-when.  Together with the load and with the ends of jobs that the core decided that is all that a
-recording has, so every analysis finds the same verdicts again and, as with a recording, where the
-time went.
+The simulator and the rescheduler keep a log: which worker began, ended or preempted which vertex,
+and when.  With the load and the ends of jobs decided by the core this contains all data of a
+recording.  So every analysis works as on a recording and finds the same verdicts.
 
-At one instant the ends of executions come first, each with the job that it aborts, then other jobs
-that are given up, then releases, then starts.  A vertex is ready when the last message that it
-needs has arrived: at the end of the execution that publishes it, or as much later (or earlier) as
-``delays`` says.  An execution that was preempted has several pieces, as a coroutine that was
-suspended.  A sync callback runs once for all of its legs.
+At the same instant ends of executions come first, each with the job that it aborts, then early
+ends of jobs, then releases, then starts.  A vertex is ready when the last message that it needs
+has arrived: at the end of the publishing execution, shifted by ``delays``.  A preempted execution
+has several pieces, like a suspended coroutine.  A sync callback runs once for all of its legs.
 """
 
 from __future__ import annotations
@@ -39,17 +37,17 @@ Id = tuple[int, int, int]
 """DAG, global vertex, job in the load."""
 
 _REASONS = {ABORTED: tables.ABORTED, EXPIRED: tables.EXPIRED, OUTDATED: tables.OUTDATED}
-"""What a recording calls the ends of jobs that did not complete."""
+"""Reasons, in terms of a recording, why jobs ended early."""
 
 
 class ComputedRun(NamedTuple):
     """
-    A schedule that was computed.
+    A computed schedule.
 
     :ivar horizon: no job is released from then on, ns.
-    :ivar end: when it ended, ns; what is open then is judged if ``judged``.
-    :ivar numbers: by DAG, what a job of the load is called; None: as in the load.
-    :ivar delay: how long messages take; None: no time.
+    :ivar end: when it ended, ns; open jobs are then judged if ``judged``.
+    :ivar numbers: by DAG the recorded numbers of the load's jobs; None: as in the load.
+    :ivar delay: transport time of messages; None: 0.
     :ivar judge_from: jobs released before are not judged.
     """
 
@@ -76,13 +74,13 @@ class ComputedRun(NamedTuple):
         """
         Return the schedule as a recording.
 
-        :param workers: how many there are.
+        :param workers: number of workers.
         """
         return _Player(self).recording(workers)
 
 
 class _Running(NamedTuple):
-    """What a worker runs, and since when; `busy` is the time of the pieces before."""
+    """The execution of a worker, and its start; `busy` is the time of earlier pieces."""
 
     since: int
     ready: int
@@ -92,7 +90,7 @@ class _Running(NamedTuple):
 
 
 class _Player:
-    """Goes through a schedule once."""
+    """Converts a schedule, event by event."""
 
     def __init__(self, schedule: ComputedRun) -> None:
         task_set = schedule.task_set
@@ -126,12 +124,12 @@ class _Player:
     def recording(self, workers: int) -> Recording:
         schedule = self._schedule
         for entry in schedule.log:
-            # what ends at an instant does so before anything is released or given up there
+            # ends come before releases and early ends of jobs at the same instant
             self._until(entry[0] - 1 if entry[1] == END else entry[0])
             self._change(entry)
             now, kind, _, dag, v, job = entry
             if kind == END and self._next_end == (now, dag, job, True, v):
-                self._end_job()     # what else of it ends at that instant comes too late
+                self._end_job()     # completions at the same instant are too late
         self._until(schedule.end)
         for what, (ran, worker) in self._running.items():
             self._row(what, ran, worker, UNKNOWN, tables.NOTHING)
@@ -160,7 +158,7 @@ class _Player:
         return job if numbers is None or dag >= self._n_dags else numbers[dag][job]
 
     def _job_ends(self) -> Iterator[tuple[int, int, int, int, int]]:
-        """Yield when jobs end otherwise than by completing, and the vertex that aborts one."""
+        """Yield early ends of jobs, and the vertex that aborts one."""
         late = (-1, -1, -1), -1
         for kind, dag, v, job, how, time in self._schedule.decisions:
             if kind == SINK_LATE:
@@ -170,7 +168,7 @@ class _Player:
                 yield time, dag, job, _REASONS[how], vertex
 
     def _until(self, now: int) -> None:
-        """Note what is released and given up to an instant."""
+        """Process releases and early ends up to an instant."""
         load, schedule = self._load, self._schedule
         while True:
             release = load.times[self._next] if self._next < len(load.times) else now + 1
@@ -204,7 +202,7 @@ class _Player:
 
     def _change(self, entry: LogEntry) -> None:
         now, kind, worker, dag, v, job = entry
-        if v < 0:       # what starts it was noticed (see ``simulate.intakes``)
+        if v < 0:       # its timer or message was noticed (see ``simulate.intakes``)
             what = (dag, ~v, job)
             self._ready[what] = max(now, self._ready.get(what, now))
             return
@@ -246,7 +244,7 @@ class _Player:
             load.cost_base[dag] + job * load.cost_stride[dag] + v - self._first[dag]] == FAILS
 
     def _complete(self, what: Id, ran: _Running, now: int) -> None:
-        """Let the messages of an execution that has ended arrive."""
+        """Deliver the messages of an execution that has ended."""
         dag, v, job = what
         delay = self._schedule.delay
         for local in self._vertices[v].successors:

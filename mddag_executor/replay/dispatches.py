@@ -1,21 +1,20 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-How late executions were dispatched: what the executor itself took.
+Dispatch times: how late the executor started executions.
 
 Theory of operation
 -------------------
-An execution could have started as soon as it was ready, its callback group had nothing else and a
-worker was idle; it is late by what passed from then until it did.
+An execution could start as soon as it was ready, its callback group was free and a worker was
+idle. Its dispatch time is the time from then to its start.
 
-Whether a worker was idle is counted.  An execution is *free* from when it is ready and its group
-has nothing else; those that are free and have not ended are on workers, or about to be, or wait
-for one.  Where they are no more than the workers at the instant from which an execution is free,
-it could have started at once.  (It may still have waited: a worker that is about to end is left
-to take what it has started itself.)  Else it had to wait for the worker that took it, until that
-had ended what it did before.
+Idle workers are counted.  An execution is *free* from when it is ready and its group is free.
+Free executions that have not ended are on workers, or wait for one.  If there are no more of them
+than workers when an execution becomes free, it could start at once.  (It may still have waited: a
+worker that is about to end keeps the callback that it started.)  Otherwise it waited until its
+worker had ended the previous execution.
 
-One that holds the interpreter had to wait for its turn: for the end of the last one that held it.
+An execution that holds the GIL also waited until the previous one had released it.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ import numpy as np
 
 class Dispatches:
     """
-    Says how late executions were dispatched.
+    Computes the dispatch times of executions.
 
     All are given by columns, in the order of their ends; times in ns.
 
-    :param n_workers: how many there were in each process.
-    :param worker: which one ran it, -1 where that is not known.
-    :param group: what identifies its mutually exclusive callback group, or -1.
+    :param n_workers: number of workers of each process.
+    :param worker: the worker of each execution, -1: unknown.
+    :param group: number of its mutually exclusive callback group, or -1.
     """
 
     def __init__(
@@ -44,21 +43,21 @@ class Dispatches:
     ) -> None:
         self._n_workers = n_workers
         self._start, self._end, self._process = start, end, process
-        # from when it was free, and from when its worker was, too
+        # when it was free, and when its worker was free, too
         self._free = np.maximum(ready, _end_before(group, end))
         ended = _end_before(worker, end)
         self._worker = np.maximum(self._free, ended)
         self._warm = start - ended <= WARM_NS
 
     def warm(self) -> Any:
-        """Return by number whether its worker had only just ended another, as an array."""
+        """Return by number whether its worker had just ended another one, as an array."""
         return self._warm
 
     def late(self, holding: Any = ()) -> Any:
         """
-        Return by number how late it was dispatched, ns, as an array.
+        Return by number the dispatch time, ns, as an array.
 
-        :param holding: the numbers of those that hold their interpreter.
+        :param holding: the numbers of executions that hold the GIL.
         """
         free, start, end, worker = self._free, self._start, self._end, self._worker
         process = self._process
@@ -78,7 +77,7 @@ class Dispatches:
 
 
 def _end_before(of: Ints, end: Ints) -> Ints:
-    """Return when what has the same number had ended before, 0 for the first and of -1."""
+    """Return the previous end of the same number; 0 for the first, and for -1."""
     found = np.zeros(len(of), dtype=np.int64)
     order = np.argsort(of, kind='stable')
     number = of[order]

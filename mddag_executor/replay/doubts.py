@@ -1,20 +1,20 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Which jobs of an imported recording cannot be judged, because what they did may be lost.
+Finds jobs of an imported recording that cannot be judged because of lost events.
 
 Theory of operation
 -------------------
-A job that has not completed counts as late or expired only where the recording shows it.  It
-is in doubt where, at or after its release,
+A job that has not completed counts as late or expired only if the recording shows it.  It is in
+doubt if, at or after its release,
 
-* a callback of one of its vertices that has not completed ran, and it is not known for which job:
-  its message is not known, or its start or end is not recorded.  Where the message's source
-  timestamp is known but its publication is not, that concerns only jobs of which no publication
-  with a source timestamp to this callback is recorded,
+* a callback of one of its uncompleted vertices ran for an unknown job: its message is unknown, or
+  its start or end is not recorded.  If the message's source timestamp is known but its publication
+  is not, this only affects jobs without a recorded publication with source timestamp to this
+  callback;
 * the tracer discarded events.
 
-Doubts come in the order of time.
+Doubts are reported in the order of time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Job = tuple[int, int]       # DAG and number
 
 
 class Doubts:
-    """Collects what is missing, and what is known of the open jobs."""
+    """Collects lost events, and the known events of open jobs."""
 
     def __init__(self, dags: Iterable[Dag]) -> None:
         self._vertices: list[tuple[int, list[tuple[str, tuple[str, ...]]], list[int]]] = []
@@ -37,24 +37,24 @@ class Doubts:
                 first, [(v.callback.key, tuple(v.callback.topics)) for v in dag.vertices],
                 list(dag.sinks)))
             first += len(dag.vertices)
-        self._unknown: dict[str, int] = {}      # by callback: the last run of an unknown job
+        self._unknown: dict[str, int] = {}      # by callback: last execution of an unknown job
         self._unsent: dict[str, int] = {}       # the same, for a message of unknown publication
         self._discarded = -1
         self._done: dict[Job, set[int]] = {}
         self._sent: dict[Job, set[str]] = {}
-        #: By DAG how many jobs there are that were not judged.
+        #: By DAG the number of withdrawn jobs.
         self.withdrawn: dict[int, int] = {}
 
     def ran_for_unknown(self, key: str, time: int, stamped: bool = False) -> None:
         """
-        Note that a callback ran for a job that is not known.
+        Note that a callback ran for an unknown job.
 
         :param stamped: whether the source timestamp of its message is known.
         """
         (self._unsent if stamped else self._unknown)[key] = time
 
     def discarded(self, time: int) -> None:
-        """Doubt what was released before events were discarded."""
+        """Doubt the jobs released before events were discarded."""
         self._discarded = max(self._discarded, time)
 
     def opened(self, dag: int, job: int) -> None:
@@ -68,12 +68,12 @@ class Doubts:
             self._done[dag, job].add(vertex)
 
     def sent(self, dag: int, job: int, topic: str) -> None:
-        """Note that a message of a job was published, and that it can be found."""
+        """Note that a message of a job was published, and can be linked."""
         if (dag, job) in self._sent:
             self._sent[dag, job].add(topic)
 
     def close(self, dag: int, job: int, release: int) -> bool:
-        """Forget a job; return whether it is one that cannot be judged."""
+        """Forget a job; return whether it cannot be judged."""
         done = self._done.pop((dag, job))
         sent = self._sent.pop((dag, job))
         first, vertices, sinks = self._vertices[dag]

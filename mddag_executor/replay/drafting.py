@@ -1,26 +1,25 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Drafts of systems from traces: nodes, callbacks, what each publishes, rates, execution times.
+Drafts systems from traces: nodes, callbacks, published topics, rates, execution times.
 
 Theory of operation
 -------------------
-1. ``Entities`` knows what there is: a first pass reads the initialisation.  What every node has
-   anyway (parameter services and their like) is left out, and with it nodes that have nothing
-   else.
+1. A first pass reads the initialisation into ``Entities``.  Entities of every node (parameter
+   services and the like) are ignored, and nodes without others, too.
 2. A second pass reads executions and publications.  Both addresses that rclcpp gives the callback
    of a subscription are one callback.  A coroutine is one execution, however often it was resumed:
-   the pieces of an execution have the same ``ready`` time in their ``mddag:dispatch`` events.
-3. A callback that the recorded declaration names keeps its name, and what was declared of it that
-   a trace does not show: deadline, queue edges, period, sync, group, name of the DAG.  Others have
-   the name of their function where the trace has it, else ``callback_0``, ``callback_1``, … by
-   node, in the order in which they were made.
-4. A topic of a node is published by the callbacks that were seen to publish it. Where none was,
-   each callback of the node may; where the node has no callback, there is supposed to be a timer.
-5. A service that was never called, and a subscription that never got a message and whose topic no
-   callback publishes, have no rate, so they start no DAG.  They are left out and named.
-6. Execution times are the quantiles of ``PERCENT``. Those of a sync callback are of the executions
-   that made it whole: the others only keep a message.
+   its pieces have the same ``ready`` time in their ``mddag:dispatch`` events.
+3. A callback in the recorded declaration keeps its name and the declared properties that a trace
+   does not show: deadline, queue edges, period, sync, group, name of the DAG.  Other callbacks are
+   named by their recorded function, otherwise ``callback_0``, ``callback_1``, … by node, in the
+   order of creation.
+4. A topic of a node is published by the callbacks that were seen to publish it. If none was, every
+   callback of the node may publish it; for a node without callbacks a timer is assumed.
+5. A service without calls, and a subscription without messages whose topic no callback publishes,
+   have no rate, so they cannot be the source of a DAG.  They are left out and reported.
+6. Execution times are the quantiles of ``PERCENT``. For a sync callback they are of the executions
+   that completed it: the others only store a message.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ Fields = dict[str, Any]
 Thread = tuple[int, int]
 """Process and thread."""
 Piece = tuple[int, ...]
-"""What the pieces of an execution have in common: DAG, vertex, job and ready time."""
+"""Identity of an execution with pieces: DAG, vertex, job and ready time."""
 
 
 @dataclass
@@ -65,10 +64,10 @@ class Runs:
     """
     The executions of a callback.
 
-    :ivar count: how many there are; ``first``, ``last``: when the first and the last began, ns.
-    :ivar times: how long each of the first ``_KEEP_TIMES`` took, its pieces together, ns; -1 where
-        the end is not recorded.
-    :ivar publishers: what they published with, by number.
+    :ivar count: their number; ``first``, ``last``: starts of the first and the last, ns.
+    :ivar times: duration of each of the first ``_KEEP_TIMES``, all pieces together, ns; -1 if the
+        end is not recorded.
+    :ivar publishers: numbers of the publishers that they used.
     """
 
     count: int = 0
@@ -80,11 +79,11 @@ class Runs:
 
     @property
     def interval_ns(self) -> int | None:
-        """Return the mean time between two of its executions; None with fewer than two."""
+        """Return the mean time between two executions; None with fewer than two."""
         return (self.last - self.first) // (self.count - 1) if self.count > 1 else None
 
     def begin(self, now: int, piece: Piece | None) -> int:
-        """Note that an execution began or was resumed; return the number of the execution."""
+        """Note the begin or resumption of an execution; return its number."""
         if piece is not None and piece in self._recent:
             return self._recent[piece]
         number = self.count
@@ -100,17 +99,17 @@ class Runs:
         return number
 
     def end(self, number: int, took: int) -> None:
-        """Note how long an execution, or a piece of it, took."""
+        """Note the duration of an execution, or of a piece of it."""
         if number < len(self.times):
             self.times[number] = max(0, self.times[number]) + took
 
 
 class System:
     """
-    What a trace shows of the system that was recorded.
+    The recorded system, as far as a trace shows it.
 
     :param path: a trace of this executor, or an imported recording of CARET or ros2_tracing.
-    :ivar warnings: what is missing of the trace, one line each.
+    :ivar warnings: missing data of the trace, one line each.
     """
 
     def __init__(
@@ -123,8 +122,9 @@ class System:
         # by callback's number
         self._declared: dict[int, Declared] = {}
         self._runs: dict[int, Runs] = {}
-        self._whole: dict[str, array[int]] = {}     # by sync callback: how long these took
-        # by thread: the piece that comes next; what runs, and since when; what ended last
+        # by sync callback: durations of completing executions
+        self._whole: dict[str, array[int]] = {}
+        # by thread: next piece; running execution and its start; last ended execution
         self._next: dict[Thread, tuple[int, Piece]] = {}
         self._running: dict[Thread, list[tuple[int, int, int]]] = {}
         self._ended: dict[Thread, tuple[int, int]] = {}
@@ -139,7 +139,7 @@ class System:
                 'record the start of the nodes, too')
         self._read(reader, progress)
         self.warnings = list(reader.warnings)
-        #: By node the topics that it publishes, and whether a callback was seen to do so.
+        #: By node its published topics, and whether a callback was seen to publish them.
         self._publishers: dict[str, dict[str, bool]] = {
             name: {} for name in self._who.names_of_nodes}
         for publisher in self._who.every_publisher.values():
@@ -151,7 +151,7 @@ class System:
                     self._publishers[publisher.node.name][publisher.topic] = True
 
     def _read(self, reader: TraceReader, progress: Callable[[int], None] | None) -> None:
-        """Note what ran, and what was published."""
+        """Note executions and publications."""
         handlers = {
             'mddag:task_set': self._recorded,
             'mddag:dispatch': self._dispatch,
@@ -168,7 +168,7 @@ class System:
                 progress(count)
 
     def _number(self, event: Event, fields: Fields) -> int:
-        """Return the number of the callback that an event is of."""
+        """Return the number of an event's callback."""
         return self._who.callback(event[2], fields['callback'], event[1]).number
 
     def _start(self, event: Event, fields: Fields) -> None:
@@ -186,8 +186,8 @@ class System:
         thread, callback = event[2:4], self._number(event, fields)
         stack = self._running.get(thread, [])
         if all(each[0] != callback for each in stack):
-            return      # it began before the recording did
-        while True:     # what began inside it and has no end was lost
+            return      # it began before the recording
+        while True:     # ends of nested executions were lost
             running, number, since = stack.pop()
             if running == callback:
                 break
@@ -195,7 +195,7 @@ class System:
         self._ended[thread] = callback, number
 
     def _publish(self, event: Event, fields: Fields) -> None:
-        """Note what publishes: runs nest in a thread, as a callback may spin."""
+        """Note a publisher; executions nest in a thread, because a callback may spin."""
         stack, handle = self._running.get(event[2:4]), fields.get('publisher_handle')
         if not stack or not handle:
             return
@@ -210,7 +210,7 @@ class System:
         try:
             self.task_set = loads(text, fields.get('file') or self.name)
         except GraphError:
-            return  # what it declares is of no use, but who is who still is
+            return  # the declaration is unusable, the entities are not
         self.workers = fields.get('workers')
 
     def _dispatch(self, event: Event, fields: Fields) -> None:
@@ -261,7 +261,7 @@ class System:
         return draft
 
     def _ordered(self, nodes: dict[str, DraftNode]) -> list[DraftNode]:
-        """Return the nodes in the order of the recorded declaration, which counts for ties."""
+        """Return the nodes in the order of the recorded declaration, which decides ties."""
         if self.task_set is None:
             return list(nodes.values())
         place = self.task_set.places()
@@ -287,7 +287,7 @@ class System:
         return callback
 
     def _free_name(self, entity: Callback, node: DraftNode) -> str:
-        """Return a name for a callback that nobody has named."""
+        """Return a free name for a callback without name."""
         declared = () if self.task_set is None else self.task_set.callbacks
         taken = {*node.callbacks, *(c.name for c in declared if c.node == entity.node_name)}
         name = function_of(entity.symbol)
@@ -306,7 +306,7 @@ class System:
         return f'callback_group_{list(dict.fromkeys(groups)).index(entity.group)}'
 
     def _measure(self, callback: DraftCallback, entity: Callback) -> bool:
-        """Fill in what was measured of a callback; return whether anything was."""
+        """Fill in the measured values of a callback; return whether there are any."""
         runs = self._runs.get(entity.number) or Runs()
         callback.runs = (callback.runs or 0) + runs.count
         if not runs.count:
@@ -325,10 +325,10 @@ class System:
 
     def measure(self, draft: Draft) -> int:
         """
-        Fill what was measured into a draft of the same system; return of how many callbacks.
+        Fill measured values into a draft of the same system; return the number of callbacks.
 
-        Callbacks are the same if node and what starts them are; of several that are started
-        alike the first is the one that was made first.
+        Callbacks are matched by node and trigger; of several with the same trigger by the order of
+        creation.
         """
         waiting: dict[tuple[str, str, str], list[Callback]] = {}
         for entity in self._entities:
@@ -344,7 +344,7 @@ class System:
 
 
 def execution_time(took: Iterable[int]) -> tuple[ExecutionTime, int] | None:
-    """Return the execution time of a callback and of how many executions it is; None of none."""
+    """Return the execution time of a callback and the number of executions; None without any."""
     times = sorted(max(1, time) for time in took if time >= 0)
     if not times:
         return None

@@ -1,13 +1,13 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Where a recorded run and a declaration disagree: what the rules of ``msg_graph.drift`` need.
+Finds differences between a recorded run and a declaration; input of ``msg_graph.drift``.
 
 Theory of operation
 -------------------
-A callback's declared key is that of the vertices that it ran as, and if it never ran as a vertex
-(its messages fitted nothing), what the declaration has for its node and what starts it
-(``msg_graph.binding``).  Runs in another declaration's terms are matched by that key.
+A callback's declared key is that of the vertices that it ran as.  If it never ran as a vertex (its
+messages did not fit), the declaration is searched for its node and trigger
+(``msg_graph.binding``).  Runs judged by another declaration are matched by that key.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 
 def drift_of(recording: Recording) -> list[Drift]:
-    """Return where a recording and the declaration that judges it disagree."""
+    """Return the differences between a recording and the declaration that judges it."""
     judge, who, table = recording.task_set, recording.who, recording.executions
     vertices = judge.vertices
     releases: dict[str, Releases] = {}
@@ -33,7 +33,7 @@ def drift_of(recording: Recording) -> list[Drift]:
             of.add(int(mine.min()))
             of.add(int(mine.max()))
             of.count = len(mine)
-    # what ran: declared callbacks when they were started, others once for each execution
+    # declared callbacks that were started; other executions once each
     declared = (table['vertex'] >= 0) & (table['start'] >= 0)
     others = (table['vertex'] < 0) & (table['end'] >= 0) & (table['piece'] == 0)
     numbers, callback_of = recording.callbacks()

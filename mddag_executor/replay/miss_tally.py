@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A tally that also knows the longest burst of misses of each sink."""
+"""A tally with the longest burst of misses of each sink."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ import numpy as np
 
 
 def longest_run(numbers: Sequence[int]) -> int:
-    """Return how many numbers follow each other at most, in whatever order and how often told."""
+    """Return the length of the longest run of consecutive numbers, in any order, with repeats."""
     ordered = np.unique(np.array(numbers, dtype=np.int64))
-    last = np.flatnonzero(np.diff(ordered) != 1)    # of each run but the last one
+    last = np.flatnonzero(np.diff(ordered) != 1)    # ends of all runs but the last one
     return int(np.diff([-1, *last, len(ordered) - 1]).max())
 
 
 class MissTally(Tally):
-    """A tally that keeps which jobs missed at each sink."""
+    """A tally that records the missed jobs of each sink."""
 
     def __init__(self, task_set: TaskSet, tables: Tables, keep: int | None = None) -> None:
         super().__init__(task_set, tables, keep)
-        #: By global vertex of each sink: the jobs that missed.
+        #: By global vertex of each sink: the missed jobs.
         self.missed_jobs = {vertex: array('q') for vertex in self.sinks}
 
     def _add_miss(

@@ -1,54 +1,53 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-End-to-end figures: how a path's data flows from its first callback to its last.
+End-to-end times: how data flows along a path from its first callback to its last.
 
 Theory of operation: flows
 --------------------------
-A path is a list of callbacks; from each to the next leads a *hop*:
+A path is a list of callbacks.  A *hop* leads from each callback A to the next, B:
 
-* trigger: the one publishes a topic that starts the other.  A flow goes on with the execution that
-  the message started.
-* topic: the other takes the topic itself (queue edge).  A flow goes on with the executions that
-  took the message, if takes are recorded, else with those for which it was the latest.
-* variable: the other reads what the one left in a variable of their node (queue edge).  A flow
-  goes on with the executions that began when it was the latest that had ended (CARET: variable
-  passing, `left_use_latest`).
+* trigger: A publishes a topic that starts B.  A flow continues with the execution that the message
+  started.
+* topic: B takes the topic itself (queue edge).  A flow continues with the executions that took the
+  message, if takes are recorded, otherwise with those that began when it was the latest message.
+* variable: B reads a variable of the node that A writes (queue edge).  A flow continues with the
+  executions of B that began when this execution of A was the latest that had ended (CARET:
+  variable passing, `left_use_latest`).
 
-What a callback publishes belongs to the execution that published it.  What is published outside
-of executions, or by another leg of a sync callback, belongs to the execution that began last
-before it (CARET: use_latest_message).
+A publication belongs to the execution that published it.  A publication outside of executions, or
+by another leg of a sync callback, belongs to the last execution that began before it (CARET:
+use_latest_message).
 
-A *flow* is what became of one publication of the first callback; with each execution that reads a
-value again it branches.  A flow that arrives nowhere is left out if another branch of the same
-execution went on.
+A *flow* is the way of one publication of the first callback; it branches with each execution that
+reads a value again.  A flow that does not arrive is dropped if another branch of the same
+execution continued.
 
-Which message an execution of a job ran for is known from the job: it is the one that the vertex
-before it published in the same job.  The topic that started a leg of a sync callback is its
-subscription's.  A simulated trace has no publications: there every topic is published when the
-callback ends.  In an imported recording the tables say which message started what.  An execution
-of several pieces (a coroutine) is one, from its first start to its last end.
+An execution of a job was started by the message that the previous vertex published in the same
+job.  The topic that started a leg of a sync callback is that of its subscription.  A simulated
+trace has no publications: each topic counts as published when the callback ends.  In an imported
+recording the tables link messages and executions.  An execution of several pieces (a coroutine) is
+one, from its first start to its last end.
 
 A *step* is an execution or a publication at a position of a path; its parent is the step whose
-data it has.  A flow is a branch from a step without a parent to one without children.  All steps
-of a position are made at once.  What happened at the same instant is in the order: ends,
-publications, starts.
+data it has.  A flow is a branch from a step without parent to one without children.  All steps of
+a position are made at once.  The order at the same instant is: ends, publications, starts.
 
 Theory of operation: response times
 -----------------------------------
-By default, as in CARET, a path's time runs from the first publication (*start*) to the start of
-the last callback's execution (*end*); ``whole`` figures run from the start of the first callback's
+By default, as in CARET, a path's time is from the first publication (*start*) to the start of the
+last callback's execution (*end*); ``whole`` times are from the start of the first callback's
 execution to the end of the last one's.  Source: caret_analyze, ``ResponseTime`` (0.5), and CARET's
-documentation of the response time's cases.
+documentation of its response time cases.
 
-* An input whose flow did not arrive takes the earliest of the ends of the inputs after it: that is
-  when something at least as new came out.  Of several outputs of an input the earliest counts.
-  The inputs of the earliest output are left out: what came before them is not known.
-* `all`: every input.  `best`: of the inputs with the same output the newest.  `worst`: the oldest.
-  `worst-with-external-latency`: the same, from the input before it on: what happened right after
-  that one had to wait for the next.  That is the *reaction time* to something outside.
-* The *data age* of an output is the time since the newest input that it is made of, for every
-  output, also if an earlier one was made of that input.
+* An input whose flow did not arrive gets the earliest end of later inputs: the first output that
+  is at least as new.  Of several outputs of an input the earliest counts.  Inputs of the earliest
+  output are ignored, because earlier inputs are unknown.
+* `all`: every input.  `best`: the newest input of each output.  `worst`: the oldest one.
+  `worst-with-external-latency`: from the input before the oldest one, because an external change
+  right after that input waits for the next.  This is the *reaction time* to external changes.
+* The *data age* of an output is the time since its newest input, for every output, including later
+  outputs of the same input.
 """
 
 from __future__ import annotations
@@ -71,8 +70,8 @@ STEPS = np.dtype([
 """
 Columns of a step: its parent's number or -1, its position, whether it is an execution.
 
-``time`` is the start of an execution or the time of a publication (0: not recorded), ``end`` that
-of an execution (-1: not recorded), ns.
+``time`` is the start of an execution or the time of a publication (0: not recorded), ``end`` the
+end of an execution (-1: not recorded), ns.
 """
 
 
@@ -88,7 +87,7 @@ class Executions(NamedTuple):
     The executions of a callback, in order of their starts.
 
     ``runs`` are the rows of their first pieces, ``topics`` the numbers of the topics that started
-    them (-1: none, -2: one that no path leads over).
+    them (-1: none, -2: a topic of no path).
     """
 
     runs: Ints
@@ -98,10 +97,10 @@ class Executions(NamedTuple):
 
 class Flows(NamedTuple):
     """
-    The flows of a path, -1 where there is none.
+    The flows of a path; -1: none.
 
-    The first publication (or the first start, where nothing is published), the start of the last
-    callback's execution, the begin of the first and the end of the last one's, ns.
+    Times of the first publication (of the first start, if nothing is published), start of the last
+    callback's execution, start of the first callback's execution, end of the last one's, ns.
     """
 
     first: Ints
@@ -125,16 +124,16 @@ class Paths:
         self._nodes = {node: i for i, node in enumerate(
             dict.fromkeys(c.node for c in task_set.callbacks))}
         self._places = task_set.places()
-        # by vertex the place of its callback, and of none
+        # by vertex the index of its callback; the last entry is for none
         self._place = np.array([*task_set.places_of_vertices(), NONE], dtype=np.int32)
         table = recording.executions
-        if not len(table):      # a row that -1 may stand for
+        if not len(table):      # row -1 must exist
             table = rows(EXECUTIONS, 1, vertex=NONE, start=NONE, end=NONE)
         self._table = table
         self._vertex = table['vertex'].astype(np.int64)
         if recording.callback_vertex:
             self._add_vertices(recording.callback_vertex)
-        # by the place of a callback the rows of its executions
+        # by the index of a callback the rows of its executions
         place = np.where(self._vertex >= 0, self._place[self._vertex], NONE).astype(np.int16)
         order = np.argsort(place, kind='stable')
         borders = np.searchsorted(place[order], np.arange(len(self._places) + 1))
@@ -142,11 +141,11 @@ class Paths:
         self._first = _first_pieces(table)
         self._start, self._end = table['start'].copy(), table['end'].copy()
         self._published()
-        # the messages that running callbacks took themselves, by the execution
+        # messages that running callbacks took themselves, by execution
         self._took = self._first[recording.takes['execution']], recording.takes['message']
 
     def _add_vertices(self, of: dict[int, int]) -> None:
-        """Find out which declared callbacks executions of no job are."""
+        """Find the declared callbacks of executions without job."""
         callbacks = np.array(sorted(of), dtype=np.int64)
         unknown = np.flatnonzero(self._vertex < 0)
         callback = self._recording.executions['callback'][unknown]
@@ -156,7 +155,7 @@ class Paths:
             [of[each] for each in callbacks.tolist()])[at[known]]
 
     def _published(self) -> None:
-        """Collect what was published on the topics that paths lead over, in order of time."""
+        """Collect publications on the topics of paths, in order of time."""
         recording, table = self._recording, self._table
         publishers = recording.who.every_publisher
         if publishers or recording.links:
@@ -173,7 +172,7 @@ class Paths:
                 (by >= 0) & (vertex >= 0),
                 self._message(table['job'][by], table['vertex'][by], topic), NONE)
             time = sent['time']
-        else:       # what is published is not recorded
+        else:       # publications are not recorded
             parts = []
             for callback in self._task_set.callbacks:
                 mine = self._of_place[self._places[callback.key]]
@@ -190,7 +189,7 @@ class Paths:
         chosen = np.flatnonzero(topic != NONE)
         chosen = chosen[sort_by(time[chosen])]
         run = np.where(by >= 0, self._first[by], NONE)
-        # by topic what was published on it
+        # by topic its publications
         columns = np.stack([each[chosen] for each in (place, node, run, message, time)])
         of_topic = topic[chosen].astype(np.int16)
         order = np.argsort(of_topic, kind='stable')
@@ -231,7 +230,7 @@ class Paths:
             hop = path_hops[position - 1] if position else None
             ran = self._of_callback(key)
             if hop is not None and hop.kind == 'trigger':
-                # else another leg of a sync callback
+                # otherwise another leg of a sync callback
                 fits = np.isin(ran.topics, [NONE, *(self._topics[t] for t in hop.topics)])
                 ran = Executions(*(each[fits] for each in ran))
             parent = np.full(len(ran.runs), NONE)
@@ -260,7 +259,7 @@ class Paths:
         return steps.table()
 
     def _messages_for(self, before: str, key: str, ran: Executions) -> list[Ints]:
-        """Return what may have started executions; what is known later counts."""
+        """Return the messages that may have started executions; later entries have priority."""
         table = self._table
         if self._recording.links:
             return [table['message'][ran.runs]]
@@ -298,7 +297,7 @@ class Paths:
         self, steps: _Steps, position: int, callback: Callback, ran: Executions, step: Ints,
         topics: list[int],
     ) -> tuple[_Timeline, Ints]:
-        """Make the steps of what was published at a position; return when, and the messages."""
+        """Make the steps of the publications at a position; return times and messages."""
         sent = np.concatenate([self._sent[topic] for topic in topics], axis=1)
         if len(topics) > 1:
             sent = sent[:, sort_by(sent[4])]
@@ -316,7 +315,7 @@ class Paths:
 
     def results(self) -> dict[str, Any]:
         """
-        Return by path its figures, all times in ns.
+        Return by path its end-to-end times, ns.
 
         ``flows`` counts the inputs and ``arrived`` those whose flow reached the last callback.
         ``response_time`` has CARET's cases from the first publication to the start of the last
@@ -335,13 +334,13 @@ class Paths:
 
 
 class _Timeline(NamedTuple):
-    """Which step was the last one from when on; in order of time."""
+    """The last step at each time; in order of time."""
 
     times: Ints
     steps: Ints
 
     def as_of(self, times: Ints, before: bool = False) -> Ints:
-        """Return the last steps at some times, or ``before`` them."""
+        """Return the last steps at given times, or ``before`` them."""
         if not len(self.times):
             return np.full(len(times), NONE)
         at = np.searchsorted(self.times, times, 'left' if before else 'right') - 1
@@ -358,7 +357,7 @@ class _Steps:
         self._ends: list[tuple[Ints, Ints]] = []
 
     def add(self, position: int, parent: Ints, is_run: bool, times: Ints) -> Ints:
-        """Add steps, if there is a parent or the path begins; return their numbers."""
+        """Add steps that have a parent, or begin the path; return their numbers."""
         wanted = (parent != NONE) | (position == 0)
         numbers = np.where(wanted, self._n + np.cumsum(wanted) - 1, NONE)
         self._n += int(wanted.sum())
@@ -385,7 +384,7 @@ class _Steps:
 
 def leaves(steps: Table, last: int) -> Ints:
     """
-    Return the steps with which flows end: those without children that are no dead ends.
+    Return the last steps of flows: those without children, except dead ends.
 
     :param last: the last position of the path.
     """
@@ -393,7 +392,7 @@ def leaves(steps: Table, last: int) -> Ints:
     child = parent != NONE
     inner = np.zeros(len(steps), dtype=np.bool_)
     inner[parent[child]] = True
-    # a dead end: another execution that read the same step went on
+    # a dead end: another execution that read the same step continued
     went_on = np.zeros(len(steps), dtype=np.bool_)
     went_on[parent[child & is_run & inner]] = True
     dead = ~inner & child & is_run & (steps['position'] != last)
@@ -421,10 +420,10 @@ def flows_of(steps: Table, last: int) -> Flows:
 
 def figures(start: Ints, end: Ints) -> dict[str, Any]:
     """
-    Return the figures of CARET's cases, of reaction time and data age.
+    Return the statistics of CARET's cases, of reaction time and data age.
 
-    :param start: of each flow, -1 where it has none: it is left out.
-    :param end: of each flow, -1 where it did not arrive.
+    :param start: start of each flow; -1: ignored.
+    :param end: end of each flow; -1: it did not arrive.
     """
     times = {name: spread(each) for name, each in cases(start, end).items()}
     data_age = times.pop('data_age')
@@ -446,12 +445,12 @@ def cases(start: Ints, end: Ints) -> dict[str, Ints]:
     start, end, arrived = start[order], end[order], arrived[order]
     if not arrived.any():
         return found
-    # each input has the earliest of its own ends, or else of those after it
+    # each input has the earliest end of its own and of later inputs
     earliest = np.minimum.accumulate(np.where(arrived, end, _NEVER)[::-1])[::-1]
     first = np.flatnonzero(np.r_[True, start[1:] != start[:-1]])
     own = np.minimum.reduceat(np.where(arrived, end, earliest), first)
     inputs = start[first]
-    counted = (own < _NEVER) & (own != own.min())   # what came before the earliest is not known
+    counted = (own < _NEVER) & (own != own.min())   # inputs before the earliest output are unknown
     inputs, own = inputs[counted], own[counted]
     took = own - inputs
     found['all'] = took
@@ -477,7 +476,7 @@ def _first_pieces(table: Table) -> Ints:
 
 
 def _find(runs: Ints, wanted: Ints) -> Ints:
-    """Return the places of runs, -1 of those that are not there."""
+    """Return the indices of runs; -1: missing."""
     if not len(runs):
         return np.full(len(wanted), NONE)
     order = np.argsort(runs, kind='stable')
@@ -487,7 +486,7 @@ def _find(runs: Ints, wanted: Ints) -> Ints:
 
 def _as_of_each(messages: Ints, wanted: Any, times: Ints) -> Ints:
     """
-    Return the last step of each message up to a time, -1 where there is none.
+    Return the last step of each message up to a time; -1: none.
 
     :param messages: rows of message, time and step.
     """

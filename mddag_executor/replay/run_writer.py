@@ -1,18 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The trace of a computed run, as the live executor would have recorded it.
+Writes the trace of a computed run as the live executor would record it.
 
 Theory of operation
 -------------------
 Virtual time is the trace's clock: it starts at 0.  A worker is a thread; the address of a callback
-is its place in the declaration, from 1.  An execution that was preempted is recorded in pieces, as
-a coroutine that was suspended.  A sync callback, which the simulator runs once, completes with all
-its legs at its end, and all of its time is the last one's.  Where executions shared CPUs or held
-the interpreter, their CPU time is recorded, which is their execution time, and whether they did.
+is its index in the declaration, from 1.  A preempted execution is recorded in pieces, like a
+suspended coroutine.  A sync callback, which the simulator runs once, completes all its legs at its
+end; the last leg gets all of its time.  If executions shared CPUs or held the GIL, their CPU time
+(the execution time) is recorded, and whether they held the GIL.
 
-Events are in the order of time.  At one instant ends, completions and releases are in the order in
-which the core saw them, each with the verdicts that came of it; then comes what started.
+Events are in the order of time.  At the same instant ends, completions and releases are in the
+order in which the core processed them, each with its verdicts; starts come last.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PROCESS = 1
 _MOST = 2 ** 31 - 1
 _ENDS = {tables.ABORTED: 'abort', tables.EXPIRED: 'expire', tables.OUTDATED: 'outdate'}
 _Entry = tuple[tuple[int, int, int], str, int, int, tuple[Any, ...]]
-"""Place in the order, name, time, thread, fields."""
+"""Position in the order, name, time, thread, fields."""
 
 
 def write_trace(
@@ -49,7 +49,7 @@ def write_trace(
 def write_events(
     task_set: TaskSet, load: Load, run: SimulatedRun, add: Callable[..., object]
 ) -> None:
-    """Give out the events of such a trace: name, time, thread, fields."""
+    """Pass the events of such a trace to ``add``: name, time, thread, fields."""
     settings = run.settings
     add('task_set', 0, 0, task_set.text, task_set.file, settings.policy, settings.workers,
         DEFAULT_DEADLINE_NS, _MOST, settings.preempts, settings.cpus or 0)

@@ -1,25 +1,24 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-How much longer callbacks may take before a deadline is missed that is met as things are.
+Finds how much longer callbacks may take before another deadline is missed.
 
 Theory of operation
 -------------------
-The load, recorded or periodic, is scheduled again and again, each time with the execution times of
-one callback (or of all) a factor longer.  The greatest factor is found by bisection, to 1 %, with
-which no deadline is missed but those that are missed with the times as they are.  What dispatch
-takes does not grow with it.
+The load, recorded or periodic, is scheduled repeatedly, each time with the execution times of one
+callback (or of all) multiplied by a factor.  Bisection finds the greatest factor, to 1 %, with
+which no deadline is missed that is met with factor 1.  Dispatch times are not multiplied.
 
-A run that meets all deadlines takes long, one that misses ends early.  So a miss, once it is
-found, is looked at by itself: the releases of a *window* before it, ``WINDOW`` times its deadline
-or twice, four times … as long, are enough to find it again, unless no worker was ever idle
-meanwhile.  The bisection goes over windows only, those that broke before first; the factor that it
-finds is tried on the whole load, which confirms it or finds another window.
+A run that meets all deadlines takes long; a run with a miss ends early.  So a miss is searched
+again in a *window*: the releases before it, ``WINDOW`` times its deadline or 2, 4, … times as
+long, are enough, unless no worker was idle meanwhile.  The bisection runs only windows, those that
+broke before first.  Its factor is tried on the whole load, which confirms it or finds another
+window.
 
-Schedules have anomalies: a longer callback may let a deadline be met that a shorter one misses.
-The factor is one below which nothing broke where it was looked.
+Schedules have anomalies: a longer callback may meet a deadline that a shorter one misses.  So the
+result is a factor below which no tried factor broke.
 
-A sink that misses every deadline with the times as they are is left out: it cannot get worse.
+A sink that misses every deadline with factor 1 is ignored: it cannot get worse.
 """
 
 from __future__ import annotations
@@ -53,16 +52,16 @@ MOST = 100.0
 EXACT = 1.01
 WINDOW = 3
 LONG = 4
-"""How many windows a load must be long for them to be worth it."""
+"""Windows are used for loads of at least this many windows."""
 _MOST_WINDOWS = 8
 _FEW_S = 3.0
 _RUNS = 5
-"""About so many runs of the whole load it takes to find the factor of a callback."""
+"""Estimated number of runs of the whole load per callback."""
 _NO_DEADLINE = NEVER // 2
 ALL = -1
-"""Stands for all callbacks."""
+"""All callbacks."""
 NOTHING = -1
-"""Stands for no sink."""
+"""No sink."""
 
 
 class Miss(NamedTuple):
@@ -70,7 +69,7 @@ class Miss(NamedTuple):
     A missed deadline.
 
     :ivar sink: its global vertex.
-    :ivar until: when the job completed or was given up.
+    :ivar until: when the job completed or ended.
     """
 
     sink: int
@@ -81,10 +80,10 @@ class Miss(NamedTuple):
 
 class Problem(NamedTuple):
     """
-    A load, and how it is scheduled.
+    A load and its scheduling.
 
     :ivar work: a recorded load, or a periodic one.
-    :ivar settings: how it is scheduled.
+    :ivar settings: the scheduling.
     :ivar callback_of: by global vertex the number of its callback.
     """
 
@@ -94,7 +93,7 @@ class Problem(NamedTuple):
     callback_of: list[int]
 
     def with_number(self, of: str, number: int) -> Problem:
-        """Return the same problem for another number of ``workers`` or ``cpus``."""
+        """Return the same problem with another number of ``workers`` or ``cpus``."""
         return self._replace(
             settings=replace(self.settings, **{of: number}))    # type: ignore[arg-type]
 
@@ -117,7 +116,7 @@ class Found(NamedTuple):
 
 
 class Fewer(NamedTuple):
-    """How many workers or CPUs there are, how few are enough, and what one less breaks."""
+    """Number of workers or CPUs, the sufficient number, and the sink that one less breaks."""
 
     given: int
     least: int
@@ -126,7 +125,7 @@ class Fewer(NamedTuple):
 
 class Search:
     """
-    Looks for the greatest factors of a problem.
+    Searches the greatest factors of a problem.
 
     :param compiled: whether the core runs compiled (see ``Problem.prepare``).
     """
@@ -145,17 +144,17 @@ class Search:
         self._of = self._callback_of_cost(load, tables)
         self._length = int(load.times[-1] - load.times[0]) if len(load.times) else 0
         self._stops = True
-        #: Windows in which something broke, the last one first.
+        #: Windows with a miss, the last one first.
         self._windows: list[tuple[int, int]] = []
-        #: By sink how many deadlines it misses without any factor.
+        #: By sink the number of missed deadlines with factor 1.
         self.missed: Counter[int] = Counter()
         #: Sinks that miss all of them.
         self.left_out: list[int] = []
-        self._missed: set[tuple[int, int]] = set()      # sink and job, without any factor
+        self._missed: set[tuple[int, int]] = set()      # sink and job, with factor 1
         self._find_missed()
 
     def _callback_of_cost(self, load: Load, tables: Tables) -> Any:
-        """Return by place of a cost whose it is; -1 of what no DAG declares."""
+        """Return by index of a cost its callback; -1: undeclared."""
         of = np.full(len(load.costs), -1, dtype=np.int64)
         jobs = np.bincount(load.dags, minlength=tables.n_dags).tolist()
         for dag in range(tables.n_dags):
@@ -167,7 +166,7 @@ class Search:
         return of
 
     def _find_missed(self) -> None:
-        """Find out what is missed anyway, and leave out the sinks that miss everything."""
+        """Find the misses with factor 1, and ignore the sinks that miss everything."""
         problem = self._problem
         with no_garbage():
             decisions = self._decisions(self._scaled(ALL, 1), False)
@@ -191,14 +190,14 @@ class Search:
         return schedule(problem.tables, load, settings, compiled=self._compiled).decisions
 
     def _misses(self, scaled: tuple[Load, int], stop: bool) -> Iterator[Miss]:
-        """Yield what is missed, but not anyway."""
+        """Yield the additional misses."""
         for kind, _, vertex, job, deadline, until in self._decisions(scaled, stop):
             if is_miss(kind) and (vertex, job) not in self._missed:
                 release = deadline - self._problem.tables.sink_deadline[vertex]
                 yield Miss(vertex, deadline, release, until)
 
     def _scaled(self, callback: int, factor: float) -> tuple[Load, int]:
-        """Return the load with a callback that takes longer, and the end of the run."""
+        """Return the load with a longer callback, and the end of the run."""
         which = self._of == callback if callback != ALL else self._of >= 0
         costs = self._costs.copy()
         pure = costs[which] - self._dispatches[which]
@@ -215,9 +214,9 @@ class Search:
         worst: bool = False,
     ) -> Miss | None:
         """
-        Return a deadline that a factor makes be missed, in a window or anywhere, if any is.
+        Return a deadline that a factor breaks, in a window or anywhere; None: no such deadline.
 
-        :param worst: the one that is missed by most; else the first.
+        :param worst: the miss with the greatest lateness; otherwise the first.
         """
         load, end = self._scaled(callback, factor)
         if window is not None:
@@ -230,7 +229,7 @@ class Search:
             stops = self._stops and not worst
             missed = list(self._misses((load, end), stops))
             if stops and missed and all(miss.sink in self.left_out for miss in missed):
-                # it stopped where a job of what is left out expired
+                # the run stopped at an expired job of an ignored sink
                 missed = list(self._misses((load, end), False))
             return min((miss for miss in missed if miss.sink not in self.left_out), default=None,
                        key=lambda miss: miss.deadline - worst * miss.until)
@@ -242,7 +241,7 @@ class Search:
             miss = self.miss(callback, factor, window)
             if miss is not None:
                 factor, breaks = self._bisect(callback, factor, miss.sink, window)
-        while factor > 1.0:     # which is known to be met
+        while factor > 1.0:     # factor 1 is known to be met
             miss = self.miss(callback, factor, worst=factor < MOST)
             if miss is None:
                 break
@@ -254,7 +253,7 @@ class Search:
         return Found(None if breaks == NOTHING else factor, breaks)
 
     def _window(self, callback: int, factor: float, miss: Miss) -> tuple[int, int] | None:
-        """Return a window in which a miss is found again, if one is much shorter than the load."""
+        """Return a window in which a miss is found again; None: not much shorter than the load."""
         length = WINDOW * (miss.deadline - miss.release)
         while LONG * length < self._length:
             window = miss.release - length, miss.deadline + 1
@@ -264,7 +263,7 @@ class Search:
         return None
 
     def fewer(self, of: str) -> Fewer | None:
-        """Return how few ``workers`` or ``cpus`` meet what is met now; None: it was not said."""
+        """Return the minimum of ``workers`` or ``cpus`` for the same result; None: unknown."""
         problem = self._problem
         given = getattr(problem.settings, of)
         if given is None:
@@ -297,12 +296,12 @@ class Search:
 
 class Slack(NamedTuple):
     """
-    What was found.
+    Results of the search.
 
     :ivar factors: by callback, and of all together (``ALL``).
-    :ivar missed: by sink how many deadlines it misses as things are.
+    :ivar missed: by sink the number of missed deadlines with factor 1.
     :ivar left_out: sinks that miss all of them.
-    :ivar fewer: of ``workers`` and ``cpus``; None: it was not said how many there are.
+    :ivar fewer: of ``workers`` and ``cpus``; None: their number is unknown.
     """
 
     factors: dict[int, Found]
@@ -317,8 +316,8 @@ def find_slack(
     """
     Find the greatest factors of all callbacks, and of all together.
 
-    :param progress: called with the number of callbacks that are done.
-    :param jobs: how many processes search, where it is not quick.
+    :param progress: called with the number of finished callbacks.
+    :param jobs: number of processes for long searches.
     """
     compiled = problem.prepare()
     search = Search(problem, compiled)
@@ -348,8 +347,8 @@ def slack_result(
     """
     Return the result format of ``slack --json``.
 
-    :param dags: of the result of the run as things are.
-    :param processes: that have so many workers each.
+    :param dags: of the result of the run with factor 1.
+    :param processes: number of processes, each with so many workers.
     """
     names = [vertex.name for vertex in task_set.vertices]
 
@@ -376,9 +375,9 @@ def slack_result(
 
 
 def _start() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the first process's to handle
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process handles Ctrl-C
 
 
 def _factor(search: Search, callback: int) -> Found:
-    """Return a callback's factor, the same in whatever order and by whomever it is looked for."""
-    return copy(search).factor(callback)    # whose windows go to no other
+    """Return a callback's factor, independent of order and process."""
+    return copy(search).factor(callback)    # a copy, because its windows must not affect others

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Spans of time: how long any of many lasts within another."""
+"""Sums of overlaps of time spans."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ class Spans:
     """
     Spans from starts to ends, ns.
 
-    Sums of times would not fit 64 bits; so times count from the first one, and sums of them are
-    taken modulo 2**64.  What is asked for is a difference that does fit.
+    Sums of times would exceed 64 bits.  So times count from the first one, and their sums are
+    modulo 2**64.  Results are differences, which fit.
     """
 
     def __init__(self, starts: Ints, ends: Ints) -> None:
@@ -23,7 +23,7 @@ class Spans:
                       for each in (self._starts, self._ends)]
 
     def within(self, begins: Ints, ends: Ints) -> Ints:
-        """Return how long they lasted within each span of time, added up, ns."""
+        """Return their total time within each of other spans, ns."""
         found: Ints = np.maximum(0, self._before(ends) - self._before(begins))
         return found
 
@@ -37,9 +37,9 @@ class Spans:
 
 
 def crowded(starts: Ints, ends: Ints, least: int) -> tuple[Ints, Ints]:
-    """Return the starts and ends of the times at which at least so many spans last."""
+    """Return the starts and ends of the times at which at least ``least`` spans overlap."""
     times = np.concatenate([np.sort(ends), np.sort(starts)])
-    order = np.argsort(times, kind='stable')    # at one instant, ends come first
+    order = np.argsort(times, kind='stable')    # at the same instant, ends come first
     times, count = times[order], np.cumsum(np.where(order < len(ends), -1, 1))
     full = count >= least
     before = np.r_[False, full[:-1]]

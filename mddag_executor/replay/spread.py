@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a distribution of times."""
+"""Statistics of times."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 
 def spread(times: Ints) -> dict[str, Any] | None:
-    """Return count, min, mean, median, p99 and max of times, ns; None: there are none."""
+    """Return count, min, mean, median, p99 and max of times, ns; None without times."""
     if not len(times):
         return None
     ordered = memoryview(np.sort(times))
@@ -22,6 +22,6 @@ def spread(times: Ints) -> dict[str, Any] | None:
 
 
 def sum_of(times: Ints) -> int:
-    """Return the sum of times, exact whatever they are."""
+    """Return the sum of times, without overflow."""
     low, high = times & 0x7FFFFFFF, times >> 31
     return int(high.sum()) * (1 << 31) + int(low.sum())

@@ -1,25 +1,26 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A trace that this executor recorded without a declaration, judged by one that is given later.
+A trace of this executor without declaration, judged by a declaration that is given later.
 
 Theory of operation
 -------------------
-Nothing in such a trace names a job, so jobs are made as those of an imported recording are
-(``imported_run``): by what started each execution.  What differs is how that is recorded.
+Such a trace names no jobs, so jobs are made as for imported recordings (``imported_run``), from
+the causes of executions.  Differences:
 
-1. *Messages to executions.*  ``rmw_take`` is recorded when a message was taken, by any thread;
-   ``dispatch`` says when the execution became ready, which is right after that.  So an execution
-   is for the last message that its subscription took until then.
-2. *Publications to messages.*  A publication is recorded just before it is sent, its source
-   timestamp is not.  A timestamp belongs to the publication of its topic that was being sent then:
-   one that had begun, and whose thread had neither published again nor ended its callback.  Each
-   has one timestamp.  If several fit, it is not known which one it is.
-3. *Ready* is recorded.  A timer's release is the last time on its period's grid.  Where the grid
-   begins is not recorded: as early as the executor noticed the timer, if it noticed half of its
-   releases soon after a grid that begins there; else each release is when it was noticed.
-4. A coroutine runs in pieces that became ready at the same time.  They are one execution, which
-   is complete at the end of the last piece.
+1. *Messages to executions.*  ``rmw_take`` is recorded when any thread takes a message;
+   ``dispatch`` has the ready time, which is right after it.  So an execution belongs to the last
+   message that its subscription took until then.
+2. *Publications to messages.*  A publication is recorded just before sending; its source timestamp
+   is not recorded.  A timestamp belongs to a publication of its topic that was being sent then: it
+   had begun, and its thread had neither published again nor ended its callback.  Each publication
+   has one timestamp.  If several publications fit, the publication is unknown.
+3. *Ready* is recorded.  A timer's release is the last time on its period's grid.  The grid's
+   origin is not recorded.  It is the earliest time at which the timer was noticed, if half of the
+   releases on that grid were noticed shortly after they were due; otherwise a release is the time
+   at which it was noticed.
+4. The pieces of a coroutine became ready at the same time.  They are one execution, which
+   completes at the end of the last piece.
 """
 
 from __future__ import annotations
@@ -51,12 +52,12 @@ _OPEN = 2 ** 62
 _ROUNDING_NS = 1_000        # of the two clocks that stamp and publication are read from
 _WAITING = 1024             # messages of a subscription that are remembered
 _UNSENT = 256               # publications of a topic without a timestamp that are remembered
-# Within both of these a timer is noticed soon: a time, and a part of its period.
+# A timer is noticed shortly after its release within both: a time, and a part of its period.
 _SOON_NS, _SOON_PART = 1_000_000, 10
 
 
 class _Window:
-    """A publication without a timestamp, and up to when it may have been sent."""
+    """A publication without a timestamp, and the time range in which it may have been sent."""
 
     __slots__ = ('publication', 'end')
 
@@ -73,12 +74,12 @@ class _OwnLinker(Linker):
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        #: By reason how many messages were dropped.
+        #: Number of dropped messages by reason.
         self.dropped: Counter[str] = Counter()
-        #: When the run ended, and up to when it is judged; None: that is not recorded.
+        #: End of the run, and end of its judged part; None: not recorded.
         self.ended: tuple[int, int] | None = None
-        # by callback the messages that were taken for it: when; and their timestamps, and when
-        # the execution became ready that is for it, 0: none so far
+        # by callback its taken messages: times; and their timestamps with the ready time of the
+        # execution that each started, 0: none so far
         self._taken: dict[int, tuple[list[int], list[tuple[int, int]]]] = {}
         self._windows: dict[str, deque[_Window]] = {}
         self._sending: dict[Thread, _Window] = {}
@@ -100,7 +101,7 @@ class _OwnLinker(Linker):
             self._find_publication(callback.start, stamp)
 
     def _find_publication(self, topic: str, stamp: int) -> None:
-        """Find out of which publication a timestamp is."""
+        """Find the publication of a timestamp."""
         windows = self._windows.get(topic)
         if windows is None or stamp in self._by_stamp.get(topic, ()):
             return
@@ -119,7 +120,7 @@ class _OwnLinker(Linker):
         return message
 
     def _sent(self, thread: Thread, now: int) -> None:
-        """End the sending of what a thread has published."""
+        """End the sending of a thread's last publication."""
         window = self._sending.pop(thread, None)
         if window is not None:
             window.end = now
@@ -157,8 +158,8 @@ class UndeclaredRun(ImportedRun):
     """
     A run of this executor that was recorded without a declaration.
 
-    :param head: what the executor wrote when it began to record.
-    :param task_set: the declaration that judges.
+    :param head: head of the trace.
+    :param task_set: the declaration to judge by.
     """
 
     def __init__(self, reader: TraceReader, name: str, head: Head, task_set: TaskSet) -> None:
@@ -168,7 +169,7 @@ class UndeclaredRun(ImportedRun):
                 continue
             ready.setdefault((event[2], event[4]), array('q')).append(event[9])
         super().__init__(reader, name, task_set, head, _OwnLinker)
-        # by address and time when it became ready: pieces to come; and what is known of the others
+        # by address and ready time: number of remaining pieces; and their execution so far
         self._to_come: dict[tuple[Address | None, int], int] = {}
         self._pieces: dict[tuple[Address | None, int], _Pieces] = {}
         for address, times in ready.items():
@@ -180,7 +181,7 @@ class UndeclaredRun(ImportedRun):
                 self._to_come[address, time] = count
 
     def read(self, progress: Callable[[int], None] | None = None) -> Recording:
-        """Return the recording; ``progress`` is called now and then with a number of events."""
+        """Return the recording; ``progress`` is called regularly with the number of events."""
         found = super().read(progress)
         assert isinstance(self._linker, _OwnLinker)
         found.shut_down = self._linker.ended is not None
@@ -198,12 +199,12 @@ class UndeclaredRun(ImportedRun):
         return self.end if self._linker.ended is None else self._linker.ended[1]
 
     def _ready(self, run: Execution, message: Publication | None) -> int:
-        return run.ready        # the executor says it
+        return run.ready        # the executor records it
 
     def _release(self, run: Execution, dag: Dag, target: Target) -> int:
         callback = run.callback
         if callback.kind == 'service':
-            return run.ready        # when a request was taken is not recorded by itself
+            return run.ready        # the time at which a request was taken is not recorded
         if callback.kind != 'timer':
             return super()._release(run, dag, target)
         if callback.grid is None:
@@ -236,10 +237,10 @@ class UndeclaredRun(ImportedRun):
 
 class _Pieces:
     """
-    What is known of a coroutine of which pieces are still to come.
+    An execution of a coroutine with remaining pieces.
 
     :ivar of: DAG, vertex and job; ``leg``: of a sync.
-    :ivar start: of the first piece; ``count``: of them so far; ``busy``: how long these ran.
+    :ivar start: start of the first piece; ``count``: pieces so far; ``busy``: their total time.
     """
 
     __slots__ = ('of', 'leg', 'start', 'count', 'busy')
@@ -250,7 +251,7 @@ class _Pieces:
 
 def _grid(ready: Ints, period: int) -> int | None:
     """
-    Return a time on the grid of a timer's releases, before them; None if it has none (rule 3).
+    Return a time on the grid of a timer's releases, before them; None: no grid (rule 3).
 
     :param ready: when it was noticed.
     """
@@ -258,7 +259,6 @@ def _grid(ready: Ints, period: int) -> int | None:
         return None
 
     def late(since: int) -> Ints:
-        """Return how long after the nearest time on a grid each was noticed."""
         found: Ints = (ready - since + period // 2) % period - period // 2
         return found
 

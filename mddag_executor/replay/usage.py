@@ -1,10 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What callbacks and workers used: executions, busy time, waiting, CPU time.
+How much time callbacks and workers used: executions, busy time, waiting, CPU time.
 
-An execution of a declared callback counts when it has completed; the time that it took so far
-counts in any case.
+An execution of a declared callback counts when it completes; its time so far always counts.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 
 NAMES = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
          'waiting_group_ns', 'measured', 'measured_busy_ns', 'cpu_ns', 'held_interpreter')
-"""The figures of a callback; the last four are of the executions whose CPU time is known."""
+"""The columns of a callback; the last four are of executions with known CPU time."""
 _MEASURED = NAMES.index('measured')
 
 
@@ -36,7 +35,7 @@ def group_waits(recording: Recording) -> Ints:
     Return by execution how long its group was busy while it waited, ns.
 
     Only callbacks of mutually exclusive groups wait for them.  The first piece of an execution
-    waits; the value is in all of its rows.
+    waits; all of its rows have the value.
     """
     table = recording.executions
     waited = np.zeros(len(table), dtype=np.int64)
@@ -53,7 +52,7 @@ def group_waits(recording: Recording) -> Ints:
     ready, start, end = (table[name][rows] for name in ('ready', 'start', 'end'))
     for begin, until in zip(*groups(group)):
         mine = slice(begin, until)
-        # only if the one before ended after this one was ready
+        # only if the previous one ended after this one was ready
         late = np.flatnonzero(
             (np.r_[-1, end[mine][:-1]] > ready[mine]) & (table['piece'][rows[mine]] == 0))
         if len(late):
@@ -72,12 +71,11 @@ def group_waits(recording: Recording) -> Ints:
 
 class PoolUse:
     """
-    How busy the pool was over time: in each step, how long all workers together ran callbacks.
+    The load of the pool over time: in each step the busy time of all workers together.
 
-    Steps begin at multiples of their length.  If there are more than ``MOST_STEPS``, their length
-    is doubled.
+    Steps begin at multiples of their length.  With more than ``MOST_STEPS`` the length is doubled.
 
-    :param step: their length at first, ns.
+    :param step: initial length, ns.
     """
 
     FIRST_STEP_NS = 100_000_000
@@ -101,13 +99,13 @@ class PoolUse:
         self.busy = Spans(starts, ends).within(borders[:-1], borders[1:]).tolist()
 
     def result(self) -> dict[str, Any]:
-        """Return the length of a step, the first's begin, and how long each step was busy, ns."""
+        """Return the length of steps, the first begin, and the busy time of each, ns."""
         return {'step_ns': self.step, 'start_ns': self.start, 'busy_ns': self.busy}
 
 
 class Usage:
     """
-    What ran in a recording.
+    The time that callbacks and workers used in a recording.
 
     :param waited: see ``group_waits``.
     """
@@ -115,7 +113,7 @@ class Usage:
     def __init__(self, recording: Recording, waited: Ints) -> None:
         task_set = recording.task_set
         self._places = task_set.places()
-        # by global vertex the place of its callback, at last that of all undeclared ones
+        # by global vertex the index of its callback; the last entry is for undeclared ones
         self._place = np.array([*task_set.places_of_vertices(), len(self._places)])
         self._table = np.zeros((len(NAMES), len(self._places) + 1), dtype=np.int64)
         table, rows = recording.executions, ran(recording)
@@ -155,7 +153,7 @@ class Usage:
         self._add('held_interpreter', place, table['holds_gil'][rows])
 
     def _add(self, name: str, places: Ints, values: Any = None) -> None:
-        """Add values of callbacks at these places; without values count them."""
+        """Add values to callbacks by index; without values count them."""
         column = self._table[NAMES.index(name)]
         if values is None:
             column += np.bincount(places, minlength=len(column))
@@ -163,20 +161,20 @@ class Usage:
             np.add.at(column, places, values)
 
     def _most(self, name: str, places: Ints, times: Ints) -> None:
-        """Keep the longest times of callbacks at these places."""
+        """Update the longest times of callbacks by index."""
         np.maximum.at(self._table[NAMES.index(name)], places, times)
 
     @property
     def busy(self) -> int:
-        """Return how long declared callbacks ran altogether, ns."""
+        """Return the total time of declared callbacks, ns."""
         return int(self._table[NAMES.index('busy_ns'), :-1].sum())
 
     def callbacks(self) -> dict[str, dict[str, int]]:
-        """Return what each declared callback used, in file order."""
+        """Return the usage of each declared callback, in file order."""
         return {key: self._result(place) for key, place in self._places.items()}
 
     def undeclared(self) -> dict[str, int]:
-        """Return what all callbacks that are not declared used together."""
+        """Return the usage of all undeclared callbacks together."""
         return self._result(-1)
 
     def _result(self, place: int) -> dict[str, int]:
@@ -184,7 +182,7 @@ class Usage:
         return dict(zip(NAMES, column if column[_MEASURED] else column[:_MEASURED]))
 
     def workers(self, count: int, duration: int) -> dict[str, Any]:
-        """Return how busy the workers were; ``lent`` is what ran beside them (blocking calls)."""
+        """Return how busy the workers were; ``lent`` is the time of blocking calls."""
         return {
             'busy_ns': {str(w): busy for w, busy in sorted(self.by_worker.items()) if w >= 0},
             'lent_ns': sum(busy for w, busy in self.by_worker.items() if w < 0),
@@ -193,7 +191,7 @@ class Usage:
 
 
 def share(busy: int, workers: int, duration: int) -> float | None:
-    """Return the share of the workers' time that was busy, None where there is no time."""
+    """Return the busy share of the workers' time, None if there is no time."""
     if workers < 1 or duration <= 0:
         return None
     return busy / (workers * duration)
