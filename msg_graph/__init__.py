@@ -3,7 +3,7 @@
 """
 Declared message graphs to DAG tasks.
 
-``load`` reads a declaration and derives its DAG tasks; the result, a ``TaskSet``, is immutable and
+``load`` reads a declaration and derives its DAG tasks. The result, an immutable ``TaskSet``, is
 all that the rest of a program needs to know about the graph. The rules are in ``derive``.
 """
 

@@ -5,16 +5,16 @@ Binding of running or recorded timers, subscriptions and services to declared ca
 
 Theory of operation
 -------------------
-A declaration names callbacks as their authors count them; a running or recorded system has timers
-with periods, subscriptions with topics and services with names.
+A declaration names callbacks; a running or recorded system has timers with periods, subscriptions
+with topics and services with names.
 
-1. They are matched by node and by what starts them.
-2. Several callbacks of one node that are started alike (two subscriptions of one topic) are bound
-   in the order of their declaration: nodes make their entities in the order in which tools count
-   the callbacks.
+1. Both are matched by node and start: the timer's period, the topic or the service.
+2. Several callbacks of one node with the same start (two subscriptions of one topic) are bound in
+   the order of their declaration: nodes make their entities in the order in which tools count the
+   callbacks.
 3. A sync callback has one entity for each of its topics, its *legs*.
-4. An entity without a remaining declared callback is undeclared. Its name is made of its node, its
-   function and what it is, as in `/camera: on_image (subscription /image)`.
+4. An entity without a remaining declared callback is undeclared. Its name consists of its node,
+   its function and its kind, as in `/camera: on_image (subscription /image)`.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from msg_graph.duration import format_duration
 from msg_graph.errors import shown
 from msg_graph.model import Callback, TaskSet
 
-# A timer made from a float of seconds is off by rounding (rclpy cuts off fractions of a ns), and
-# declared periods like 33.3ms or 16.7ms are rounded themselves.
+# A timer made from a float of seconds has a rounding error (rclpy cuts off fractions of a ns), and
+# declared periods such as 33.3ms or 16.7ms are rounded themselves.
 _PERIOD_TOLERANCE = 2e-3
 
 _WORDS = {'subscription': 'topic', 'service': 'service'}
@@ -47,7 +47,7 @@ _LIFECYCLE = {
 
 
 class Entity(NamedTuple):
-    """A timer, subscription or service: its node, and what starts it."""
+    """A timer, subscription or service: its node and its start."""
 
     node: str
     kind: str
@@ -102,15 +102,15 @@ class Binder:
         return self._callbacks[place]
 
     def unbound(self) -> list[Callback]:
-        """Return the callbacks without an entity, or of a sync without one for each leg."""
+        """Return the callbacks without an entity, or syncs without one for each leg."""
         places = {place for free in list(self._free.values()) for place in free}
         return [self._callbacks[place] for place in sorted(places)]
 
     def release(self, callback: Callback, topic: str | None = None) -> None:
         """
-        Undo a binding, as its entity is gone; the callback can be bound again.
+        Undo a binding after the entity was removed; the callback can be bound again.
 
-        :param topic: the leg of a sync callback; None for all that are bound.
+        :param topic: the leg of a sync callback; None: all that are bound.
         :raises KeyError: the callback, or that leg of it, is not bound.
         """
         place = self._place[callback.key]
@@ -130,11 +130,11 @@ def is_period(period_ns: int, declared_ns: int) -> bool:
 
 def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
     """
-    Return which entity a declared callback without an entity probably means, as a question.
+    Return the entity that an unbound declared callback probably means, as a question.
 
-    That is an entity of another node or topic whose name has one namespace more or less, a timer
-    of its node with another period, or an entity of a node or topic with a similar name.  It may
-    also be the only one that is started alike.
+    Candidates are an entity of another node or topic whose name has one namespace more or less, a
+    timer of its node with another period, and an entity of a node or topic with a similar name;
+    also the only entity with the same start.
     """
     undeclared = list(undeclared)
     timers = []
@@ -172,15 +172,15 @@ def _starts_alike(entity: Entity, other: Entity) -> bool:
 
 
 def _same_below(name: str, other: str) -> bool:
-    """Return whether two names are the same, but for namespaces before one of them."""
+    """Return whether two names are equal except for namespaces before one of them."""
     return name.endswith(other) or other.endswith(name)
 
 
 def function_of(symbol: str) -> str | None:
     """
-    Return the name of the function of a recorded symbol, None if it has none.
+    Return the function's name in a recorded symbol, None if it has none.
 
-    :param symbol: `package.module.Class.function`, or what rclcpp records.
+    :param symbol: `package.module.Class.function`, or a symbol of rclcpp.
     """
     found = _PYTHON.fullmatch(symbol) or _CPP.fullmatch(symbol)
     return None if found is None else found[1]
@@ -190,8 +190,8 @@ def entity_name(node: str, symbol: str, what: str) -> str:
     """
     Return the name of an undeclared callback.
 
-    :param symbol: that of its function; empty where there is none.
-    :param what: its kind and what starts it, as `timer 100ms`.
+    :param symbol: of its function; empty if there is none.
+    :param what: its kind and start, as `timer 100ms`.
     """
     function = function_of(symbol)
     if not node:
@@ -203,7 +203,7 @@ def is_background(name: str, node: str) -> bool:
     """
     Return whether a topic or service belongs to the client library or to an action.
 
-    Every node or lifecycle node has some of them; a declaration is about the others.
+    Every node or lifecycle node has some of these; declarations do not contain them.
     """
     before, _, word = name.rpartition('/')
     return (name in _BACKGROUND_TOPICS or '/_action/' in name or word in _BACKGROUND_SERVICES

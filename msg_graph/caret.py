@@ -1,25 +1,26 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-CARET architecture files: what they say about nodes and callbacks.
+CARET architecture files: nodes and callbacks from them.
 
 Theory of operation
 -------------------
 An architecture file (caret_analyze's ``Architecture.export``) lists for each node its callbacks
-with what starts them, its callback groups, the topics that it publishes and subscribes, with the
-callbacks that do, its ``variable_passings`` and its ``message_contexts``. ``UNDEFINED`` means that
-CARET could not find it out, and that it was not filled in.
+with their start, its callback groups, its published and subscribed topics with their callbacks,
+its ``variable_passings`` and its ``message_contexts``. ``UNDEFINED`` means that CARET could not
+find a value, and that it was not filled in.
 
-1. A topic's publisher is the callback that the file names; if it names none, the only callback of
+1. A topic's publisher is the callback named in the file; if none is named, the only callback of
    the node; else it is unknown.
 2. A variable passing is a queue edge: the reading callback reads the writing one's variable.
-3. A message context ``use_latest_message`` from a subscribed to a published topic says that the
-   publisher's callback uses the latest message: nothing new if it is that message's own callback,
-   a queue edge on that callback if another one takes it, and on the topic if no callback does. The
-   other contexts (``callback_chain``, ``inherit_unique_stamp``) say what variable passings say.
-4. A mutually exclusive callback group counts where it has several callbacks.
-5. In 2021 files had ``type`` for ``callback_type``, one ``callback_name`` for each topic that is
-   published, and paths that list callbacks (``path_name_aliases``).
+3. A message context ``use_latest_message`` from a subscribed to a published topic means that the
+   publisher's callback uses the latest message. If that message starts the callback itself, it
+   adds nothing. If another callback receives the message, it is a queue edge on that callback; if
+   no callback does, on the topic. The other contexts (``callback_chain``,
+   ``inherit_unique_stamp``) repeat the variable passings.
+4. A mutually exclusive callback group counts if it has several callbacks.
+5. In 2021 files had ``type`` for ``callback_type``, one ``callback_name`` for each published
+   topic, and paths that list callbacks (``path_name_aliases``).
 6. Other keys are ignored: the format grows.
 """
 
@@ -41,9 +42,9 @@ def declaration_from_caret(
     """
     Return the text of a declaration with marked blanks.
 
-    :param text: the architecture file's.
+    :param text: of the architecture file.
     :param file: its name, for errors and for the first line.
-    :param measure: fills in what was measured, before the declaration is written.
+    :param measure: adds measured values before the declaration is written.
     """
     draft = read_architecture(text, file)
     if measure is not None:
@@ -52,7 +53,7 @@ def declaration_from_caret(
 
 
 def read_architecture(text: str, file: str) -> Draft:
-    """Return what an architecture file says."""
+    """Return the contents of an architecture file."""
     tree = parse_yaml(text, file)
     if not isinstance(tree, Mapping) or 'nodes' not in tree.entries:
         raise GraphError(file, None, 'this is no architecture file of CARET', _REMEDY)

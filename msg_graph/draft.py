@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Drafts of declarations: a system as far as a file, a trace or the system itself shows it.
+Drafts of declarations: a system as known from a file, a trace or the running system.
 
 Theory of operation
 -------------------
@@ -9,22 +9,21 @@ Drafts come from CARET architecture files (``caret``), from traces and from runn
 code that makes a draft checks the names in it. ``declaration_of`` writes it as a declaration to
 fill in.
 
-What is known becomes entries. What is unknown becomes a comment with ``FILL IN`` and a proposal,
-which is an entry once its first ``# `` is removed. ``mddag graph check`` lists all blanks that are
-still open (``open_blanks``) instead of the errors that follow from them:
+Known values become entries. An unknown value becomes a comment with ``FILL IN`` and a proposal,
+which is an entry once its first ``# `` is removed. ``mddag graph check`` lists all open blanks
+(``open_blanks``) instead of the errors that follow from them:
 
 1. *deadline* of a sink: the shortest period of the sources that lead to it.
-2. *period* of a subscription whose topic no callback publishes, and of a service: the measured
+2. *period* of a service, and of a subscription whose topic no callback publishes: the measured
    time between two of its executions, if there is one.
-3. *publishes*, where it is not known which of a node's callbacks publishes a topic: on each that
-   may.
-4. *timers* that are only supposed, as nothing else seems to start what their node publishes.
+3. *publishes*, if it is unknown which of a node's callbacks publishes a topic: on each that may.
+4. *timers* that are only assumed, because no known callback publishes a topic of their node.
 
-``accept`` decides by the recording instead of asking: measured periods and proposed deadlines
-become entries, only recorded publications count, and a source with an unknown rate is left out
+``accept`` uses the recording instead of asking: measured periods and proposed deadlines become
+entries, only recorded publications count, and a source with an unknown rate is left out
 (``leave_out_sources``).
 
-A named path becomes an entry if each of its nodes has exactly one callback that fits.
+A named path becomes an entry if each of its nodes has exactly one matching callback.
 """
 
 from __future__ import annotations
@@ -41,12 +40,12 @@ from msg_graph.model import ExecutionTime, ReleaseFrom
 from msg_graph.yamltext import plain_scalar
 
 UNDEFINED = 'UNDEFINED'
-"""Stands for a topic at the end of a path (CARET's word)."""
+"""CARET's word for the missing topic at the end of a path."""
 MARK = 'FILL IN'
 LEFT_OUT = '# Left out:'
 _OPEN = re.compile(rf'\s*#\s+(?:(\w+:).*\s#\s+)?{MARK}: (.*)')
 _ENTRY = re.compile(r'\s*- (?:name|node):|\s*-\s*\{')
-_LITTLE = 1e-4      # of a period
+_LITTLE = 1e-4  # fraction of a period
 
 
 @dataclass
@@ -56,15 +55,15 @@ class DraftCallback:
 
     :ivar kind: ``timer``, ``subscription``, ``sync`` or ``service``.
     :ivar starts: the topics that start it, or its service; empty for a timer.
-    :ivar period_ns: its timer's period; of a source that is no timer, where that is known.
-    :ivar publishes: topics that it publishes for sure.
+    :ivar period_ns: its timer's period; of another source its period, if known.
+    :ivar publishes: topics that it certainly publishes.
     :ivar maybe: topics of its node that it may publish.
     :ivar reads: topics and callbacks of its node that it reads by queue edges.
-    :ivar runs: how many executions of it were recorded; None: nothing was.
+    :ivar runs: how many executions of it were recorded; None: there is no recording.
     :ivar interval_ns: measured mean time between two of its executions.
-    :ivar times: its measured execution time, and the number of executions that were measured.
-    :ivar guessed: whether it is only supposed that there is this timer.
-    :ivar also: other keys that were declared, with their values.
+    :ivar times: its measured execution time, and the number of measured executions.
+    :ivar guessed: whether the timer is only assumed.
+    :ivar also: other declared keys, with their values.
     """
 
     node: str
@@ -87,18 +86,18 @@ class DraftCallback:
 
     @property
     def key(self) -> str:
-        """Return the key that the callback has in a declaration."""
+        """Return the callback's key in a declaration."""
         return f'{self.node}:{self.name}'
 
     @property
     def source_period_ns(self) -> int | None:
-        """Return the time between two releases if this is a source, as far as it is known."""
+        """Return the time between two releases if this is a source, if known."""
         return self.interval_ns if self.period_ns is None else self.period_ns
 
 
 @dataclass
 class DraftNode:
-    """A node with its callbacks by name, and topics that it subscribes without a callback."""
+    """A node with its callbacks by name, and the topics it subscribes without a callback."""
 
     name: str
     callbacks: dict[str, DraftCallback] = field(default_factory=dict)
@@ -119,8 +118,8 @@ class Draft:
     """
     A system.
 
-    :ivar origin: what it was made from, for the first line of the declaration.
-    :ivar left_out: callbacks that the declaration does not have, with the reason.
+    :ivar origin: the source of the draft, for the first line of the declaration.
+    :ivar left_out: callbacks missing from the declaration, with the reason.
     """
 
     origin: str
@@ -137,9 +136,9 @@ class Draft:
 
 def leave_out_sources(draft: Draft, reason: Callable[[DraftCallback], str]) -> None:
     """
-    Leave out sources, and callbacks that become sources as their topics have no publisher then.
+    Leave out sources, and callbacks that become sources because their topics lose the publisher.
 
-    :param reason: says why a source is left out; an empty text keeps it.
+    :param reason: returns why a source is left out; an empty text keeps it.
     """
     while True:
         published = {topic for callback in draft.callbacks()
@@ -163,7 +162,7 @@ def _is_source(callback: DraftCallback, published: Container[str]) -> bool:
 
 
 def accept(draft: Draft) -> None:
-    """Decide what is not known by what was recorded, so that the periods of all sources are."""
+    """Replace unknown values by recorded ones, so that the periods of all sources are known."""
     for callback in draft.callbacks():
         callback.maybe.clear()
     leave_out_sources(draft, _without_rate)
@@ -193,7 +192,7 @@ def declaration_of(draft: Draft, accepted: bool = False) -> str:
 
 
 def open_blanks(text: str, file: str) -> list[GraphError]:
-    """Return an error for each blank that is left in a declaration."""
+    """Return an error for each open blank in a declaration."""
     return [GraphError(
         file, number,
         f"{match[1] or 'this'} is a blank to fill in ({match[2]})",
@@ -203,7 +202,7 @@ def open_blanks(text: str, file: str) -> list[GraphError]:
 
 
 def with_blanks(error: GraphError, text: str, file: str) -> GraphError:
-    """Return an error with the blanks of its file, and without what is wrong because of them."""
+    """Return an error with the blanks of its file, without the errors that these cause."""
     blanks = open_blanks(text, file)
     if not blanks:
         return error
@@ -237,7 +236,7 @@ class _Writer:
         return _is_source(callback, self._published)
 
     def _shortest_periods(self) -> dict[str, DraftCallback]:
-        """Return by callback the source with the shortest period that leads to it, perhaps."""
+        """Return by callback the source with the shortest period that may lead to it."""
         found: dict[str, DraftCallback] = {}
         sources = [c for c in self._callbacks if self._is_source(c) and c.source_period_ns]
         for source in sorted(sources, key=lambda c: c.source_period_ns or 0):
@@ -305,7 +304,7 @@ class _Writer:
         return f'        {callback.kind}: {callback.starts[0]}'
 
     def _source(self, callback: DraftCallback) -> Iterator[str]:
-        """Yield what concerns a source: the name of its DAG, and its period if it is no timer."""
+        """Yield the entries of a source: the name of its DAG, and its period if it is no timer."""
         source = self._is_source(callback)
         if source and callback.dag:
             yield f'        dag: {plain_scalar(callback.dag)}'
@@ -392,14 +391,14 @@ def _period(source: DraftCallback) -> str:
 
 
 def _whole(period_ns: int) -> str:
-    """Return a timer's period as people write it: rounded to 1 us, where that changes little."""
+    """Return a timer's period rounded to 1 us, if that changes little."""
     rounded = round(period_ns / MICROSECOND) * MICROSECOND
     close = abs(rounded - period_ns) <= _LITTLE * period_ns
     return exact_duration(rounded if close else period_ns)
 
 
 def _rounded(nanoseconds: int) -> str:
-    """Return a measured time with three digits."""
+    """Return a measured time with three significant digits."""
     digits = 10 ** max(0, len(str(nanoseconds)) - 3)
     return exact_duration(max(1_000, round(nanoseconds / digits) * digits))
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Drift: where a system that ran and its declaration disagree.
+Drift: differences between a system that ran and its declaration.
 
 Theory of operation
 -------------------
@@ -9,19 +9,19 @@ The rules are the same for live runs and recordings. Observations are counts by 
 
 1. *publishes*: a callback published a topic that it does not declare. Topics of the client library
    do not count.
-2. *rate* of a source: the mean time between two releases is not the declared period, by more than
-   ``TOLERANCE`` of it. It takes ``LEAST`` releases to say so.
-3. *rate* of a subscription: it got messages more or less often than the jobs of its DAGs were
-   released, by more than ``TOLERANCE``. It takes ``LEAST`` expected ones. Dropped messages count
-   as received: their loss is no fault of the declaration. A sync is not judged by this rule, as
-   the declaration does not say how its messages are joined.
-4. *never ran*: a callback never ran, while it should have done so at least twice. The report asks
-   about an undeclared entity that may be meant (``binding.meant``).
+2. *rate* of a source: the mean time between two releases differs from the declared period by more
+   than ``TOLERANCE`` of it. At least ``LEAST`` releases are needed.
+3. *rate* of a subscription: it received messages more or less often than the jobs of its DAGs were
+   released, by more than ``TOLERANCE``. At least ``LEAST`` expected messages are needed. Dropped
+   messages count as received: their loss is no fault of the declaration. Syncs are not checked,
+   because a declaration does not say how messages are joined.
+4. *never ran*: a callback never ran, but should have run at least twice. The report suggests an
+   undeclared entity that may be meant (``binding.meant``).
 5. A callback may run in another process if all its DAGs may span processes (``release_from:
    header_stamp``) or the declaration has ``processes:``, and its node was not seen here. Then it
    is not reported.
-6. Of callbacks that follow each other only the first that disagrees by rule 2, 3 or 4 is
-   reported: those after it have no messages because of it.
+6. Of consecutive callbacks only the first that differs by rule 2, 3 or 4 is reported: it is the
+   reason why the others have no messages.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LEAST = 10
 
 @dataclass
 class Releases:
-    """The releases of a DAG: how many, and the first and the last one, ns."""
+    """The releases of a DAG: the number, and the first and the last one, ns."""
 
     count: int = 0
     first: int = 0
@@ -54,22 +54,22 @@ class Releases:
         self.count += 1
 
     def mean_ns(self, lost: int = 0) -> int:
-        """Return the mean time between two, of which some were not seen; there are two or more."""
+        """Return the mean time between releases, with ``lost`` unseen; at least two are needed."""
         return (self.last - self.first) // (self.count + lost - 1)
 
 
 @dataclass
 class Observed:
     """
-    What was seen of a system.
+    The observations of a system.
 
     :ivar duration_ns: how long it was watched.
-    :ivar releases: by the key of its source callback, the releases of a DAG.
-    :ivar got: by callback how many messages it got or how often its timer released it.
-    :ivar ran: by callback how often it ran.
-    :ivar publishes: by callback the topics that it published, declared or not.
-    :ivar nodes: the nodes that were seen; None where that is not known.
-    :ivar undeclared: what was seen and is not declared.
+    :ivar releases: the releases of each DAG, by the key of its source callback.
+    :ivar got: by callback, the number of its messages or of its timer's releases.
+    :ivar ran: by callback, the number of its executions.
+    :ivar publishes: by callback, the topics that it published, declared or not.
+    :ivar nodes: the nodes that were seen; None if unknown.
+    :ivar undeclared: the undeclared entities that were seen.
     """
 
     duration_ns: int = 0
@@ -84,12 +84,12 @@ class Observed:
 @dataclass(frozen=True)
 class Drift:
     """
-    One disagreement.
+    One difference.
 
     :ivar kind: ``publishes``, ``rate`` or ``never ran``.
-    :ivar topic: the topic that is published and not declared, or None.
-    :ivar declared: what the declaration says: a period in ns, or a number of messages; or None.
-    :ivar observed: the same as it was seen, or None.
+    :ivar topic: the undeclared topic that is published, or None.
+    :ivar declared: the declared value: a period in ns, or a number of messages; or None.
+    :ivar observed: the observed value, or None.
     """
 
     kind: str
@@ -100,12 +100,12 @@ class Drift:
     text: str
 
     def result(self) -> dict[str, Any]:
-        """Return its form in results for machines."""
+        """Return its form in JSON results."""
         return asdict(self)
 
 
 def drift(task_set: TaskSet, observed: Observed) -> list[Drift]:
-    """Return where a system and its declaration disagree, in the order of the declaration."""
+    """Return the differences between a system and its declaration, in the declaration's order."""
     found: dict[str, list[Drift]] = {}
     for callback in task_set.callbacks:
         extra = [topic for topic in sorted(observed.publishes.get(callback.key, ()))
@@ -121,7 +121,7 @@ def drift(task_set: TaskSet, observed: Observed) -> list[Drift]:
 
 
 def _suspects(task_set: TaskSet, observed: Observed) -> dict[str, Drift]:
-    """Return what disagrees by rules 2, 3 and 4, by callback."""
+    """Return the differences by rules 2, 3 and 4, by callback."""
     dags = dags_of(task_set)
     suspects = {}
     for callback in task_set.callbacks:
@@ -188,7 +188,7 @@ def _message_rate(callback: Callback, dags: list[Dag], observed: Observed) -> Dr
         source = dag.vertices[dag.source].callback.key
         expected += observed.releases.get(source, Releases()).count
     got = observed.got.get(callback.key, 0)
-    # What was released last may still be under way.
+    # The last release may still be in progress.
     if expected < LEAST or expected * (1 - TOLERANCE) - len(dags) <= got <= expected * (
             1 + TOLERANCE) + len(dags):
         return None

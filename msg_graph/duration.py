@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Times as people write them (``100ms``, ``20 us``, ``1.5s``) to integer nanoseconds and back."""
+"""Times as text (``100ms``, ``20 us``, ``1.5s``) to integer nanoseconds and back."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _DURATION = re.compile(_NUMBER + r'[ \t]*(?P<unit>[^\W\d_]*)')
 
 class DurationError(ValueError):
     """
-    A text that is no usable time.
+    A text that is not a valid time.
 
     :ivar problem: what is wrong with it.
     :ivar remedy: what to write instead.
@@ -49,12 +49,12 @@ def parse_duration(
     text: str, *, minimum_ns: int = MICROSECOND, maximum_ns: int = DAY
 ) -> int:
     """
-    Return the nanoseconds that a text like ``100ms``, ``20 us`` or ``1.5s`` means.
+    Return the nanoseconds in a text such as ``100ms``, ``20 us`` or ``1.5s``.
 
     Units are ns, us (or µs), ms, s and min. Fractions of a nanosecond are rounded to the nearest.
 
-    :param minimum_ns: the least time that makes sense here, in ns.
-    :param maximum_ns: the longest time that makes sense here, in ns.
+    :param minimum_ns: the least allowed time, ns.
+    :param maximum_ns: the longest allowed time, ns.
     :raises DurationError: (a ``ValueError``) no number, no unit or an unknown one, a negative
         time, or one outside of the bounds.
     """
@@ -94,15 +94,15 @@ def format_duration(ns: int) -> str:
 
 
 def whole_us(ns: float) -> int:
-    """Return a time as a deadline can be: rounded up to whole us, at least one, at most a day."""
+    """Round a time up to a valid deadline: whole us, at least one, at most a day."""
     return max(1, -int(-min(DAY, ns) // 1000)) * 1000
 
 
 def exact_duration(ns: int) -> str:
     """
-    Return just this time in the largest of s, ms, us and ns that needs three decimals at most.
+    Return exactly this time in the largest of s, ms, us and ns with three decimals at most.
 
-    ``parse_duration`` reads it back, if it is a time at all.
+    ``parse_duration`` reads it back if the time is valid.
     """
     for unit, factor in (('s', SECOND), ('ms', MILLISECOND), ('us', MICROSECOND)):
         if factor <= ns <= DAY and ns % (factor // 1000) == 0:

@@ -1,15 +1,15 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-New deadlines of sinks and new ``processes:``, in the text of a declaration and in its task set.
+New deadlines of sinks and new ``processes:``, in the text of a declaration and its task set.
 
 Theory of operation
 -------------------
-1. Deadlines belong to callbacks: where a callback is several vertices, all have its deadline.
-2. In the text only the values of ``deadline:`` change, in their places; a callback without one
-   gets a new line, or a new entry in its braces.  New ``processes:`` are the last entry.  Comments
-   outside of it, order, layout and everything else stay.
-3. The new text must give the task set with only that changed; otherwise it is refused.  (A value
+1. Deadlines belong to callbacks: all vertices of a callback have its deadline.
+2. In the text only the values of ``deadline:`` change; a callback without one gets a new line, or
+   a new entry in its braces.  New ``processes:`` are the last entry.  Comments outside of it,
+   order and layout stay.
+3. The new text must give the task set with only that change; otherwise it is refused.  (A value
    may be an alias of another one.)
 """
 
@@ -44,7 +44,7 @@ def checked(text: str, wanted: TaskSet) -> str:
 
 
 def without_lines(task_set: TaskSet) -> TaskSet:
-    """Return the task set without the places in the text."""
+    """Return the task set without line numbers."""
     nowhere = {callback.key: {'line': 0, 'file': None} for callback in task_set.callbacks}
     return replace(task_set.with_callbacks(nowhere), text='')
 
@@ -58,7 +58,7 @@ def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, list[
     """
     Return the task set of a declaration whose sinks may lack deadlines.
 
-    :return: the task set, and the keys of the callbacks that lack theirs; it is a second there.
+    :return: the task set, and the keys of the callbacks without a deadline; theirs is set to 1 s.
     """
     missing: list[str] = []
     task_set = loads(text, name, without_deadline=missing)
@@ -67,14 +67,14 @@ def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, list[
 
 def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Table[str, int]) -> str:
     """
-    Return a declaration with other deadlines; comments, order and all else stay.
+    Return a declaration with other deadlines; comments, order and everything else stay.
 
-    :param task_set: what the text declares.
+    :param task_set: the task set of the text.
     :param deadlines: by the callback's key, ns.
     """
     try:
         result = _with_deadlines(text, deadlines)
-    except KeyError:  # of a declaration of several files
+    except KeyError:  # the declaration has several files
         raise _refused(task_set.file) from None
     return checked(result, with_deadlines(task_set, deadlines))
 
@@ -107,7 +107,7 @@ def _with_deadlines(text: str, deadlines: Table[str, int]) -> str:
             end = callback.value[0][1].end_mark  # after the first entry
             edits.append((end.line, end.column, end.column, f', deadline: {value}'))
         else:
-            # Before the second key, which begins a line; better, before one that comes later.
+            # Before the second key, which begins a line; preferably before a later one.
             begin = callback.value[min(2, len(callback.value) - 1)][0].start_mark
             line = ' ' * begin.column + f'deadline: {value}\n'
             edits.append((begin.line, 0, 0, line))
@@ -126,7 +126,7 @@ def with_deadlines(task_set: TaskSet, deadlines: Table[str, int]) -> TaskSet:
 
 
 def load_processes(text: str, file: str, task_set: TaskSet) -> tuple[Process, ...]:
-    """Return the processes that a file declares for a task set; its other keys do not count."""
+    """Return the processes that a file declares for a task set; its other keys are ignored."""
     entry = Entry(parse_yaml(text, file) or Mapping(1), file, 'the file', FILE)
     processes = read_processes(entry, (callback.node for callback in task_set.callbacks))
     if not processes:
@@ -136,7 +136,7 @@ def load_processes(text: str, file: str, task_set: TaskSet) -> tuple[Process, ..
 
 
 def with_processes(task_set: TaskSet, processes: Iterable[Process]) -> TaskSet:
-    """Return a task set, and its text, with other processes, which have all of its nodes."""
+    """Return a task set, and its text, with other processes, which contain all of its nodes."""
     order = {callback.node: i for i, callback in enumerate(reversed(task_set.callbacks))}
     processes = tuple(
         replace(each, nodes=tuple(sorted(each.nodes, key=lambda node: -order[node])))

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The error of the package, alone or several together, and how text from a file is shown."""
+"""The errors of the package, single or several together, and the display of text from files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ T = TypeVar('T')
 R = TypeVar('R')
 
 MOST_ERRORS = 50
-"""So many errors of a declaration are collected at most."""
+"""The most errors of a declaration that are collected."""
 
 _LONGEST_SHOWN = 120
 
@@ -24,8 +24,8 @@ class GraphError(Exception):
 
     ``str()`` gives one line, ``FILE[:LINE]: what is wrong: what to do``.
 
-    :ivar file: the file's name as it was given to ``load`` or ``loads``.
-    :ivar line: line of the offending entry, counted from 1; None: of no single line.
+    :ivar file: the file's name as passed to ``load`` or ``loads``.
+    :ivar line: line of the entry, counted from 1; None: of no single line.
     :ivar problem: what is wrong, naming the entry.
     :ivar remedy: what to do about it.
     :ivar errors: all errors that were found together, this one first.
@@ -76,8 +76,8 @@ class Collector:
     """
     Collects errors that do not depend on each other.
 
-    As a context manager it keeps an error, as often as it is entered; ``check`` raises the kept
-    ones. It raises at once when it has ``MOST_ERRORS``: more are not read, and the search for
+    It is a context manager that collects an error each time it is entered; ``check`` raises the
+    collected ones. At ``MOST_ERRORS`` it raises at once: more are not read, and the search for
     similar words takes time.
     """
 
@@ -99,7 +99,7 @@ class Collector:
         return True
 
     def check(self) -> None:
-        """End a stage: what comes next would only stumble over the errors of this one."""
+        """End a stage: the next one would only find consequences of these errors."""
         if len(self.errors) == 1:
             raise self.errors[0]
         if self.errors:
@@ -107,7 +107,7 @@ class Collector:
 
 
 def for_each(items: Iterable[T], work: Callable[[T], R]) -> list[R]:
-    """Return what a function returns of each item."""
+    """Apply a function to each item; return the results."""
     found = Collector()
     results: list[R] = []
     for item in items:
@@ -118,21 +118,21 @@ def for_each(items: Iterable[T], work: Callable[[T], R]) -> list[R]:
 
 
 def printable(text: str) -> str:
-    """Return the text with everything escaped that would break a line or a terminal."""
+    """Escape everything in a text that would break a line or a terminal."""
     if text.isprintable():
         return text
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def shown(text: str) -> str:
-    """Return text from a file in quotes, on one line and not too long."""
+    """Return text from a file in quotes, shortened to one line."""
     if len(text) > _LONGEST_SHOWN:
         text = text[:_LONGEST_SHOWN] + '…'
     return f"'{printable(text)}'"
 
 
 def listed(texts: Iterable[str], most: int = 8) -> str:
-    """Return quoted texts with commas between them; what is beyond ``most`` is only counted."""
+    """Return quoted texts with commas between them; those beyond ``most`` are only counted."""
     every = list(texts)
     parts = [shown(text) for text in every[:most]]
     if len(every) > most:

@@ -1,18 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The language of declarations: every key with the kind of its value, for the parser and for editors.
+The language of declarations: every key with the kind of its value, for parser and editors.
 
 Theory of operation
 -------------------
-An *entry* is a mapping of the declaration. A table says which keys it may have, and of what *kind*
-the value of each is. A kind reads a value, with errors that name file, line and entry, and has its
-part of the JSON Schema. So the tables below are the only description of a file: the parser uses
-them, and the JSON Schema is made from them.
+An *entry* is a mapping of the declaration. A table lists its keys, each with the *kind* of its
+value. A kind reads a value, with errors that name file, line and entry, and has its part of the
+JSON Schema. So the tables below are the only description of a file: the parser uses them, and the
+JSON Schema is made from them.
 
-A *name* of a node, topic, callback, … is a text that is valid for what it names.
+A *name* of a node, topic, callback, … is a text that is valid as such.
 
-The schema is that of draft 7, which the language servers for YAML know best. It describes single
+The schema is of draft 7, the one best supported by language servers for YAML. It describes single
 entries; only ``load`` checks the rules about several (publishers, cycles, sinks).
 """
 
@@ -45,7 +45,7 @@ _ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
 _WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
 
 Check = Callable[[str], 'tuple[str, str] | None']
-"""Checks a text; returns what is wrong with it and what to do, or None."""
+"""Checks a text; returns the problem and its remedy, or None."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Name:
     """
     A kind of name.
 
-    :ivar what: what errors call it.
+    :ivar what: its description in errors.
     """
 
     what: str
@@ -62,11 +62,11 @@ class Name:
 
     @property
     def is_global(self) -> bool:
-        """Whether it is a full name of the ROS graph, as a node's or topic's."""
+        """Return whether it is a full name of the ROS graph, as of a node or topic."""
         return self.pattern is _ROS_NAME
 
     def check(self, text: str) -> tuple[str, str] | None:
-        """Return what is wrong with a name and what to do, or None."""
+        """Return the problem of a name and its remedy, or None."""
         what = f'{self.what} name'
         if self.is_global and not text.startswith('/'):
             return (f'{shown(text)} is not an absolute {what}',
@@ -83,7 +83,7 @@ class Name:
         return None
 
 
-NODE = Name('node', _ROS_NAME)  # as rmw_validate_node_name and its namespaces ask
+NODE = Name('node', _ROS_NAME)  # after rmw_validate_node_name and its namespaces
 TOPIC = Name('topic', _ROS_NAME, 247)  # RMW_TOPIC_MAX_NAME_LENGTH
 SERVICE = Name('service', _ROS_NAME, 247)
 CALLBACK = Name('callback')
@@ -113,9 +113,9 @@ def check_key(text: str) -> tuple[str, str] | None:
 @dataclass(frozen=True)
 class Kind:
     """
-    What a value can be.
+    The kind of a value.
 
-    :ivar read: returns what a value at a key of an entry says, or raises a ``GraphError``.
+    :ivar read: returns the value at a key of an entry, or raises a ``GraphError``.
     :ivar schema: its JSON Schema.
     :ivar missing: its value if the key is missing.
     """
@@ -127,7 +127,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class Key:
-    """A key that an entry may have: the kind of its value, and what editors show of it."""
+    """A key that an entry may have: the kind of its value, and its description in editors."""
 
     kind: Kind
     about: str
@@ -135,7 +135,7 @@ class Key:
 
 
 RENAMED = {'on_miss': 'on_late'}
-"""Keys of earlier versions, and what they are called now."""
+"""Keys of earlier versions, and their present names."""
 
 
 class Entry:
@@ -143,7 +143,7 @@ class Entry:
     One mapping of the declaration.
 
     :ivar file: the file's name.
-    :ivar name: how errors call the mapping; it may be set later.
+    :ivar name: the mapping's name in errors; it may be set later.
     """
 
     def __init__(self, tree: Tree, file: str, name: str, keys: Table[str, Key]) -> None:
@@ -170,7 +170,7 @@ class Entry:
         return self._tree.line
 
     def has(self, key: str) -> bool:
-        """Whether the mapping has the key."""
+        """Return whether the mapping has the key."""
         return key in self._tree.entries
 
     def get(self, key: str) -> Any:
@@ -186,7 +186,7 @@ class Entry:
         return described.kind.read(self, key, value)
 
     def one_of(self, keys: Table[str, Any], what: str) -> str:
-        """Return the one key of several that the mapping has."""
+        """Return the key that the mapping has, of several alternatives."""
         found = [key for key in keys if self.has(key)]
         if not found:
             raise self.error(None, f'nothing says {what}', f'add one of {", ".join(keys)}')
@@ -218,7 +218,7 @@ class Entry:
 
 
 def text(check: Check, form: Schema, missing: str | None = None) -> Kind:
-    """Return the kind of a text that a check finds right."""
+    """Return the kind of a text that passes a check."""
     def read(entry: Entry, key: str, value: Tree) -> str:
         if not isinstance(value, Scalar):
             raise entry.value_error(key, value, f'is {kind_of(value)}', 'write a text')
@@ -233,7 +233,7 @@ def text(check: Check, form: Schema, missing: str | None = None) -> Kind:
 
 
 def name(what: Name) -> Kind:
-    """Return the kind of such a name."""
+    """Return the kind of a name."""
     return text(what.check, {
         # YAML reads some short names as numbers, and this program does not.
         'type': 'string' if what.is_global else ['string', 'integer'],
@@ -241,7 +241,7 @@ def name(what: Name) -> Kind:
 
 
 def choice(*words: str, missing: str | None = '') -> Kind:
-    """Return the kind of some words; a missing key has the first, unless ``missing`` is given."""
+    """Return the kind of a choice of words; a missing key gives the first, or ``missing``."""
     def check(word: str) -> tuple[str, str] | None:
         if word in words:
             return None
@@ -253,7 +253,7 @@ def choice(*words: str, missing: str | None = '') -> Kind:
 
 
 def items(form: Schema) -> Kind:
-    """Return the kind of a list that is not empty, whose items are read later."""
+    """Return the kind of a non-empty list whose items are read later."""
     def read(entry: Entry, key: str, value: Tree) -> list[Tree]:
         if not isinstance(value, Sequence):
             raise entry.error(
@@ -269,8 +269,8 @@ def texts(item: Kind, least: int = 0, *too_few: str) -> Kind:
     """
     Return the kind of a list of different texts.
 
-    :param least: so many there are at least.
-    :param too_few: what is wrong with fewer, and what to do.
+    :param least: the minimum number of texts.
+    :param too_few: the problem of fewer texts, and its remedy.
     """
     def read(entry: Entry, key: str, value: Tree) -> tuple[str, ...]:
         if not isinstance(value, Sequence):
@@ -294,7 +294,7 @@ def texts(item: Kind, least: int = 0, *too_few: str) -> Kind:
 
 
 def numbers(**bounds: int) -> Kind:
-    """Return the kind of a list of finite numbers that is not empty."""
+    """Return the kind of a non-empty list of finite numbers."""
     trees = items({'anyOf': [{'type': 'number', **bounds}, _USE]})
 
     def read(entry: Entry, key: str, value: Tree) -> list[float]:
@@ -326,7 +326,7 @@ def time(least_ns: int = MICROSECOND) -> Kind:
 
 
 def whole(least: int, most: int) -> Kind:
-    """Return the kind of a whole number within bounds."""
+    """Return the kind of an integer within bounds."""
     def read(entry: Entry, key: str, value: Tree) -> int:
         if not (isinstance(value, Scalar) and value.plain and _INTEGER.fullmatch(value.text)):
             raise entry.error(key, f'{shown(key)} is {_described(value)}', 'write a whole number')
@@ -340,7 +340,7 @@ def whole(least: int, most: int) -> Kind:
 
 
 def truth() -> Kind:
-    """Return the kind of true and false."""
+    """Return the kind of a boolean."""
     def read(entry: Entry, key: str, value: Tree) -> bool:
         if not (isinstance(value, Scalar) and value.plain and value.text in ('true', 'false')):
             raise entry.error(key, f'{shown(key)} is {_described(value)}', 'write true or false')
@@ -350,7 +350,7 @@ def truth() -> Kind:
 
 
 def pairs(value_kind: Kind) -> Kind:
-    """Return the kind of a mapping of texts; of each its key, text and line."""
+    """Return the kind of a mapping of texts: key, text and line of each."""
     def read(entry: Entry, key: str, value: Tree) -> list[tuple[str, str, int]]:
         if not isinstance(value, Mapping):
             raise entry.error(key, f"'{key}' is no mapping", f'write {key}: {{name: value}}')
@@ -362,7 +362,7 @@ def pairs(value_kind: Kind) -> Kind:
 
 
 def kind_of(tree: Tree) -> str:
-    """Return what a tree is, in words."""
+    """Return a description of a tree."""
     if isinstance(tree, Scalar):
         return 'empty' if tree.is_null else f'the text {shown(tree.text)}'
     return 'a list' if isinstance(tree, Sequence) else 'a mapping'
@@ -427,7 +427,7 @@ def _read_execution_time(entry: Entry, key: str, value: Tree) -> ExecutionTime:
 
 
 def _read_processes(entry: Entry, key: str, value: Tree) -> dict[str, dict[str, int]]:
-    """Return of each process its nodes, and of each of these its line."""
+    """Return the nodes of each process, with their lines."""
     found: dict[str, dict[str, int]] = {}
     for process, _, line in _NODES_BY_PROCESS.read(entry, key, value):
         wrong = PROCESS.check(process)
@@ -441,7 +441,7 @@ def _read_processes(entry: Entry, key: str, value: Tree) -> dict[str, dict[str, 
 
 
 def _percent(entry: Entry, count: int) -> tuple[float, ...]:
-    """Return the shares that the quantiles belong to: declared, or evenly spaced."""
+    """Return the percentages of the quantiles: declared, or evenly spaced."""
     percent = entry.get('percent')
     if percent is None:
         return tuple(100.0 * i / (count - 1) for i in range(count)) if count > 1 else (50.0,)

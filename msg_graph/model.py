@@ -21,7 +21,7 @@ Keep = Literal['all', 'newest']
 Importance = Literal['high', 'normal', 'low']
 
 MOST_WORKERS = 4096
-"""Of one executor, declared or asked for."""
+"""The maximum of one executor, declared or requested."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +30,8 @@ class ExecutionTime:
     Execution time of a callback, as a distribution given by quantiles.
 
     :ivar quantiles_ns: the quantiles, never decreasing; a single value is a constant.
-    :ivar percent: the share (0 to 100, increasing) of executions that take at most the quantile
-        at the same place. Below the first and above the last the distribution is flat.
+    :ivar percent: for each quantile the share (0 to 100, increasing) of executions that take at
+        most that time. Below the first and above the last the distribution is flat.
     """
 
     quantiles_ns: tuple[int, ...]
@@ -80,7 +80,7 @@ class WeaklyHard:
     of: int
 
     def __str__(self) -> str:
-        """Return it as in a declaration."""
+        """Return its text in a declaration."""
         return f'{self.misses} of {self.of}'
 
 
@@ -92,22 +92,21 @@ class Callback:
     :ivar node: fully qualified name of its node.
     :ivar name: its name within the node.
     :ivar key: ``node:name``, unique in the declaration.
-    :ivar kind: what starts it.
+    :ivar kind: timer, subscription, sync or service.
     :ivar timer_period_ns: period of its timer; None for other kinds.
     :ivar topics: the topics that start it: one for a subscription, two or more for a sync.
     :ivar service: the service that it serves, or None.
-    :ivar period_ns: period of the DAG that it is the source of, declared or its timer's, or None.
+    :ivar period_ns: of a source, the period of its DAG, declared or its timer's; else None.
     :ivar publishes: topics that it publishes.
     :ivar reads: topics and callbacks of its node whose data it reads later (queue edges).
-    :ivar deadline_ns: relative deadline, if it is a sink; else None.
+    :ivar deadline_ns: of a sink, its relative deadline; else None.
     :ivar release_from: where a source's release time comes from.
     :ivar group: name of its mutually exclusive callback group within the node, or None.
-    :ivar dag: declared name of the DAG that it is the source of, or None.
-    :ivar execution_time: its execution time, or None where it is not declared.
+    :ivar dag: of a source, the declared name of its DAG, or None.
+    :ivar execution_time: its execution time; None: not declared.
     :ivar line: line of its declaration, counted from 1.
-    :ivar on_late: what is done with a late job of the DAG that it is the source of; None: what
-        the run does by default.
-    :ivar max_active_jobs: bound on the open jobs of the DAG that it is the source of, or None.
+    :ivar on_late: of a source, the treatment of late jobs; None: the default of the run.
+    :ivar max_active_jobs: of a source, the bound on open jobs of its DAG, or None.
     :ivar holds_interpreter: whether it computes in Python (True), or waits, or computes with the
         interpreter's lock released (False); None: not declared.
     :ivar keep: of a source or sink: ``newest`` if an execution that has not started is dropped
@@ -145,12 +144,12 @@ class Callback:
 @dataclass(frozen=True, slots=True)
 class Vertex:
     """
-    One callback in one DAG; a callback that several messages of a job start is several vertices.
+    One callback in one DAG; a callback that several messages of a job start has several vertices.
 
-    :ivar name: the callback's key where this is its only vertex; else ``key@dag``, and where one
-        DAG holds the callback several times ``key@dag#1``, ``key@dag#2``, … in order of index.
+    :ivar name: the callback's key if this is its only vertex; else ``key@dag``, or, for several
+        vertices in one DAG, ``key@dag#1``, ``key@dag#2``, … in order of index.
     :ivar dag: index of its DAG.
-    :ivar index: its place in its DAG.
+    :ivar index: its index in its DAG.
     :ivar predecessors: indices, in the DAG, of the vertices that start it, ascending.
     :ivar successors: indices, in the DAG, of the vertices that it starts, in the order of the
         topics that it publishes, those of one topic ascending.
@@ -172,15 +171,15 @@ class Dag:
     A DAG task: period, graph, and one relative deadline for each sink.
 
     :ivar name: unique among the DAGs: the source's ``dag:``, else its node.
-    :ivar index: its place among the DAGs, which is its source's place in the file.
+    :ivar index: its index among the DAGs, in the order of the sources in the file.
     :ivar period_ns: time between two releases.
     :ivar source: index of the one vertex with no predecessor.
     :ivar sinks: indices of the vertices with no successor, ascending.
     :ivar edges: trigger edges as pairs of indices, ascending.
-    :ivar release_from: where a job's release time comes from; of a timer's it is when that was
-        due, and ``header_stamp`` says where other processes of the DAG have it from.
-    :ivar on_late: what is done with a late job, or None where the declaration says nothing.
-    :ivar max_active_jobs: bound on the open jobs, or None where the declaration has none.
+    :ivar release_from: where a job's release time comes from; for a timer it is its due time, and
+        ``header_stamp`` is the release in other processes of the DAG.
+    :ivar on_late: the treatment of late jobs; None: not declared.
+    :ivar max_active_jobs: bound on the open jobs; None: not declared.
     """
 
     name: str
@@ -201,7 +200,7 @@ class QueueEdge:
     Data that a callback reads without being started by it.
 
     :ivar reader: key of the reading callback.
-    :ivar topic: the topic that is taken from; None for a member variable.
+    :ivar topic: the topic that is read; None for a member variable.
     :ivar writers: keys of the callbacks that publish the topic, or that write the variable.
     """
 
@@ -229,7 +228,7 @@ class Process:
     A process that nodes run in.
 
     :ivar name: unique among the processes.
-    :ivar nodes: the declared nodes in it, in file order.
+    :ivar nodes: its declared nodes, in file order.
     """
 
     name: str
@@ -246,9 +245,9 @@ class TaskSet:
     :ivar queue_edges: by reader in file order, then in the order of its ``reads``.
     :ivar paths: the declared end-to-end paths, in file order.
     :ivar workers: declared number of workers, or None.
-    :ivar file: name of the file that this was read from.
-    :ivar text: the declaration as it was read; put together to one where it includes others.
-    :ivar processes: those that the nodes run in, each declared node in one; none: not declared.
+    :ivar file: name of the declaration's file.
+    :ivar text: the text of the declaration, assembled if it includes other files.
+    :ivar processes: the declared processes, which contain each declared node once; may be empty.
     :ivar vertices: the vertices of all DAGs, DAG by DAG.
     """
 
@@ -266,7 +265,7 @@ class TaskSet:
     _callback: dict[str, Callback] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Build what the look-ups by name need."""
+        """Build the indices for look-ups by name."""
         every = tuple(vertex for dag in self.dags for vertex in dag.vertices)
         object.__setattr__(self, 'vertices', every)
         object.__setattr__(self, '_vertex', {vertex.name: vertex for vertex in every})
@@ -280,7 +279,7 @@ class TaskSet:
 
     def vertex(self, name: str) -> Vertex:
         """
-        Return the vertex of that name.
+        Return the vertex with this name.
 
         :raises KeyError: there is none.
         """
@@ -288,7 +287,7 @@ class TaskSet:
 
     def dag(self, name: str) -> Dag:
         """
-        Return the DAG of that name.
+        Return the DAG with this name.
 
         :raises KeyError: there is none.
         """
@@ -303,7 +302,7 @@ class TaskSet:
         return self._callback[key]
 
     def with_callbacks(self, change: Mapping[str, Mapping[str, Any]]) -> TaskSet:
-        """Return the task set with some fields of callbacks changed, by key, but no edges."""
+        """Return the task set with some fields of callbacks changed, by key; edges stay."""
         new = {c.key: replace(c, **change.get(c.key, {})) for c in self.callbacks}
         return replace(self, callbacks=tuple(new.values()), dags=tuple(
             replace(dag, vertices=tuple(
@@ -312,17 +311,17 @@ class TaskSet:
                 for vertex in dag.vertices)) for dag in self.dags))
 
     def places(self) -> dict[str, int]:
-        """Return the place of each callback in ``callbacks``, by its key."""
+        """Return the index of each callback in ``callbacks``, by its key."""
         return {callback.key: place for place, callback in enumerate(self.callbacks)}
 
     def places_of_vertices(self) -> list[int]:
-        """Return by vertex (see ``vertices``) the place of its callback in ``callbacks``."""
+        """Return by vertex (see ``vertices``) the index of its callback in ``callbacks``."""
         places = self.places()
         return [places[vertex.callback.key] for vertex in self.vertices]
 
 
 def topological_order(dag: Dag) -> list[int]:
-    """Return the vertices (indices in the DAG) so that each comes after its predecessors."""
+    """Return the vertices (indices in the DAG), each after its predecessors."""
     waiting = [len(vertex.predecessors) for vertex in dag.vertices]
     order = [dag.source]
     for index in order:
@@ -337,7 +336,7 @@ def path_lengths(dag: Dag, weights: Sequence[int]) -> list[int]:
     """
     Return for each vertex the length of the longest path from the source through it.
 
-    :param weights: weight of each vertex, by its index in the DAG; the vertex's own counts.
+    :param weights: of each vertex, by its index in the DAG; the vertex's own weight is included.
     """
     lengths = [0] * len(dag.vertices)
     for index in topological_order(dag):
@@ -347,7 +346,7 @@ def path_lengths(dag: Dag, weights: Sequence[int]) -> list[int]:
 
 
 def mean_execution_times(dag: Dag) -> list[int] | None:
-    """Return each vertex's mean execution time in ns, or None where one is not declared."""
+    """Return each vertex's mean execution time in ns; None if one is not declared."""
     means = []
     for vertex in dag.vertices:
         if vertex.callback.execution_time is None:
@@ -360,7 +359,7 @@ def load_of(dag: Dag) -> float | None:
     """
     Return the load of the DAG in cores, with mean execution times: sum(C) / T.
 
-    None where an execution time is not declared.
+    None if an execution time is not declared.
     """
     means = mean_execution_times(dag)
     return None if means is None else sum(means) / dag.period_ns

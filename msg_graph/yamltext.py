@@ -1,19 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-YAML text to a tree of plain values that know their lines.
+YAML text to a tree of plain values with their lines.
 
 Theory of operation
 -------------------
 The tree is built from the parser's events, not by PyYAML's composer or constructor:
 
-1. Nesting beyond ``MAX_DEPTH`` ends it, so none can overflow the stack.
-2. Scalars stay text. Their key decides what they mean, so that ``on``, ``1e3`` or ``2026-01-01``
-   never become something else.
-3. An alias shares the tree of its anchor. Every tree knows its size with all aliases written out;
-   beyond ``MAX_SIZE`` the file is refused, so that nested aliases cannot explode. An alias inside
-   of its own anchor is refused.
-4. Duplicate keys, explicit tags and a second document are errors, not surprises.
+1. Nesting beyond ``MAX_DEPTH`` is refused, so the stack cannot overflow.
+2. Scalars stay text. Their key decides their meaning, so ``on``, ``1e3`` or ``2026-01-01`` are not
+   converted.
+3. An alias shares the tree of its anchor. Every tree knows its size with all aliases expanded; a
+   file beyond ``MAX_SIZE`` is refused, so nested aliases cannot explode. An alias inside of its
+   own anchor is refused.
+4. Duplicate keys, explicit tags and a second document are errors.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Scalar:
 
     @property
     def is_null(self) -> bool:
-        """Whether there is no value."""
+        """Return whether the value is empty."""
         return self.plain and self.text in ('', '~', 'null')
 
 
@@ -65,7 +65,7 @@ class Sequence:
         self.size = 1
 
     def with_items(self, items: list[Tree]) -> Sequence:
-        """Return a list in the same place with as many other items."""
+        """Return a list with the same lines and other items."""
         result = Sequence(self.line)
         result.items, result.size = items, self.size
         return result
@@ -83,7 +83,7 @@ class Mapping:
         self.size = 1
 
     def with_entries(self, entries: dict[str, Tree]) -> Mapping:
-        """Return a mapping in the same place with other values of its keys."""
+        """Return a mapping with the same lines and other values."""
         result = Mapping(self.line)
         result.entries, result.key_lines, result.size = entries, self.key_lines, self.size
         return result
@@ -108,12 +108,12 @@ def decode(data: bytes, file: str) -> str:
 
 
 def plain_scalar(text: str) -> str:
-    """Return a name (without quotes in it), quoted if YAML would read it as something else."""
+    """Return a name (without quotes in it), quoted if YAML would read it as another type."""
     return text if _PLAIN.fullmatch(text) and text.lower() not in _WORDS else f"'{text}'"
 
 
 def yaml_lines(tree: Tree) -> list[str]:
-    """Return the lines of a text that gives an equal tree; its texts have one line each."""
+    """Return the lines of a text with an equal tree; its scalars must have one line each."""
     if isinstance(tree, Scalar):
         simple = tree.plain and _SIMPLE.fullmatch(tree.text)
         return [tree.text if simple else "'" + tree.text.replace("'", "''") + "'"]
@@ -135,7 +135,7 @@ def yaml_lines(tree: Tree) -> list[str]:
 
 
 def parse_yaml(text: str, file: str) -> Tree | None:
-    """Return the tree of the one document in ``text``, or None where there is none."""
+    """Return the tree of the one document in ``text``, or None if there is none."""
     text = text[1:] if text.startswith('\ufeff') else text
     strange = _NOT_YAML.search(text)
     if strange is not None:
@@ -218,7 +218,7 @@ class _Builder:
         return tree
 
     def _fill(self, tree: Sequence | Mapping) -> None:
-        """Read the entries of a list or mapping, and count them, with aliases written out."""
+        """Read the entries of a list or mapping, and count them, with aliases expanded."""
         key: str | None = None
         while type(event := next(self._events)) not in _ENDS:
             each = self._tree(event)

@@ -1,12 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What a synthetic callback does for its execution time.
+Emulations of a callback's execution time.
 
-``sleep`` is work outside of Python (a GPU, a C++ library that releases the GIL): it occupies a
-worker but no CPU, so the CPU time that the process uses is overhead.  ``spin`` uses CPU time and
-the GIL: all such callbacks together get at most one core.  ``native`` uses CPU time without the
-GIL, as numpy or OpenCV do.
+``sleep`` emulates work outside of Python (a GPU, a C++ library that releases the GIL).  It
+occupies a worker but no CPU, so the CPU time that the process uses is overhead.  ``spin`` uses CPU
+time and the GIL: all such callbacks together get at most one core.  ``native`` uses CPU time
+without the GIL, like numpy or OpenCV.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import statistics
 import time
 
 Emulate = Callable[[int], None]
-"""Executes for that many nanoseconds in the calling thread."""
+"""Executes for this many nanoseconds in the calling thread."""
 
 
 def typical_oversleep_ns(samples: int = 100, asked_ns: int = 300_000) -> int:
-    """Measure by how much time.sleep() is late on this machine when it is idle: the median, ns."""
+    """Measure by how much time.sleep() is typically late on an idle machine: the median, ns."""
     late = []
     for _ in range(samples):
         start = time.monotonic_ns()
@@ -32,12 +32,11 @@ def typical_oversleep_ns(samples: int = 100, asked_ns: int = 300_000) -> int:
 
 def sleeper(oversleep_ns: int) -> Emulate:
     """
-    Make a function that takes a worker for some time without taking CPU.
+    Make a function that occupies a worker for some time without using CPU.
 
-    It asks time.sleep() for less by what this machine typically adds, so that the mean is right
-    when the machine isn't overloaded.  What is shorter than that (about 70 us under Linux, whose
-    timer slack is 50 us) is waited out busily.  When the machine is overloaded, executions get
-    longer: that is so for real callbacks too, and it is not hidden.
+    It reduces the argument of time.sleep() by the typical oversleep, so that the mean is right on
+    an idle machine.  Shorter times (below about 70 us under Linux, whose timer slack is 50 us) are
+    waited busily.  In an overload executions get longer, as those of real callbacks do.
 
     :param oversleep_ns: the typical oversleep.
     """
@@ -55,7 +54,7 @@ def sleeper(oversleep_ns: int) -> Emulate:
 
 
 def spinner() -> Emulate:
-    """Make a function that takes that much CPU time of the calling thread."""
+    """Make a function that uses this much CPU time of the calling thread."""
     thread_time_ns = time.thread_time_ns
 
     def emulate(execution_ns: int) -> None:
@@ -68,10 +67,10 @@ def spinner() -> Emulate:
 
 def native() -> Emulate:
     """
-    Make a function that takes about that much CPU time in C, without the interpreter lock.
+    Make a function that uses about this much CPU time in C, without the GIL.
 
-    How much C does in a time is measured first (some milliseconds), and then goes by what it did
-    lately: the speed of a virtual machine changes by a tenth.
+    Its speed is first measured (some milliseconds), and then adapted from recent executions: the
+    speed of a virtual machine changes by a tenth.
     """
     def compute(iterations: int) -> None:
         hashlib.pbkdf2_hmac('sha256', b'password', b'salt', iterations)

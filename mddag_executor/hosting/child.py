@@ -1,13 +1,13 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A run in a process of its own, which returns its result as JSON.
+A run in a separate process, which returns its result as JSON.
 
-``run_child`` is the side of the process that wants the result, ``answer`` that of the child.
-rclpy's executors cannot be stopped in an orderly way while callbacks wait for their pool, so the
-child ends without destroying anything.  A child that does not end in time is killed: rclpy's
-EventsExecutor holds off SIGTERM.  The kernel kills it when the process that started it ends
-(``signal_at_end_of``), whatever the child does: a child that hangs may hold the interpreter.
+``run_child`` is called by the process that wants the result, ``answer`` by the child.  rclpy's
+executors cannot be stopped in order while callbacks wait for their pool, so the child ends without
+destroying anything.  A child that does not end in time is killed, because rclpy's EventsExecutor
+blocks SIGTERM.  The kernel also kills it when its parent ends (``signal_at_end_of``), even if it
+hangs and holds the GIL.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _PR_SET_PDEATHSIG = 1
 _PARENT = 'MDDAG_CHILD_OF'
 
 Tick = Callable[[float], None]
-"""Called every half second with the seconds since the child was started."""
+"""Called every half second with the seconds since the start of the child."""
 
 
 class ChildError(MddagError):
-    """A run that its child cannot make."""
+    """A run that the child cannot make."""
 
 
 class CrashError(ChildError):
@@ -51,11 +51,11 @@ def run_child(
     Run a child and return its result.
 
     :param name: of the run, for messages.
-    :param limit_s: the child is killed if it takes longer.
+    :param limit_s: the child is killed after this time.
     :raises CrashError: when the child crashed, was killed, or gave no result.
     :raises ChildError: when its input is wrong.
     """
-    # Of this machine only: it must not find another one's nodes, nor be found by them.
+    # This machine only: the child and nodes of other machines must not discover each other.
     environment = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ,
                    _PARENT: str(os.getpid())}
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
@@ -125,9 +125,9 @@ def answer(run: Callable[[], dict[str, Any]]) -> NoReturn:
 
 def signal_at_end_of(parent: int, which: signal.Signals) -> None:
     """
-    Have this process get a signal when the one that started it ends, on Linux.
+    Let the kernel send this process a signal when its parent ends, on Linux.
 
-    :param parent: the process id of that.
+    :param parent: the process id of the parent.
     """
     try:
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, which)
@@ -139,9 +139,9 @@ def signal_at_end_of(parent: int, which: signal.Signals) -> None:
 
 def _take_stdout() -> TextIO:
     """
-    Return standard output, and redirect what else is written to it to standard error.
+    Return standard output, and redirect other output on it to standard error.
 
-    Native code of rclpy's writes there: where a clock has many timers, for instance.
+    Native code of rclpy writes there: for instance about a clock with many timers.
     """
     output = os.fdopen(os.dup(sys.stdout.fileno()), 'w')
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())

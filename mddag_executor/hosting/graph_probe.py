@@ -1,24 +1,24 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A draft of the system that runs now, from the ROS graph and from the rates of its topics.
+A draft of the running system, from the ROS graph and the rates of its topics.
 
 Theory of operation
 -------------------
-The ROS graph shows which node publishes, subscribes and serves what. It does not show timers,
-of callback groups, nor which callback publishes a topic. So:
+The ROS graph shows the topics and services of each node. It shows neither timers, nor callback
+groups, nor which callback publishes a topic. So:
 
-1. A node that subscribes a topic has a callback for it, and so for a service. Each of a node's
-   callbacks may publish what the node publishes.
-2. A node that subscribes and serves nothing is supposed to have one timer, which publishes all
-   that the node does, as often as the most frequent of its topics comes. So the probe listens to
-   these topics for a while, without looking into the messages.
+1. A node has a callback for each topic it subscribes, and for each service. Each of a node's
+   callbacks may publish the node's topics.
+2. A node without subscriptions and services is assumed to have one timer, which publishes all of
+   the node's topics, at the rate of the most frequent one. So the probe listens to these topics
+   for a while, without deserialising messages.
 
-A topic's rate is that of its messages' source timestamps, divided by the number of its publishers.
-Messages that were lost on the way count, by their sequence numbers: images are often published as
-best effort. So nothing needs to spin: messages are taken by polling, of all topics alike. What
-every node has anyway is left out, and so are hidden nodes (``_…``). Nodes are looked for until the
-end, as they are found one by one.
+The rate of a topic is that of its messages' source timestamps, divided by the number of its
+publishers. Lost messages are counted by their sequence numbers: images are often published as best
+effort. So no executor needs to spin: messages are polled, from all topics alike. Topics and
+services that every node has are left out, and so are hidden nodes (``_…``). Discovery continues
+until the end, as nodes are found one by one.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from rclpy.utilities import try_shutdown
 _LEAST_MESSAGES = 3
 _STEP_S = 0.2
 _POLL_S = 0.02
-_DEPTH = 200  # so up to 10,000 messages a second of one topic
+_DEPTH = 200  # for up to 10,000 messages a second on one topic
 
 
 @dataclass
 class Endpoints:
-    """What a node publishes, subscribes and serves: names with their types."""
+    """A node's published topics, subscribed topics and services, with their types."""
 
     publishes: dict[str, str] = field(default_factory=dict)
     subscribes: dict[str, str] = field(default_factory=dict)
@@ -63,7 +63,7 @@ class Seen(Releases):
     """
     The messages of a topic by their source timestamps.
 
-    :ivar lost: how many were published between them and did not come.
+    :ivar lost: how many messages between them were published but not received.
     """
 
     lost: int = 0
@@ -77,7 +77,7 @@ class Seen(Releases):
         self._number = number
 
     def interval_ns(self, publishers: int = 1) -> int | None:
-        """Return the mean time between two messages; None with too few of them."""
+        """Return the mean time between two messages; None if there are too few."""
         lost = self.lost if publishers == 1 else 0
         if self.count < 2 or self.count + lost < _LEAST_MESSAGES or self.last <= self.first:
             return None
@@ -87,7 +87,7 @@ class Seen(Releases):
 @dataclass
 class Probe:
     """
-    What was found.
+    The findings.
 
     :ivar nodes: endpoints by node.
     :ivar seen: messages by topic.
@@ -101,17 +101,17 @@ class Probe:
     warnings: list[str] = field(default_factory=list)
 
     def warn(self, text: str) -> None:
-        """Add a warning that is not there yet."""
+        """Add a warning, unless it exists."""
         if text not in self.warnings:
             self.warnings.append(text)
 
 
 def probe(seconds: float, tick: Callable[[float], None] | None = None) -> Probe:
     """
-    Look at the ROS graph of this domain.
+    Inspect the ROS graph of this domain.
 
-    :param seconds: how long; most of it goes to measuring rates.
-    :param tick: gets now and then for how many seconds it has been looking.
+    :param seconds: duration; most of it is spent on measuring rates.
+    :param tick: called repeatedly with the elapsed seconds.
     """
     context = Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
@@ -145,7 +145,7 @@ def _look(node: Node, context: Context, seconds: float, tick: Callable[[float], 
 
 
 def _take(subscription: Any, seen: Seen) -> None:
-    """Count what has come; nothing is deserialised."""
+    """Count arrived messages; they are not deserialised."""
     take = message_taker(subscription)
     with subscription.handle:
         for _ in range(_DEPTH):
@@ -158,7 +158,7 @@ def _take(subscription: Any, seen: Seen) -> None:
 
 
 def _nodes(node: Node, found: Probe) -> None:
-    """Add which nodes there are, and what they publish, subscribe and serve."""
+    """Add the nodes, with their topics and services."""
     names = [f'{namespace.rstrip("/")}/{name}'
              for name, namespace in node.get_node_names_and_namespaces()
              if not name.startswith('_')]
@@ -178,7 +178,7 @@ def _nodes(node: Node, found: Probe) -> None:
         ):
             try:
                 listed = get(name, namespace or '/')
-            except Exception as error:  # rclpy raises several kinds where the node has just ended
+            except Exception as error:  # rclpy raises several kinds if the node has just ended
                 found.warn(f'{full}: {error}')
                 continue
             target.update((each, types[0]) for each, types in listed
@@ -203,7 +203,7 @@ def _listen(node: Node, found: Probe) -> list[tuple[Any, Seen]]:
             subscription = node.create_subscription(
                 _message_type(kind), topic, lambda _: None, qos, raw=True,
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
-        except Exception as error:  # whatever the package of the type raises when it is imported
+        except Exception as error:  # any error of the import of the type's package
             found.warn(
                 f'{topic}: its rate is not known: its type {kind} cannot be used here ({error})')
         else:
@@ -212,7 +212,7 @@ def _listen(node: Node, found: Probe) -> list[tuple[Any, Seen]]:
 
 
 def _message_type(kind: str) -> Any:
-    """Return the class of a type as `std_msgs/msg/String`: other nodes say it, so nothing else."""
+    """Return the class of a type name such as `std_msgs/msg/String`, which is not trusted."""
     match kind.split('/'):
         case [package, 'msg', name] if package.isidentifier() and name.isidentifier():
             return getattr(import_module(f'{package}.msg'), name)
@@ -220,7 +220,7 @@ def _message_type(kind: str) -> Any:
 
 
 def draft_of(found: Probe) -> Draft:
-    """Return what is known of the system, and what is supposed (rules 1 and 2)."""
+    """Return the known and assumed parts of the system (rules 1 and 2)."""
     nodes = []
     for name, endpoints in sorted(found.nodes.items()):
         starts = [*(('subscription', topic) for topic in sorted(endpoints.subscribes)),

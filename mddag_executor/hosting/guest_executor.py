@@ -3,10 +3,10 @@
 """
 The executors of hosted programs: the host's executor runs their nodes, and they wait.
 
-An executor that a program makes gets a class of its own, derived from the class that it had, with
-the methods of ``GuestExecutor`` instead of rclpy's.  So it does not matter when a program imports
-rclpy's classes, and methods that a program overrides stay.  ``node.executor`` is this executor
-even when the host's executor runs the node.
+The executor that a program makes gets a new class, derived from its former class, with the methods
+of ``GuestExecutor`` instead of rclpy's.  So it does not matter when a program imports rclpy's
+classes, and overridden methods stay.  ``node.executor`` is this executor even when the host's
+executor runs the node.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from mddag_executor.hosting.host import Guest, Host
 
 _MOST_TURNS = 10
-"""More callbacks than this, the usual queue depth, are not remembered for ``spin_once``."""
+"""At most this many callbacks, the usual queue depth, are remembered for ``spin_once``."""
 _STEP_S = 0.01
-"""A step that does not know of whose callbacks it is one ends after this time."""
+"""A step of unknown callbacks ends after this time."""
 _MOST_ERRORS = 100
-"""More exceptions than this are not kept for the next spin: the program does not handle them."""
+"""At most this many exceptions are kept for the next spin: the program does not handle them."""
 
 
 class GuestExecutor:
@@ -37,7 +37,8 @@ class GuestExecutor:
     The methods of an executor of a hosted program.
 
     :ivar guest: the program; None when a callback has made the executor.
-    :ivar is_global: whether it is the one of ``rclpy.spin``, which removes a node after each use.
+    :ivar is_global: whether it is the executor of ``rclpy.spin``, which removes a node after each
+        use.
     """
 
     host: Host
@@ -57,19 +58,19 @@ class GuestExecutor:
         return self._n_spinning > 0
 
     def spin(self) -> None:
-        """Have the nodes run, and wait for the end."""
+        """Let the nodes run, and wait for the end."""
         self._wait(lambda: False, None)
         self._turns = 0
 
     def spin_once(self, timeout_sec: Any = None) -> None:
-        """Have the nodes run, and wait until a callback has run since the last call."""
+        """Let the nodes run, and wait until a callback has run since the last call."""
         if timeout_sec is None and is_called_by_spin():
             self.spin()
         else:
             self._step(lambda: False, timeout_sec)
 
     def spin_until_future_complete(self, future: Any, timeout_sec: Any = None) -> None:
-        """Have the nodes run, and wait for a future."""
+        """Let the nodes run, and wait for a future."""
         self._wait(self._is_done(future), timeout_sec)
         self._turns = 0
 
@@ -99,7 +100,7 @@ class GuestExecutor:
         raised: list[BaseException] = []
 
         def is_over() -> bool:
-            if self._errors and not raised:  # each of them comes out of one spin
+            if self._errors and not raised:  # each error comes out of one spin
                 raised.append(self._errors.popleft())
             return bool(raised) or self._is_stopped or until()
 
@@ -121,7 +122,7 @@ class GuestExecutor:
             self.guest.settled = True
 
     def wake_waiting(self) -> None:
-        """Have waiting threads check again what they wait for."""
+        """Let waiting threads check their conditions again."""
         with self._changed:
             self._changed.notify_all()
 
@@ -163,7 +164,7 @@ class GuestExecutor:
         return self.host.executor.create_task(callback, *args, **kwargs)
 
     def wake(self) -> None:
-        """Have the host's executor note that entities of a node have changed."""
+        """Let the host's executor note that entities of a node have changed."""
         if self.host.executor is not None:
             self.host.executor.wake()
 
@@ -188,7 +189,7 @@ def make_guest(executor: Any, host: Host, guest: Guest | None) -> None:
 
 @cache
 def _guest_class(kind: type[Executor]) -> type[Any]:
-    """Derive a class with our methods instead of those of rclpy and of this package."""
+    """Derive a class with the methods of this module instead of those of rclpy."""
     methods = {
         name: method for name, method in vars(GuestExecutor).items() if callable(method) and (
             getattr(kind, name, method).__module__.partition('.')[0]

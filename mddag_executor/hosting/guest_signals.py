@@ -5,11 +5,12 @@ Signal handlers of hosted programs, none of which runs in the main thread.
 
 Theory of operation
 -------------------
-Python runs handlers in the main thread, and only the main thread may set them.  So the handlers
-of programs are kept here.  For the first one of a signal the main thread is asked to set a handler
-for all programs; a signal of this module interrupts whatever it waits for.  When the signal comes,
-first its handler of before runs (SIGINT ends the run), then those of the programs.  An exception
-of a program's handler is raised in the program's own thread, as soon as that runs Python.
+Python runs handlers in the main thread, and only the main thread may set them.  So the handlers of
+programs are stored here.  For the first handler of a signal the main thread sets a common handler
+for all programs; a signal of this module interrupts the main thread for that.  When the signal
+arrives, first its earlier handler runs (SIGINT ends the run), then those of the programs.  An
+exception of a program's handler is raised in the program's own thread, as soon as that runs
+Python.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class GuestSignals:
         self._asked: list[tuple[int, Any]] = []
 
     def install(self, replace: Callable[[Any, str, Callable[[Any], Any]], None]) -> None:
-        """Keep handlers of programs, if the calling thread is the main thread."""
+        """Store handlers of programs, if the calling thread is the main thread."""
         self._set = signal.signal
         if threading.current_thread() is threading.main_thread():
             self._before[_DOORBELL] = signal.signal(_DOORBELL, self._answer)
@@ -48,7 +49,7 @@ class GuestSignals:
             replace(signal, 'getsignal', self._getsignal)
 
     def uninstall(self) -> None:
-        """Restore the handlers of before."""
+        """Restore the earlier handlers."""
         for number, before in self._before.items():
             self._set(number, signal.SIG_DFL if before is None else before)
 

@@ -1,22 +1,21 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Find and run what ``mddag run --node SPEC`` names.
+Find and run the programs of ``mddag run --node SPEC``.
 
 Theory of operation
 -------------------
 A SPEC is
 
-* ``package/executable``: what ``ros2 run`` would start.  It is looked for in
-  ``PREFIX/lib/PACKAGE/`` of the ament index (``AMENT_PREFIX_PATH``), then among the console
-  scripts of the Python distribution of that name, which is what a package installed with pip has.
-  A Python script is executed as ``__main__``, as Python would do it.
+* ``package/executable``, as for ``ros2 run``.  It is searched in ``PREFIX/lib/PACKAGE/`` of the
+ament index (``AMENT_PREFIX_PATH``), then among the console scripts of the Python distribution with
+that name, as installed by pip.  A Python script is executed as ``__main__``, as by Python.
 * ``module:NodeClass``: a subclass of ``rclpy.node.Node``; it is constructed without arguments.
-* ``module:function``: it may return a node or several, or be a ``main()`` that spins.  One
-  required argument gets the list of command line arguments.
+* ``module:function``: it may return one or several nodes, or be a ``main()`` that spins.  One
+required argument receives the list of command line arguments.
 
-``resolve`` finds the file or imports the module, so whatever is wrong with a SPEC is said before
-any node starts; ``hosting`` then runs the ``Program`` that it returns.
+``resolve`` finds the file or imports the module, so an error in a SPEC is reported before any node
+starts; ``hosting`` then runs the returned ``Program``.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from rclpy.node import Node
 
 
 class LoadingError(MddagError):
-    """A ``--node`` that cannot be run; one line that says why and what to do."""
+    """A ``--node`` that cannot be run; one line with the reason and the remedy."""
 
     def __init__(self, spec: str, problem: str, remedy: str) -> None:
         super().__init__(f'--node {spec}: {problem}: {remedy}')
@@ -53,17 +52,17 @@ class LoadingError(MddagError):
 
 
 class ProgramFailed(LoadingError, UserCodeError):
-    """A program that raised before its nodes were there; its cause is what it raised."""
+    """A program that raised during its start; the cause is its exception."""
 
 
 @dataclass(frozen=True)
 class Program:
     """
-    Something that brings nodes.
+    A program that makes nodes.
 
     :ivar spec: as the user wrote it.
-    :ivar argv0: what ``sys.argv[0]`` is while it starts.
-    :ivar run: runs it; what it returns may be nodes.
+    :ivar argv0: ``sys.argv[0]`` during its start.
+    :ivar run: runs it; the result may be nodes.
     :ivar arguments: its own command line arguments.
     """
 
@@ -75,11 +74,11 @@ class Program:
 
 def resolve(text: str, ros_arguments: Iterable[str] = ()) -> Program:
     """
-    Find what a SPEC names; arguments of the program may follow it, as in a shell.
+    Find the program of a SPEC; its arguments may follow, as in a shell.
 
-    What is imported sees the command line that the program will see.
+    Imported modules see the command line that the program will see.
 
-    :raises LoadingError: when it cannot be found or imported, or is nothing that brings nodes.
+    :raises LoadingError: when it cannot be found or imported, or does not make nodes.
     """
     try:
         spec, *arguments = shlex.split(text) or ['']
@@ -98,7 +97,7 @@ def resolve(text: str, ros_arguments: Iterable[str] = ()) -> Program:
 
 
 def ros_arguments(given: Sequence[str] | None) -> list[str]:
-    """Return what programs and rclpy get of ``--ros-args``."""
+    """Return the ``--ros-args`` for programs and rclpy."""
     return ['--ros-args', *given] if given else []
 
 
@@ -158,7 +157,7 @@ def _import(spec: str, module_name: str) -> ModuleType:
 
 
 def _failure(error: Exception) -> type[LoadingError]:
-    """Return the kind of error that an import is which failed: something missing, or a defect."""
+    """Return the kind of error of a failed import: a missing module, or a defect."""
     return LoadingError if isinstance(error, (ImportError, SyntaxError)) else ProgramFailed
 
 
@@ -196,7 +195,7 @@ def _executable(spec: str, package: str, name: str) -> Program:
             return _script(spec, folder / name)
         files = [p.name for p in folder.iterdir() if p.is_file() and os.access(p, os.X_OK)]
     except (PackageNotFoundError, ValueError, OSError):
-        pass  # no such package, no name for one, no folder, or no AMENT_PREFIX_PATH at all
+        pass  # no such package, an invalid name, no folder, or no AMENT_PREFIX_PATH
     if name in scripts:
         return replace(_attribute(spec, scripts[name].module, scripts[name].attr), argv0=name)
     if found:
@@ -229,8 +228,8 @@ def _script(spec: str, path: Path) -> Program:
             spec, f'{path} is not valid Python ({describe(error)})', 'correct it') from None
 
     def run() -> None:
-        # Not runpy.run_path: it swaps sys.modules['__main__'] until the script ends, and several
-        # scripts run here at once, in threads.
+        # Not runpy.run_path: it replaces sys.modules['__main__'] until the script ends, and
+        # several scripts run here concurrently, in threads.
         folder = str(path.parent)
         if folder not in sys.path:
             sys.path.insert(0, folder)
@@ -252,7 +251,7 @@ def describe(error: BaseException) -> str:
 
 
 def _suggest(word: str, known: Iterable[str]) -> str:
-    """Return a remedy for a word that is not among the known ones."""
+    """Return a remedy for an unknown word."""
     names = sorted(set(known))
     more = ', …' if len(names) > 10 else ''
     return did_you_mean(

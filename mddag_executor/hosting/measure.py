@@ -1,32 +1,30 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A run of synthetic nodes: how long their callbacks execute, and the figures from what they noted.
+Measurement of synthetic nodes: the execution times of a run, and the figures from its ledger.
 
 Theory of operation
 -------------------
 As in the paper's experiment, each vertex gets **one** execution time for the whole run, drawn from
-its declared quantiles.  Then all of them are scaled by one factor so that the normalised
-utilisation, sum(C / T) / workers, is what was asked for.  One such draw is one point of the
-experiment: whether its deadlines can be met at all depends on the draw
-(``ExecutionPlan.infeasible``), so a figure measured with one seed speaks for that seed.
+its declared quantiles.  Then all of them are scaled by one factor to the requested normalised
+utilisation, sum(C / T) / workers.  One such draw is one point of the experiment.  Whether its
+deadlines can be met at all depends on the draw (``ExecutionPlan.infeasible``), so a figure
+measured with one seed is valid for that seed only.
 
-The nodes themselves write the ledger, so any executor can be measured with the same yardstick,
-and an executor cannot embellish its figures: each body appends how long it took, each sink
-appends (release, completion).  Appending to a list is one indivisible step in CPython, so no lock
-is taken in a callback.
+The nodes themselves write the ledger, so all executors are measured in the same way: each body
+appends its duration, each sink appends (release, completion).  Appending to a list is one
+indivisible step in CPython, so a callback locks nothing.
 
 *Due* are the nominal releases (first release plus k periods) whose deadline lies inside the
-measured window, whether or not the executor ever noticed them.  Of these a sink is *on time* when
-it completed by its deadline, *late* when it completed after it, and *missing* when it has not
-completed when the ledger is closed.  A release that an executor skipped, a message that got lost
-and a job that still waits are all missing.  What was not yet due at the window's end is not
-counted either way.
+measured window, whether or not the executor noticed them.  Of these a sink is *in time* when it
+completed by its deadline, *late* when it completed after it, and *missing* when it has not
+completed when the ledger is closed.  A release that an executor skipped, a lost message and a job
+that still waits are all missing.  Releases not yet due at the window's end are not counted.
 
-CPU for each callback is all CPU that the process took during the window (executor, middleware,
+CPU for each callback is all CPU that the process used during the window (executor, middleware,
 interpreter, publishing, emulation of short bodies), divided by the vertices that executed in it.
-In ``spin`` mode the CPU that the bodies were to take is subtracted.  Legs of a sync callback
-that do not complete the join are not counted as callbacks: their cost is overhead.
+In ``spin`` mode the planned CPU time of the bodies is subtracted.  Legs of a sync callback that do
+not complete the join are not counted as callbacks: their cost is overhead.
 """
 
 from __future__ import annotations
@@ -51,7 +49,7 @@ Mode = Literal[Body, 'mixed']
 BODIES: tuple[Body, ...] = ('sleep', 'spin', 'native')
 
 _EARLY_NS = 1_000_000
-"""How much before its nominal time a release may be noted: clocks are read twice (ns)."""
+"""How much before its nominal time a release may be noted, ns: clocks are read twice."""
 
 
 class PlanError(MddagError):
@@ -72,11 +70,10 @@ class ExecutionPlan:
 
     :param task_set: the declared DAG tasks.
     :param seed: the same seed gives the same draw, on every machine and Python version.
-    :param utilisation: normalised utilisation to scale to; None takes the draw as it is.
-    :param workers: the number of workers that the utilisation is normalised to.
-    :param mode: what executions do: one of ``BODIES``, or ``mixed``, which draws it for each
-        callback.
-    :raises PlanError: when a utilisation is asked for and no execution time is declared.
+    :param utilisation: normalised utilisation to scale to; None: the draw is not scaled.
+    :param workers: the number of workers for normalisation.
+    :param mode: the emulation: one of ``BODIES``, or ``mixed``, which draws it for each callback.
+    :raises PlanError: when a utilisation is requested and no execution time is declared.
     """
 
     def __init__(
@@ -107,7 +104,7 @@ class ExecutionPlan:
 
     @property
     def utilisation(self) -> float:
-        """Return the normalised utilisation that results: sum(C / T) / workers."""
+        """Return the resulting normalised utilisation: sum(C / T) / workers."""
         return normalised(self.task_set, self._times, self.workers)
 
     def execution_ns(self, dag: int, vertex: int) -> int:
@@ -115,13 +112,13 @@ class ExecutionPlan:
         return self._times[dag][vertex]
 
     def body(self, vertex: Vertex) -> Body:
-        """Return what the execution of a vertex does."""
+        """Return the emulation of a vertex."""
         if self.mode == 'mixed':
             return random.Random(f'{self.seed} {vertex.callback.key}').choice(BODIES)
         return self.mode
 
     def infeasible(self) -> list[Infeasible]:
-        """Return the sinks that no scheduler can serve in time."""
+        """Return the sinks that no scheduler can complete in time."""
         found = []
         for dag in self.task_set.dags:
             ends = path_lengths(dag, self._times[dag.index])
@@ -133,7 +130,7 @@ class ExecutionPlan:
 
 
 class Reading(NamedTuple):
-    """What is counted at one instant: ns since the epoch, CPU of the process (ns), bodies run."""
+    """Counters at one instant: ns since the epoch, CPU of the process (ns), bodies run."""
 
     at_ns: int
     cpu_ns: int
@@ -142,16 +139,17 @@ class Reading(NamedTuple):
 
 class Ledger:
     """
-    What is noted of one run of synthetic nodes; as JSON, its ``vars`` are for ``of_processes``.
+    The observations of a run of synthetic nodes; as JSON, its ``vars`` are for ``of_processes``.
 
-    ``durations[dag][vertex]`` takes how long each body took (ns), ``completions[dag][vertex]`` of
-    a sink (release, completion) in ns since the epoch, ``delays[dag]`` when a timer started that
-    is a source, and by how much after its release.  ``misattributed`` takes (vertex name, release
-    by the message, release by the executor) where these differ, ``unattributed`` the names of
-    vertices that ran as no job, ``dropped_joins`` those of joins that were given up.
+    ``durations[dag][vertex]`` receives the duration of each body (ns),
+    ``completions[dag][vertex]`` of a sink (release, completion) in ns since the epoch,
+    ``delays[dag]`` of a timer that is a source its start and the delay after its release.
+    ``misattributed`` receives (vertex name, release by the message, release by the executor) if
+    these differ, ``unattributed`` the names of vertices that ran without a job, ``dropped_joins``
+    those of dropped joins.
 
-    :param keep: how much of each to keep, the last; None: all.
-    :ivar window: the readings between which the run is measured.
+    :param keep: how many of the latest entries of each to keep; None: all.
+    :ivar window: the readings at the beginning and the end of the measurement.
     """
 
     def __init__(self, task_set: TaskSet, keep: int | None = None) -> None:
@@ -170,7 +168,7 @@ class Ledger:
         self.clock_offset_ns = epoch_offset_ns()
         #: Executions up to this long were emulated busily, longer ones by sleep.
         self.busy_below_ns = 0
-        #: By so much the same release may differ: each process has a trace clock of its own.
+        #: The tolerance between two readings of one release: each process has its own trace clock.
         self.tolerance_ns = 0
 
     def reading(self) -> Reading:
@@ -183,10 +181,10 @@ class Ledger:
     @classmethod
     def of_processes(cls, task_set: TaskSet, parts: Sequence[dict[str, Any]]) -> Ledger:
         """
-        Return the ledger of a run from those of its processes, of one at least.
+        Return the ledger of a run from those of its processes, at least one.
 
-        The window is that in which all of them measured; what each counted in its own, which is
-        hardly another one, counts for its part of that.
+        The window is that in which all of them measured.  The counts of a process in its own
+        window, which is almost the same, are scaled to it.
         """
         whole = cls(task_set)
         for part in parts:
@@ -217,7 +215,7 @@ class Ledger:
 
 def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:
     """
-    Judge what came due in the window.
+    Judge the results that were due in the window.
 
     :return: the figures of ``python -m benchmarks live --json`` (``sink_jobs_due``, ``on_time``,
         …, ``cpu_us_per_callback``), the window, and for each DAG and sink due, on_time, late,
@@ -272,7 +270,7 @@ def judge_sink(
     """
     Return the verdicts about a sink.
 
-    :param due: the releases of its jobs; ``completed``: when those completed, by release.
+    :param due: the releases of its jobs; ``completed``: their completions, by release.
     """
     tally = SinkTally(deadline, None)
     for release in due:
@@ -291,7 +289,7 @@ def _throughput(
     counts = [after - before for before, after in zip(start.bodies, end.bodies)]
     callbacks = sum(counts)
     cpu = end.cpu_ns - start.cpu_ns
-    # CPU that the emulation itself takes is execution, not overhead.
+    # CPU time of the emulation itself is execution, not overhead.
     times = [plan.execution_ns(v.dag, v.index) for v in plan.task_set.vertices]
     bodies = [plan.body(v) for v in plan.task_set.vertices]
     cpu -= sum(n * t for v, (n, t) in enumerate(zip(counts, times))
@@ -305,9 +303,9 @@ def _throughput(
 
 def _taken(ledger: Ledger, plan: ExecutionPlan) -> float:
     """
-    Return the normalised utilisation from the mean times that the bodies really took.
+    Return the normalised utilisation from the measured mean times of the bodies.
 
-    What never ran counts with its planned time, so a starving executor looks no better.
+    A vertex that never ran counts with its planned time, so a starving executor looks no better.
     """
     total = 0.0
     for vertex in plan.task_set.vertices:

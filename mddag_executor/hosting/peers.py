@@ -1,11 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The synthetic nodes of a declaration under one of rclpy's executors, to compare with.
+The synthetic nodes of a declaration under one of rclpy's executors, for comparison.
 
-``measure_peer`` runs them in a process of its own, and those of a declaration with ``processes:``
-in one process for each, all at the same time.  The nodes measure themselves (``measure``), as they
-do under this program's executor.
+``measure_peer`` runs them in a separate process, or in one process for each of ``processes:``, all
+at the same time.  The nodes measure themselves (``measure``), as under this program's executor.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from rclpy.utilities import ok as context_ok
 
 WARM_UP_S = 1.0
 PATIENCE_S = 90.0
-"""What a process may take besides its window and warm-up: discovery and the end."""
+"""The time of a process in addition to its window and warm-up: discovery and the end."""
 
 
 def make_peer(name: str, workers: int) -> Executor:
@@ -53,17 +52,17 @@ class UnfinishedSession(Session):
     """
     A session whose executor is not shut down: the process ends instead.
 
-    rclpy's executors cannot be stopped in an orderly way while callbacks wait for their pool.
+    rclpy's executors cannot be stopped in order while callbacks wait for their pool.
     """
 
     def __init__(self, executor: Executor) -> None:
-        """Make a session that knows how to spin each executor."""
+        """Make a session that can spin any executor."""
         is_native = not isinstance(executor, Executor)  # only EventsExecutor is
         super().__init__(
             executor, partial(spin_events_executor, executor) if is_native else None)
 
     def end(self) -> None:
-        """Let a moment pass for what just completes."""
+        """Wait briefly for callbacks that are just completing."""
         if not self.stopped:
             self.stop()
             time.sleep(0.05)
@@ -72,7 +71,7 @@ class UnfinishedSession(Session):
         """
         Check that a run was measured to its end.
 
-        :raises BaseException: what has ended it instead.
+        :raises BaseException: the exception that has ended it.
         """
         if self.error is not None:
             raise self.error
@@ -83,7 +82,7 @@ class UnfinishedSession(Session):
 def run_nodes(
     executor: Executor, workload: SyntheticWorkload, seconds: float, warm_up_s: float = WARM_UP_S
 ) -> None:
-    """Run synthetic nodes under any executor; what they measure is in their ledger."""
+    """Run synthetic nodes under any executor; their measurements are in their ledger."""
     for node in workload.nodes:
         executor.add_node(node)
     session = UnfinishedSession(executor)
@@ -100,10 +99,10 @@ def measure_peer(
     mode: Mode, tick: Tick | None = None,
 ) -> dict[str, Any]:
     """
-    Run the nodes of a declaration under an executor of rclpy; return what ``measure`` does.
+    Run the nodes of a declaration under an executor of rclpy; return the result of ``measure``.
 
     :param executor: ``single``, ``multi`` or ``events``.
-    :param seconds: how long to measure, after ``WARM_UP_S``.
+    :param seconds: duration of the measurement, after ``WARM_UP_S``.
     :raises ChildError: when the run cannot be made.
     """
     task_set = load(graph)

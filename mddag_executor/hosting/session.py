@@ -5,13 +5,13 @@ One run of an executor, from the start of its nodes to a clean end.
 
 Theory of operation
 -------------------
-The executor spins in a thread of its own; the thread that made the ``Session`` only waits, so
-that Python delivers signals to it at once whatever the executor does.  Everything that can end a
-run (time, a signal, an exception of a callback, the end of the programs) calls ``stop``.
+The executor spins in a separate thread.  The thread that made the ``Session`` only waits, so
+Python delivers signals to it at once, whatever the executor does.  Everything that can end a run
+(time, a signal, an exception of a callback, the end of the programs) calls ``stop``.
 
-That notes the end and releases a lock on which ``wait`` sleeps.  No ``threading.Event``: a
-signal's handler runs in the thread that waits, between any two of its steps, also while that holds
-the event's inner lock, and ``set`` would then wait for that lock for ever.
+``stop`` notes the end and releases a lock on which ``wait`` sleeps.  A ``threading.Event`` would
+be wrong.  A signal handler runs in the waiting thread, between any two of its steps, even while
+that thread owns the event's inner lock; ``set`` would then wait for that lock for ever.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ HURRIED_END_TIMEOUT_S = 0.5
 MATCH_TIMEOUT_S = 30.0
 
 Tick = Callable[[float], None]
-"""Called now and then with how many seconds the run has been going on."""
+"""Called repeatedly with the seconds since the start of the run."""
 
 
 class SessionError(MddagError):
@@ -41,8 +41,8 @@ class Session:
     """
     Spins an executor in a thread; a context manager.
 
-    :param executor: any rclpy executor, its nodes added or not.
-    :param spin: what spins it, if that is not ``executor.spin``.
+    :param executor: any rclpy executor, with or without nodes.
+    :param spin: spins it; by default ``executor.spin``.
     :param on_end: called when its end begins.
     """
 
@@ -75,7 +75,7 @@ class Session:
         try:
             self._spin()
         except ExternalShutdownException:
-            pass  # somebody shut the context down: that ends a run, too
+            pass  # the context was shut down: that ends a run, too
         except BaseException as error:
             self.error = error
         finally:
@@ -83,9 +83,9 @@ class Session:
 
     def stop(self, hurried: bool = False) -> None:
         """
-        Let the run end; from any thread, also from a signal's handler.
+        End the run; from any thread, also from a signal handler.
 
-        :param hurried: wait less for callbacks that do not end.
+        :param hurried: shorten the wait for callbacks that do not end.
         """
         if hurried:
             self._patience_s = HURRIED_END_TIMEOUT_S
@@ -93,7 +93,7 @@ class Session:
         try:
             self._bell.release()
         except RuntimeError:
-            pass  # it has rung already
+            pass  # it is released already
 
     @property
     def stopped(self) -> bool:
@@ -117,11 +117,11 @@ class Session:
         self, unmatched: Callable[[], list[str]], patience_s: float = MATCH_TIMEOUT_S
     ) -> None:
         """
-        Wait until publishers and subscriptions have met, or the run is to end.
+        Wait until publishers and subscriptions have discovered each other, or the run is to end.
 
-        :param unmatched: returns the topics where they have not yet.
-        :param patience_s: for how long to wait until more of them have.
-        :raises SessionError: when in that time no more of them have.
+        :param unmatched: returns the topics on which they have not.
+        :param patience_s: how long to wait for progress.
+        :raises SessionError: when there is no progress in that time.
         """
         fewest = math.inf
         end = 0.0
@@ -140,7 +140,7 @@ class Session:
         """
         Shut the executor down, once.
 
-        ``clean`` says whether all callbacks have ended; one that does not is left behind.
+        ``clean`` is whether all callbacks have ended; one that does not is left running.
         """
         self.stop()
         if self._ended:
@@ -149,7 +149,7 @@ class Session:
         if self._on_end is not None:
             self._on_end()
         begin = time.monotonic()
-        # In steps: a signal may shorten the patience meanwhile.
+        # In steps: a signal may shorten the wait meanwhile.
         while self.executor.shutdown(0.1) is False:
             if time.monotonic() - begin > self._patience_s:
                 self.clean = False

@@ -5,37 +5,31 @@ Real rclpy nodes made from a declaration.
 
 Theory of operation
 -------------------
-One rclpy node for each declared node, with exactly the declared callbacks and publishers.  A
-callback executes for its planned time and then publishes on all of its topics, over the middleware
-like any node.
-
-Every message is a ``std_msgs/Header``.  Its stamp is the *release* of the job, passed on
-unchanged from the source to the sinks, and its ``frame_id`` is ``DAG#INDEX``: the DAG and the
-local index of the vertex that published it.  So a callback that several publishers start (OR)
-knows which of its vertices it runs as.  A sync callback (AND) has one subscription for each topic;
-it executes in the leg that brings the last of the messages with equal stamps.  Incomplete joins
-are kept for the last ``JOIN_LIMIT`` jobs, then dropped and counted.
-
-A source takes its release from the executor (``current_job``) when ours runs it.  Under another
-executor it is the nominal due time of the timer: rcl keeps timers on an exact grid, start plus n
-periods, and leaves out what it missed, so the release that a call stands for is the next due time
-that the timer named at the call before.  A late call does not make a release later.
-
-Sources that are no timers get a stand-in sensor: one thread (node ``/mddag_sensors``, with
-publishers and clients only, given to no executor, so it takes no worker) publishes on their topics
-or calls their services at the nominal releases.  A service's request is a
-``rcl_interfaces/ListParameters``, whose ``depth`` carries the release (ns) as a stamp would.
-
-Queue edges (``reads:``) start nothing and are not subscribed to.  QoS is reliable, keep last 10:
-deep enough that nothing is lost unless a callback falls ten periods behind.  Callbacks without a
-declared group may overlap themselves (one ``ReentrantCallbackGroup`` for each node), as jobs do in
-the paper; each declared group is a ``MutuallyExclusiveCallbackGroup`` of its node.  The nodes have
-no services for parameters and types and no rosout publisher, so that a hundred of them start
-within a second.
-
-All timers are started together, only when every publisher has met its subscribers, so that no
-release is lost to discovery; the DAGs' first releases are one period after that instant.  Then
-``WARM_UP_S`` pass before the measured window begins.
+1. *Nodes.*  One rclpy node for each declared node, with exactly the declared callbacks and
+   publishers.  A callback executes for its planned time and then publishes on all of its topics.
+2. *Messages* are of type ``std_msgs/Header``.  The stamp is the *release* of the job, passed on
+   unchanged from the source to the sinks.  ``frame_id`` is ``DAG#INDEX``: the DAG and the local
+   index of the publishing vertex.  So a callback that several publishers start (OR) knows which of
+   its vertices it runs as.  A sync callback (AND) has one subscription for each topic; it executes
+   in the leg that receives the last of the messages with equal stamps.  Incomplete joins of the
+   last ``JOIN_LIMIT`` jobs are kept; older ones are dropped and counted.
+3. *Releases.*  Under this package's executor a source gets its release from ``current_job``.
+   Under another executor it is the nominal due time of the timer.  rcl keeps timers on an exact
+   grid, start plus n periods, and skips missed periods, so the release of a call is the next due
+   time that the timer reported at the previous call.  A late call does not make a release later.
+4. *Sensors.*  Sources that are no timers get a stand-in sensor.  One thread (node
+   ``/mddag_sensors``, with publishers and clients only, not on any executor, so it occupies no
+   worker) publishes on their topics or calls their services at the nominal releases.  A service's
+   request is a ``rcl_interfaces/ListParameters``, whose ``depth`` carries the release (ns).
+5. *Settings.*  Queue edges (``reads:``) start no callback and are not subscribed.  QoS is
+   reliable, keep last 10: no message is lost unless a callback is ten periods late.  Callbacks
+   without a declared group may overlap themselves (one ``ReentrantCallbackGroup`` for each node),
+   as jobs do in the paper; each declared group is a ``MutuallyExclusiveCallbackGroup`` of its
+   node.  The nodes have no services for parameters and types and no rosout publisher, so a hundred
+   of them start within a second.
+6. *Start.*  All timers start together, when every publisher has discovered its subscribers, so
+   that no release is lost to discovery.  The DAGs' first releases are one period after that
+   instant.  The measured window begins ``WARM_UP_S`` later.
 """
 
 from __future__ import annotations
@@ -78,15 +72,15 @@ QOS = QoSProfile(
 SENSORS_NODE = '/mddag_sensors'
 WARM_UP_S = 1.0
 JOIN_LIMIT = 64
-"""Incomplete joins that a sync vertex keeps; the oldest is dropped and counted."""
+"""How many incomplete joins a sync vertex keeps; the oldest is dropped and counted."""
 SENSOR = '#sensor '
-"""What the ``frame_id`` of a stand-in sensor's message starts with; its topic follows."""
+"""The prefix of ``frame_id`` of a stand-in sensor's message; its topic follows."""
 _LEAD_NS = 20_000_000
 _CLOCKS_NS = 1_000_000
-"""Well above what the clocks of two processes differ by, and below any period."""
+"""Well above the difference between the clocks of two processes, and below any period."""
 
 CurrentJob = Callable[[], Any]
-"""Returns None, or what has the ``release_ns`` of the job that the calling thread runs."""
+"""Returns None, or an object with the ``release_ns`` of the job that the calling thread runs."""
 
 
 def quiet_node(full_name: str, context: Context | None = None, **parameters: bool) -> Node:
@@ -101,7 +95,7 @@ def quiet_node(full_name: str, context: Context | None = None, **parameters: boo
 
 
 def no_job() -> None:
-    """Stand for ``current_job`` under executors that know no jobs."""
+    """Replace ``current_job`` under executors that have no jobs."""
 
 
 def stamped(release: int, sender: str = '') -> Header:
@@ -119,10 +113,10 @@ def release_of(message: Header) -> int:
 
 class Role:
     """
-    A callback as one vertex: what it does for a message of that DAG.
+    A callback as one vertex, and its actions for a message of that DAG.
 
     :ivar senders: the ``frame_id`` of the messages that it waits for.
-    :ivar waiting: of a sync the incomplete joins: which messages have come, by release.
+    :ivar waiting: of a sync the incomplete joins: the received messages, by release.
     :param sender: the ``frame_id`` of the messages that it publishes.
     """
 
@@ -195,7 +189,7 @@ class Grid:
         return int(self._first + self._offset)
 
     def release(self) -> int:
-        """Return the due time that this call of the timer stands for."""
+        """Return the due time of this call of the timer."""
         with self._lock:
             release = self._next
             left = self._timer.time_until_next_call()
@@ -209,9 +203,9 @@ def callback_of(
     roles: list[Role], ledger: Ledger, current_job: CurrentJob
 ) -> Callable[[Header], None]:
     """
-    Make the callback of a subscription: the sender of a message says which vertex runs.
+    Make the callback of a subscription: the sender of a message selects the vertex.
 
-    That of all legs of a sync executes the body in the last leg of a job.
+    For a sync, it executes the body in the last leg of a job.
     """
     by_sender = {sender: role for role in roles for sender in role.senders}
     is_sync = bool(roles) and roles[0].vertex.callback.kind == 'sync'
@@ -219,7 +213,7 @@ def callback_of(
     def on_message(message: Header) -> None:
         role = by_sender.get(message.frame_id)
         if role is None:
-            return  # published by somebody outside of the declaration
+            return  # published from outside of the declaration
         release = release_of(message)
         if is_sync and not role.is_whole(release, message.frame_id):
             return
@@ -234,9 +228,9 @@ def callback_of(
 
 def attributed(role: Role, release: int, ledger: Ledger, current_job: CurrentJob) -> int:
     """
-    Compare the release that a message carries with the job that the executor runs it as.
+    Compare the release in a message with the job that the executor runs it as.
 
-    :return: of a source the release that the executor says, otherwise the message's.
+    :return: of a source the executor's release, otherwise the message's.
     """
     job = current_job()
     if job is None:
@@ -250,7 +244,7 @@ def attributed(role: Role, release: int, ledger: Ledger, current_job: CurrentJob
 
 @dataclass
 class Sensor:
-    """Stand-in for what starts DAGs whose source is no timer, and what sends a release."""
+    """Stand-in for the senders of messages and requests to sources that are no timers."""
 
     dags: list[int]
     period_ns: int
@@ -259,17 +253,17 @@ class Sensor:
 
 class SyntheticWorkload:
     """
-    The nodes of a declaration, their timers and stand-in sensors, and the books about them.
+    The nodes of a declaration, their timers, stand-in sensors and ledger.
 
     Use: add ``nodes`` to an executor, ``run``, ``destroy``; then ``measure`` judges the ledger.
 
     :param task_set: the declaration.
-    :param plan: how long each vertex executes.
-    :param current_job: ``mddag_executor.executor.current_job`` under our executor; leave it out
-        under others.
-    :param context: where the nodes belong to; None is rclpy's default context.
+    :param plan: the execution time of each vertex.
+    :param current_job: ``mddag_executor.executor.current_job`` under this package's executor;
+        leave it out under others.
+    :param context: of the nodes; None is rclpy's default context.
     :param keep: how much of each series the ledger keeps; None: all.
-    :param process: make only the nodes that the declaration puts into this process.
+    :param process: make only the nodes that the declaration assigns to this process.
     :ivar timers: by the DAG that they release.
     """
 
@@ -293,7 +287,7 @@ class SyntheticWorkload:
             self._emulate['spin'] = spinner()
         if 'native' in bodies:
             self._emulate['native'] = native()
-        # Timers on the steady clock: steps of the system's clock move no release.
+        # Timers on the steady clock: steps of the system clock move no release.
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._nodes: dict[str, Node] = {}
         self._sensor_node: Node | None = None
@@ -317,7 +311,7 @@ class SyntheticWorkload:
 
     @property
     def nodes(self) -> list[Node]:
-        """Return the nodes that an executor is to run."""
+        """Return the nodes to add to an executor."""
         return list(self._nodes.values())
 
     def run(
@@ -330,9 +324,10 @@ class SyntheticWorkload:
 
         :param duration_s: length of the measured window, which begins ``warm_up_s`` after the
             timers; None: until the session is stopped.
-        :param begin: waits until publishers and subscriptions have met, and for other processes.
+        :param begin: waits until publishers and subscriptions have discovered each other, and for
+            other processes.
         :return: whether there is a window: the run was not stopped before it began.
-        :raises mddag_executor.hosting.session.SessionError: when they do not find each other.
+        :raises mddag_executor.hosting.session.SessionError: when discovery fails.
         """
         ledger, was_measured = self.ledger, False
         ledger.warm_up_ns = round(warm_up_s * 1e9)
@@ -352,7 +347,7 @@ class SyntheticWorkload:
         return was_measured
 
     def unmatched(self) -> list[str]:
-        """Return the topics whose publishers and subscriptions have not all met yet."""
+        """Return the topics whose publishers and subscriptions have not discovered each other."""
         found = set()
         for (_, topic), publisher in self._publishers.items():
             if publisher.get_subscription_count() < self._n_subscribers[topic]:
@@ -368,7 +363,8 @@ class SyntheticWorkload:
         """
         Start all timers and sensors together.
 
-        :param wake: wakes the executor: a wait set that waits already does not see a timer start.
+        :param wake: wakes the executor: a wait set that already waits does not notice a timer's
+            start.
         """
         first = self.ledger.first_release
         for dag in self.timers:
@@ -391,9 +387,9 @@ class SyntheticWorkload:
 
     def stop(self) -> None:
         """
-        Stop the sensors and whoever waits for the start.
+        Stop the sensors and the threads that wait for the start.
 
-        Timers go on: rclpy's executors raise when a timer is cancelled that they are about to
+        Timers continue: rclpy's executors raise when a timer is cancelled that they are about to
         call.  They end with the executor.
         """
         self._stop.set()
@@ -442,7 +438,7 @@ class SyntheticWorkload:
         return node
 
     def _publisher(self, node: Node, topic: str) -> Publisher:
-        # Callbacks of a node that publish the same topic share the publisher, as members do.
+        # Callbacks of a node that publish the same topic share the publisher.
         key = (node.get_fully_qualified_name(), topic)
         if key not in self._publishers:
             self._publishers[key] = node.create_publisher(Header, topic, QOS)
@@ -498,12 +494,13 @@ class SyntheticWorkload:
         return self._process in (None, self.task_set.process_of(node))
 
     def _add_sensors(self) -> None:
-        """Make what starts the DAGs whose sources are no timers."""
+        """Make the senders for DAGs whose sources are no timers."""
         first: dict[str, Callback] = {}
         for vertex in self.task_set.vertices:
             if vertex.predecessors or vertex.callback.kind == 'timer':
                 continue
-            # One message on a topic releases all DAGs that wait for it, in other processes, too.
+            # One message on a topic releases all DAGs with a source on it, in other processes,
+            # too.
             start = vertex.callback.service or vertex.callback.topics[0]
             self._n_publishers[start] += start not in first
             if not self._is_here(first.setdefault(start, vertex.callback).node):
@@ -515,7 +512,7 @@ class SyntheticWorkload:
                 make = self._requests if vertex.callback.service else self._messages
                 self._sensors[start] = Sensor([], period, make(start))
             sensor = self._sensors[start]
-            # (Of two periods the shorter one sets the pace.)
+            # The shorter of two periods applies.
             sensor.period_ns = min(sensor.period_ns, period)
             sensor.dags.append(vertex.dag)
 
@@ -530,6 +527,6 @@ class SyntheticWorkload:
 
         def send(release: int) -> None:
             future = client.call_async(ListParameters.Request(depth=release))
-            client.remove_pending_request(future)  # nobody waits for the answer
+            client.remove_pending_request(future)  # the answer is not used
 
         return send
