@@ -1,3 +1,3 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Results for people: tables now, pictures to come."""
+"""Results as tables, pictures and files."""

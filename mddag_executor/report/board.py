@@ -1,11 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What executors report of themselves on ``/diagnostics``: the newest of it, and its tables.
+The newest ``/diagnostics`` of executors, and tables of them.
 
-The statuses are those of ``mddag_executor.executor.diagnostics``; others on the topic are left
-out.
-On a terminal rich draws the tables (the extra ``top``), elsewhere they are plain text.
+The statuses are those of ``mddag_executor.executor.diagnostics``; others on the topic are ignored.
+On a terminal rich draws the tables (the extra ``top``), otherwise they are plain text.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ class Column(NamedTuple):
     """
     A column of a table: its title, and the field or the value of a status that it shows.
 
-    :ivar unit: ``ms`` or ``%`` (the value is a share), or nothing.
+    :ivar unit: ``ms`` or ``%`` (the value is a share), or empty.
     """
 
     title: str
@@ -36,7 +35,7 @@ class Column(NamedTuple):
     unit: str = ''
 
 
-# The most important ones first: a narrow terminal leaves columns out from the right.
+# The most important columns first: on a narrow terminal the last ones are left out.
 _DAG_COLUMNS = (
     Column('DAG', 'name'), Column('state', 'level'), Column('results', 'window_results'),
     Column('missed', 'window_missed'), Column('p99', 'response_p99_ms', 'ms'),
@@ -52,15 +51,15 @@ _POOL_COLUMNS = (
     Column('skipped', 'skipped'), Column('no job', 'unattributed'), Column('message', 'message'))
 _PROCESS = Column('process', 'process')
 _WORDS = ('process', 'name', 'level', 'message')
-_LEAST = 3          # so many columns stay
-_MESSAGE = 20       # a message has this much room, or no column
-_MOST_MESSAGES = 5  # of what is not OK, below the tables
+_LEAST = 3          # minimum number of columns
+_MESSAGE = 20       # minimum width of the message column
+_MOST_MESSAGES = 5  # messages of statuses that are not OK, below the tables
 KEYS = 'q or Ctrl-C: quit'
 
 
 @dataclass(frozen=True)
 class Status:
-    """A status as it came: whose it is, name, level, message, values, and when it came (s)."""
+    """A received status: process, name, level, message, values, and time of arrival (s)."""
 
     process: str
     name: str
@@ -76,19 +75,19 @@ class Status:
 
     @property
     def is_ours(self) -> bool:
-        """Return whether an executor of this kind has sent it."""
+        """Return whether an executor of this project has sent it."""
         return self.is_pool or 'window_missed_ratio' in self.values
 
 
 class Board:
-    """The newest statuses of all processes, of a thousand at most."""
+    """The newest statuses of all processes, at most a thousand."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._statuses: dict[tuple[str, str], Status] = {}
 
     def take(self, message: Any) -> None:
-        """Show a ``DiagnosticArray``."""
+        """Add a ``DiagnosticArray``."""
         now = self._clock()
         for each in message.status:
             level = each.level[0] if isinstance(each.level, bytes) else int(each.level)
@@ -96,14 +95,14 @@ class Board:
                 each.hardware_id, each.name, LEVELS[level] if level < len(LEVELS) else str(level),
                 each.message, {pair.key: pair.value for pair in each.values}, now)
             if status.is_ours:
-                # At the end, so that the first one is the one that was silent for longest.
+                # At the end, so that the first status is the oldest one.
                 self._statuses.pop((status.process, status.name), None)
                 self._statuses[(status.process, status.name)] = status
                 if len(self._statuses) > MOST_STATUSES:
                     del self._statuses[next(iter(self._statuses))]
 
     def statuses(self) -> list[Status]:
-        """Return them by process and name; of a process that is silent, as GONE."""
+        """Return the statuses by process and name; those of silent processes are GONE."""
         now = self._clock()
         found = []
         for _, s in sorted(self._statuses.items()):
@@ -114,7 +113,7 @@ class Board:
         return found
 
     def result(self) -> dict[str, Any]:
-        """Return what there is for machines."""
+        """Return the statuses for JSON."""
         return {'statuses': [
             {'process': s.process, 'name': s.name, 'level': s.level, 'message': s.message,
              'values': s.values} for s in self.statuses()]}
@@ -131,7 +130,7 @@ def of_pools(statuses: list[Status]) -> list[Status]:
 
 
 def _cell(status: Status, column: Column) -> str:
-    """Return what a column shows of a status."""
+    """Return the cell of a status in a column."""
     if column.key == 'name' and status.is_pool:
         return printable(status.name.rpartition(': ')[0] or status.name)
     if column.key in _WORDS:
@@ -149,11 +148,11 @@ def columns_that_fit(
     columns: Sequence[Column], rows: Sequence[Status], width: int | None
 ) -> list[Column]:
     """
-    Return the columns for a terminal: as many as there is room for.
+    Return the columns that fit on a terminal.
 
     The process is shown if there are several.
 
-    :param width: of the terminal; None: there is room for all.
+    :param width: of the terminal; None: unlimited.
     """
     kept = [*([_PROCESS] if width is None or len({s.process for s in rows}) > 1 else []), *columns]
 
@@ -179,7 +178,7 @@ def plain(statuses: list[Status]) -> str:
 
 def picture(statuses: list[Status], width: int) -> Any:
     """
-    Return for rich both tables, what is not OK, and the keys; nothing is taken for markup.
+    Return both tables, messages and keys for rich; no text is interpreted as markup.
 
     :param width: of the terminal.
     """

@@ -1,12 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Two runs side by side, sink by sink and callback by callback.
+Compares two runs, sink by sink and callback by callback.
 
-Sinks and callbacks are the same where their names are. What only one run has is listed with the
-other side empty. A sink is *worse* in the second run if a larger share of its deadlines was
-missed there, if no job of it was due there but was in the first or, with a tolerance, if its p99
-response time grew by more than that.
+Sinks and callbacks are matched by name. If only one run has them, the other side is empty. A sink
+is *worse* in the second run if it missed a larger share of its deadlines, if none of its jobs was
+due in contrast to the first run or, with a tolerance, if its p99 response time grew by more.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ def compare(
     """
     Compare the results of two replays.
 
-    :param tolerance: how much a p99 response time may grow, as a share (0.1 is 10 %).
-    :param before: results as ``Replay`` and ``Reschedule`` give them; ``after``, too.
-    :returns: for JSON: ``sinks`` by DAG and name with both sides (``a``, ``b``; null where a run
-        lacks it), ``change_ns`` and ``change`` (share) of response times and ``worse``;
-        ``callbacks`` with both sides' executions and mean times; ``worse`` of the whole;
-        ``compared``, how many sinks were due in both.
+    :param tolerance: allowed growth of a p99 response time, as a share (0.1 is 10 %).
+    :param before: results of ``Replay`` or ``Reschedule``; ``after``, too.
+    :returns: for JSON: ``sinks`` by DAG and name with both sides (``a``, ``b``; null if missing),
+        ``change_ns`` and ``change`` (share) of response times and ``worse``; ``callbacks`` with
+        both sides' executions and mean times; ``worse`` of the whole; ``compared``, the number of
+        sinks due in both.
     """
     dags: dict[str, Any] = {}
     for name in _union(before['dags'], after['dags']):
@@ -109,7 +108,7 @@ def _callback(use: Mapping[str, int] | None) -> dict[str, Any] | None:
 
 
 def sinks_table(difference: Mapping[str, Any]) -> str:
-    """Return the table of sinks: both runs' figures, those first that are worse in run B."""
+    """Return the table of sinks of both runs; the sinks that are worse in run B come first."""
     sinks = [(name, sink) for dag in difference['dags'].values()
              for name, sink in dag['sinks'].items()]
     short = short_names(name for name, _ in sinks)
@@ -129,7 +128,7 @@ def sinks_table(difference: Mapping[str, Any]) -> str:
 
 
 def _order(sink: Mapping[str, Any]) -> tuple[bool, float]:
-    """Return the key for the order of sinks: what got worse, then what missed most in B."""
+    """Return the sort key of sinks: worse ones, then the largest share of misses in B."""
     b = sink['b']
     missed = 0 if b is None else (b['due'] - b['in_time']) / max(1, b['due'])
     return not sink['worse'], -missed
@@ -165,7 +164,7 @@ def callbacks_table(difference: Mapping[str, Any]) -> str:
 
 
 def lines(difference: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
-    """Yield the tables, that of callbacks if wanted, a line for each run, and the verdict."""
+    """Yield the tables (callbacks optionally), a line for each run, and the verdict."""
     yield sinks_table(difference)
     if callbacks:
         yield callbacks_table(difference)

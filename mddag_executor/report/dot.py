@@ -5,17 +5,17 @@ A picture in DOT, Graphviz's language.
 
 Theory of operation
 -------------------
-1. Every name is in a quoted string. There Graphviz gives a meaning only to the quotation mark and
-   to the backslash (`\n`, `\N`, `\G`, …); control characters are written as escapes. Only the
-   title with the legend is an HTML-like label, whose texts are escaped for HTML.
-2. A box has the name of its node above that of its callback. Graphviz leads arrows around boxes,
+1. Every name is in a quoted string. In it only the quotation mark and the backslash (`\n`, `\N`,
+   `\G`, …) are special to Graphviz; control characters are written as escapes. Only the title with
+   the legend is an HTML-like label, whose texts are escaped for HTML.
+2. A box has the name of its node above that of its callback. Graphviz routes arrows around boxes,
    but not around the titles of frames.
-3. A queue edge begins at a text next to the reader, which says what is read and from whom. So no
+3. A queue edge begins at a text next to the reader, which names the topic and the writer. So no
    line joins two DAGs.
-4. In a small graph the topics are on the trigger edges, and the DAGs are in one column. In a
-   larger one the topics are tool tips. Graphviz lays out each DAG by itself and packs them into a
-   grid, in the order of the file, with as many columns as give about the proportions of a screen.
-   (Version 2.43 leaves out the labels of edges when it packs.)
+4. A small graph has topics on the trigger edges, and its DAGs in one column. In a larger graph
+   topics are tool tips. Graphviz lays out each DAG separately and packs them into a grid, in the
+   order of the file, with as many columns as give about the proportions of a screen. (Version 2.43
+   drops the labels of edges when it packs.)
 5. ``dot`` takes minutes for thousands of boxes. For more than ``_MANY`` it spends less time on the
    order of boxes, and lines are straight.
 """
@@ -45,9 +45,9 @@ _STUB = 'shape=plaintext, fontsize=9, fontcolor="#2244bb", margin="0.02,0.02"'
 _PIECES = re.compile(r'[^/_]*[/_]?')
 _MANY = 1_000
 _QUICK = 'splines=line, nslimit=0.1, nslimit1=0.1, mclimit=0.1, size="166,166",'
-"""166 inches are 16,000 dots: viewers take no wider PNG."""
+"""166 inches are 16,000 dots, the maximum width of PNG viewers."""
 _BOX_WIDTH, _BOX_HEIGHT = 150, 70
-"""About the size of a box with the gap to the next one, points."""
+"""Approximate size of a box with the gap to the next one, points."""
 _PROPORTION = 1.5
 
 
@@ -57,7 +57,7 @@ def to_dot(picture: Picture) -> str:
 
 
 def quoted(text: str) -> str:
-    """Return a text as a quoted string of DOT that means just this text."""
+    """Return a text as a literal quoted string of DOT."""
     return '"' + printable(text).replace('\\', '\\\\').replace('"', '\\"') + '"'
 
 
@@ -99,14 +99,14 @@ def _lines(picture: Picture) -> Iterator[str]:
 
 
 def _columns(picture: Picture) -> int:
-    """Return how many columns of DAGs give the proportions of a screen, about."""
+    """Return the number of columns of DAGs that gives about the proportions of a screen."""
     width = max(dag.depth for dag in picture.dags) * _BOX_WIDTH
     height = sum(_BOX_HEIGHT * (1 + len(dag.boxes) / dag.depth) for dag in picture.dags)
     return max(1, min(len(picture.dags), round(math.sqrt(_PROPORTION * height / width))))
 
 
 def _upwards(dags: Sequence[DagFrame], columns: int) -> Iterator[DagFrame]:
-    """Yield the DAGs row by row from the lowest row up: so Graphviz fills the picture."""
+    """Yield the DAGs row by row from the lowest row up, the order in which Graphviz packs."""
     for end in range(len(dags), 0, -columns):
         yield from dags[max(0, end - columns):end]
 
@@ -154,7 +154,7 @@ def _box(box: Box) -> str:
 
 
 def _legend(picture: Picture) -> str:
-    """Return title and legend as an HTML-like label; the legend has what is in the picture."""
+    """Return title and legend as an HTML-like label; the legend has only what is drawn."""
     kinds = {box.kind for box in picture.boxes}
     shapes = [text for kind, (_, text) in _SHAPES.items() if kind in kinds]
     colours = ''.join(f'<td bgcolor="{colour}">{escape(text)}</td>'

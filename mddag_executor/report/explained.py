@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Why deadlines were missed, as tables and lines for people."""
+"""The causes of missed deadlines, as tables and lines of text."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_STALLS = 10
 
 
 def causes_line(misses: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line with the causes of all misses, stops of the machine apart, if there are any."""
+    """Yield a line with the causes of all misses, stops of the machine separately, if any."""
     causes = {cause: n for cause, n in misses['causes'].items() if n}
     if not causes:
         return
@@ -34,7 +34,7 @@ def causes_line(misses: Mapping[str, Any]) -> Iterator[str]:
 
 
 def causes_table(misses: Mapping[str, Any]) -> str:
-    """Return a table of the causes, with what can be done."""
+    """Return a table of the causes, with remedies."""
     return table(('cause', 'misses', 'share', 'what to do'), [
         [cause, n, percent(n, misses['missed']), REMEDIES[cause]]
         for cause, n in sorted(misses['causes'].items(), key=lambda item: -item[1]) if n])
@@ -63,7 +63,7 @@ def stalls_table(stalls: Sequence[Mapping[str, int]], start: int) -> str:
 
 
 def job_lines(job: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what became of a job, and where its time went."""
+    """Yield the fate of a job, and the parts of its time."""
     late = job['verdict'] if job['late_ns'] is None else f'late by {format_ns(job["late_ns"], 3)}'
     allowed = job['deadline_ns'] - job['release_ns']
     parts = job['parts']

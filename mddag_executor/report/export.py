@@ -1,21 +1,21 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A recording for spreadsheets and data frames: one row for each execution, or for each sink's job.
+A recording for spreadsheets and data frames: one row per execution, or per job and sink.
 
-Executions: a row is one run of a callback on a worker; a coroutine that was suspended has several,
-``first`` marks the first. What no DAG declares has neither DAG nor job.
+Executions: a row is one run of a callback on a worker; a suspended coroutine has several,
+``first`` marks the first. Undeclared callbacks have neither DAG nor job.
 
 Jobs: a row is the verdict about one job at one sink: ``in_time``, ``late``, ``overdue`` (not
 completed when the run ended past its deadline), ``expired``, ``failed`` or ``aborted``; the last
 four have no completion.
 
-Columns that end in ``_ns`` are whole nanoseconds: times on the recording's clock, or durations.
-``start_s`` and ``release_s`` are seconds since the run's first release (or execution, where one
-came before). ``reference_deadline_ns`` is the vertex's (RAD), ``slack_ns`` what was left of it at
-the end. ``worker`` -1 is a spare thread in addition to the pool.
+Columns that end in ``_ns`` are integer nanoseconds: times on the recording's clock, or durations.
+``start_s`` and ``release_s`` are seconds since the run's first release (or an earlier execution).
+``reference_deadline_ns`` is the vertex's (RAD), ``slack_ns`` its remainder at the end. ``worker``
+-1 is a spare thread in addition to the pool.
 
-Rows come in the order of their releases, those without one by their readiness.
+Rows are in the order of their releases; without release, of their ready times.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from mddag_executor.report.text import printable
 import numpy as np
 
 ROWS = ('executions', 'jobs')
-"""What a row may be."""
+"""Kinds of rows."""
 _BATCH = 65_536
 
 
@@ -42,8 +42,8 @@ class Column(NamedTuple):
     """
     A column to export.
 
-    :ivar values: numbers, or with ``names`` the places of names.
-    :ivar known: where there is a value; None: everywhere.
+    :ivar values: numbers, or with ``names`` indices of names.
+    :ivar known: which rows have a value; None: all.
     """
 
     name: str
@@ -58,7 +58,7 @@ def columns_of(replay: Replay, rows: str) -> list[Column]:
 
 
 def executions(replay: Replay) -> tuple[list[Column], Ints]:
-    """Return the columns of executions, and the rows of the table that they are."""
+    """Return the columns of executions, and their rows of the table."""
     recording, judged = replay.recording, replay.judged
     rows = ran(recording)
     row, release, known = _releases(replay, rows)
@@ -87,7 +87,7 @@ def executions(replay: Replay) -> tuple[list[Column], Ints]:
 
 
 def _releases(replay: Replay, rows: Ints) -> tuple[Ints, Ints, Mask]:
-    """Return the rows of the jobs of executions, their releases, and where there are any."""
+    """Return the jobs of executions (rows), their releases, and which have one."""
     table = replay.recording.executions
     row, release = np.full(len(rows), -1), np.zeros(len(rows), dtype=np.int64)
     dags = table['dag'][rows]
@@ -124,7 +124,7 @@ def _seconds(recording: Recording, times: Ints) -> Any:
 # --- formats -------------------------------------------------------------------------------------
 
 def write_csv(file: BinaryIO, columns: Sequence[Column]) -> None:
-    """Write CSV (RFC 4180, UTF-8) below a line of titles; no value is an empty cell."""
+    """Write CSV (RFC 4180, UTF-8) with a header line; a missing value is an empty cell."""
     text = io.TextIOWrapper(file, 'utf-8', 'backslashreplace', newline='')
     writer = csv.writer(text)
     writer.writerow([column.name for column in columns])
@@ -135,7 +135,7 @@ def write_csv(file: BinaryIO, columns: Sequence[Column]) -> None:
 
 
 def _cells(column: Column, begin: int) -> Iterator[Any]:
-    """Return some values as CSV has them; a name is harmless for terminals and spreadsheets."""
+    """Return some values as CSV cells; names are made harmless for terminals and spreadsheets."""
     values = column.values[begin:begin + _BATCH]
     if column.names:
         names = [_harmless(name) for name in column.names]
@@ -184,7 +184,7 @@ def write_parquet(file: BinaryIO, columns: Sequence[Column]) -> None:
 
 
 def check_available(form: str) -> None:
-    """Find out whether a format can be written, before long work starts."""
+    """Check that a format can be written, before long work starts."""
     module = {'parquet': 'pyarrow', 'tables': 'pyarrow'}.get(form)
     if module is None:
         return
@@ -194,7 +194,7 @@ def check_available(form: str) -> None:
         raise MddagError(
             f'-o *.{form}: {module} is not installed: '
             "pip install 'mddag_executor[export]'") from None
-    except ImportError as error:  # such as a pyarrow that wants a newer NumPy
+    except ImportError as error:  # for example a pyarrow that needs a newer NumPy
         raise MddagError(
             f'-o *.{form}: {module} does not load: {" ".join(str(error).split())}: '
             'install versions that fit together') from None

@@ -1,9 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Verdicts as annotations of GitHub Actions: lines of output that a workflow shows at its summary.
+Verdicts as annotations of GitHub Actions: output lines that a workflow shows in its summary.
 
-A sink that is not within the tolerance is an error; a sink of which no job was due is a warning.
+A sink that is not within the tolerance is an error; a sink without due jobs is a warning.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def _line(level: str, file: str | None, title: str, message: str) -> str:
 
 
 def _escaped(text: str, more: str = '') -> str:
-    """Return a text in which nothing ends the line or, in a property, the property."""
+    """Return a text that cannot end the line or, in a property, the property."""
     text = printable(text).replace('%', '%25')
     for character in more:
         text = text.replace(character, f'%{ord(character):02X}')

@@ -50,7 +50,7 @@ _BARS = 'Each bar is one execution, in the colour of the least slack that it lea
 
 
 def check_available() -> None:
-    """Find out whether reports can be made, before long work starts."""
+    """Check that reports can be made, before long work starts."""
     try:
         import bokeh  # noqa: F401
     except ImportError:
@@ -103,7 +103,7 @@ def _facts(result: dict[str, Any]) -> list[tuple[str, str]]:
     utilisation = result['utilisation']
     pool = [('policy', str(result['policy']) + (', preemptive' if result['preemptive'] else '')),
             ('workers', str(result['workers']))]
-    if 'recorded_callbacks' in result:      # another executor ran it
+    if 'recorded_callbacks' in result:      # recorded by another executor
         pool = [('imported', f'{result["workers"]} threads ran callbacks')]
     return [
         *pool, ('duration', format_ns(result['duration_ns'])),

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The data of an HTML report: what its script draws the timeline and its texts from.
+The data of an HTML report, from which its script draws the timeline and makes texts.
 
 The page has the executions that ``timeline`` selects, as columns of numbers. They refer to tables
 of names, jobs and verdicts, from which the script makes the texts of tool tips. So a page stays
@@ -26,28 +26,28 @@ import numpy as np
 
 MOST_MISSES = 200
 MOST_LINES = 150
-"""So many lines the timeline by callback has, more only for a single DAG."""
+"""Maximum number of lines of the timeline by callback; a single DAG may have more."""
 LONGEST_LABEL = 40
 UNKNOWN = '#969696'
 COLOURS = ('#d7191c', '#fd8d3c', '#fec44f', '#9ecae1', '#3182bd', UNKNOWN)
 """The colours of executions, from the least slack to the most, and without a verdict."""
 _SHARES = (0.0, 0.1, 0.25, 0.5)
-"""Between the colours: slack as a share of the deadline."""
-_HIDDEN = -10       # the place of a callback whose line is left out
+"""Thresholds between the colours: slack as a share of the deadline."""
+_HIDDEN = -10       # position of a callback without line
 
 
 class ReportData(NamedTuple):
     """
-    What a report is about.
+    The contents of a report.
 
-    :ivar breakdown: by sink where the times of its jobs went, as in the result of a replay.
+    :ivar breakdown: by sink the parts of its response times, as in the result of a replay.
     :ivar facts: below the title: pairs of a word and a text.
     :ivar duration_ns: from the first release to the end of the run.
     :ivar paths: end-to-end times of the declared paths, as in the result of a replay.
     :ivar recorded: the callbacks of an imported recording, as in the result of a replay.
-    :ivar misses: why deadlines were missed, as in the result of a replay.
+    :ivar misses: causes of missed deadlines, as in the result of a replay.
     :ivar causes: the cause of each miss, by global vertex of the sink and job.
-    :ivar worker_names: the names of workers, if they have more than a number.
+    :ivar worker_names: the names of workers, if they are more than a number.
     """
 
     title: str
@@ -72,7 +72,7 @@ NumberedJobs = dict[tuple[int, int], tuple[int, float | None]]
 
 
 class Line(NamedTuple):
-    """A line of a timeline: its label, its place from the bottom, whether it is a DAG's title."""
+    """A line of a timeline: label, position from the bottom, whether it is a DAG's title."""
 
     label: str
     y: int
@@ -83,8 +83,8 @@ class SinkJob(NamedTuple):
     """
     The verdict about a job at a sink (a global vertex).
 
-    Times are ns since the origin; ``completed`` is None if it never was. ``place`` is that in the
-    page's table of verdicts.
+    Times are ns since the origin; ``completed`` is None if it never completed. ``place`` is the
+    index in the page's table of verdicts.
     """
 
     sink: int
@@ -102,12 +102,12 @@ class SinkJob(NamedTuple):
 
     @property
     def shown(self) -> int:
-        """Return when it is marked in the pictures."""
+        """Return the time of its mark in the pictures."""
         return self.deadline if self.completed is None else self.completed
 
     @property
     def slack_share(self) -> float:
-        """Return the slack as a share of the deadline; below zero if that was missed."""
+        """Return the slack as a share of the deadline; negative if that was missed."""
         if self.completed is None:
             return float('-inf')
         return (self.deadline - self.completed) / max(1, self.deadline - self.release)
@@ -117,8 +117,8 @@ class Prepared(NamedTuple):
     """
     A report's data, ready to be drawn.
 
-    :ivar executions: the columns of the executions; ``marks`` those of the missed deadlines.
-    :ivar lines: of the timeline by callback; ``n_hidden`` is the number of DAGs that have none.
+    :ivar executions: the columns of the executions; ``marks``: of the missed deadlines.
+    :ivar lines: of the timeline by callback; ``n_hidden`` is the number of DAGs without line.
     :ivar misses: the worst misses, in the order of their releases.
     :ivar meta: for the page's script.
     """
@@ -135,7 +135,7 @@ class Prepared(NamedTuple):
 
 
 def prepare(data: ReportData) -> Prepared:
-    """Return what the pictures of a report are drawn from."""
+    """Prepare a report's data for drawing."""
     shown = data.timeline.shown()
     starts = np.concatenate([shown.releases['release'], shown.executions['ready']])
     origin = int(starts.min()) if len(starts) else 0
@@ -159,7 +159,7 @@ def prepare(data: ReportData) -> Prepared:
 
 
 def _badness(miss: SinkJob) -> tuple[int, int, int]:
-    """Return the key for the order of misses: first what never completed, then the latest."""
+    """Return the sort key of misses: uncompleted ones first, then the latest."""
     if miss.completed is None:
         return 0, 0, miss.deadline
     return 1, miss.deadline - miss.completed, miss.deadline
@@ -179,7 +179,7 @@ def _verdicts(shown: Shown, origin: int) -> dict[tuple[int, int], SinkJob]:
 def _numbered_jobs(
     data: ReportData, shown: Shown, verdicts: Mapping[tuple[int, int], SinkJob], origin: int
 ) -> NumberedJobs:
-    """Return by DAG and number of each job its place in the page's table and its release (s)."""
+    """Return by DAG and number of each job its index in the page's table and its release (s)."""
     jobs: NumberedJobs = {}
 
     def add(dag: int, job: int, release: float | None) -> None:
@@ -202,7 +202,7 @@ def _executions(
     jobs: NumberedJobs, ys: list[int],
     worker_lines: list[int],
 ) -> dict[str, Any]:
-    """Return the columns of executions: times, lines, and places in the page's tables."""
+    """Return the columns of executions: times, lines, and indices in the page's tables."""
     table, n_declared = shown.executions, len(data.task_set.vertices)
     names = np.where(shown.row >= 0, shown.row, n_declared - 1 - shown.row)
     leads_to = list(_leads_to(data))
@@ -232,7 +232,7 @@ def _meta(
     data: ReportData, verdicts: Mapping[tuple[int, int], SinkJob],
     jobs: NumberedJobs, worst: list[SinkJob],
 ) -> dict[str, Any]:
-    """Return the tables that the page's script makes texts from; times in ns but releases."""
+    """Return the tables for the texts of the page's script; times in ns, releases in s."""
     names = [vertex.name for vertex in data.task_set.vertices]
     short = short_names(names)
     return {
@@ -252,7 +252,7 @@ def _meta(
 
 
 def json_for_html(value: Any) -> str:
-    """Return JSON that can be in a script element whatever it contains."""
+    """Return JSON that can be in a script element with any contents."""
     text = json.dumps(value, ensure_ascii=True, separators=(',', ':'), allow_nan=False)
     return text.replace('<', '\\u003c').replace('>', '\\u003e').replace('&', '\\u0026')
 
@@ -266,7 +266,7 @@ def _lines(data: ReportData) -> tuple[list[Line], list[int], int]:
     """
     Return the lines of the timeline by callback, from the top.
 
-    Also return the place of each row, and how many DAGs are left out.
+    Also return the position of each row, and the number of DAGs without line.
     """
     task_set, undeclared = data.task_set, data.timeline.undeclared_names()
     chosen = _chosen_dags(data)
@@ -292,7 +292,7 @@ def _lines(data: ReportData) -> tuple[list[Line], list[int], int]:
 
 
 def _chosen_dags(data: ReportData) -> set[int]:
-    """Return the DAGs that the timeline by callback has lines for: those that missed most."""
+    """Return the DAGs with lines in the timeline by callback: those that missed most."""
     results = data.tally.result()['dags']
 
     def badness(dag: Dag) -> float:
@@ -310,7 +310,7 @@ def _chosen_dags(data: ReportData) -> set[int]:
 
 
 def _worker_lines(data: ReportData) -> list[int]:
-    """Return the place of each worker, and at last of spare threads (0: there are none)."""
+    """Return the position of each worker, then of spare threads (0: none)."""
     spare = any(not 0 <= worker < data.workers for worker in data.timeline.workers)
     return [data.workers - w + spare for w in range(data.workers)] + [int(spare)]
 

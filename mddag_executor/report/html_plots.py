@@ -98,7 +98,7 @@ def _seconds(plot: Any, what: str) -> None:
 
 
 def _overview(data: ReportData, prepared: Prepared, time: Range1d) -> Any:
-    """Return the use of the pool over the whole run, with a window that can be moved."""
+    """Return the use of the pool over the whole run, with a movable window."""
     duration = max(1, data.duration_ns) / 1e9
     plot: Any = figure(
         height=150, sizing_mode='stretch_width', tools='', toolbar_location=None,
@@ -133,7 +133,7 @@ def _timeline(
     name: str, lines: list[Line], time: Range1d, gaps: list[tuple[float, float]],
     executions: ColumnDataSource, marks: ColumnDataSource,
 ) -> Any:
-    """Return a timeline with a line for each worker or callback; ``name`` is the column of it."""
+    """Return a timeline with a line for each worker or callback, given by column ``name``."""
     count = len(lines)
     plot: Any = figure(
         height=count * _LINE + 94, sizing_mode='stretch_width', x_range=time,
@@ -172,7 +172,7 @@ def _by_class(palette: Sequence[str]) -> Any:
 
 
 def _wheel(plot: Any) -> None:
-    """Zoom with Ctrl and the wheel; the wheel alone moves the page."""
+    """Zoom with Ctrl and the wheel; without Ctrl the wheel scrolls the page."""
     tool = WheelZoomTool(dimensions='width', modifiers='ctrl')
     plot.add_tools(tool)
     plot.toolbar.active_scroll = tool
@@ -186,7 +186,7 @@ def _lines(plot: Any, lines: list[Line]) -> None:
 
 
 def _histograms(data: ReportData) -> list[Any]:
-    """Return response-time histograms, the sinks nearest to or furthest past their deadline."""
+    """Return response-time histograms, sinks with the least slack first."""
     names = {vertex: data.tally.vertex_name(vertex) for vertex in data.tables.sinks}
     short = short_names(names.values())
     sinks = [vertex for vertex in data.tables.sinks if data.tally.sinks[vertex].responses]
@@ -204,10 +204,10 @@ def _histogram(title: str, tally: Any) -> Any:
     deadline = tally.relative_deadline_ns
     responses = np.fromiter(tally.responses, dtype=np.int64, count=len(tally.responses))
     scale, unit = _scale(max(deadline, int(responses.max())))
-    # a width of which the deadline is a multiple, so that no bar is half late
+    # the deadline is a multiple of the width, so no bar is partly late
     width = deadline / max(1, round(40 * deadline / max(deadline, int(responses.max()))))
     places = np.floor(np.maximum(responses - 1, 0) / width).astype(np.int64)
-    if int(places.max()) > 400:     # a few very late ones: all of those in the last bar
+    if int(places.max()) > 400:     # a few very late jobs: all of them in the last bar
         places = np.minimum(places, 400)
     counts = np.bincount(places)
     left = np.flatnonzero(counts) * width

@@ -33,7 +33,7 @@ from mddag_executor.report.text import Cell, format_ns, printable
 from mddag_executor.text import counted
 
 MOST_ROWS = 50
-"""So many sinks are in the page itself; a script adds the others."""
+"""Number of sinks in the page itself; a script adds the others."""
 _COLOURS = {
     'release_lag_ns': '#c7c7c7', 'waiting_ns': '#fd8d3c', 'executing_ns': '#3182bd',
     'suspended_ns': '#9e9ac8', 'transport_ns': '#74c476', 'unknown_ns': '#636363'}
@@ -42,7 +42,7 @@ _PARTS = [(name.removesuffix('_ns').replace('_', ' '), _COLOURS.get(name, '#8c6d
 
 
 class Html(str):
-    """Text that is markup already."""
+    """Text that is already markup."""
 
     __slots__ = ()
 
@@ -54,9 +54,9 @@ def html_table(
     """
     Return a table.
 
-    :param texts: how many columns on the left hold text; the others are aligned to the right.
-    :param bad: columns that stand out where they are neither 0 nor empty.
-    :param attributes: of each row, markup already.
+    :param texts: number of text columns on the left; the others are right-aligned.
+    :param bad: columns that are highlighted if they are neither 0 nor empty.
+    :param attributes: of each row, already markup.
     """
     extra = iter(attributes) if attributes is not None else None
     lines = ['<table><thead><tr>', *(
@@ -127,8 +127,8 @@ def sinks_html(data: ReportData) -> str:
     """
     Return the table of sinks, the worst ones first: verdicts and response times.
 
-    The rows after the first ``MOST_ROWS`` are data for the page's script, which adds them when
-    they are wanted.
+    The rows after the first ``MOST_ROWS`` are data for the page's script, which adds them on
+    demand.
     """
     rare = rare_ends(total(data.tally.result()['dags']))
     header = ['DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', *rare, *RESPONSES]
@@ -193,11 +193,11 @@ def misses_html(data: ReportData, prepared: Prepared) -> str:
 
 
 def worst_html(data: ReportData) -> str:
-    """Return a table with a bar for each sink: where the time of its worst job went."""
+    """Return a table with a bar for each sink: the parts of its worst job's time."""
     short = short_names(vertex.name for vertex in data.task_set.vertices)
     rows = []
     worst_of = {vertex: each['worst'] for vertex, each in data.breakdown.items()}
-    if len(worst_of) > MOST_ROWS:       # those nearest to their deadlines, or furthest past them
+    if len(worst_of) > MOST_ROWS:       # sinks with the least slack
         worst_of = dict(sorted(worst_of.items(), key=lambda item: (
             item[1]['release_ns'] - item[1]['completed_ns'])
             / data.tables.sink_deadline[item[0]])[:MOST_ROWS])
@@ -241,7 +241,7 @@ def paths_html(data: ReportData) -> str:
 
 
 def callbacks_html(data: ReportData) -> str:
-    """Return the table of callbacks: how often each ran, how long, how long it waited."""
+    """Return the table of callbacks: executions, execution times, waiting times."""
     rows = list(callbacks_rows(data.usage.callbacks()))
     undeclared = data.usage.undeclared()
     if undeclared['executions']:

@@ -1,11 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The verdicts of a replay as JUnit XML, which CI systems read: one test case for each sink.
+The verdicts of a replay as JUnit XML for CI systems: one test case per sink.
 
-A sink within the tolerance passes; one that is not fails, with the reason; one of which no job
-was due is skipped, because nothing is known of it. The time of a test case is the longest
-response time, in seconds.
+A sink within the tolerance passes; otherwise it fails, with the reason; a sink without due jobs is
+skipped. The time of a test case is the longest response time, in seconds.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ def junit(
 
     :param result: a result of ``replay --json``.
     :param broken: by DAG and sink why it failed.
-    :param name: what was replayed.
+    :param name: name of the replayed recording.
     """
     cases = []
     failures = skipped = 0
@@ -79,5 +78,5 @@ def _facts(sink: Mapping[str, Any], due: int, in_time: int) -> str:
 
 
 def _text(text: str) -> str:
-    """Return a text that XML can hold: most control characters are not allowed in it."""
+    """Return a text for XML, which does not allow most control characters."""
     return ''.join(c if c.isprintable() else printable(c) for c in text)

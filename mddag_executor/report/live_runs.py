@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What came of a live run, as lines of text below the table of its sinks."""
+"""Lines of text about a live run, below the table of its sinks."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
 
 
 def _absent(dags: dict[str, Any]) -> Iterator[str]:
-    """Yield a line for each sink to which more than one job has not come from its process."""
+    """Yield a line for each sink that more than one job of its process did not reach."""
     for name, dag in dags.items():
         for sink, verdicts in dag['sinks'].items():
             absent = dag['jobs'] - counts(verdicts).due
@@ -80,13 +80,13 @@ def _absent(dags: dict[str, Any]) -> Iterator[str]:
 
 
 def ended_line(process: dict[str, Any]) -> str:
-    """Return the line about a process of a run that has died."""
+    """Return the line about a process that has died."""
     return printable(f'process {process["name"]} {process["how"]}: '
                      f'{process["said"] or "it said nothing"}')
 
 
 def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines about what the synthetic nodes themselves measured."""
+    """Yield the lines with the measurements of the synthetic nodes."""
     yield (
         f'measured by the nodes, {measured["window_ns"] / 1e9:.1f} s after a warm-up of '
         f'{measured["warm_up_ns"] / 1e9:g} s: {measured["sink_jobs_due"]} due, '

@@ -3,9 +3,9 @@
 """
 A picture in Mermaid, which many web pages and editors show as a drawing.
 
-Names are in quoted labels, which Mermaid reads as HTML. So everything in them except plain
-letters, digits and a few harmless signs is written as its number (`#35;`): no name can end the
-label, open a tag or start a comment. Identifiers are generated.
+Names are in quoted labels, which Mermaid reads as HTML. So all characters except plain letters,
+digits and a few harmless signs are written as their number (`#35;`): no name can end the label,
+open a tag or start a comment. Identifiers are generated.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def to_mermaid(picture: Picture) -> str:
 
 
 def quoted(text: str) -> str:
-    """Return a text as a quoted label that means just this text."""
+    """Return a text as a literal quoted label."""
     return '"' + _NOT_PLAIN.sub(lambda found: f'#{ord(found[0])};', printable(text)) + '"'
 
 

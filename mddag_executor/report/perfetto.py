@@ -7,21 +7,21 @@ Theory of operation
 -------------------
 Tracks are in groups:
 
-* *workers*: one for each worker, with what it ran; arrows (flows) go from the execution that
-  published to the one that its message started (of several pieces, to and from the last);
-* *callbacks*: in a group for each DAG one for each callback, with its executions by job;
-* *jobs*: one for each sink, with each job from its release to its completion there, and one with
-  an instant at each deadline;
+* *workers*: one per worker, with its executions; arrows (flows) go from the publishing execution
+  to the execution that its message started (of several pieces, to and from the last);
+* *callbacks*: a group per DAG with a track per callback, with its executions by job;
+* *jobs*: one per sink, with each job from its release to its completion there, and one with an
+  instant at each deadline;
 * *missed deadlines*: an instant for each;
-* *ready callbacks*: a counter of those that wait for a worker or their group.
+* *ready callbacks*: a counter of callbacks that wait for a worker or their group.
 
-Executions of one track may overlap (a reentrant group, jobs that overlap): then it has several
-tracks of one name, as Perfetto demands that slices of a track nest. An execution goes to the
+Executions of one track may overlap (a reentrant group, overlapping jobs): then it has several
+tracks of one name, because Perfetto requires slices of a track to nest. An execution goes to the
 first of them that is free when it starts.
 
-A trace is a row of packets in protobuf's encoding; the numbers of the fields are those of
-Perfetto's ``trace_packet.proto``. Names of events are in the first packet of an event (interned);
-each packet says with a flag that it needs them. Times are the recording's, in nanoseconds.
+A trace is a sequence of packets in protobuf's encoding; field numbers are those of Perfetto's
+``trace_packet.proto``. Names of events are in the first packet of an event (interned); a flag in
+each packet says that it needs them. Times are the recording's, in nanoseconds.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _PENDING_BYTES = 1 << 20
 
 
 def varint(value: int) -> bytes:
-    """Return a number as protobuf has it."""
+    """Return a number in protobuf's encoding."""
     value &= _MASK
     out = bytearray()
     while value > 0x7F:
@@ -63,17 +63,17 @@ def varint(value: int) -> bytes:
 
 
 def number(field: int, value: int) -> bytes:
-    """Return a field that is a number."""
+    """Return a field with a number."""
     return varint(field << 3) + varint(value)
 
 
 def text(field: int, value: str) -> bytes:
-    """Return a field that is a text."""
+    """Return a field with a text."""
     return message(field, value.encode('utf-8', 'backslashreplace'))
 
 
 def message(field: int, content: bytes) -> bytes:
-    """Return a field that is a message."""
+    """Return a field with a message."""
     return varint(field << 3 | 2) + varint(len(content)) + content
 
 
@@ -95,7 +95,7 @@ class _Writer:
         self._pending: list[bytes] = []
         self._size = 0
         self._uuid = _READY
-        # by kind and number: the end of the last slice and the uuid of each of its tracks
+        # by kind and number: end of the last slice and uuid of each of its tracks
         self._lanes: dict[tuple[Any, ...], list[list[int]]] = {}
         self._groups: dict[int, int] = {}
         self._names: dict[str, int] = {}
@@ -179,7 +179,7 @@ class _Writer:
     def _flows(
         self, parts: list[bytes], vertex: int, job: int, leg: int, whole: bool
     ) -> None:
-        """Let the flows of the messages that it took end here, and those that it sends begin."""
+        """End the flows of received messages, and begin those of sent ones."""
         base, into = job * self._n_edges + 1, self._into[vertex]
         legs: Iterable[int] = range(len(into)) if leg < 0 else (leg,)
         parts += (_fixed(_FLOW_ENDS, base + into[each]) for each in legs if each < len(into))
@@ -187,7 +187,7 @@ class _Writer:
             parts += (_fixed(_FLOW, base + edge) for edge in self._out[vertex])
 
     def _ready(self, ready: Any, started: Any) -> None:
-        """Write how many callbacks were ready over time."""
+        """Write the number of ready callbacks over time."""
         times = np.concatenate([ready, started])
         step = np.repeat([1, -1], len(ready))
         when, place = np.unique(times, return_inverse=True)
@@ -197,7 +197,7 @@ class _Writer:
             self._event(time, _COUNTER, _READY, number(_VALUE, count))
 
     def _verdicts(self) -> None:
-        """Write jobs on the tracks of their sinks, and missed deadlines where all of them are."""
+        """Write jobs on the tracks of their sinks, and missed deadlines on their track."""
         verdicts = self._replay.judged.verdicts
         verdicts = verdicts[sort_by(verdicts['release'], verdicts['sink'])]
         names = [vertex.name for vertex in self._task_set.vertices]
@@ -224,7 +224,7 @@ class _Writer:
     # --- tracks ----------------------------------------------------------------------------------
 
     def _group(self, dag: int) -> int:
-        """Return the track that holds a DAG's callbacks."""
+        """Return the track of a DAG's callbacks."""
         if dag not in self._groups:
             name = 'undeclared'
             if dag >= 0:
@@ -236,7 +236,7 @@ class _Writer:
     def _lane(
         self, key: tuple[Any, ...], name: str, parent: int, rank: int, start: int, end: int
     ) -> int:
-        """Return a track of a name that is free from a time on, and take it."""
+        """Reserve a track of a name that is free at ``start``; return it."""
         lanes = self._lanes.setdefault(key, [])
         for lane in lanes:
             if lane[0] <= start:

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A task set as a picture: what is drawn, in words of boxes, frames and arrows.
+A task set as a picture: boxes, frames and arrows, independent of the picture language.
 
 Theory of operation
 -------------------
@@ -11,7 +11,7 @@ Theory of operation
    DAG gets one arrow, from the writer's first vertex.
 3. The colour of a box is its RAD offset (reference absolute deadline minus release): the most
    urgent is red, the least urgent is blue, on a logarithmic scale over the whole task set.
-4. Names are kept as they are. Each picture language escapes them in its own way.
+4. Names are kept as they are. Each picture language escapes them itself.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from msg_graph import TaskSet, Vertex
 from msg_graph.model import path_lengths
 
 MOST_LABELLED = 30
-"""The topics are on the arrows of a picture with at most this many boxes."""
+"""Maximum number of boxes of a picture with topics on its arrows."""
 _RED, _BLUE = 0.0, 0.62
 _MOST_IN_LEGEND = 12
 
@@ -38,9 +38,9 @@ class Box:
     A vertex; arrows refer to its ``mark``.
 
     :ivar node: the name of its node.
-    :ivar lines: callback, what starts it if that is not a topic, a sink's deadline.
+    :ivar lines: callback, trigger if that is not a topic, a sink's deadline.
     :ivar kind: ``timer``, ``subscription``, ``sync`` or ``service``.
-    :ivar note: everything about it, for a tool tip.
+    :ivar note: all properties, for a tool tip.
     """
 
     mark: str
@@ -54,7 +54,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class DagFrame:
-    """A DAG: its title with name and period, and how many boxes its longest path has."""
+    """A DAG: its title with name and period, and the number of boxes of its longest path."""
 
     mark: str
     title: str
@@ -64,7 +64,7 @@ class DagFrame:
 
 @dataclass(frozen=True, slots=True)
 class Arrow:
-    """A trigger edge, or a queue edge if ``queue`` is set; ``note`` names what is sent."""
+    """A trigger edge, or a queue edge if ``queue`` is set; ``note`` names the message."""
 
     start: str
     end: str
@@ -74,7 +74,7 @@ class Arrow:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """All that is drawn; ``legend`` has the colours and their RAD offsets, most urgent first."""
+    """A whole picture; ``legend`` has the colours and their RAD offsets, most urgent first."""
 
     title: str
     dags: tuple[DagFrame, ...]

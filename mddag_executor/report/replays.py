@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of a replay: where the time of each sink went, what each callback took."""
+"""Tables of a replay: response times of sinks, execution times of callbacks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _COMPARISON_HEADER = (
 
 
 def times_tables(dags: Mapping[str, Any]) -> Iterator[str]:
-    """Yield tables of where the response times went: on average, and for the worst job."""
+    """Yield tables of the parts of response times: mean, and of the worst job."""
     for title, which in (('Where the response times went, on average:', 'mean'),
                          ('The same of the worst job of each sink:', 'worst')):
         found = [(sink.shown_name, None if sink.result['breakdown'] is None
@@ -64,7 +64,7 @@ def callbacks_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[
 
 
 def _computed(use: Mapping[str, int]) -> list[Cell]:
-    """Return which share of its time a callback computed, and how often it held the lock."""
+    """Return the share of CPU time in a callback's time, and how often it held the GIL."""
     n, busy = use.get('measured', 0), use.get('measured_busy_ns', 0)
     return [f'{use["cpu_ns"] / busy:.0%}' if n and busy else None,
             f'{use["held_interpreter"] / n:.0%}' if n else None]
@@ -94,9 +94,9 @@ _CASES = ('all', 'best', 'worst', 'worst_with_external_latency')
 
 def recorded_tables(result: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
     """
-    Yield the tables of what was recorded besides the jobs: paths, imported callbacks.
+    Yield the tables of recorded data except jobs: paths, imported callbacks.
 
-    :param callbacks: also show the imported callbacks where there are DAGs.
+    :param callbacks: also show the imported callbacks if there are DAGs.
     """
     if result.get('paths'):
         yield 'End to end, from the first publication to the start of the last callback:'
@@ -127,7 +127,7 @@ def paths_rows(paths: Mapping[str, Any]) -> Iterator[list[Cell]]:
 
 
 def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> str:
-    """Return a table of rescheduled sinks, each figure next to the recorded one."""
+    """Return a table of rescheduled sinks, each number next to the recorded one."""
     rows: list[list[Cell]] = []
     for sink in worst_first(dags):
         sides = (sink.result, recorded[sink.dag]['sinks'][sink.name])
@@ -144,13 +144,13 @@ def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> st
 
 
 def summary(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines that stand below the tables of a replay."""
+    """Yield the lines below the tables of a replay."""
     yield verdicts_line(result['dags'])
     yield from never_due_lines(result['dags'])
     if result['skip_ns']:
         yield f'left out: jobs released in the first {format_ns(result["skip_ns"])}'
     pool = f'policy {printable(result["policy"])}, ' + counted(result['workers'], 'worker')
-    if 'recorded_callbacks' in result:      # another executor ran it
+    if 'recorded_callbacks' in result:      # recorded by another executor
         pool = f'imported: {counted(result["workers"], "thread")} ran callbacks'
     if result.get('processes'):
         pool += f' in {counted(len(result["processes"]), "process", "processes")}'
@@ -180,7 +180,7 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _use(result: Mapping[str, Any]) -> str:
-    """Return how busy the workers were, or are with what is asked of them when rescheduled."""
+    """Return how busy the workers were or, if rescheduled, would be."""
     use = result['worker_use']['use']
     if result['rescheduled']:
         return '' if use is None else f', workers busy {100 * use:.1f} %'

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""How much longer callbacks may take, as tables for people and as a page with bars."""
+"""The result of the slack search as tables of text, and as a page with bars."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BEST = '#3182bd'
 
 
 def lines(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the tables of callbacks, the tightest first, and of sinks, and the lines below."""
+    """Yield the tables of callbacks (tightest first) and sinks, and the lines below."""
     short = _short(result)
     yield from _load_lines(result)
     yield '\nHow many times as long each callback may take, if the others take as long as now:'
@@ -36,7 +36,7 @@ def lines(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _is_judged(result: Mapping[str, Any]) -> bool:
-    """Return whether there are sinks that complete, some of them in time."""
+    """Return whether some sinks complete in time."""
     sinks = result['sinks']
     never = sum(sink['margin_ns'] is None and not result['missed'].get(name)
                 for name, sink in sinks.items())
@@ -53,7 +53,7 @@ def _margins(sink: Mapping[str, Any]) -> list[Cell]:
 
 
 def _summary(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines that stand below the tables."""
+    """Yield the lines below the tables."""
     never = [name for name, sink in result['sinks'].items()
              if sink['margin_ns'] is None and not result['missed'].get(name)]
     if never:
@@ -77,7 +77,7 @@ def _summary(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _load_lines(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield how much longer all may take together, and how many workers and CPUs are enough."""
+    """Yield the factor for all callbacks together, and the sufficient workers and CPUs."""
     if not _is_judged(result):
         return
     load, most = result['load'], result['most']
@@ -127,7 +127,7 @@ def _tightest(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 
 def _least_first(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Return the sinks, that with the least margin first, as a share of its deadline."""
+    """Return the sinks by margin as a share of the deadline, the least first."""
     def share(item: tuple[str, Any]) -> float:
         margin = item[1]['margin_ns']
         return float('-inf') if margin is None else margin['min'] / item[1]['relative_deadline_ns']
@@ -136,7 +136,7 @@ def _least_first(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 
 def _times(factor: float) -> str:
-    """Return a factor for people, never rounded up."""
+    """Return a factor as text, never rounded up."""
     return f'{math.floor(factor * 100) / 100:.2f} times'
 
 

@@ -1,11 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Tables of what came of each sink, for live runs, simulations and replays alike.
+Tables of sinks for live runs, simulations and replays.
 
 The numbers are those of the result format: ``completed`` counts all completions, ``late`` those
-after the deadline and what was overdue and open when the run ended. For people *due* is every
-sink job that got a verdict, and *in time* what completed by its deadline.
+after the deadline and the overdue jobs that were open when the run ended. In tables *due* counts
+the results that got a verdict, and *in time* those that completed by their deadline.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ RESPONSES = ('median', 'p99', 'max', 'deadline')
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
-    """Return for each vertex its name with only the last parts of its node's that are needed."""
+    """Return the names of vertices with only the necessary last parts of their node's name."""
     left = list(dict.fromkeys(names))
     short: dict[str, str] = {}
     parts = 1
@@ -45,9 +45,9 @@ class Sink(NamedTuple):
     """
     A sink in a table.
 
-    :ivar dag: the name of its DAG, and as a table shows it: in the DAG's first row only.
-    :ivar name: its name, and as the table shows it.
-    :ivar result: what there is of it.
+    :ivar dag: the name of its DAG, and the table's text: in the DAG's first row only.
+    :ivar name: its name, and the table's text.
+    :ivar result: its result.
     """
 
     dag: str
@@ -69,7 +69,7 @@ def each_sink(dags: Mapping[str, Any]) -> Iterator[Sink]:
 
 def sink_table(dags: Mapping[str, Any]) -> str:
     """
-    Return a table for a terminal with a row for each sink, those that missed most first.
+    Return a table for a terminal with a row for each sink; most misses first.
 
     It has counts, and response times by the deadline. If the declaration tolerates misses of a
     sink, `tolerates` and `worst` say how many, and how many missed in the worst window. Rows with
@@ -109,12 +109,12 @@ def worst_first(dags: Mapping[str, Any]) -> list[Sink]:
 
 
 def missed_share(verdicts: Counts) -> float:
-    """Return which share of the due deadlines was missed."""
+    """Return the missed share of the due deadlines."""
     return (verdicts.due - verdicts.in_time) / max(1, verdicts.due)
 
 
 def rare_ends(every: Counts) -> list[str]:
-    """Return which counts are shown only because there are any."""
+    """Return the counts that are only shown if they are not 0."""
     return [name for name in ('failed', 'aborted') if getattr(every, name)]
 
 
@@ -126,7 +126,7 @@ def response_cells(response: Mapping[str, int] | None, digits: int = 4) -> list[
 
 
 def percent(part: int, whole: int) -> str:
-    """Return a share for people; never rounded up to 100 % or down to 0 %."""
+    """Return a share as text; never rounded up to 100 % or down to 0 %."""
     if not whole:
         return '-'
     share = 100 * part / whole
@@ -148,7 +148,7 @@ def verdicts_text(every: Counts) -> str:
 
 
 def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line about the sinks of which no job was due, where there are any."""
+    """Yield a line about the sinks without due jobs, if any."""
     never = never_due(dags)
     if never:
         yield f'never due, so not judged: {counted(len(never), "sink")}: {listed(never)}'
@@ -156,9 +156,9 @@ def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:
 
 def drift_lines(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """
-    Yield a line for each disagreement of a run and its declaration, and none where there is none.
+    Yield a line for each difference between a run and its declaration.
 
-    :param found: what ``drift`` holds in a result for machines.
+    :param found: ``drift`` of a JSON result.
     """
     if not found:
         return

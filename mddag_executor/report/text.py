@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Text for people: aligned tables, times with units, and names from files made harmless."""
+"""Text output: aligned tables, times with units, and harmless names from files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mddag_executor.text import listed as listed_plainly
 Cell = str | int | float | None
 
 WIDTH, NARROW = 120, 100
-"""No table is wider than 120 columns, or 100 with few rows, if its names can be shortened."""
+"""A table is at most 120 columns wide, or 100 with few rows, if its names can be shortened."""
 _FEW_ROWS = 15
 _LONGEST_LIST = 10
 _SHORTEST_NAME = 18
@@ -28,9 +28,9 @@ def printable(text: str) -> str:
     r"""
     Return a text with control characters written as escapes (`\x1b`).
 
-    Names come from files; a terminal must never obey them. Escaped are also
-    line breaks, changes of the writing direction and lone surrogates. (``msg_graph.errors`` has
-    the same for its own errors; to take it from there would load YAML for every `--help`.)
+    Names come from files; a terminal must never interpret them. Line breaks, changes of the
+    writing direction and lone surrogates are escaped, too. (``msg_graph.errors`` has a copy for
+    its own errors; importing that one would load YAML for every `--help`.)
     """
     if text.isprintable():
         return text
@@ -38,18 +38,18 @@ def printable(text: str) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names for a line on a terminal: the first ones, and how many more there are."""
+    """Return names for a line on a terminal: the first ones, and the number of others."""
     return listed_plainly([printable(name) for name in names], _LONGEST_LIST)
 
 
 def format_ns(nanoseconds: int, digits: int = 4) -> str:
     """
-    Return a time for people, for instance `12.34 ms`.
+    Return a time as text, for instance `12.34 ms`.
 
     An exact value has no zeros at the end (`100 ms`); a rounded one keeps them (`100.0 ms`).
 
     :param nanoseconds: the time
-    :param digits: how many digits count
+    :param digits: number of significant digits
     """
     sign, size = ('-', -nanoseconds) if nanoseconds < 0 else ('', nanoseconds)
     text, unit = '', ''
@@ -67,7 +67,7 @@ def format_ns(nanoseconds: int, digits: int = 4) -> str:
 
 
 def shortened(text: str, longest: int) -> str:
-    """Return a text of at most so many characters, with an ellipsis in place of its middle."""
+    """Return a text of limited length, with an ellipsis in place of its middle."""
     if len(text) <= longest:
         return text
     half = (longest - 1) // 2
@@ -91,7 +91,7 @@ def table(
 
     :param header: the titles of the columns
     :param rows: their cells; None is printed as `-`, a float with two decimals
-    :param marked: which rows are red where there are colours
+    :param marked: rows that are red if colours are available
     """
     body = [[_cell(cell) for cell in row] for row in rows]
     for row in body:

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What ran when, for pictures: executions around missed deadlines, and some of all other times.
+Selects executions for pictures: those around missed deadlines, and samples of the rest.
 
 Theory of operation
 -------------------
@@ -32,7 +32,7 @@ _FIRST_STEP = 1 << 16       # of the sums, ns
 
 class Shown(NamedTuple):
     """
-    What is shown; times in ns on the recording's clock.
+    The shown data; times in ns on the recording's clock.
 
     :ivar executions: rows of the recording's table, in order of start; ``row`` the row of each.
     :ivar releases: rows of the recording's table.
@@ -47,11 +47,11 @@ class Shown(NamedTuple):
 
 class Timeline:
     """
-    What of a recording is shown.
+    The shown part of a recording.
 
-    :param most: how many executions are shown at most.
-    :ivar n_executions: how many there are; ``n_missed`` the deadlines missed.
-    :ivar busy_over_time: how busy the workers were over time, without spare threads; in
+    :param most: maximum number of shown executions.
+    :ivar n_executions: number of executions; ``n_missed``: of missed deadlines.
+    :ivar busy_over_time: load of the workers over time, without spare threads; in
         ``missed_over_time`` each missed deadline is one nanosecond.
     """
 
@@ -73,14 +73,14 @@ class Timeline:
         self._blocks = self._chosen(max(2, most // block))
 
     def _chosen(self, most: int) -> Ints:
-        """Return the numbers of the blocks that are shown, ascending."""
+        """Return the numbers of the shown blocks, ascending."""
         count = -(-max(1, self.n_executions) // self._block)
         if count <= most:
             return np.arange(count)
         at = np.searchsorted(self._end, self._judged.missed['until'], 'right')
         number = np.minimum(at // self._block, count - 1)
         missed = np.bincount(number, minlength=count)
-        # much of such a job ran in the block before
+        # much of such a job ran in the previous block
         early = number[(6 * (at % self._block) < self._block) & (number > 0)] - 1
         missed += np.bincount(early, minlength=count)
         numbers = np.arange(count)
@@ -94,7 +94,7 @@ class Timeline:
         undeclared = np.flatnonzero(row < 0)
         different, first, which = np.unique(
             table['callback'][self._rows[undeclared]], return_index=True, return_inverse=True)
-        order = np.argsort(first, kind='stable')    # in the order in which they came
+        order = np.argsort(first, kind='stable')    # in the order of their first executions
         place = np.empty(len(order), dtype=np.int64)
         place[order] = np.minimum(np.arange(len(order)), MOST_UNDECLARED)
         row[undeclared] = -1 - place[which]
@@ -103,7 +103,7 @@ class Timeline:
 
     @property
     def kept(self) -> int:
-        """Return how many executions are shown."""
+        """Return the number of shown executions."""
         return len(self._shown())
 
     def undeclared_names(self) -> list[str]:
@@ -112,19 +112,19 @@ class Timeline:
         return names + [OTHERS] * (len(self._undeclared) > MOST_UNDECLARED)
 
     def _shown(self) -> Ints:
-        """Return the places of the executions that are shown."""
+        """Return the indices of the shown executions."""
         blocks = np.zeros(-(-max(1, self.n_executions) // self._block), dtype=np.bool_)
         blocks[self._blocks] = True
         return np.flatnonzero(blocks[np.arange(self.n_executions) // self._block])
 
     def _shows(self, times: Ints) -> Ints:
-        """Return the places of times that lie in blocks that are shown."""
+        """Return the indices of times within shown blocks."""
         number = np.minimum(np.searchsorted(self._end, times, 'right') // self._block,
                             max(0, self.n_executions - 1) // self._block)
         return np.flatnonzero(np.isin(number, self._blocks))
 
     def shown(self) -> Shown:
-        """Return what is shown."""
+        """Return the shown data."""
         chosen = self._shown()
         table, row = self._recording.executions[self._rows[chosen]], self._row[chosen]
         order = np.argsort(table['start'], kind='stable')
@@ -133,7 +133,7 @@ class Timeline:
                      verdicts[self._shows(verdicts['until'])])
 
     def gaps(self) -> list[tuple[int, int]]:
-        """Return the stretches of time (ns) that are not shown: between blocks that are."""
+        """Return the hidden time ranges between shown blocks, ns."""
         before, after = self._blocks[:-1], self._blocks[1:]
         return [(int(self._end[(b + 1) * self._block - 1]), int(self._end[a * self._block]))
                 for b, a in zip(before.tolist(), after.tolist()) if a != b + 1]
