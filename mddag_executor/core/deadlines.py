@@ -3,9 +3,9 @@
 """
 The deadlines of open jobs, for drivers with a clock: a miss is known when it happens (rule 6).
 
-A driver asks for the next deadline, and calls ``judge`` when that is over.  Each slot has one
-entry in a heap, for the next deadline of its job.  A job that ends leaves its entry behind, so an
-entry may be too early for the slot's next job: it is then replaced when its time has come.
+A driver asks for the next deadline, and calls ``judge`` after it.  Each slot has one entry in a
+heap, for the next deadline of its job.  A job that ends leaves its entry behind, so an entry may
+be too early for the slot's next job: it is replaced when its time has come.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Deadlines:
         self._rule = t, s
         self._state = s
         self._heap: list[tuple[int, int]] = []
-        # by slot: the time of its entry, and up to when its job was judged
+        # by slot: the time of its entry, and until when its job was judged
         self._entry: dict[int, int] = {}
         self._judged: dict[int, int] = {}
         self.next = NEVER

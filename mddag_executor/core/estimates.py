@@ -4,8 +4,8 @@
 Latest starts from measured execution times, for drivers that measure (rule 7).
 
 ``State.start_by`` and ``reach_by`` begin with the declared execution times.  When the measured
-mean of a vertex has changed by more than an eighth, those of its DAG are computed again.  So an
-execution costs one comparison.
+mean of a vertex has changed by more than an eighth, those of its DAG are computed again.  So most
+executions cost one comparison.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class MeanTimes:
         self._mean = t.mean_time[:]
 
     def note(self, vertex: int, mean: int) -> None:
-        """Note the mean time of the last executions of a vertex, ns."""
+        """Note the recent mean execution time of a vertex, ns."""
         known = self._mean[vertex]
         change = mean - known
         if change * CHANGE > known + LEAST_CHANGE_NS or -change * CHANGE > known + LEAST_CHANGE_NS:

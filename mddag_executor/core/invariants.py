@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What is always true of the state between two calls of the rules; for debugging.
+Invariants of the state between two calls of the rules; for debugging.
 
 The rules themselves are in ``rules``, the queues in ``queues``, and jobs in ``jobs``.
 """
@@ -143,7 +143,7 @@ def _open_jobs(t: Tables, s: State) -> Iterator[str]:
         if len(free) != len({*free}) or {*free} != of_dag.get((dag, FREE), set()):
             yield f'the list of free slots of DAG {dag} is {free}'
         if dag == t.n_dags:
-            continue  # what no DAG declares is in no list
+            continue  # undeclared jobs are in no list
         jobs = _chain(s.job_next, s.oldest[dag], len(s.job_dag))
         back = _chain(s.job_previous, s.newest[dag], len(s.job_dag))
         if jobs != back[::-1] or {*jobs} != of_dag.get((dag, OPEN), set()):

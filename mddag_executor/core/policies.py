@@ -1,17 +1,17 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Scheduling policies: in which order ready callbacks run.
+Scheduling policies: the order in which ready callbacks run.
 
 A policy is a key function and one row of ``POLICIES``.  The key is a tuple of four integers;
-smaller runs first.  The first integer is the *priority* (only it decides about preemption, and a
-preemption needs a strictly smaller one), the others break ties, so that two runs and two machines
-agree.  The ties are those of the paper's own program.
+smaller runs first.  The first integer is the *priority*: only it decides about preemption, which
+needs a strictly smaller one.  The others break ties, so that all runs and machines agree.  The
+ties are those of the paper's own program.
 
-A key function gets the tables, the global vertex index, the job's release and index, and the
-*order*, a running number of what enters the ready queue (rule 3 of ``rules``).  It must stay free
-of anything but integer arithmetic on its arguments, because it is compiled for the simulator and
-called as it is by the live executor.
+A key function receives the tables, the global vertex index, the job's release and index, and the
+*order*, a running number of entries into the ready queue (rule 3 of ``rules``).  It must contain
+only integer arithmetic on its arguments, because it is compiled for the simulator and called
+directly by the live executor.
 """
 
 from __future__ import annotations
@@ -59,15 +59,14 @@ def key_dm(t: Tables, v: int, release: int, job: int, order: int) -> Key:
 
 def key_ros2(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     """
-    Return the key of rclcpp's executor within a polling round: the place in the wait set.
+    Return the key of rclcpp's executor within a polling round: the index in the wait set.
 
     Timers come first, then subscriptions, services and clients, each in order of registration,
-    which is that of the declaration (rclpy goes through them node by node).  The rounds, which are
-    what sets this executor apart, are rule 9 of ``rules``.  Source: D. Casini et al., "Response-
-    Time Analysis of ROS 2 Processing Chains Under Reservation-Based Scheduling", ECRTS 2019; for
-    several workers X. Jiang et al., "Real-Time Scheduling and Analysis of Processing Chains on
-    Multi-Threaded Executor in ROS 2", RTSS 2022; and rclcpp of Jazzy, where timers too are looked
-    up when it polls only.
+    which is that of the declaration (rclpy visits them node by node).  The polling rounds of this
+    executor are rule 9 of ``rules``.  Source: D. Casini et al., "Response-Time Analysis of ROS 2
+    Processing Chains Under Reservation-Based Scheduling", ECRTS 2019; for several workers X. Jiang
+    et al., "Real-Time Scheduling and Analysis of Processing Chains on Multi-Threaded Executor in
+    ROS 2", RTSS 2022; and rclcpp of Jazzy, which checks timers, too, only when it polls.
     """
     return (t.entity[v], order, 0, 0)
 
@@ -77,7 +76,7 @@ def key_picas(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     Return the key of PiCAS: the fixed priority of the callback, then order of becoming ready.
 
     Source: H. Choi, Y. Xiang and H. Kim, "PiCAS: New Design of Priority-Driven Chain-Aware
-    Scheduling for ROS2", RTAS 2021.  ``Tables.chain_rank`` says how chains and DAGs are ordered.
+    Scheduling for ROS2", RTAS 2021.  See ``Tables.chain_rank`` for the order of chains and DAGs.
     """
     return (t.chain_rank[v], order, 0, 0)
 
@@ -91,9 +90,9 @@ class Policy(NamedTuple):
     """
     A row of the policy table.
 
-    ``preemptive`` says how the paper's experiment runs the policy; an executor of callbacks
-    cannot preempt and ignores it.  ``polling`` says that it works in rounds (rule 9 of
-    ``rules``).  ``urgency`` says what the keys are: deadlines of sinks, latest starts for them, or
+    ``preemptive``: whether the paper's experiment runs the policy with preemption; an executor of
+    callbacks cannot preempt and ignores it.  ``polling``: whether it works in rounds (rule 9 of
+    ``rules``).  ``urgency``: what the keys are: deadlines of sinks, latest starts for them, or
     neither (rule 7).
     """
 
@@ -106,9 +105,9 @@ class Policy(NamedTuple):
 
     def mode(self, preemptive: bool | None, processes: int = 1) -> bool:
         """
-        Return whether to preempt: as was asked for, else as the policy does by itself.
+        Return whether to preempt: as requested, else the default of the policy.
 
-        :raises PolicyError: when the policy knows no preemption, or that is not known of so many
+        :raises PolicyError: when the policy does not support preemption, or not with so many
             processes (rule 12).
         """
         if processes > 1 and (preemptive or self.polling):
@@ -144,13 +143,13 @@ class PolicyError(MddagError):
 
 def policy(name: str) -> Policy:
     """
-    Look a policy up by name.
+    Return the policy with this name.
 
-    :raises PolicyError: when there is none of that name.
+    :raises PolicyError: when there is none.
     """
     try:
         return POLICIES[name]
-    except (KeyError, TypeError):  # a list, say
+    except (KeyError, TypeError):  # a list, for example
         raise PolicyError(
             f"policy '{name}': there is no such policy: choose one of {', '.join(POLICIES)}"
         ) from None

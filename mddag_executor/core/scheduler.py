@@ -29,26 +29,26 @@ class Scheduler:
     """
     The scheduling rules bound to one run.
 
-    A driver reports what happens in order of time; it is not thread-safe.  Executions ``x``,
+    A driver reports events in order of time; the object is not thread-safe.  Executions ``x``,
     slots, DAGs and vertices are the integers of ``core.state`` and ``core.tables``.
 
     :param tables: the task set's tables.
     :param n_workers: size of the bounded pool.
     :param policy_name: a row of ``core.policies``; PolicyError when there is none.
-    :param preemptive: see ``core.state.new_state``, as the remaining ones.
+    :param preemptive: see ``core.state.new_state``, also for the remaining parameters.
     :ivar ready: ``ready(x, now)`` makes an execution ready.
-    :ivar ready_undeclared: ``ready_undeclared(job, group, holds, now)`` makes a callback ready
-        that no DAG declares, and returns its execution.
+    :ivar ready_undeclared: ``ready_undeclared(job, group, holds, now)`` makes an undeclared
+        callback ready, and returns its execution.
     :ivar take: ``take(worker, now)`` dispatches the next execution on an idle worker and returns
-        it; -1 when there is none to run.
-    :ivar schedule: ``schedule(now)`` dispatches one execution where the rules want it; -1 when
-        there is nothing to do.
+        it; -1: there is none to run.
+    :ivar schedule: ``schedule(now)`` dispatches one execution where the rules want it and returns
+        it; -1: there is none to dispatch.
     :ivar complete: ``complete(x, now)`` ends a running execution; it returns False for a leg that
-        did not make its vertex whole.
-    :ivar fail: ``fail(x, now)`` ends one that failed; see ``complete``.
+        did not complete its vertex.
+    :ivar fail: ``fail(x, now)`` ends a failed execution; see ``complete``.
 
-    What only passes on (``drop``, ``lend``, ``expire``, …) is bound as it is: see ``core.rules``
-    and ``core.jobs``.
+    Functions without own logic here (``drop``, ``lend``, ``expire``, …) are bound unchanged: see
+    ``core.rules`` and ``core.jobs``.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Scheduler:
             dispatch_overhead=dispatch_overhead, switch_overhead=switch_overhead,
             polling=self.policy.polling, urgency=self.policy.urgency))
         self._free_groups: list[int] = []
-        # bound here: a method of its own would be one more call for each execution
+        # bound here: a method would be one more call for each execution
         rule = self.tables, self.state
         self.ready: Callable[[int, int], None] = partial(
             rules.make_ready, *rule, self.policy.key)
@@ -110,7 +110,7 @@ class Scheduler:
         return self.execution(slot, self.tables.source[self.state.job_dag[slot]])
 
     def start(self, x: int, worker: int, now: int) -> None:
-        """Start what began on an idle worker before all that waits, and is known of only now."""
+        """Start an execution reported late: it began on an idle worker before all that waits."""
         self.ready(x, now)
         self.state.ready.remove(self.state.x_key[x])
         heapify(self.state.ready)
@@ -127,7 +127,7 @@ class Scheduler:
             self.expire(slot, now)
 
     def withdraw(self, slot: int) -> None:
-        """Close the open job in a slot without any decision: what became of it is not known."""
+        """Close the open job in a slot without any decision: its end is not known."""
         jobs.withdraw_job(self.state, slot, EXPIRED)
 
     def expire_idle(self, now: int) -> None:
@@ -138,30 +138,30 @@ class Scheduler:
     def new_group(self) -> int:
         """Add a mutually exclusive callback group and return its number."""
         for place, group in enumerate(self._free_groups):
-            # What was dropped may stand in it for a while yet.
+            # Dropped executions may remain in it for a while.
             if self.state.group_owner[group] == -1 and not self.state.group_heap[group]:
                 del self._free_groups[place]
                 return group
         return add_group(self.state)
 
     def free_group(self, group: int) -> None:
-        """Give a group's number back, to be used again once nothing of it runs or waits."""
+        """Free a group's number, for reuse after its executions have ended."""
         self._free_groups.append(group)
 
     def decisions(self) -> list[Decision]:
-        """Take away what has been decided since the last call."""
+        """Return and clear the decisions since the last call."""
         taken = self.state.decisions[:]
         self.state.decisions.clear()
         return taken
 
     @property
     def idle_workers(self) -> int:
-        """Count the workers that run nothing."""
+        """Return the number of workers that run nothing."""
         return self.state.scalars[N_IDLE]
 
     @property
     def queue_length(self) -> int:
-        """Count the executions that wait, for a worker or for their group."""
+        """Return the number of executions that wait, for a worker or for their group."""
         waiting = sum(len(heap) for heap in self.state.group_heap)
         waiting += sum(len(queue) for queue in self.state.entity_queue)
         waiting += len(self.state.held_back) + sum(map(self._is_refused, self.state.group_owner))

@@ -1,14 +1,15 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Stops: stretches of time in which no thread of the process ran, and the misses that they explain.
+Stops: times in which no thread of the process ran, and the misses that they explain.
 
 1.  A stop explains a late completion if it lasted, between the job's release and its completion,
-    at least as long as the completion was late: without the stop it would have been in time.
-2.  It explains a job that never completed if it was released during the stop: a period that is
+    at least as long as the completion was late: without the stop the job would have been in time.
+2.  It explains a job that never completed if the job was released during the stop: the period was
     skipped.
-3.  A stop is known a little later than what it delayed, and a late completion may come long after
-    it.  So both sides wait for each other: the last stops, and the last misses not explained yet.
+3.  A stop is reported after the executions that it delayed, and a late completion may come long
+    after the stop.  So both are kept for comparison: the last stops, and the last unexplained
+    misses.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from collections import deque
 from typing import Any, NamedTuple
 
 LEAST_NS = 20_000_000
-"""What is shorter is no stop."""
+"""A shorter time is no stop, ns."""
 KEEP_STOPS = 100
 KEEP_MISSES = 2_000
 
 
 class _Miss(NamedTuple):
-    """Release, deadline, completion (-1: never), and what the driver calls it."""
+    """Release, deadline, completion (-1: never), and the driver's object for it."""
 
     release: int
     deadline: int
@@ -49,9 +50,9 @@ class Stops:
 
     def stopped(self, begin: int, end: int) -> list[Any]:
         """
-        Note a stop; each begins after the one before has ended.
+        Note a stop; each begins after the previous one has ended.
 
-        Return what `missed` got of the misses that it turns out to explain.
+        Return the ``what`` of each earlier miss that it explains.
         """
         self._count += 1
         self._total_ns += end - begin
@@ -68,7 +69,7 @@ class Stops:
 
     def missed(self, release: int, deadline: int, completed: int, what: Any = None) -> bool:
         """
-        Note a miss; return whether a stop that is known explains it.
+        Note a miss; return whether a known stop explains it.
 
         :param completed: -1: never.
         """
@@ -80,7 +81,7 @@ class Stops:
         return False
 
     def result(self) -> dict[str, Any]:
-        """Return how many stops there were, how long, the misses they explain, the last stops."""
+        """Return the stops' number, duration, explained misses, and the last stops."""
         return {
             'count': self._count, 'total_ns': self._total_ns, 'misses': self._misses,
             'latest': [{'begin_ns': begin, 'end_ns': end} for begin, end in self._latest]}

@@ -1,47 +1,46 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Static tables of a task set: what the scheduling rules look up.
+Static tables of a task set, used by the scheduling rules.
 
 Theory of operation
 -------------------
 A task set is flattened into columns.  A *global vertex index* numbers the vertices of all DAGs one
-after the other, in DAG order; a *local* one is the place of a vertex in its DAG.  Behind the
-declared DAGs stands one more, the *undeclared DAG*, with one vertex and no judged sink: every
-callback that no DAG declares runs as a job of it, released when the callback became ready and with
-``default_deadline`` as its deadline, so that it neither starves nor pushes in front.
+after the other, in DAG order; a *local* one is the index of a vertex in its DAG.  After the
+declared DAGs comes the *undeclared DAG*, with one vertex and no judged sink.  Every undeclared
+callback runs as a job of it, released when the callback became ready and with ``default_deadline``
+as its deadline, so that it neither starves nor overtakes everything else.
 
-What a job needs while it is open lives in a *region* of consecutive execution ids (see
-``state``): one id for each vertex, or, where sync callbacks run leg by leg as the live executor
-does it, one id for each *leg* of a sync vertex.  A leg is one message that the sync waits for: of
-each of its topics one from each vertex before it that publishes the topic (``legs_of``).
+An open job owns a *region* of consecutive execution ids (see ``state``): one id for each vertex,
+or, if sync callbacks run leg by leg (live), one id for each *leg* of a sync vertex.  A leg is one
+message that the sync waits for: on each of its topics one from each preceding vertex that
+publishes the topic (``legs_of``).
 
 The offsets are relative to a job's release:
 
 * ``rad_offset``: reference absolute deadline (RAD) minus release: of a sink its own relative
-  deadline, of any other vertex the least among the sinks that it leads to (Yano and Azumi, RTSS
-  2024 WiP, extended GEDF).
+deadline, of any other vertex the least among the sinks that it leads to (Yano and Azumi, RTSS 2024
+WiP, extended GEDF).
 * ``dag_deadline``: the latest deadline of the DAG (GEDF with one deadline for each DAG).
-* ``latest_start``: the latest time at which the vertex can start with every sink that it leads to
-  in time, if each vertex takes its mean execution time (0 where none is declared) and never waits:
-  the least of these sinks' deadlines minus the longest path to them (least laxity first).
+* ``latest_start``: the latest start of the vertex with which every sink that it leads to is in
+time, if each vertex takes its mean execution time (0 if none is declared) and never waits: the
+least difference of these sinks' deadlines and the longest paths to them (least laxity first).
 * ``reach_deadline``, ``reach_start``: the same two of each sink that the vertex leads to
-  (``reach_sink``), from ``first_reach`` of the vertex on.  ``mean_time`` is the declared mean
-  execution time, ``height`` the number of vertices on the longest way to a sink.
+(``reach_sink``), from ``first_reach`` of the vertex on.  ``mean_time`` is the declared mean
+execution time, ``height`` the number of vertices on the longest path to a sink.
 
 ``process`` is the number of the declared process that a callback runs in, from 1.
 
-For policies that know callbacks, not jobs:
+For policies that order callbacks, not jobs:
 
-* ``entity``: place of the callback in the wait set of an executor of ROS 2: timers, then
-  subscriptions, services and clients, each in the order of the declaration.  A sync has one place
-  for each topic, next to one another.  Vertices of one callback are one entity.
-* ``chain_rank``: fixed priority by chains, as PiCAS assigns them; smaller is more urgent.  A chain
-  is a path from the source to a sink.  Chains rank by the sink's relative deadline, then by the
-  period and order of their DAGs; a callback has the rank of its most urgent chain (so those with
-  the same least deadline in one DAG are one chain, however it branches).  Within a chain later
-  callbacks, those with more vertices on the longest path to them from the source, are more urgent;
-  vertices that are equally late go by index.
+* ``entity``: index of the callback in the wait set of an executor of ROS 2: timers, then
+subscriptions, services and clients, each in the order of the declaration.  A sync has consecutive
+indices for its topics.  Vertices of one callback are one entity.
+* ``chain_rank``: fixed priority by chains, as in PiCAS; smaller is more urgent.  A chain is a path
+from the source to a sink.  Chains rank by the sink's relative deadline, then by the period and
+order of their DAGs; a callback has the rank of its most urgent chain (so all paths of a DAG with
+the same least deadline are one chain).  Within a chain later callbacks, those with more vertices
+on the longest path to them from the source, are more urgent; ties go by index.
 """
 
 from __future__ import annotations
@@ -53,21 +52,21 @@ from msg_graph import Callback, Dag, TaskSet, Vertex
 from msg_graph.model import path_lengths, topological_order
 
 NEVER = 2 ** 62
-"""A time that is never reached (ns): larger than any clock, small enough to add to."""
+"""A time that is never reached, ns: larger than any clock, small enough to add to."""
 
 DEFAULT_DEADLINE_NS = 100_000_000
-"""The deadline that an undeclared callback is ordered by, after its release."""
+"""The relative deadline by which undeclared callbacks are ordered, ns."""
 MAX_ACTIVE_JOBS = 64
-"""So many jobs of a DAG may be unfinished at a time."""
+"""How many jobs of a DAG may be open at a time."""
 EXPIRE_AFTER_NS = 1_000_000_000
-"""A job that nothing of runs or waits expires so long after its latest deadline."""
+"""An idle job expires this long after its latest deadline, ns."""
 
 CONTINUE, DEMOTE, ABORT = range(3)
 ON_LATE = {'continue': CONTINUE, 'demote': DEMOTE, 'abort': ABORT}
-"""What is done with a late job, by its name in declarations and options."""
+"""The treatments of late jobs, by their names in declarations and options."""
 
 _WAIT_SET = {'timer': 0, 'subscription': 1, 'sync': 1, 'service': 2}
-"""Kinds of callbacks in the order in which executors of ROS 2 look them up."""
+"""Kinds of callbacks in the order in which executors of ROS 2 check them."""
 
 
 class Tables(NamedTuple):
@@ -131,13 +130,13 @@ class Tables(NamedTuple):
         """
         Flatten a task set.
 
-        :param task_set: the DAG tasks; ``None`` stands for no declared DAG at all.
-        :param legs: sync vertices run once for each leg (live), not once when all are there.
+        :param task_set: the DAG tasks; ``None``: there is no declared DAG.
+        :param legs: sync vertices run once for each leg (live), not once when all have arrived.
         :param groups: use the declared callback groups (live passes False: it has the real ones).
         :param default_deadline: relative deadline of undeclared callbacks, ns.
         :param max_active_jobs: bound on the open jobs of a DAG that declares none itself.
-        :param expire_after: how long past its latest deadline an idle job stays open, ns.
-        :param on_late: what is done with late jobs of a DAG that does not declare it.
+        :param expire_after: how long after its latest deadline an idle job stays open, ns.
+        :param on_late: the treatment of late jobs of a DAG that does not declare it.
         """
         columns = _Columns(legs, groups, max_active_jobs, expire_after, ON_LATE[on_late])
         columns.enter(task_set.callbacks if task_set is not None else ())
@@ -175,7 +174,7 @@ class _Columns:
         self.lists['first_reach'].append(0)
 
     def enter(self, callbacks: Sequence[Callback]) -> None:
-        """Give each declared callback its place in the wait set."""
+        """Assign each declared callback its index in the wait set."""
         for callback in sorted(callbacks, key=lambda each: _WAIT_SET[each.kind]):
             self._entities[callback.key] = self._n_entities
             self._n_entities += max(1, len(callback.topics)) if self._legs else 1
@@ -263,8 +262,8 @@ class _Columns:
             n_entities=self._n_entities, **lists)
 
     def _ranks(self) -> list[int]:
-        """Return the place of each vertex's callback among all, by its most urgent vertex."""
-        keys = [*self._keys, '']  # the last is the undeclared
+        """Return the rank of each vertex's callback, by its most urgent vertex."""
+        keys = [*self._keys, '']  # the last is the undeclared one
         best: dict[str, tuple[int, ...]] = {}
         for key, chain in zip(keys, self._chains):
             best[key] = min(chain, best.get(key, chain))
@@ -273,7 +272,7 @@ class _Columns:
 
 
 def processes_of(task_set: TaskSet) -> list[int]:
-    """Return by vertex the number of the declared process that it runs in, from 1."""
+    """Return by vertex the number of its declared process, from 1."""
     place = {node: number for number, process in enumerate(task_set.processes, 1)
              for node in process.nodes}
     return [place.get(vertex.callback.node, 1) for vertex in task_set.vertices]
@@ -281,7 +280,7 @@ def processes_of(task_set: TaskSet) -> list[int]:
 
 def legs_of(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int, int]]:
     """
-    Return the messages that start a vertex, its legs: the place of the topic, and who publishes.
+    Return the messages that start a vertex, its legs: topic index and publishing vertex.
 
     :param vertices: those of its DAG.
     """
@@ -295,7 +294,7 @@ def legs_of(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int, int]]
 
 def rad_offsets(dag: Dag) -> list[int]:
     """
-    RAD minus release for each vertex of a DAG, ns, by local index.
+    Return RAD minus release for each vertex of a DAG, ns, by local index.
 
     The rule of the paper's extended GEDF: a sink has its own deadline, every other vertex the
     least of its successors', hence the least among the sinks that it leads to.
@@ -304,7 +303,7 @@ def rad_offsets(dag: Dag) -> list[int]:
 
 
 def mean_time(vertex: Vertex) -> int:
-    """Return the declared mean execution time, ns; 0 where none is declared."""
+    """Return the declared mean execution time, ns; 0 if none is declared."""
     declared = vertex.callback.execution_time
     return 0 if declared is None else declared.mean_ns
 
@@ -313,7 +312,7 @@ def reached_sinks(dag: Dag) -> list[list[tuple[int, int, int]]]:
     """
     Return the sinks that each vertex of a DAG leads to, by local index.
 
-    :return: of each the local index, its deadline, and the latest start for it (see
+    :return: for each sink its local index, its deadline, and the latest start for it (see
         ``latest_start`` in the theory of operation; it may be negative), ns.
     """
     costs = [mean_time(vertex) for vertex in dag.vertices]

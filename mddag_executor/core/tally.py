@@ -1,10 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Counts of what the core decided: per DAG and sink, in the result format of the commands.
+Counts of the core's decisions: per DAG and sink, in the result format of the commands.
 
-Live executor, replayer and simulator all feed the core's decisions in here, so their figures
-mean the same.
+Live executor, replayer and simulator all use this module, so their figures have the same meaning.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ VERDICTS = {
     SINK_IN_TIME: 'in_time', SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
     SINK_ABORTED: 'aborted', SINK_FAILED: 'failed', SINK_DROPPED: 'dropped',
     SINK_OVERDUE: 'overdue'}
-"""What a verdict of the core is called."""
+"""The names of the core's verdicts."""
 OUTCOMES = {COMPLETED: 'completed', LATE: 'late', ABORTED: 'aborted', EXPIRED: 'expired',
             FAILED: 'failed', OUTDATED: 'dropped'}
 
@@ -64,7 +63,7 @@ def quantiles_us(values: list[int]) -> dict[str, float] | None:
 
 
 class Counts(NamedTuple):
-    """Verdicts about the jobs of a sink, or of several; ``late`` with the overdue."""
+    """Verdicts about the jobs of one or several sinks; ``late`` includes the overdue."""
 
     due: int
     in_time: int
@@ -76,11 +75,11 @@ class Counts(NamedTuple):
 
     @property
     def missed(self) -> int:
-        """Return how many were not in time."""
+        """Return the number of results that were not in time."""
         return self.due - self.in_time
 
     def minus(self, earlier: Counts) -> Counts:
-        """Return what has come since."""
+        """Return the difference to earlier counts."""
         return Counts(*(now - before for now, before in zip(self, earlier)))
 
     @classmethod
@@ -90,7 +89,7 @@ class Counts(NamedTuple):
 
 
 def counts(sink: Mapping[str, Any]) -> Counts:
-    """Return the verdicts that a sink's result holds, or its counters (``vars``)."""
+    """Return the verdicts in a sink's result, or in its counters (``vars``)."""
     overdue = sink.get('overdue', 0)
     aborted, failed, dropped = (sink.get(key, 0) for key in ('aborted', 'failed', 'dropped'))
     in_time = sink['completed'] - (sink['late'] - overdue)
@@ -99,7 +98,7 @@ def counts(sink: Mapping[str, Any]) -> Counts:
 
 
 def is_kept(sink: Mapping[str, Any]) -> bool:
-    """Return whether a sink's result has no miss, or no more than its declaration tolerates."""
+    """Return whether a sink's result has no more misses than its declaration tolerates."""
     tolerate = sink.get('tolerate')
     if tolerate is None:
         return not counts(sink).missed
@@ -112,7 +111,7 @@ def total(dags: Mapping[str, Any]) -> Counts:
 
 
 def never_due(dags: Mapping[str, Any]) -> list[str]:
-    """Return the sinks of a result of which no job was due: nothing is known of them."""
+    """Return the sinks of a result without a due job, whose deadlines were never tested."""
     return [name for dag in dags.values() for name, sink in dag['sinks'].items()
             if not counts(sink).due]
 
@@ -121,10 +120,10 @@ def of_processes(
     task_set: TaskSet, results: Iterable[tuple[str, Mapping[str, Any]]]
 ) -> dict[str, Any]:
     """
-    Return the verdicts of a run (``Tally.result``) from those of its processes.
+    Combine the verdicts of a run's processes (``Tally.result``).
 
-    A sink is judged in its node's process, a job counted in its source's.  A process that was
-    started again has several results; the response times of these have no quantiles in common.
+    A sink is judged in its node's process, a job counted in its source's.  A restarted process has
+    several results; their response times have no common quantiles.
 
     :param results: the name of the process, and its result.
     """
@@ -148,7 +147,7 @@ def of_processes(
 
 
 def _added(deadline: int, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the result of one sink from several."""
+    """Return the combined result of one sink."""
     if len(parts) == 1:
         return dict(parts[0])
     result = SinkTally(deadline, None).result()
@@ -167,7 +166,7 @@ class Latest:
     """
     The last ``keep`` of a series of numbers (None: all), 8 bytes each.
 
-    Numbers beyond 64 bits, which damaged recordings may give, are kept as the nearest within.
+    Numbers beyond 64 bits, possible in damaged recordings, are stored as the nearest within.
     """
 
     __slots__ = ('_keep', '_values', '_next')
@@ -178,7 +177,7 @@ class Latest:
         self._next = 0
 
     def append(self, value: int) -> None:
-        """Add a number, in place of the oldest where there are ``keep`` already."""
+        """Add a number, which replaces the oldest if there are ``keep`` already."""
         values = self._values
         try:
             if len(values) != self._keep:
@@ -190,23 +189,23 @@ class Latest:
             self.append(2 ** 63 - 1 if value > 0 else -2 ** 63)
 
     def __len__(self) -> int:
-        """Return how many are kept."""
+        """Return the number of stored values."""
         return len(self._values)
 
     def __getitem__(self, index: int) -> int:
-        """Return one of them, the oldest with 0, the last with -1."""
+        """Return a value; 0 is the oldest, -1 the last."""
         length = len(self._values)
         if not -length <= index < length:
             raise IndexError(index)
         return self._values[(self._next + index) % length]
 
     def __iter__(self) -> Iterator[int]:
-        """Give them from the oldest to the last."""
+        """Yield the values from the oldest to the last."""
         return iter(self._values[self._next:] + self._values[:self._next])
 
 
 class SinkTally:
-    """What came of one sink: counts, and response times (completion minus release, ns)."""
+    """The results of one sink: counts, and response times (completion minus release, ns)."""
 
     def __init__(self, relative_deadline_ns: int, keep: int | None) -> None:
         self.relative_deadline_ns = relative_deadline_ns
@@ -266,7 +265,7 @@ class Tally:
         self.dropped = 0
         #: By vertex and job: the deadlines of sinks that are overdue and have no verdict yet.
         self.overdue: dict[tuple[int, int], int] = {}
-        #: The miss that was known first; of those judged at the run's end, the first deadline's.
+        #: The first known miss; of those judged at the run's end, the one with the first deadline.
         self.first_miss: dict[str, Any] | None = None
         self._first_kind = -1
 
@@ -303,7 +302,7 @@ class Tally:
                     self._add_miss(kind, dag, vertex, job, deadline, time)
 
     def _end_overdue(self, vertex: int, job: int) -> None:
-        """Let the verdict of a sink take the place of its being overdue."""
+        """Let the verdict of a sink replace its overdue state."""
         if self.overdue.pop((vertex, job), None) is not None:
             self.sinks[vertex].late -= 1
             self.sinks[vertex].overdue -= 1
@@ -340,14 +339,14 @@ class Tally:
                 'deadline_ns': deadline, 'completed_ns': completed}
 
     def _first_of_all(self) -> dict[str, Any] | None:
-        """Return the first miss, of a sink that is overdue if there is no verdict yet."""
+        """Return the first miss, of an overdue sink if there is no verdict yet."""
         if self.first_miss is not None or not self.overdue:
             return self.first_miss
         (vertex, job), deadline = min(self.overdue.items(), key=lambda item: item[1])
         return self._miss(vertex, job, deadline, None)
 
     def sinks_of(self, dag: Dag) -> dict[int, SinkTally]:
-        """Return what came of the sinks of a DAG, by global vertex."""
+        """Return the results of the sinks of a DAG, by global vertex."""
         return {v: self.sinks[v] for v in self._sinks_of(dag.index)}
 
     def _sinks_of(self, dag: int) -> list[int]:

@@ -1,22 +1,22 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-How many missed deadlines are tolerated, and whether a run keeps within that.
+How many missed deadlines are tolerated, and whether a run meets that.
 
 Theory of operation
 -------------------
-A sink whose declaration says `tolerate: m of k` is judged by that: of any k of its jobs in a row
-at most m miss (`mddag_executor/core/weakly_hard.py`). For the others two measures are given with
-the run, as in CARET's report (its callback validation), and both have to hold:
+A sink with a declared `tolerate: m of k` is judged by that: of any k of its jobs in a row at most
+m miss (`mddag_executor/core/weakly_hard.py`). For the others two limits apply to the run, as in
+CARET's report (its callback validation), and both have to hold:
 
-* *ratio*: of the sink's jobs that were due, the share that missed the deadline is at most R;
+* *ratio*: of the sink's due jobs, the fraction that missed the deadline is at most R;
 * *burst*: the longest run of consecutive jobs that missed it is at most B.
 
 A job was due at a sink when it completed there, expired, was aborted, or was past its deadline at
 the end of the run.  Jobs are consecutive by their number; a job that is not in the trace ends a
-burst.  Where only one of the two is given, only that one is asked for; where neither is, no miss
-is tolerated.  A sink of which no job was due is within every tolerance, unless none was due at any
-sink: then nothing has shown that deadlines hold, and all sinks fail.
+burst.  If only one of the two limits is given, only that one applies; if neither is, no miss is
+tolerated.  A sink without a due job is within every tolerance, unless no sink has a due job: then
+deadlines were never tested, and all sinks fail.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ NOTHING_DUE = 'no job was due at any sink, so no deadline was judged'
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What is tolerated of each sink; None: not asked for."""
+    """The tolerance of each sink; None: no limit."""
 
     ratio: float | None = None
     burst: int | None = None
 
     def broken_by(self, sink: Mapping[str, Any]) -> str | None:
         """
-        Return why a sink is not within the tolerance, None where it is.
+        Return why a sink is not within the tolerance; None if it is.
 
         :param sink: its part of a result, with its `longest_burst`.
         """
@@ -78,4 +78,4 @@ class Tolerance:
 
 
 NO_MISS = Tolerance()
-"""No miss is tolerated, but of sinks whose declaration tolerates some."""
+"""No miss is tolerated, except by sinks whose declaration tolerates some."""

@@ -18,13 +18,13 @@ from collections.abc import Iterable
 
 class MissWindow:
     """
-    The most misses in any window of jobs in a row, counted while the misses come in.
+    The most misses in any window of jobs in a row, updated with each miss.
 
-    Misses may come in any order, as long as a job is less than ``ORDER`` jobs or one window behind
-    the newest that missed: older ones are forgotten.
+    Misses may be added in any order, as long as a job is less than ``ORDER`` jobs or one window
+    behind the newest that missed: older ones are forgotten.
 
     :param of: the length of the window, in jobs
-    :ivar worst: how many jobs of one window missed, at most
+    :ivar worst: the most misses in one window
     """
 
     ORDER = 1000
@@ -32,7 +32,7 @@ class MissWindow:
     def __init__(self, of: int) -> None:
         self.of = of
         self.worst = 0
-        self._jobs: list[int] = []      # the latest that missed, in ascending order
+        self._jobs: list[int] = []  # the latest misses, ascending
 
     def add(self, job: int) -> None:
         """Count a job that missed; a job may be given more than once."""
@@ -41,7 +41,7 @@ class MissWindow:
         if at < len(jobs) and jobs[at] == job:
             return
         jobs.insert(at, job)
-        # The windows that hold the job, each by the miss that it ends with.
+        # The windows that contain the job, each by the miss that it ends with.
         for last in range(at, bisect_left(jobs, job + self.of)):
             self.worst = max(self.worst, last + 1 - bisect_right(jobs, jobs[last] - self.of))
         if len(jobs) > 2 * (self.of + self.ORDER):
