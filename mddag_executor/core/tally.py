@@ -34,7 +34,7 @@ from mddag_executor.core.state import (
     SINK_MISSED,
     SINK_OVERDUE,
 )
-from mddag_executor.core.tables import Tables
+from mddag_executor.core.tables import DEMOTE, Tables
 from mddag_executor.core.weakly_hard import MissWindow
 from msg_graph import Dag, TaskSet, Vertex, WeaklyHard
 
@@ -154,7 +154,8 @@ def _added(deadline: int, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for part in parts:
         for key in ('completed', 'late', 'overdue', 'expired', 'failed', 'aborted', 'dropped',
                     'demoted'):
-            result[key] += part[key]
+            if key in part:
+                result[key] = result.get(key, 0) + part[key]
         if 'tolerate' in part:
             worst = result.get('tolerate', part['tolerate'])['worst']
             result['tolerate'] = {
@@ -215,7 +216,7 @@ class SinkTally:
         self.failed = 0
         self.aborted = 0
         self.dropped = 0
-        self.demoted: int | None = 0  # None: not known, of a recording
+        self.demoted: int | None = None  # None: late jobs are not demoted, or it is not known
         self.overdue = 0
         self.shortest: int | None = None
         self.longest: int | None = None
@@ -239,11 +240,14 @@ class SinkTally:
             response = {
                 'min': self.shortest, 'median': quantile(ordered, 0.5),
                 'p99': quantile(ordered, 0.99), 'max': self.longest}
-        return {
+        result = {
             'relative_deadline_ns': self.relative_deadline_ns, 'completed': self.completed,
             'late': self.late, 'overdue': self.overdue, 'expired': self.expired,
             'failed': self.failed, 'aborted': self.aborted, 'dropped': self.dropped,
-            'demoted': self.demoted, 'response_ns': response}
+            'response_ns': response}
+        if self.demoted is not None:
+            result['demoted'] = self.demoted
+        return result
 
 
 class Tally:
@@ -259,6 +263,9 @@ class Tally:
         self.jobs = [0] * tables.n_dags
         self.ends = [dict.fromkeys(OUTCOMES, 0) for _ in range(tables.n_dags)]
         self.sinks = {v: SinkTally(tables.sink_deadline[v], keep) for v in tables.sinks}
+        for v, sink in self.sinks.items():
+            if tables.on_late[tables.dag_of[v]] == DEMOTE:
+                sink.demoted = 0
         #: By sink: its misses in any window, if the declaration tolerates some.
         self.windows = {v: MissWindow(tolerate.of) for v in self.sinks
                         if (tolerate := self._tolerate(v)) is not None}

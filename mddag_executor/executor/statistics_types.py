@@ -16,14 +16,19 @@ ResponseTimes = TypedDict(  # noqa: UP013 - a class would shadow min and max
 """Response times of a sink from the release on; quantiles are those of the last 2,000."""
 
 
-class SinkCounts(TypedDict):
+class Demotions(TypedDict, total=False):
+    """Jobs of a sink that were put behind others; only with ``on_late: demote``."""
+
+    demoted: int
+
+
+class SinkCounts(Demotions):
     """
     The results of a sink.
 
     ``late`` counts completions after the deadline and, at the end of the run, jobs that were
-    ``overdue``. ``dropped`` counts jobs replaced by a newer one (``keep: newest``), ``demoted``
-    jobs that could no longer be in time and were put behind others. ``response_ns`` is missing if
-    no job completed.
+    ``overdue``. ``dropped`` counts jobs replaced by a newer one (``keep: newest``).
+    ``response_ns`` is None if no job completed.
     """
 
     relative_deadline_ns: int
@@ -34,7 +39,6 @@ class SinkCounts(TypedDict):
     failed: int
     aborted: int
     dropped: int
-    demoted: int
     response_ns: ResponseTimes | None
 
 

@@ -38,7 +38,7 @@ def test_the_result_for_machines(
                             'dropped': 0},
         'sinks': {'/filter:run': {
             'relative_deadline_ns': 8 * MS, 'completed': 3, 'late': 1, 'overdue': 0, 'expired': 0,
-            'failed': 0, 'aborted': 0, 'dropped': 0, 'demoted': None,
+            'failed': 0, 'aborted': 0, 'dropped': 0,
             'response_ns': {'min': 5 * MS, 'median': 6 * MS, 'p99': 10 * MS, 'max': 10 * MS},
             'longest_burst': 1,
             'slack_ns': {'min': -2 * MS, 'p1': -2 * MS, 'median': 2 * MS, 'max': 3 * MS},

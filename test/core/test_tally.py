@@ -73,12 +73,12 @@ def test_a_tally_of_everything() -> None:
             'sinks': {
                 '/n:x': {'relative_deadline_ns': 10 * US, 'completed': 3, 'late': 2,
                          'overdue': 1, 'expired': 0, 'failed': 0, 'aborted': 1,
-                         'dropped': 0, 'demoted': 0,
+                         'dropped': 0,
                          'response_ns': {'min': 5 * US, 'median': 10 * US, 'p99': 10 * US + 1,
                                          'max': 10 * US + 1}},
                 '/n:y': {'relative_deadline_ns': 20 * US, 'completed': 2, 'late': 0,
                          'overdue': 0, 'expired': 1, 'failed': 0, 'aborted': 1,
-                         'dropped': 0, 'demoted': 0,
+                         'dropped': 0,
                          'response_ns': {'min': 3 * US, 'median': 3 * US, 'p99': 20 * US,
                                          'max': 20 * US}}}}}}
 
