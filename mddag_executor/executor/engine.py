@@ -5,23 +5,23 @@ The engine of a live run: the core, and the work that waits in it.
 
 Theory of operation
 -------------------
-The engine gets what happens, with the time of it, and says what to run.  It has no thread,
-lock or clock and knows nothing of rclpy; ``workers`` has all of these, and calls the engine under
-its lock, so that times never decrease.  Nobody but the engine and its parts (``jobs``,
-``other_processes``) changes the core's state.
+The engine receives events with their times, and decides what to run.  It has no thread, lock or
+clock and does not use rclpy; ``workers`` has all of these, and calls the engine under its lock, so
+that times never decrease.  Only the engine and its parts (``jobs``, ``other_processes``) change
+the core's state.
 
-1.  *What becomes ready* (``timer_due``, ``arrived``, ``ready``) is work for a job of a declared
-    DAG, or for none.  Messages of known publications go to the job of these (``jobs``), others
-    may enter from another process (``other_processes``), and what fits nothing runs as undeclared.
-2.  *A queue holds as many messages as its QoS says*; of more than that the oldest go, and are
-    counted.  What no DAG declares runs in the order of becoming ready, so that nobody starves.
-    For that the turn is the callback's and not the message's: where a queue overflows all the
-    time, none of its messages waits for long, and it would have its turn after everybody who has
-    waited longer.  So the next message takes the place of the one that goes.
-3.  *What to run* (``dispatch``) and *what became of it* (``finished``,
-    ``suspended``, ``refused``, …) is the core's decision, see ``core.rules``.
-4.  *What the core decides beside* (verdicts, ends of jobs, what an abort drops) is counted,
-    recorded and reported to the user (``verdicts``).
+1.  *Ready work* (``timer_due``, ``arrived``, ``ready``) belongs to a job of a declared DAG, or to
+    none.  Messages of known publications go to the job of these (``jobs``), others may enter from
+    another process (``other_processes``), and all others run as undeclared.
+2.  *Queue depth.*  A queue retains as many messages as its QoS allows; beyond that the oldest are
+    dropped and counted.  Undeclared callbacks run in the order in which they became ready, so that
+    none starves.  In a queue that overflows permanently, every message is young, and its callback
+    would always come after all others.  So the next message takes over the position of the dropped
+    one.
+3.  *The core decides* what to run (``dispatch``), and handles the ends of executions
+    (``finished``, ``suspended``, ``refused``, …): see ``core.rules``.
+4.  *Further decisions* of the core (verdicts, ends of jobs, executions dropped by an abort) are
+    counted, recorded and reported to the user (``verdicts``).
 """
 
 from __future__ import annotations
@@ -56,23 +56,23 @@ if TYPE_CHECKING:
     from mddag_executor.executor.work import Work
 
 MOST_MISSED = 1000
-"""After a long stop (a suspended machine) at most so many releases are judged one by one."""
+"""After a long stop (a suspended machine) at most this many releases are judged one by one."""
 MOST_LOOKED_AT = 32
-"""When more executions are ready than this, it is not checked whether all of them hold the GIL."""
+"""With more ready executions than this, it is not checked whether all of them hold the GIL."""
 LONG_NS = 1_000_000
-"""While a callback holds the GIL for longer than this, what cannot start wakes nobody."""
+"""While a callback holds the GIL for longer than this, callbacks that cannot start are muted."""
 
 
 class Engine:
     """
-    Turns what became ready into executions of the core, and its decisions into work.
+    Converts ready work to executions of the core, and the core's decisions to work.
 
     All times are ns on the trace's clock and do not decrease from call to call.
 
-    :param on_late: what is done with late jobs of a DAG that does not declare it.
-    :param record: where trace events go; None records nothing.
-    :param on_miss: gets every miss (see ``Verdicts``).
-    :param process: which of the declared processes this is.
+    :param on_late: the treatment of late jobs of a DAG that does not declare it.
+    :param record: receives trace events; None: they are not recorded.
+    :param on_miss: receives every miss (see ``Verdicts``).
+    :param process: the declared process that this is.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Engine:
         self.record = record
         self.on_late = on_late
         self.undeclared = 0
-        # how often a callback group did not let something run, and what waits for that
+        # how often a callback group refused an execution, and the entities to ask about again
         self.refusals = 0
         self.to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
@@ -105,12 +105,12 @@ class Engine:
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
-        # those that hold the GIL, in the order in which they began; not to be changed from outside
+        # executions that hold the GIL, in the order in which they began; read-only outside
         self.holders: list[Work] = []
         self._holds_since = 0
         self._keys_are_deadlines = policy in ('rad', 'gedf')
 
-    # --- what became ready -----------------------------------------------------------------------
+    # --- ready work --- --------------------------------------------------------------------------
 
     def timer_due(self, work: Work, due: int, now: int) -> None:
         """Handle a timer that became due at ``due``."""
@@ -130,7 +130,7 @@ class Engine:
         """
         Note that ``count`` periods after that of ``due`` were missed: they are late.
 
-        But not those before the executor began to look after the timer.
+        Periods before the executor began to manage the timer are not counted.
         """
         if entity.removed or self._finished:
             return
@@ -147,9 +147,9 @@ class Engine:
         """
         Handle a message.
 
-        :param origin: the publication that it comes from, where one was found.
-        :param release: the release of the job that it starts or enters with, if it does.
-        :param stamp: that of its header where it says which job it belongs to, else -1.
+        :param origin: its publication, if found.
+        :param release: the release of the job that it starts or enters with, if any.
+        :param stamp: of its header if that identifies the job, else -1.
         """
         entity = work.entity
         if entity.removed or self._finished:
@@ -181,12 +181,12 @@ class Engine:
             self._start_undeclared(work, now)
 
     def ready(self, work: Work, now: int) -> None:
-        """Handle anything that no DAG declares: requests, guard conditions, waitables, tasks."""
+        """Handle other undeclared work: requests, guard conditions, waitables, tasks."""
         if not work.entity.removed and not self._finished:
             self._start_undeclared(work, now)
 
     def ran_at_once(self, entity: Entity) -> None:
-        """Count an undeclared callback that ran where it was taken."""
+        """Count an undeclared callback that was handled at once."""
         entity.ready += 1
         entity.ran += 1
         self.undeclared += 1
@@ -207,7 +207,7 @@ class Engine:
             slot = self._release(dag, release, now)
             job = Origin(slot, dag, self._state.job_index[slot], entity.remote_publishers[0])
             self.other_processes.note(stamp, job)
-        # Of a sync: the first of its legs that nothing has come for yet.
+        # For a sync: the first of its legs that has no message yet.
         return job._replace(vertex=next(
             (v for v in entity.remote_publishers if self._is_idle(job, *entity.targets[v])),
             entity.remote_publishers[0]))
@@ -225,14 +225,14 @@ class Engine:
         return job._replace(vertex=announced.vertex)
 
     def reference_deadline(self, work: Work) -> int | None:
-        """Return when an execution of an open job is to be done; None for any other."""
+        """Return the reference absolute deadline of an open job's execution; None for others."""
         release = None if work.origin is None else self.open_release(work.origin)
         if release is None or work.origin is None:
             return None
         return release + self.tables.rad_offset[work.origin.vertex]
 
     def open_release(self, origin: Origin) -> int | None:
-        """Return the release of a job that is open, None of one that has ended."""
+        """Return the release of an open job, None if the job has ended."""
         state, slot = self._state, origin.slot
         is_open = (state.job_dag[slot] == origin.dag and state.job_index[slot] == origin.job
                    and state.job_state[slot] == OPEN)
@@ -301,12 +301,12 @@ class Engine:
         entity.waiting[x] = None
         self._work[x] = work
         if state.decisions:
-            self._decided(now)  # it took the place of an older one, which was dropped
+            self._decided(now)  # it replaced an older one, which was dropped
 
-    # --- what does not run -----------------------------------------------------------------------
+    # --- dropped work --- ------------------------------------------------------------------------
 
     def _replace_oldest(self, work: Work, now: int) -> None:
-        """Keep QoS for a callback that no DAG declares: whose turn it is stays as it was."""
+        """Drop the oldest message of an undeclared callback; the callback keeps its position."""
         entity = work.entity
         places = iter(entity.waiting)
         first, second = next(places), next(places, -1)
@@ -335,29 +335,29 @@ class Engine:
         self._decided(now)
 
     def remove(self, entity: Entity, now: int) -> None:
-        """Forget a destroyed entity: what waits of it never runs."""
+        """Forget a destroyed entity: its waiting executions never run."""
         entity.removed = entity.may_be_gone = True
         for x in list(entity.waiting):
             self._drop(entity, x, 'destroyed', now)
 
-    # --- what to run -----------------------------------------------------------------------------
+    # --- dispatch --- ----------------------------------------------------------------------------
 
     @property
     def has_waiting(self) -> bool:
-        """Return whether anything waits that a worker may be able to run."""
+        """Return whether an execution waits that a worker may be able to run."""
         state = self._state
         return bool(state.ready or state.held_back or state.unpolled)
 
     @property
     def idle_workers(self) -> int:
-        """Return how many workers run nothing."""
+        """Return the number of workers that run nothing."""
         return self._state.scalars[N_IDLE]
 
     def dispatch(self, worker: int, now: int) -> Work | None:
         """
         Dispatch the next execution on a worker that runs nothing; None: nothing may start.
 
-        :param worker: the one to take if it runs nothing; else the lowest idle one is taken.
+        :param worker: the worker to use if it is idle; else the lowest idle one is used.
         """
         state = self._state
         if not (state.ready or state.held_back or state.unpolled) or not state.scalars[N_IDLE]:
@@ -394,7 +394,7 @@ class Engine:
         return -1  # a successor, or a release that lies before the arrival
 
     def may_start_more(self, now: int) -> bool:
-        """Return whether an idle worker may be able to start something; True if in doubt."""
+        """Return whether an idle worker may be able to start an execution; True if in doubt."""
         state = self._state
         ready, held_back = state.ready, state.held_back
         if not state.scalars[N_IDLE] or not (ready or held_back or state.unpolled):
@@ -423,17 +423,17 @@ class Engine:
         return min(self._state.x_key[work.x][0] for work in self.holders)
 
     def _may_be_overtaken(self, now: int) -> bool:
-        """Return whether what comes first may overtake the last one that began to hold the GIL."""
+        """Return whether the first waiting execution may overtake the latest holder of the GIL."""
         return overtaking_pays(
             self.tables, self._state, 1, now - self._holds_since,
             self.holders[-1].entity.habit.mean_ns, False)
 
     def overtaking_bound(self, now: int) -> tuple[int, int]:
         """
-        Return what need not be known while the last one that began to hold the GIL does so.
+        Return which arrivals need not be known while the latest execution holds the GIL.
 
-        :return: what holds the GIL, too, and has at least this relative deadline (ns), and until
-            when (0, 0: everything has to be known).
+        :return: the least relative deadline (ns) of such arrivals, if they hold the GIL, too, and
+            until when (0, 0: all arrivals have to be known).
         """
         if len(self.holders) != 1:
             return 0, 0
@@ -460,17 +460,17 @@ class Engine:
             self.holders.remove(work)
 
     def stop_holding(self, work: Work) -> None:
-        """Give the interpreter back for an execution that does not need it now."""
+        """Release the interpreter for an execution that does not need it now."""
         self._let_go(work)
         self.scheduler.stop_holding(work.x)
 
     def lend(self, work: Work) -> None:
-        """Free the worker of an execution that goes on without one."""
+        """Free the worker of an execution that continues without one."""
         self._let_go(work)
         self.scheduler.lend(work.x)
 
     def resume(self, work: Work) -> None:
-        """Make a suspended execution ready to go on; nothing happens when it is not suspended."""
+        """Make a suspended execution ready again; does nothing if it is not suspended."""
         if work.x >= 0 and self._state.x_state[work.x] == SUSPENDED:
             self.scheduler.resume(work.x)
 
@@ -479,14 +479,14 @@ class Engine:
         self.scheduler.leave_group(work.x)
 
     def ask_again(self) -> None:
-        """Make ready again what a callback group did not let run."""
+        """Make executions ready again that a callback group has refused."""
         refused, self.to_ask_again = self.to_ask_again, []
         for entity in refused:
             x = next(iter(entity.waiting), -1)
             if x >= 0 and self._state.x_state[x] == SUSPENDED:
                 self.scheduler.resume(x)
 
-    # --- what became of it -----------------------------------------------------------------------
+    # --- ends of executions --- ------------------------------------------------------------------
 
     def finished(
         self, work: Work, start: int, end: int, now: int, vtid: int, worker: int,
@@ -495,8 +495,8 @@ class Engine:
         """
         End an execution that ran from ``start`` to ``end``; ``now`` is not before these.
 
-        :param vtid: the thread that it ran in; ``worker`` is -1 where that has lent its worker.
-        :param failed: whether its callback has let an exception out.
+        :param vtid: the thread that it ran in; ``worker`` is -1 if that has lent its worker.
+        :param failed: whether its callback has raised an exception.
         """
         entity = work.entity
         entity.ran += 1
@@ -512,7 +512,7 @@ class Engine:
             self.mean_times.note(origin.vertex, entity.habit.mean_ns)
         if self.verdicts.tally.overdue and work.origin is not None:
             deadline = self.verdicts.tally.overdue.get((work.origin.vertex, work.origin.job), -1)
-            if end <= deadline:  # that it was overdue was reported before this was known
+            if end <= deadline:  # it was reported overdue before this was known
                 entity.busy_ns += deadline + 1 - end
                 end = deadline + 1
         end_it = self.scheduler.fail if failed else self.scheduler.complete
@@ -528,7 +528,7 @@ class Engine:
             leg = x - state.job_base[slot] - tables.region_offset[vertex]
             held = state.x_holds[x]
             whole = end_it(x, end)
-            if failed:  # this first, or its completion would count
+            if failed:  # first, or its completion would count
                 self.record('fail', now, vtid, dag, tables.index_in_dag[vertex], job)
             self.record(
                 EXECUTION, start, vtid, entity.address, dag, tables.index_in_dag[vertex],
@@ -545,7 +545,7 @@ class Engine:
         self._work[work.x] = work
 
     def refused(self, work: Work, now: int) -> None:
-        """Put an execution back that its callback group does not let run now (see ``groups``)."""
+        """Put an execution back that its callback group has refused (see ``groups``)."""
         entity, x = work.entity, work.x
         if entity.removed:
             self.destroyed(work, now)
@@ -557,12 +557,12 @@ class Engine:
         self.to_ask_again.append(entity)
         self.refusals += 1
         if 0 < entity.depth < len(entity.waiting) and entity.kind != TIMER:
-            self._drop(entity, x, 'qos_depth', now)  # a newer one has come meanwhile
+            self._drop(entity, x, 'qos_depth', now)  # a newer one has arrived meanwhile
 
     def left_open(
         self, work: Work, start: int, end: int, vtid: int, worker: int, ran: bool
     ) -> None:
-        """Take an execution off its worker that could not do its work: its context has ended."""
+        """Free the worker of an execution that could not finish because its context has ended."""
         if self.record is not None and ran:
             self._record_run(work, start, end, vtid, worker)
         self.lend(work)
@@ -581,7 +581,7 @@ class Engine:
         self._decided(now)
 
     def _record_run(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
-        """Record that a callback has run which no DAG declares, or which goes on later."""
+        """Record the run of an undeclared callback, or of one that goes on later."""
         record = self.record
         assert record is not None
         _, dag, job, vertex = work.origin or NO_ORIGIN
@@ -596,18 +596,18 @@ class Engine:
         record('callback_end', end, vtid, address)
 
     def release_of(self, work: Work) -> int:
-        """Return the release of the job that a declared execution belongs to; it is not over."""
+        """Return the release of the job of a declared execution; the job must not have ended."""
         assert work.origin is not None
         return self._state.job_release[work.origin.slot]
 
     def _decided(self, now: int) -> None:
-        """Carry out what the core has decided since the last call."""
+        """Carry out the core's decisions since the last call."""
         decisions = self.scheduler.decisions()
-        if self._finished:  # it was judged already, and the trace is closed
+        if self._finished:  # the run was judged already, and the trace is closed
             return
         for x in self.verdicts.add(decisions, now):
             work = self._work.pop(x, None)
-            if work is not None:  # the core dropped it: of an aborted job, or for a newer one
+            if work is not None:  # dropped by the core: of an aborted job, or for a newer one
                 work.entity.waiting.pop(x, None)
                 work.x = -1
                 origin = work.origin or NO_ORIGIN
@@ -616,11 +616,11 @@ class Engine:
 
     @property
     def is_judging(self) -> bool:
-        """Return whether there are verdicts about jobs that are released now."""
+        """Return whether jobs that are released now are judged."""
         return self._state.scalars[JUDGE_FROM] < NEVER
 
     def set_judging(self, judging: bool, since: int | None, now: int) -> None:
-        """Give verdicts about jobs released from now (or a time) on, or about none for now."""
+        """Judge jobs released from now (or a time) on, or none for now."""
         release = NEVER if not judging else now if since is None else since
         judge_from(self._state, release)
         if self.record is not None:
@@ -637,14 +637,14 @@ class Engine:
     # --- debugging -------------------------------------------------------------------------------
 
     def size(self) -> int:
-        """Return how many jobs and executions there are to ``validate``."""
+        """Return the number of jobs and executions that ``validate`` checks."""
         return len(self._state.job_dag) + len(self._state.x_state)
 
     def validate(self) -> None:
         """
-        Check all that is always true between two calls.
+        Check the invariants that hold between two calls.
 
-        :raises InvariantError: when something is not.
+        :raises InvariantError: when one is violated.
         """
         broken = [
             *broken_invariants(self.tables, self._state), *self.deadlines.broken_invariants(),
@@ -682,10 +682,10 @@ class Engine:
 
     def finish(self, now: int, end: int | None = None) -> None:
         """
-        Judge what is open, once, when the run ends.
+        Judge open jobs, once, when the run ends.
 
-        :param end: when it began to start nothing more, if that was before now: what ran has ended
-            since, but a deadline after it could no longer be met.
+        :param end: when executions stopped starting, if that was before now: running ones have
+            ended since, but later deadlines are not judged.
         """
         end = now if end is None else end
         self.scheduler.expire_idle(end)
