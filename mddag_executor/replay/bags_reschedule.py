@@ -5,15 +5,16 @@ Ordinary bags rescheduled: recorded sensor messages as releases, declared execut
 
 Theory of operation
 -------------------
-* A DAG whose source is a subscription has a job for each message of its topic in the bag, ready
-  when the message came.  Its release is what the declaration's `release_from` says: the arrival,
-  the stamp in the message's header, or its publication, where the recorder kept that.  Where a
-  message has no such stamp, or one later than its arrival, it is released at its arrival.
+* A DAG whose source is a subscription has a job for each message of its topic in the bag, ready at
+  its arrival.  Its release is as declared by `release_from`: the arrival, the header stamp, or the
+  publication if the recorder stored it.  If a message has no such stamp, or a stamp after its
+  arrival, it is released at its arrival.
 * A DAG whose source is a timer has jobs at k * T from the bag's first message on, while messages
-  come (see ``trace.times``): when the timers really ran is not in a bag.
+  arrive (see ``trace.times``): a bag does not have the real times of timers.
 * Execution times are drawn for each execution from the declared quantiles (seeded), or come from a
   table, fixed for the whole run.
-* What is not in a bag is left out and said: transport, dispatch, what else the machine did.
+* Data that a bag does not have is ignored, and reported: transport, dispatch, other load of the
+  machine.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _CALLED = {'header_stamp': 'header stamp', 'source_timestamp': 'publication time
 
 
 class Source(NamedTuple):
-    """What became of a DAG's source: jobs as pairs (ready, release), ns, and what to say of it."""
+    """The jobs of a DAG's source as pairs (ready, release), ns, and notes about them."""
 
     jobs: list[tuple[int, int]]
     note: str
@@ -49,9 +50,9 @@ class Source(NamedTuple):
 
 class _Builder:
     """
-    Makes a load of the messages of a bag.
+    Makes a load from the messages of a bag.
 
-    :ivar notes: what was assumed, one line each; ``warnings``: what is missing or doubtful.
+    :ivar notes: assumptions, one line each; ``warnings``: missing or doubtful data.
     """
 
     def __init__(self, bag: Bag, task_set: TaskSet) -> None:
@@ -137,7 +138,7 @@ class _Builder:
         return Source(sorted(jobs), f'{counted(len(jobs), "job")} from the {what} of {topic}')
 
     def _timer_jobs(self, period: int) -> list[tuple[int, int]]:
-        """Return the jobs of a timer: at its period, while messages came."""
+        """Return the jobs of a timer: at its period, while messages arrive."""
         found: list[tuple[int, int]] = []
         for start, end in self._bag.stretches:
             first = self._start - (self._start - start) // period * period
@@ -180,15 +181,16 @@ def reschedule_bag(
     cpus: int | None = None,
 ) -> Reschedule:
     """
-    Run the core over the messages of an ordinary bag.
+    Run the core with the messages of an ordinary bag.
 
     :param path: a bag's folder, or one of its files.
     :param policy: a row of ``mddag_executor.core.POLICIES``; None: `rad`.
-    :param workers: size of the pool; None: as declared, else 7.
+    :param workers: size of the pool; None: as declared, otherwise 7.
     :param times: execution times by DAG and vertex, ns; None: drawn from the declared ones.
     :param dispatch_overhead: added to each execution, ns.
-    :param skip: how long after the bag's first message jobs are not judged (a warm-up), ns.
-    :param cpus: that those who compute share; None: enough for all.
+    :param skip: warm-up time after the bag's first message; jobs released in it are not judged,
+        ns.
+    :param cpus: shared by executions that compute; None: enough for all.
     """
     policy = policy or 'rad'
     find_policy(policy).mode(preemptive)

@@ -1,11 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Replay rescheduled: what the core would have done with the recorded releases.
+Replay rescheduled: the recorded load, scheduled again by the core.
 
-The recorded load (see ``load``) goes through the core in virtual time.  What
-became of a job in the recording does not matter, only when it was released, how long its callbacks
-took, and how long the executor took to notice, to dispatch and to carry messages.
+The recorded load (see ``load``) is scheduled in virtual time.  Recorded ends of jobs don't matter,
+only their releases, execution times, and the executor's times for noticing, dispatch and
+transport.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ import numpy as np
 
 class Reschedule:
     """
-    What the core makes of a load that was recorded.
+    The schedule of a recorded load.
 
     :param work: the load, made from a run or from a bag.
     :param start: when the recording began, ns.
-    :param about: what the result says of the recording.
-    :param recorded: the same run as it was; None: it was a bag.
-    :param notes: what was assumed, one line each.
-    :ivar processes: which nodes run in which process; empty: all in one.
+    :param about: the result's part about the recording.
+    :param recorded: the replay as recorded; None: it was a bag.
+    :param notes: assumptions, one line each.
+    :ivar processes: nodes of each process; empty: one process.
     :ivar workers: of all processes.
-    :ivar decisions: what the core decided; ``busy``: how long each worker was busy, ns.
-    :ivar warnings: what is missing or doubtful, one line each.
+    :ivar decisions: decisions of the core; ``busy``: by worker its busy time, ns.
+    :ivar warnings: missing or doubtful data, one line each.
     """
 
     def __init__(
@@ -77,22 +77,22 @@ class Reschedule:
 
     @cached_property
     def log(self) -> Sequence[LogEntry]:
-        """Return every start, end and preemption, on the recording's clock; it runs once more."""
+        """Return starts, ends and preemptions, on the recording's clock; runs the load again."""
         return self._run(self.work.load, self.settings, log=True).log
 
     @property
     def worker_names(self) -> list[str]:
-        """Return what workers are called, where that is more than a number."""
+        """Return the names of workers, if they are more than a number."""
         return [f'{process.name} {w}' for process in self.processes
                 for w in range(self.settings.workers)]
 
     @property
     def duration_ns(self) -> int:
-        """Return how long the recording is."""
+        """Return the duration of the recording."""
         return max(0, self.settings.duration_ns - self._start)
 
     def computed(self) -> ComputedRun:
-        """Return the schedule, to be played to observers."""
+        """Return the schedule as a computed run."""
         load, edges = self.work.load, edge_numbers(self.tables)
         end = self.settings.duration_ns
 
@@ -109,7 +109,7 @@ class Reschedule:
         return self.work.jobs[dag][job]
 
     def result(self) -> dict[str, Any]:
-        """Return the result format of ``replay --json``, with the recorded run beside it."""
+        """Return the result format of ``replay --json``, including the recorded run."""
         duration, settings, work = self.duration_ns, self.settings, self.work
         verdicts = self.tally.result()
         miss = verdicts['first_miss']
@@ -158,28 +158,27 @@ def reschedule(
     processes: Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None = None,
 ) -> Reschedule:
     """
-    Run the core over the releases and execution times of a trace.
+    Run the core with the releases and execution times of a trace.
 
     :param path: a trace of this executor.
     :param task_set: the declaration to schedule by; None: the one in the trace.
     :param policy: a row of ``mddag_executor.core.POLICIES``; None: as recorded.
     :param workers: size of the pool of each process; None: as recorded.
-    :param preemptive: whether a smaller key takes the worker of a larger one; None: as recorded,
-        where the policy can.
-    :param on_late: what is done with late jobs of a DAG that does not declare it.
-    :param overheads: whether noticing, dispatch and transport take the time that they took in the
-        recording, or none.
+    :param preemptive: whether a smaller key preempts a larger one; None: as recorded, if the
+        policy supports it.
+    :param on_late: handling of late jobs of a DAG that does not declare it.
+    :param overheads: whether noticing, dispatch and transport take their recorded times, or none.
     :param dispatch_overhead: added to each execution, ns.
-    :param name: what messages call the trace, where that is not its path.
-    :param progress: called now and then with the number of events read so far.
-    :param skip: how long after the first release jobs are not judged (a warm-up), ns.
-    :param cpus: that those who compute share; None: as recorded, enough where that is not known.
-    :param processes: returns which node runs in which process, from the task set and the time of
-        each vertex; None: as recorded, or as ``task_set`` says.
-    :raises mddag_executor.trace.TraceError: when it is no trace.
-    :raises mddag_executor.replay.ReplayError: when there is nothing in it to replay, none of the
+    :param name: the trace's name in messages, if not its path.
+    :param progress: called regularly with the number of events read.
+    :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
+    :param cpus: shared by executions that compute; None: as recorded, enough for all if unknown.
+    :param processes: returns the nodes of each process, from the task set and the time of each
+        vertex; None: as recorded, or as in ``task_set``.
+    :raises mddag_executor.trace.TraceError: if the file is not a trace.
+    :raises mddag_executor.replay.ReplayError: if the trace has nothing to replay, none of the
         declaration's callbacks, or an execution time that is neither recorded nor declared.
-    :raises mddag_executor.errors.MddagError: on a policy or number of workers that cannot be.
+    :raises mddag_executor.errors.MddagError: for an invalid policy or number of workers.
     """
     if policy is not None:
         find_policy(policy).mode(bool(preemptive))
@@ -220,7 +219,7 @@ def reschedule(
             'give a GRAPH that declares it')
     tables = with_groups(
         tables, builder.callback_of, run.who.groups, declared_first=not run.same)
-    del builder     # what it holds, the load has too
+    del builder     # the load has copies of its data
     give_back()
     warnings = recorded.warnings
     if cpus is not None and run.declared and len(work.load.computed) == 0:
@@ -246,9 +245,9 @@ def _placed(
     run: Recording, recorded: Sequence[Process], builder: LoadBuilder
 ) -> Sequence[Process]:
     """
-    Return the processes of a recording, or those of another declaration that judges it.
+    Return the processes of a recording, or of another declaration that judges it.
 
-    The trace of one process of several has callbacks of that only.
+    The trace of one of several processes only has the callbacks of that process.
     """
     declared = run.task_set.processes
     if recorded:
@@ -261,7 +260,7 @@ def _placed(
 def _settings(
     head: Head, name: str, policy: str | None, workers: int | None
 ) -> tuple[str, int]:
-    """Return policy and workers: as asked for, or else as recorded."""
+    """Return policy and workers as requested, otherwise as recorded."""
     if policy is None:
         policy = head.policy
         if policy not in POLICIES:
@@ -281,11 +280,11 @@ def with_groups(
     tables: Tables, callback_of: dict[int, int], groups: dict[int, int], declared_first: bool
 ) -> Tables:
     """
-    Return tables with the callback groups that callbacks had in the recording.
+    Return tables with the callback groups of the recording.
 
     :param callback_of: by global vertex the callback that ran as it.
     :param groups: by callback its group in the recording, -1 for a reentrant one.
-    :param declared_first: whether declared groups go before recorded ones.
+    :param declared_first: whether declared groups have priority over recorded ones.
     """
     numbers: dict[tuple[bool, int], int] = {}
     column = []

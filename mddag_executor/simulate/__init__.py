@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Simulation in virtual time: the core over releases and execution times."""
+"""Simulation in virtual time: the core with given releases and execution times."""
 
 from mddag_executor.simulate.engine import END, LogEntry, PREEMPT, START
 from mddag_executor.simulate.errors import SimulationError

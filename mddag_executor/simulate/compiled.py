@@ -1,10 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Runs in the compiled core: calls of the entry points of ``kernel`` with memory that they use.
+Runs of the compiled core: calls the entry points of ``kernel`` with memory for their data.
 
-A structure has three words for each field: those of a vector (address, length, capacity; see
-``vectors``), or an integer in the first of them.
+A structure has three words for each field: the words of a vector (address, length, capacity; see
+``vectors``), or an integer in the first word.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 ACCEPT_RUNS, RUN_ONCE = 'accept_runs', 'run_once'
 """The entry points: of ``evaluate``, and of everything else."""
 _WORD = 8
-_COMPILE_S = {ACCEPT_RUNS: 15.0, RUN_ONCE: 40.0}    # about how long compiling takes
+_COMPILE_S = {ACCEPT_RUNS: 15.0, RUN_ONCE: 40.0}    # approximate compile times
 
 
 def check_available() -> None:
@@ -46,7 +46,7 @@ def check_available() -> None:
 
 
 def pays(name: str, plain_s: float) -> bool:
-    """Return whether compiled code is sooner done with work that takes plain Python this long."""
+    """Return whether compiled code is faster for work that takes plain Python this long."""
     return available() and (plain_s > _COMPILE_S[name] or _is_compiled(name))
 
 
@@ -58,7 +58,7 @@ def _is_compiled(name: str) -> bool:
 
 
 def prepare(name: str) -> None:
-    """Compile an entry point, or load what was compiled before, by a call that runs nothing."""
+    """Compile an entry point, or load it from disk, with a call that runs nothing."""
     if not _is_compiled(name):
         progress.report(f'compiling the core, once: about {_COMPILE_S[name]:.0f} s')
     if name == RUN_ONCE:
@@ -75,7 +75,7 @@ class AcceptRuns:
     """
     Simulates runs up to their first miss, in compiled code; several threads may call it.
 
-    :param load: that of all runs, except for its costs.
+    :param load: the load of all runs, except for its costs.
     """
 
     def __init__(self, tables: Tables, load: Load) -> None:
@@ -88,7 +88,7 @@ class AcceptRuns:
         self, settings: Settings, times: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.bool_]:
         """Return which runs, with the execution times of their rows, have no miss."""
-        load = self._load.copy()  # its costs become those of each run
+        load = self._load.copy()  # its costs are replaced for each run
         working = EmptyMemory(len(State._fields))
         times = np.ascontiguousarray(times, dtype=np.int64)
         accepted = np.zeros(len(times), dtype=np.bool_)
@@ -106,9 +106,9 @@ def run_once(
     tables: Tables, load: Load, policy: str, orders: Orders
 ) -> tuple[int, Sequence[LogEntry], Sequence[Decision], list[int]]:
     """
-    Run a load as ``engine.run_load`` does.
+    Run a load like ``engine.run_load``.
 
-    :return: the end, the log of every worker, the decisions, how long each worker was busy.
+    :return: the end, the log of every worker, the decisions, the busy time of each worker.
     """
     lent = [LentTuple(tables, list(POLICIES).index(policy)), LentTuple(load), LentTuple(orders)]
     state, _, _, busy, log = working = [
@@ -141,7 +141,7 @@ class LentTuple:
 
     @property
     def address(self) -> int:
-        """Return where the structure is, as long as this object lives."""
+        """Return the address of the structure, valid as long as this object lives."""
         return int(self._words.ctypes.data)
 
     def copy(self) -> LentTuple:
@@ -159,11 +159,11 @@ class EmptyMemory:
 
     @property
     def address(self) -> int:
-        """Return where it is, as long as this object lives."""
+        """Return its address, valid as long as this object lives."""
         return int(self._words.ctypes.data)
 
     def words(self, field: int, width: int) -> npt.NDArray[np.int64]:
-        """Return a copy of a field, which is a vector of elements with so many words."""
+        """Return a copy of a field, a vector whose elements have ``width`` words."""
         address, length = self._words[3 * field:3 * field + 2].tolist()
         if length == 0:
             return np.empty((0, width), dtype=np.int64)
@@ -171,12 +171,12 @@ class EmptyMemory:
         return np.ctypeslib.as_array(data).reshape(length, width).copy()
 
     def rows(self, field: int, width: int) -> Rows:
-        """Return the same as tuples."""
+        """Return a field as tuples."""
         return Rows(self.words(field, width))
 
 
 class Rows(Sequence[tuple[int, ...]]):
-    """Rows of integers as tuples, made on access: the array takes a sixth of their memory."""
+    """Rows of integers as tuples, made on access: the array needs a sixth of their memory."""
 
     _SOME = 8192
 

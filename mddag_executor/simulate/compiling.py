@@ -1,19 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The core's own source compiled to machine code.
+Compiles the core's own source to machine code.
 
 Theory of operation
 -------------------
-The functions of the core and of the event loop are used as they are: each is bound to one common
-namespace, in which the names of the others mean their compiled versions, and the names of
-``heapq`` mean those of ``vectors``.  There is no second copy of a rule.  Only ``add_queue`` is
-replaced, as an empty list has no type.  The policy is an additional field of the tables, and the
-key function dispatches on it, so that all policies need one compilation.
+The functions of the core and of the event loop are used unchanged: each is bound to a common
+namespace, in which the names of the others refer to their compiled versions, and the names of
+``heapq`` to those of ``vectors``.  No rule exists twice.  Only ``add_queue`` is replaced, because
+an empty list has no type.  The policy is an additional field of the tables; the key function
+selects by it, so one compilation is enough for all policies.
 
-numba keeps the machine code of the entry points (``kernel``) on disk, as ``cache=True`` says.  It
-only checks the file of the entry point itself, so a hash of all sources is part of the name under
-which the code is kept.  numba is imported, and anything compiled, on first use only.
+numba stores the machine code of the entry points (``kernel``) on disk (``cache=True``).  It only
+checks the file of the entry point itself, so a hash of all sources is part of the stored name.
+numba is imported, and code is compiled, on first use only.
 """
 
 from __future__ import annotations
@@ -69,15 +69,16 @@ def entry_points() -> dict[str, Callable[..., Any]]:
 
 def _cached(function: FunctionType, sources: str) -> Any:
     from numba import njit
-    function.__qualname__ = f'{function.__name__}_{sources}'    # in the names of numba's files
+    # part of the names of numba's files
+    function.__qualname__ = f'{function.__name__}_{sources}'
     try:
         return njit(error_model='numpy', nogil=True, cache=True)(function)
-    except RuntimeError:    # no folder to write to
+    except RuntimeError:    # no writable folder
         return njit(error_model='numpy', nogil=True)(function)
 
 
 def _functions(module: ModuleType) -> list[tuple[str, FunctionType]]:
-    """Return the functions that a module itself defines and that are to be compiled."""
+    """Return the functions of a module that are to be compiled."""
     return [
         (name, value) for name, value in vars(module).items()
         if isinstance(value, FunctionType) and value.__module__ == module.__name__
@@ -85,7 +86,7 @@ def _functions(module: ModuleType) -> list[tuple[str, FunctionType]]:
 
 
 def _bound(function: FunctionType, space: dict[str, Any]) -> FunctionType:
-    """Return a function with the same code, whose globals are those of a namespace."""
+    """Return a function with the same code and another global namespace."""
     return FunctionType(function.__code__, space, function.__name__, function.__defaults__)
 
 

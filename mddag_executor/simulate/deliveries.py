@@ -1,18 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Messages in virtual time, if they take time or executions may fail.
+Messages in virtual time, if transport takes time or executions may fail.
 
 Theory of operation
 -------------------
-If messages take time, an edge to a successor comes true ``delay`` after its vertex completes; the
-core gets each by ``rules.edge``.  A negative delay: the callback published before its end.  Then
-the edge comes true that long before the end, but not before the execution began.  With
-preemption, edges come true at the end.  A delay of NEVER means that nothing is published.
-If executions may be stopped (see ``machine``), the end is not known in advance; but the progress
-of the execution when it publishes, its *place*, is.
+If transport takes time, an edge to a successor is satisfied ``delay`` after its vertex completes;
+the core gets each edge by ``rules.edge``.  With a negative delay the callback published before its
+end: the edge is satisfied that long before the end, but not before the start.  With preemption,
+edges are satisfied at the end.  A delay of NEVER means that nothing is published. If executions
+may be stopped (see ``machine``), the end is not known in advance, but the *place* is: the progress
+of the execution when it publishes.
 
-A message whose job has ended meanwhile is ignored.
+A message is ignored if its job has ended.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ from mddag_executor.simulate.load import FAILS, Load, place_of
 from mddag_executor.simulate.machine import Machine
 
 DELAY_NS = 1_000_000
-"""Time of a message to another process of this machine, whose interpreter is in use."""
+"""Time of a message to another process of this machine whose interpreter is busy."""
 
 
 class Deliveries(NamedTuple):
     """
-    The messages of one run of a state that was made with ``propagate=2``; empty to begin with.
+    The messages of one run of a state made with ``propagate=2``; initially empty.
 
-    ``messages`` are those under way, a heap: (time, order, slot, job, vertex that it starts);
-    ``sent`` has one element: how many there were.  ``next_vertex`` says, by execution that runs
-    and may be stopped, what it starts next before its end, at ``Machine.publishes_at``.
+    ``messages`` is a heap of messages in transport: (time, order, slot, job, vertex that it
+    starts); ``sent`` has one element, their total number.  ``next_vertex`` has, by running
+    execution that may be stopped, the vertex that it starts next before its end, at
+    ``Machine.publishes_at``.
     """
 
     messages: list[QueueEntry]
@@ -51,7 +52,7 @@ def next_arrival(d: Deliveries) -> int:
 
 
 def delay_of(t: Tables, s: State, load: Load, x: int, edge: int) -> int:
-    """Return how long after the end of an execution an edge of its vertex comes true."""
+    """Return how long after the end of an execution an edge of its vertex is satisfied."""
     slot = s.x_slot[x]
     dag = s.job_dag[slot]
     return load.delays[load.delay_base[dag] + s.job_index[slot] * load.delay_stride[dag]
@@ -61,7 +62,7 @@ def delay_of(t: Tables, s: State, load: Load, x: int, edge: int) -> int:
 def sends_at_start(
     t: Tables, s: State, load: Load, d: Deliveries, m: Machine | None, x: int, now: int
 ) -> None:
-    """Send what an execution that starts publishes before or after its end, as far as known."""
+    """Send the messages of a started execution, as far as their times are known."""
     vertex = s.x_vertex[x]
     first, end = t.first_successor[vertex], t.first_successor[vertex + 1]
     if s.scalars[PREEMPTIVE] != 0 or first == end:
@@ -82,7 +83,7 @@ def sends_at_start(
 def _find_next_place(
     t: Tables, s: State, load: Load, d: Deliveries, m: Machine, x: int
 ) -> None:
-    """Find what an execution publishes next before its end, and how far it is then."""
+    """Find the next publication of an execution before its end, and its place."""
     vertex = s.x_vertex[x]
     last_place, last = m.publishes_at[x], d.next_vertex[x]
     place, after = NEVER, -1
@@ -101,7 +102,7 @@ def ends_sending(
     t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine | None, x: int,
     now: int,
 ) -> None:
-    """End an execution, and send what it publishes."""
+    """End an execution, and send its messages."""
     slot, vertex = s.x_slot[x], s.x_vertex[x]
     job = s.job_index[slot]
     if m is not None:
@@ -123,11 +124,11 @@ def ends_sending(
 def arrive_due(
     t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine | None, now: int
 ) -> None:
-    """Make the edges true whose messages arrive now, in the order in which they were sent."""
+    """Satisfy the edges whose messages arrive now, in the order of sending."""
     while len(d.messages) > 0 and d.messages[0][0] <= now:
         message = heappop(d.messages)
         _arrive(t, s, key, message[2], message[3], message[4], now)
-    if m is not None:  # what running executions publish now, before their end
+    if m is not None:  # publications of running executions before their end
         for worker in range(len(s.worker_x)):
             x = s.worker_x[worker]
             if x >= 0 and m.publishes_at[x] < NEVER:

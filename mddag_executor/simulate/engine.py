@@ -7,18 +7,18 @@ Theory of operation
 -------------------
 Time jumps from event to event; an event is the release of a job or the end of an execution.  At
 one instant first the completions are given to the core, workers in ascending order, then the
-releases in DAG order, then the core dispatches until it has nothing left to do (design section 9).
-A completion at the horizon counts; nothing is released or dispatched there any more.
+releases in DAG order, then the core dispatches until nothing is left to do (design section 9). A
+completion at the horizon counts; nothing is released or dispatched from then on.
 
-If messages take time or executions fail, ``deliveries`` ends the executions, and the messages of
-an instant arrive between its completions and its releases.  If CPUs are few or executions hold the
-interpreter, ``machine`` computes after each instant when the running ones finish.
+If transport takes time or executions fail, ``deliveries`` ends the executions, and the messages of
+an instant arrive between its completions and its releases.  If CPUs are limited or executions hold
+the GIL, ``machine`` computes after each instant when the running executions finish.
 
-A job's deadlines count from its release, which is the time at which its source becomes ready,
-unless ``releases`` says that it was earlier (a sensor's message that arrived later).
+A job's deadlines count from its release.  This is the time at which its source becomes ready,
+unless ``releases`` has an earlier time (a sensor's message that arrived later).
 
-Like the rules this is plain integer arithmetic on lists, so that it can be compiled as it is;
-arguments that are None cost nothing then.
+Like the rules this is integer arithmetic on lists, so that it can be compiled unchanged; arguments
+that are None then cost nothing.
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ def run_load(
     busy: list[int], log: list[LogEntry], progress: Callable[[int], None] | None,
 ) -> int:
     """
-    Run the core over a load (see ``run``) with a state and so on that are all empty.
+    Run the core over a load (see ``run``) with an empty state, deliveries and machine.
 
-    :param busy: gets for each worker how long it was busy, ns; ``log`` what they did, if kept.
+    :param busy: receives by worker its busy time, ns; ``log``: the log of the workers, if wanted.
     """
     sends = len(load.delay_base) > 0
     stops = len(load.holds) > 0 or o.cpus < NEVER
@@ -132,10 +132,9 @@ def run(
     """
     Run the core over a load and return the time at which the run ended, ns.
 
-    Decisions are left in ``s.decisions``.  With ``stop_at_first_miss`` the run ends with the
-    instant at which the first miss is known: a late completion, an expiry or an abort.
-    ``progress`` gets the virtual time at each event.  To ``busy`` is added how long each worker
-    was busy.
+    Decisions are in ``s.decisions``.  With ``stop_at_first_miss`` the run ends with the instant at
+    which the first miss is known: a late completion, an expiry or an abort.  ``progress`` receives
+    the virtual time at each event.  The busy time of each worker is added to ``busy``.
     """
     n_workers = len(s.worker_x)
     finish_at = [NEVER] * n_workers
@@ -211,7 +210,7 @@ def _end_busy(busy: list[int] | None, since: list[int], now: int) -> None:
 def release_load(
     t: Tables, s: State, key: KeyFunction, load: Load, i: int, now: int
 ) -> None:
-    """Release the i-th job of a load, with the execution times that the load gives it."""
+    """Release the i-th job of a load, with its execution times."""
     dag = load.dags[i]
     job = load.jobs[i]
     release = load.releases[i] if len(load.releases) > 0 else now
@@ -239,7 +238,7 @@ def _dispatch(
     running: list[int], since: list[int], busy: list[int] | None, log: list[LogEntry] | None,
     deliveries: Deliveries | None, machine: Machine | None,
 ) -> None:
-    """Dispatch what is to run now; ``running`` is for the preempted executions of the log."""
+    """Dispatch executions; ``running`` has the preempted executions for the log."""
     if machine is not None:
         decide(t, s, machine, now)
     x = rules.schedule(t, s, key, now)

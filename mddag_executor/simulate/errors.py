@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What can be wrong with a simulation."""
+"""Errors of simulations."""
 
 from __future__ import annotations
 

@@ -5,18 +5,19 @@ The time that processes need to notice messages and timers, in virtual time.
 
 Theory of operation
 -------------------
-1. Each process has one more thread, its *intake*.  It notices that a timer is due, and receives
-   the messages of other processes.  (Within a process the publishing thread delivers them.)
-2. For that it needs Python's lock of its process (``machine``): where a callback computes, it
-   waits a switch interval, in which the callback is stopped.  What the message or timer starts is
+1. Each process has an additional thread, its *intake*.  It notices due timers, and receives the
+   messages of other processes.  (Within a process the publishing thread delivers them.)
+2. The intake needs the GIL of its process (``machine``).  If a callback computes, the intake waits
+   for a switch interval; then the callback is stopped.  The callback of the message or timer is
    ready when the intake has noticed it.
-3. So a *way* into a process, the edge from a vertex of another one, or to a source that is a
-   timer, gets one more vertex.  It has no group, holds nothing, and belongs to a pool of one
-   worker, numbered after those of the processes: the most urgent message is received first.
-4. Timers that are due while another one of their process is noticed are noticed with it.
+3. So a *way* into a process gets an additional vertex.  A way is an edge from a vertex of another
+   process, or to a source that is a timer.  The vertex has no group, holds nothing, and belongs to
+   a pool of one worker, numbered after those of the processes: the most urgent message is received
+   first.
+4. Timers that are due while another timer of their process is noticed are noticed with it.
 
-The outcome of a run is in terms of the tables without these vertices.  The log has the end of a
-vertex ``~v`` when the intake has noticed what starts vertex ``v``.
+Results of a run are in terms of the tables without these vertices.  The log has the end of a
+vertex ``~v`` when the intake has noticed the trigger of vertex ``v``.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from msg_graph import Dag, TaskSet, Vertex
 import numpy as np
 
 Way = tuple[int | None, int]
-"""Two local vertices: one that sends to another process (or None: a timer), and the next."""
+"""Two local vertices: the sender in another process (None: a timer), and the next vertex."""
 
 
 class Costs(NamedTuple):
     """
-    What intakes cost, ns; by default as on a machine with two cores.
+    The costs of intakes, ns; the defaults are of a machine with two cores.
 
-    :ivar timer_ns: a timer of the interpreter, ``timer_ready_ns`` from when it is due until its
-        callback is ready where nothing computes; ``message_ns`` a message of another process,
-        ``message_ready_ns`` from when its publisher has ended.
+    :ivar timer_ns: GIL time of a timer; ``timer_ready_ns``: from due until its callback is ready,
+        if nothing computes; ``message_ns``: GIL time of a message of another process;
+        ``message_ready_ns``: from the end of its publisher.
     :ivar send_ns: the additional cost of a message to another process for its publisher.
     """
 
@@ -54,17 +55,17 @@ class Costs(NamedTuple):
 
     @property
     def timer_rest(self) -> int:
-        """Return what the intake still takes when the timer's callback is ready."""
+        """Return the remaining time of the intake when the timer's callback is ready."""
         return max(0, self.timer_ns - self.timer_ready_ns)
 
     @property
     def message_rest(self) -> int:
-        """Return the same of a message."""
+        """Return the remaining time of the intake when the message's callback is ready."""
         return max(0, self.message_ns - self.message_ready_ns)
 
     @property
     def delay_ns(self) -> int:
-        """Return how long a message is on its way to the intake."""
+        """Return the transport time of a message to the intake."""
         return max(0, self.message_ready_ns - self.message_ns)
 
 
@@ -72,7 +73,7 @@ class Intakes:
     """
     The intakes of the processes of a run.
 
-    :param tables: of the task set; they say what runs in which process.
+    :param tables: of the task set, with the process of each vertex.
     """
 
     def __init__(
@@ -87,7 +88,7 @@ class Intakes:
         built = Tables.build(
             replace(task_set, dags=tuple(map(_with_intakes, task_set.dags, self._ways))),
             default_deadline=tables.dag_deadline[-1])
-        # by vertex which one it is without intakes, or ~ of the one that is noticed
+        # by vertex its number without intakes, or ~ of the vertex that is noticed
         self._vertex: list[int] = []
         for first, dag, ways in zip(tables.first_vertex, task_set.dags, self._ways):
             self._vertex += range(first, first + len(dag.vertices))
@@ -104,7 +105,7 @@ class Intakes:
     def schedule(
         self, load: Load, settings: Settings, *, log: bool = False, compiled: bool | None = None,
     ) -> Scheduled:
-        """Run the core over a load, as ``schedule`` does, with what the intakes do in it."""
+        """Run the core over a load like ``schedule``, with the work of the intakes."""
         ended, entries, decisions, busy = schedule(
             self._tables, self._load(load), replace(settings, intakes=True), log=log,
             compiled=compiled)
@@ -121,7 +122,7 @@ class Intakes:
             busy[:settings.workers * settings.processes])
 
     def _load(self, load: Load) -> Load:
-        """Return a load with what the intakes do in it, and a row for each job."""
+        """Return a load with the work of the intakes, and a row for each job."""
         counts = np.bincount(
             np.asarray(load.dags, dtype=np.int64), minlength=len(self._ways)).tolist()
         given: dict[str, Any] = {
@@ -145,9 +146,9 @@ class Intakes:
         return self._join_rounds(grown)
 
     def _wider(self, dag: int, block: Any, name: str, times: int) -> Any:
-        """Return what a column has of a DAG, so many times, with that of the intakes."""
+        """Return the block of a DAG in a column, repeated, with the values of the intakes."""
         if dag >= len(self._ways):
-            return block    # the undeclared
+            return block    # the undeclared callbacks
         rows = np.tile(block.reshape(-1, self._plain.n_region[dag]), (times, 1))
         added = np.zeros((len(rows), len(self._ways[dag])), dtype=np.int64)
         if name in ('costs', 'computed'):
@@ -163,7 +164,7 @@ class Intakes:
         return self._ways[dag][-1:] != [] and self._ways[dag][-1][0] is None
 
     def _join_rounds(self, load: Load) -> Load:
-        """Have timers that are due while another one is noticed be noticed with it (rule 4)."""
+        """Join the noticing of timers that are due while another is noticed (rule 4)."""
         times, dags, jobs, releases = (
             np.array(column, dtype=np.int64) for column in (
                 load.times, load.dags, load.jobs,
@@ -192,7 +193,7 @@ class Intakes:
         return load._replace(**columns)
 
     def _delays(self, load: Load) -> dict[str, Any]:
-        """Return the columns of how long messages take: to an intake, not from it."""
+        """Return the columns of transport times: to an intake, not from it."""
         if not load.delay_base:
             return {}
         numbers = edge_numbers(self._plain)
@@ -228,7 +229,7 @@ def _ways(dag: Dag, tables: Tables) -> list[Way]:
 
 
 def _with_intakes(dag: Dag, ways: list[Way]) -> Dag:
-    """Return a DAG with a vertex for each way, behind the others."""
+    """Return a DAG with a vertex for each way, after the others."""
     vertices, source = list(dag.vertices), dag.source
     for new, (before, after) in enumerate(ways, len(vertices)):
         later = vertices[after]

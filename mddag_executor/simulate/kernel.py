@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Entry points of the compiled core: whole runs, in memory that ``compiled`` lends them.
+Entry points of the compiled core: whole runs, in memory that ``compiled`` provides.
 
 They are only called compiled: the names of the core that they use are then bound to its compiled
 functions (see ``compiling``).  Structures are passed as addresses.
@@ -52,7 +52,7 @@ def free_state(state: int) -> None:
 
 
 def free_fields(structure: int, fields: int) -> None:
-    """Free the memory of a structure of vectors in which nothing is nested any more."""
+    """Free the memory of a structure of vectors without nested vectors."""
     for field in range(fields):
         free(as_vector(structure + 24 * field))
 
@@ -89,14 +89,14 @@ def run_once(
     tables: int, load: int, orders: int, state: int, deliveries: int, machine: int, busy: int,
     log: int,
 ) -> int:
-    """Run a load and return when it ended; the caller frees what it leaves."""
+    """Run a load and return when it ended; the caller frees the results."""
     return run_load(
         as_tables(tables), as_state(state), as_deliveries(deliveries), as_machine(machine),
         key_of_policy, as_load(load), as_orders(orders), as_vector(busy), as_log(log), None)
 
 
 def free_run(state: int, deliveries: int, machine: int, busy: int, log: int) -> None:
-    """Free what ``run_once`` left."""
+    """Free the results of ``run_once``."""
     free_state(state)
     queues = as_machine(machine).lock_queue
     for process in range(len(queues)):

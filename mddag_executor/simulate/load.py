@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What arrives in virtual time: releases, with all that is known of what they cause."""
+"""The load of a run in virtual time: releases, and the properties of their executions."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ class Load(NamedTuple):
     """
     Releases in order of (time, DAG), with the indices and execution times of their jobs.
 
-    Times are in ns.  The execution time of vertex v in job k of DAG d is ``costs[cost_base[d] +
-    k * cost_stride[d] + local index of v]``: a stride of zero gives every job the same times, the
+    Times are in ns.  The execution time of vertex v in job k of DAG d is ``costs[cost_base[d] + k
+    * cost_stride[d] + local index of v]``: a stride of zero gives every job the same times, the
     number of vertices of the DAG a row for each job.  The other columns are indexed like
     ``costs``, and may be empty:
 
     * ``releases``: by release, if a source becomes ready later (``times``) than it is released;
-    * ``holds``: which interpreter an execution holds (from 1; 0: none);
-    * ``computed``: its CPU time; -1: it waits, as far as is known.  Empty: it computes all the
-      time;
-    * ``locks``: whether it computes with Python's lock, as those do that hold the interpreter;
-    * ``warmth``: how much longer it took, ns, because its worker had slept before; below 0: how
-      much longer it would take on a worker that has slept;
-    * ``fates``: its fate (``RUNS``, …; ``SKIPPED`` is given at a source).
+    * ``holds``: the interpreter that an execution holds (from 1; 0: none);
+    * ``computed``: its CPU time; -1: it only waits, as far as is known.  Empty: it computes all
+      the time;
+    * ``locks``: whether it computes with the GIL, as executions that hold the interpreter do;
+    * ``warmth``: its extra time because its worker had slept before, ns; negative: its extra time
+      on a worker that has slept;
+    * ``fates``: its fate (``RUNS``, …; ``SKIPPED`` only at a source).
 
     ``delays[delay_base[d] + k * delay_stride[d] + e]`` is how long after a vertex's completion its
-    edge e in job k of DAG d comes true (see ``deliveries``); the edges of a DAG are numbered as in
-    ``Tables.successors``, from its first vertex on.
+    edge e in job k of DAG d is satisfied (see ``deliveries``); the edges of a DAG are numbered as
+    in ``Tables.successors``, from its first vertex on.
     """
 
     times: list[int]
@@ -59,18 +59,18 @@ def as_lists(load: Load) -> Load:
 
 
 def as_arrays(load: Load) -> Load:
-    """Return a load whose columns are arrays, which are faster to change and to lend."""
+    """Return a load whose columns are arrays, which are faster to change and to pass."""
     import numpy as np
     return Load(*(np.array(column, dtype=np.int64) for column in load))  # type: ignore[arg-type]
 
 
 def needs_python(load: Load) -> bool:
-    """Return whether executions that do not hold the interpreter need it at their end."""
+    """Return whether executions that do not hold the interpreter need the GIL at their end."""
     return len(load.computed) > 0 and len(load.holds) > 0
 
 
 def place_of(s: State, load: Load, x: int) -> int:
-    """Return the place of an execution in ``load.costs``."""
+    """Return the index of an execution in ``load.costs``."""
     slot = s.x_slot[x]
     dag = s.job_dag[slot]
     return (load.cost_base[dag] + s.job_index[slot] * load.cost_stride[dag]

@@ -1,29 +1,31 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The machine in virtual time: CPUs, and the interpreter that one thread at a time computes with.
+The machine in virtual time: CPUs, and the GIL, with which one thread at a time computes.
 
 Theory of operation
 -------------------
-In isolation, an execution takes its cost.  What it needs depends on its progress; in order
+In isolation, an execution takes its cost.  It passes through these parts, in this order:
 
-1.  it computes with Python's lock: half of its CPU time if it computes with the lock, all of it if
-    it hardly waits; if it only waits, the little that Python needs to begin;
-2.  it computes without the lock: CPU time of one that computes and does not hold the interpreter;
-3.  it waits, and needs nothing;
-4.  it computes with the lock again: the rest of its CPU time, in which it publishes.
+1. it computes with the GIL: half of its CPU time if it computes with the GIL, all of it if it
+   hardly waits; a short time to begin if it only waits;
+2. it computes without the GIL: CPU time of an execution that does not hold the interpreter;
+3. it waits, and needs nothing;
+4. it computes with the GIL again: the rest of its CPU time, in which it publishes.
 
-If what it needs is not free, it is stopped.  The rules of the core (rule 11) decide which of the
-executions that hold the interpreter are started; this module, how the running ones share it:
+An execution that does not get the GIL or CPU that it needs is stopped.  The rules of the core
+(rule 11) decide which executions that hold the interpreter are started.  This module decides how
+running executions share it:
 
-* **The lock.**  An execution keeps it until it needs it no more, or until another one has waited
-  for a *switch interval*; then they alternate, in the order in which they asked, as in CPython.
-  What starts when an execution of its process ends goes on in its thread, and with the lock.
-* **CPUs.**  Executions that compute share the CPUs; of those with the lock only the one that has
-  it.  If there are too many, they alternate by *slices*; what begins to compute goes first.
+* **The GIL.**  An execution keeps it until it no longer needs it, or until another one has waited
+  for a *switch interval*.  Then they alternate, in the order of their requests, as in CPython. An
+  execution that starts when another one of its process ends continues in its thread, with the GIL.
+* **CPUs.**  Executions that compute share the CPUs; of those that need the GIL only its holder
+  does.  If there are too many, they alternate by *slices*; an execution that begins to compute
+  goes first.
 
-A stop makes the rest of an execution longer (``State.x_left``), so the core, which puts preempted
-executions back, needs to know of none.  All times are integers, ns.
+A stop makes the rest of an execution longer (``State.x_left``), so the core, which can continue
+preempted executions, does not know of stops.  All times are integers, ns.
 """
 
 from __future__ import annotations
@@ -39,22 +41,22 @@ from mddag_executor.simulate.load import Load, place_of
 SWITCH_NS = 1_000_000
 """Python's switch interval while an executor spins."""
 SLICE_NS = 3_000_000
-"""How long the operating system lets a thread compute while others wait for a CPU."""
+"""Time slice of the operating system if threads wait for a CPU."""
 BRIEF_NS = 100_000
-"""CPU time in Python, at most, at the end of an execution that computes without the lock."""
+"""Maximum CPU time with the GIL at the end of an execution that computes without it."""
 WARM_NS = 100_000
-"""A worker is warm for so long after an execution has ended: its thread does not sleep yet."""
+"""A worker is warm for this time after an execution has ended: its thread does not sleep yet."""
 HARDLY = 8
-"""An execution that waits for less than this part of its time keeps the interpreter."""
+"""An execution that waits for at most 1 / HARDLY of its CPU time keeps the GIL meanwhile."""
 
 # What an execution needs.
 _LOCK, _CPU, _NOTHING = range(3)
 
 # Columns of ``Machine.scalars``: number of CPUs; whether executions that do not hold the
-# interpreter need it at their end; the time up to which the machine is up to date; when the slices
-# end, if nothing happens before; when an execution needs something else; how often the CPUs were
-# shared out; when overtaking pays that does not pay now; number of interpreters, which the further
-# pools (``intakes``) use, too.
+# interpreter need the GIL at their end; the time up to which the machine is up to date; when the
+# slices end, if nothing happens before; when an execution needs something else; how often the CPUs
+# were assigned; when overtaking pays that does not pay now; number of interpreters, which the
+# additional pools (``intakes``) use, too.
 CPUS, PYTHON, SETTLED, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT, INTERPRETERS = range(8)
 
 
@@ -62,27 +64,27 @@ class Machine(NamedTuple):
     """Which running executions compute; made by ``new_machine``."""
 
     scalars: list[int]
-    # by started execution: the progress up to which it computes with the lock, computes without
-    # it, and waits; at which it publishes next before its end (``deliveries``; NEVER: never)
+    # by started execution: the progress up to which it computes with the GIL, computes without it,
+    # and waits; at which it publishes next before its end (``deliveries``; NEVER: never)
     locked_until: list[int]
     computes_until: list[int]
     waits_until: list[int]
     publishes_at: list[int]
-    # its progress, what it needs and up to which progress; in which sharing it had a CPU last
+    # its progress, its need and up to which progress; the assignment in which it last had a CPU
     at: list[int]
     need: list[int]
     until: list[int]
     share: list[int]
-    # the stopped ones; those that compute, first those with a CPU; those that begin to compute
+    # stopped executions; computing executions, first those with a CPU; those that begin to compute
     still: list[int]
     computing: list[int]
     joining: list[int]
-    # by interpreter, from 1: those that want its lock, first the one that has it; the one that had
-    # it while others waited, or -1; when the next one gets it
+    # by interpreter, from 1: executions that need its GIL, the holder first; the previous holder
+    # while others waited, or -1; when the next one gets it
     lock_queue: list[list[int]]
     lock_had: list[int]
     switch_at: list[int]
-    # by worker: when it ended an execution without having begun another since; or -NEVER
+    # by worker: end of its last execution if it has not started another; or -NEVER
     ended_at: list[int]
 
 
@@ -90,8 +92,8 @@ def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = Fal
     """
     Return a machine on which nothing runs yet.
 
-    :param cpus: how many there are; None: as many as are needed.
-    :param python: whether executions that do not hold the interpreter need it at their end.
+    :param cpus: number of CPUs; None: as many as are needed.
+    :param python: whether executions that do not hold the interpreter need the GIL at their end.
     """
     machine = empty(Machine)
     fill_machine(t, s, machine, cpus or NEVER, int(python), NEVER)
@@ -101,7 +103,7 @@ def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = Fal
 def fill_machine(
     t: Tables, s: State, m: Machine, cpus: int, python: int, interpreters: int
 ) -> None:
-    """Fill the columns of a machine that is all empty; see ``new_machine``."""
+    """Fill the columns of an empty machine; see ``new_machine``."""
     for value in (cpus, python, 0, NEVER, NEVER, 1, NEVER, interpreters):
         m.scalars.append(value)
     for vertex in range(len(t.process)):
@@ -116,7 +118,7 @@ def fill_machine(
 
 
 def settle(s: State, m: Machine, now: int) -> None:
-    """Advance the machine: time has passed."""
+    """Advance the machine to the present time."""
     passed = now - m.scalars[SETTLED]
     for i in range(len(m.still)):
         s.x_left[m.still[i]] += passed
@@ -175,7 +177,7 @@ def starts(s: State, load: Load, m: Machine, x: int, now: int) -> None:
 
 
 def begins(s: State, m: Machine, x: int, cost: int, cpu: int, locks: bool) -> None:
-    """Note the cost of a dispatched execution, and which part of it computes."""
+    """Note the cost of a dispatched execution, and its computing parts."""
     while len(m.at) <= x:
         for column in (m.locked_until, m.computes_until, m.waits_until, m.publishes_at, m.at,
                        m.need, m.until, m.share):
@@ -205,7 +207,7 @@ def _set_parts(m: Machine, x: int, first: int, second: int, third: int) -> None:
 
 
 def share(t: Tables, s: State, m: Machine, now: int, finish_at: list[int]) -> None:
-    """Share lock and CPUs out, and set when executions finish."""
+    """Assign the GIL and CPUs, and compute when executions finish."""
     number = m.scalars[SHARES] = m.scalars[SHARES] + 1
     m.joining.clear()
     on = s.worker_x
@@ -239,7 +241,7 @@ def share(t: Tables, s: State, m: Machine, now: int, finish_at: list[int]) -> No
 
 
 def _find_need(t: Tables, s: State, m: Machine, x: int, at: int) -> None:
-    """Find what an execution needs at its progress; if it did not before, it queues for it."""
+    """Find what an execution needs at its progress; queue it for a new need."""
     need, until = _NOTHING, s.x_cost[x]
     if at < m.locked_until[x]:
         need, until = _LOCK, m.locked_until[x]
@@ -263,7 +265,7 @@ def _find_need(t: Tables, s: State, m: Machine, x: int, at: int) -> None:
 
 
 def _ask(t: Tables, s: State, m: Machine, x: int, interpreter: int) -> None:
-    """Queue for the lock; an execution after one that had it and has ended gets its place."""
+    """Queue for the GIL; an execution that follows an ended holder gets its place."""
     queue = m.lock_queue[interpreter]
     if len(queue) > 0 and m.at[x] == 0:
         first = queue[0]
@@ -277,7 +279,7 @@ def _ask(t: Tables, s: State, m: Machine, x: int, interpreter: int) -> None:
 
 
 def _pass_lock(s: State, m: Machine, process: int, now: int) -> None:
-    """Find which execution has the lock of an interpreter now: it needs a CPU."""
+    """Find which execution has the GIL of an interpreter now: it needs a CPU."""
     queue = m.lock_queue[process]
     kept = 0
     for i in range(len(queue)):

@@ -23,7 +23,7 @@ JUDGES = ('horizon', 'completions')
 @dataclass
 class SimulatedRun:
     """
-    Outcome of a run: the tally, when it ended (ns) and, if asked for, the log of every worker.
+    The result of a run: the tally, its end (ns) and, if requested, the log of every worker.
 
     ``log`` and ``decisions`` (those of the core) are in order of time.
     """
@@ -59,11 +59,11 @@ def simulate(
     Run the core over a load.
 
     :param utilisation: of the load, for the result.
-    :param max_active_jobs: bound on the open jobs of a DAG that declares none itself.
+    :param max_active_jobs: maximum number of open jobs of a DAG that does not declare it.
     :param log: keep the log of every worker.
-    :param progress: gets the virtual time (ns) now and then.
-    :raises SimulationError: on settings that make no sense.
-    :raises mddag_executor.core.PolicyError: when there is no such policy.
+    :param progress: receives the virtual time (ns) regularly.
+    :raises SimulationError: for invalid settings.
+    :raises mddag_executor.core.PolicyError: if there is no such policy.
     """
     check(settings)
     tables = Tables.build(
@@ -79,7 +79,7 @@ def simulate(
 
 
 def check(settings: Settings) -> None:
-    """Check that settings make sense."""
+    """Check settings."""
     if not 1 <= settings.workers <= MOST_WORKERS:
         raise SimulationError(
             f'workers: {settings.workers} is out of range: give 1 to {MOST_WORKERS}')

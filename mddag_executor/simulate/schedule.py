@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A load in virtual time: how it is scheduled, and what comes of it."""
+"""Schedules a load in virtual time."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from mddag_executor.simulate.engine import LogEntry, Orders, run_load
 from mddag_executor.simulate.load import as_lists, Load
 from mddag_executor.simulate.machine import Machine
 
-# About plain Python's time for each execution, without and with a machine, to choose the faster.
+# Approximate time of plain Python per execution, without and with a machine, to choose the faster.
 _PLAIN_S, _STOPS_S = 10e-6, 50e-6
 SOON_S = 1.0
-"""Below this, loading compiled code does not pay."""
+"""For less time, loading compiled code does not pay."""
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,15 @@ class Settings:
     :ivar workers: of each process.
     :ivar duration_ns: when the run ends, on the load's clock.
     :ivar preemptive: None: the policy's own mode of the paper's experiment.
-    :ivar judge: ``horizon`` judges what is open at the end, ``completions`` (the paper's way)
-        only what completed.
+    :ivar judge: ``horizon`` judges open jobs at the end, ``completions`` (as in the paper) only
+        completions.
     :ivar dispatch_overhead_ns: added to an execution at each dispatch; ``switch_overhead_ns``: at
         each preemption.
     :ivar cpus: shared by the executions that compute; None: enough for all.
     :ivar judge_from: jobs released before are not judged.
-    :ivar processes: how many there are, each with an interpreter of its own; ``intakes``: and a
-        pool of one more worker, behind those of all (see ``intakes``).
-    :ivar on_late: what is done with late jobs of a DAG that does not declare it.
+    :ivar processes: number of processes, each with its own interpreter; ``intakes``: whether each
+        has an additional pool of one worker, after those of all processes (see ``intakes``).
+    :ivar on_late: handling of late jobs of a DAG that does not declare it.
     """
 
     policy: str = 'rad'
@@ -58,12 +58,12 @@ class Settings:
 
     @property
     def preempts(self) -> bool:
-        """Return whether a more urgent execution takes the worker of a running one."""
+        """Return whether a more urgent execution preempts a running one."""
         return find_policy(self.policy).mode(self.preemptive, self.processes)
 
     @property
     def orders(self) -> Orders:
-        """Return the same as integers, for the engine; raise as ``preempts``."""
+        """Return the settings as integers for the engine; raise like ``preempts``."""
         return Orders(
             self.workers, self.processes, int(self.intakes), int(self.preempts),
             int(find_policy(self.policy).polling), find_policy(self.policy).urgency,
@@ -74,9 +74,9 @@ class Settings:
 
 class Scheduled(NamedTuple):
     """
-    The outcome of a load: when the run ended, and, in order of time, log and decisions.
+    The result of a load: when the run ended, and, in order of time, log and decisions.
 
-    :ivar busy: how long each worker was busy, ns.
+    :ivar busy: by worker its busy time, ns.
     """
 
     ended: int
@@ -93,7 +93,7 @@ def schedule(
     Run the core over a load.
 
     :param log: keep the log of every worker.
-    :param progress: gets the virtual time (ns) now and then, by plain Python.
+    :param progress: receives the virtual time (ns) regularly, from plain Python only.
     :param compiled: whether to use the compiled core; None: if that is faster.
     """
     orders = settings.orders._replace(keep_log=int(log))
@@ -113,7 +113,7 @@ def schedule(
 
 
 def prepare(tables: Tables, load: Load, settings: Settings, runs: int = 1) -> bool:
-    """Return whether so many runs are faster compiled; if so, compile, or load the code."""
+    """Return whether ``runs`` runs are faster compiled; if so, compile, or load the code."""
     executions = runs * len(load.times) * max(1, tables.n_vertices // max(1, tables.n_dags))
     stops = len(load.holds) > 0 or settings.cpus is not None
     plain_s = executions * (_STOPS_S if stops else _PLAIN_S)

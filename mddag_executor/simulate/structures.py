@@ -32,14 +32,14 @@ _KINDS = {
 
 
 def _structure(row: Any, **more: Any) -> Any:
-    """Return the structure type of a class of named tuples, with more fields."""
+    """Return the structure type of a class of named tuples, with additional fields."""
     fields = {
         name: _KINDS[str(getattr(kind, '__forward_arg__', kind))]
         for name, kind in row.__annotations__.items()}
     return StructureType(row.__name__, {**fields, **more})
 
 
-# Functions for compiled code that make an address a structure or vector.
+# Functions for compiled code that turn an address into a structure or vector.
 as_tables = at(_structure(Tables, policy=types.int64))
 as_state = at(_structure(State))
 as_load = at(_structure(Load))
@@ -52,17 +52,17 @@ as_vector = at(VectorType())
 
 def key_of_policy(t: Any, v: int, release: int, job: int, order: int) -> Key:
     """
-    Return the key of the policy whose number the tables have in one more field, ``policy``.
+    Return the key of the policy whose number is in the additional field ``policy`` of the tables.
 
-    This is not a compiled function but an overloaded one: only these can be passed from function
-    to function in code that is kept on disk.
+    It is an overloaded function, because only these can be passed between functions in stored
+    code.
     """
     key: Key = list(POLICIES.values())[t.policy].key(t, v, release, job, order)
     return key
 
 
 def bind_policies(space: dict[str, Any]) -> None:
-    """Show numba how to compile ``key_of_policy``, with the key functions in a namespace."""
+    """Register ``key_of_policy`` with numba, with the key functions of a namespace."""
     arguments = 't, v, release, job, order'
     *others, last = (row.key.__name__ for row in POLICIES.values())
     lines = [f'def choose({arguments}):']

@@ -1,22 +1,22 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Growing arrays and structures of them for compiled code, used as lists and named tuples are.
+Growing arrays and structures for compiled code, used like lists and named tuples.
 
 Theory of operation
 -------------------
 The core's functions work on named tuples of lists.  numba can compile that with its own typed
 lists, but then each call passes some thirty reference-counted lists: a run of the Autoware
 workload took 44 to 55 ms instead of 0.8 ms on the same (busy) machine, and compiling 133 s.  The
-types here look the same to the source and cost what they cost in C:
+types here have the same source interface and the cost of C:
 
-* a *vector* is the address of three words: address of its data, length, capacity.  An element is
-  a 64-bit integer, or a tuple of them, or a vector.  ``append`` grows the data with ``realloc``;
+* a *vector* is the address of three words: address of its data, length, capacity.  An element is a
+  64-bit integer, or a tuple of them, or a vector.  ``append`` grows the data with ``realloc``;
 * a *structure* is the address of three words for each field: those of a vector, or an integer.
 
-Nothing is counted or checked: an index must be within 0 and the length.  (Tests compare with the
-plain core on lists, where Python checks.)  The code that makes a structure frees it, with
-``free``, or lends it memory that stays in place while the structure is used.
+There are no reference counts and no checks: an index must be from 0 to below the length.  (Tests
+compare with the plain core on lists, for which Python checks.)  The code that makes a structure
+frees it with ``free``, or provides memory that stays in place while the structure is used.
 
 This module needs numba; nothing is compiled when it is imported.
 """
@@ -44,7 +44,7 @@ class VectorType(types.Type):
     """
     A vector.
 
-    :param width: how many integers an element's tuple has; 0 for plain integers.
+    :param width: number of integers in an element's tuple; 0 for plain integers.
     :param nested: the elements are vectors with elements of that width.
     """
 
@@ -55,7 +55,7 @@ class VectorType(types.Type):
 
     @property
     def words(self) -> int:
-        """Return how many words an element takes."""
+        """Return the number of words of an element."""
         return WORDS if self.nested else max(1, self.width)
 
     @property
@@ -67,7 +67,7 @@ class VectorType(types.Type):
 
 
 class StructureType(types.Type):
-    """A structure: fields by name, each ``types.int64`` or of three words, as a vector."""
+    """A structure: fields by name, each ``types.int64``, or a vector; three words each."""
 
     def __init__(self, name: str, fields: dict[str, types.Type]) -> None:
         self.fields = fields
@@ -170,7 +170,7 @@ _free = types.ExternalFunction('free', types.void(types.int64))
 
 
 def at(kind: types.Type) -> Callable[..., Any]:
-    """Return a function for compiled code that makes an address a vector or structure."""
+    """Return a function for compiled code that turns an address into a vector or structure."""
     @intrinsic
     def convert(typing: Any, address: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -210,7 +210,7 @@ def _overload_setitem(vector: Any, index: Any, value: Any) -> Any:
 
 @overload(operator.delitem, strict=False)
 def _overload_delitem(vector: Any, index: Any) -> Any:
-    # del vector[start:], which cuts the end off
+    # del vector[start:], which truncates
     if isinstance(vector, VectorType) and isinstance(index, types.SliceType):
         return lambda vector, index: _set_word(vector, 1, index.start)
     return None
@@ -265,7 +265,7 @@ def _overload_clear(vector: Any) -> Any:
 
 @njit
 def add_queue(vector):
-    """Do what ``core.state.add_queue`` does: append an empty vector to a vector of vectors."""
+    """Append an empty vector to a vector of vectors, like ``core.state.add_queue``."""
     length = _get_word(vector, 1)
     if length == _get_word(vector, 2):
         _grow(vector, 3)
@@ -276,7 +276,7 @@ def add_queue(vector):
 
 @njit
 def free(vector):
-    """Free the data of a vector, which must contain no vectors any more."""
+    """Free the data of a vector, which must not contain vectors."""
     _free(_get_word(vector, 0))
     for place in range(3):
         _set_word(vector, place, 0)
@@ -314,14 +314,14 @@ def _sink(heap, place):
 
 @njit
 def heappush(heap, entry):
-    """Do what ``heapq.heappush`` does."""
+    """Do the same as ``heapq.heappush``."""
     heap.append(entry)
     _rise(heap, len(heap) - 1)
 
 
 @njit
 def heappop(heap):
-    """Do what ``heapq.heappop`` does, on a heap that is not empty."""
+    """Do the same as ``heapq.heappop``, on a heap that is not empty."""
     last = len(heap) - 1
     top = heap[0]
     heap[0] = heap[last]
@@ -333,7 +333,7 @@ def heappop(heap):
 
 @njit
 def heapify(heap):
-    """Do what ``heapq.heapify`` does."""
+    """Do the same as ``heapq.heapify``."""
     for place in range(len(heap) // 2 - 1, -1, -1):
         _sink(heap, place)
 
@@ -342,5 +342,5 @@ def heapify(heap):
 
 @njit
 def set_address(vector, address):
-    """Let a vector that is lent its data use other data of the same length."""
+    """Point a vector without own memory at other data of the same length."""
     _set_word(vector, 0, address)

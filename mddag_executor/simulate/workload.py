@@ -31,16 +31,18 @@ def draw_execution_times(
     """
     Draw one execution time (ns) for each vertex, for the whole run, as in the paper.
 
-    :param undeclared: that of callbacks which declare none, ns; None: each must declare one.
+    :param undeclared: execution time of callbacks that declare none, ns; None: each must declare
+        one.
     :return: one list for each DAG, by local vertex index; the same seed gives the same draw.
-    :raises SimulationError: when a callback declares no execution time.
+    :raises SimulationError: if a callback declares no execution time.
     """
     generator = random.Random(seed)
     times = []
     for dag in task_set.dags:
         row = []
         for vertex in dag.vertices:
-            # Also if nothing is declared: then declaring one more time changes no other draw.
+            # Drawn even if nothing is declared: then declaring one more time changes no other
+            # draw.
             share = generator.random()
             times_of_callback = vertex.callback.execution_time
             if times_of_callback is None and undeclared is not None:
@@ -60,7 +62,7 @@ def read_execution_times(task_set: TaskSet, text: str, name: str) -> list[list[i
     Read fixed execution times: JSON ``{"DAG": {"/node:callback": microseconds, …}, …}``.
 
     :return: ns, one list for each DAG, by local vertex index.
-    :raises SimulationError: on anything that is not that, or a vertex without a time.
+    :raises SimulationError: for any other contents, or a vertex without a time.
     """
     try:
         data = json.loads(text)
@@ -119,7 +121,7 @@ def scale_execution_times(
     """
     Return the execution times scaled by one factor to a normalised utilisation, ns.
 
-    :raises SimulationError: the target is not a number above zero, or there is nothing to scale.
+    :raises SimulationError: if the target is not a positive number, or there is nothing to scale.
     """
     now = utilisation(task_set, times, workers)
     if not (target > 0 and math.isfinite(target)):
