@@ -1,10 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Jobs as a whole: rules 1, 6 to 8 and 10 of the scheduling rules, whose text stands in ``rules``.
+Jobs as a whole: rules 1, 6 to 8 and 10 of the scheduling rules, which ``rules`` lists.
 
-Here jobs are opened, judged and ended, and their slots recycled.  Like ``rules`` this is nothing
-but integer arithmetic and list indexing.
+Jobs are opened, judged and ended here, and their slots recycled.  Like ``rules`` this module
+contains only integer arithmetic and list indexing.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from mddag_executor.core.tables import DEMOTE, NEVER, Tables
 
 def open_undeclared(s: State, dag: int, job: int, release: int) -> int:
     """
-    Open the job of a callback that no DAG declares; return its slot, or -1 as ``release_job``.
+    Open the job of an undeclared callback; return its slot, or -1 as ``release_job``.
 
-    It has one execution and nobody judges it, so it stands in no list of open jobs.
+    It has one execution and is not judged, so it is in no list of open jobs.
     """
     slot = s.free_slot[dag]
     if slot >= 0:
@@ -133,36 +133,36 @@ def _link_newest(s: State, dag: int, slot: int) -> None:
 
 
 def judge_from(s: State, release: int) -> None:
-    """Give verdicts about jobs released from a time on only (rule 6); NEVER: for now, none."""
+    """Judge only jobs released from a time on (rule 6); NEVER: none for now."""
     s.scalars[JUDGE_FROM] = release + s.scalars[SKIP]
 
 
 def is_judged(s: State, slot: int) -> bool:
-    """Return whether a job was released when there are verdicts already (rule 6)."""
+    """Return whether a job was released after judging began (rule 6)."""
     return s.job_release[slot] >= s.scalars[JUDGE_FROM]
 
 
 def is_miss(kind: int) -> bool:
-    """Return whether a decision of that kind is a miss: of a sink, and not in time (rule 6)."""
+    """Return whether a decision is a miss: about a sink that was not in time (rule 6)."""
     return SINK_IN_TIME < kind < JOB_END
 
 
 def judge(s: State, slot: int, kind: int, vertex: int, deadline: int, time: int) -> None:
-    """Say what came of a sink of a job, if it is judged (rule 6)."""
+    """Decide the result of a job at a sink, if the job is judged (rule 6)."""
     if is_judged(s, slot):
         s.decisions.append(
             (kind, s.job_dag[slot], vertex, s.job_index[slot], deadline, time))
 
 
 def close_job(s: State, slot: int, end: int, now: int) -> None:
-    """End an open job (rule 8): it leaves the open jobs and, when nothing is active, its slot."""
+    """End an open job (rule 8): remove it from the list; free its slot if nothing is active."""
     judged = -1 if is_judged(s, slot) else NOT_JUDGED
     s.decisions.append((JOB_END, s.job_dag[slot], judged, s.job_index[slot], end, now))
     withdraw_job(s, slot, end)
 
 
 def withdraw_job(s: State, slot: int, end: int) -> None:
-    """Close an open job as ``close_job``, without a decision: what became of it is not known."""
+    """Close an open job as ``close_job``, without a decision: its end is not known."""
     dag = s.job_dag[slot]
     before, after = s.job_previous[slot], s.job_next[slot]
     if before < 0:
@@ -193,7 +193,7 @@ def expire_idle(t: Tables, s: State, dag: int, now: int) -> None:
         return
     patience = t.dag_deadline[dag] + t.expire_after[dag]
     slot = s.oldest[dag]
-    while slot >= 0:  # all of them: releases that messages carry may come out of order
+    while slot >= 0:  # all of them: releases from messages may be out of order
         after = s.job_next[slot]
         if s.job_active[slot] == 0 and now - s.job_release[slot] > patience:
             expire_job(t, s, slot, now)
@@ -238,7 +238,7 @@ def outdate_sink(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
 
 
 def announce_demoted(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
-    """Say once that a sink of an open job can no longer be in time, and is demoted (rule 7)."""
+    """Report once that a sink of an open job is demoted: it cannot be in time (rule 7)."""
     head = s.job_base[slot] + t.region_offset[vertex]
     job = s.job_index[slot]
     if s.job_state[slot] == OPEN and s.x_demoted[head] != job and s.x_pending[head] >= 0:
@@ -267,7 +267,7 @@ def overdue(t: Tables, s: State, slot: int, now: int) -> bool:
 
 
 def next_deadline(t: Tables, s: State, slot: int, after: int) -> int:
-    """Return the first deadline after a time of a job's sinks that have not completed; NEVER."""
+    """Return the first deadline, after a time, of a job's incomplete sinks; NEVER: none."""
     dag = s.job_dag[slot]
     first = NEVER
     for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
@@ -281,9 +281,9 @@ def next_deadline(t: Tables, s: State, slot: int, after: int) -> int:
 
 def announce_overdue(t: Tables, s: State, slot: int, after: int, until: int) -> None:
     """
-    Say which sinks of an open job have not completed by their deadlines (rule 6).
+    Report the sinks of an open job that have not completed by their deadlines (rule 6).
 
-    :param after: only of deadlines after that; ``until``: and not after that.
+    :param after: only deadlines after this time; ``until``: and not after this one.
     """
     dag = s.job_dag[slot]
     for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
@@ -310,7 +310,7 @@ def finish(t: Tables, s: State, now: int) -> None:
 
 
 def deactivate(s: State, slot: int) -> None:
-    """Count one waiting or running execution of a job less; free the slot of an ended job."""
+    """Count one active execution of a job less; free the slot of an ended job."""
     s.job_active[slot] -= 1
     if s.job_active[slot] == 0 and s.job_state[slot] != OPEN:
         free_slot(s, slot)

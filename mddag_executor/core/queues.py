@@ -5,22 +5,22 @@ The queues in which executions wait: rules 3, 4, 9, 11 and 12 (see ``rules``).
 
 Theory of operation
 -------------------
-A waiting execution stands in exactly one of
+A waiting execution is in exactly one of
 
 * the ready queue (``State.ready``), a heap by the keys of the policy;
-* the heap of its callback group (``State.group_heap``), if the group was busy when its turn came;
-* the heap of those that are held back (``State.held_back``), if the interpreter was held when its
-  turn came by one that is as urgent, or no worker of its process was idle;
-* under a policy that polls, the queue of its *entity* (``State.entity_queue``): what the wait set
-  of rclpy and rclcpp knows, a timer or a subscription with the messages that wait for it.
+* the heap of its callback group (``State.group_heap``), if the group was busy when it came first;
+* the heap of deferred executions (``State.held_back``), if an execution as urgent held the
+interpreter when it came first, or no worker of its process was idle;
+* under a policy that polls, the queue of its *entity* (``State.entity_queue``), as in the wait set
+of rclpy and rclcpp: a timer, or a subscription with its waiting messages.
 
-An execution that is dropped leaves its entry behind, *stale*, until it gets to the top or stale
-entries are the larger part of all.
+A dropped execution leaves a *stale* entry, until the entry reaches the top or stale entries are
+the larger part of all.
 
-**Polling rounds** (rule 9).  Between two polls the ready queue is the answer of the last one: what
-becomes ready waits at its entity, in order of becoming ready.  ``poll`` takes the first of every
-entity that has any, so each runs once in a round at most.  What nobody declared has one queue for
-all, of which every entry is an entity of its own.
+**Polling rounds** (rule 9).  Between two polls the ready queue is the result of the last one;
+executions that become ready wait at their entity, in that order.  ``poll`` takes the first of
+every entity, so each entity runs at most once in a round.  Undeclared executions share one queue,
+in which every entry counts as a separate entity.
 """
 
 from __future__ import annotations
@@ -43,28 +43,28 @@ from mddag_executor.core.state import (
 from mddag_executor.core.tables import NEVER, Tables
 
 TURN_NS = 1_000_000
-"""Nothing overtakes who holds the interpreter for less than this: Python takes turns no sooner."""
+"""No overtaking if the holder needs less time than this: Python switches threads no sooner."""
 LONGER, LONG_NS = 3, 5_000_000
 PATIENCE = 2
-"""Who waits for the interpreter overtakes if so many times the wait is past its time (RAD)."""
+"""Overtaking pays if the wait for the interpreter, times this, reaches RAD minus release."""
 SWEEP_AT = 64
-"""So many stale entries may stand in the queues anyway."""
+"""How many stale entries are always allowed in the queues."""
 
 
 def is_stale(s: State, entry: QueueEntry) -> bool:
-    """Return whether a queue's entry is of a dropped execution (whose id may be in use again)."""
+    """Return whether an entry is of a dropped execution (whose id may be in use again)."""
     return s.x_state[entry[4]] != WAITING or s.x_key[entry[4]] != entry
 
 
 def add_stale(s: State) -> None:
-    """Count one more stale entry; take all out when they are the larger part."""
+    """Count one more stale entry; remove all when they are the larger part."""
     s.scalars[N_STALE] += 1
     if s.scalars[N_STALE] > SWEEP_AT:
         _sweep(s)
 
 
 def _sweep(s: State) -> None:
-    """Take stale entries out of all queues when they are the larger part: memory is bounded."""
+    """Remove stale entries from all queues when they are the larger part: memory is bounded."""
     length = len(s.ready) + len(s.held_back)
     for group in range(len(s.group_heap)):
         length += len(s.group_heap[group])
@@ -99,11 +99,11 @@ def _keep_valid(s: State, heap: list[QueueEntry]) -> None:
 
 def next_queue(t: Tables, s: State, first: bool) -> list[QueueEntry]:
     """
-    Return the queue whose first entry goes first; it is empty when nothing is there to go.
+    Return the queue whose first entry is dispatched first; empty if there is none.
 
-    What was held back counts as soon as it may start (rules 11 and 12).
+    Deferred executions count as soon as they may start (rules 11 and 12).
 
-    :param first: nothing has been set aside since anything became free.
+    :param first: no execution has been set aside since a resource became free.
     """
     if s.scalars[N_STALE] > 0:
         _drop_stale(s, s.ready)
@@ -118,7 +118,7 @@ def next_queue(t: Tables, s: State, first: bool) -> list[QueueEntry]:
 
 
 def _bring_forward(t: Tables, s: State) -> None:
-    """Put what was held back and may start now into the ready queue."""
+    """Move deferred executions that may start now into the ready queue."""
     kept = 0
     for i in range(len(s.held_back)):
         entry = s.held_back[i]
@@ -148,10 +148,10 @@ def idle_worker(t: Tables, s: State, x: int) -> int:
 
 def may_start(t: Tables, s: State, entry: QueueEntry) -> bool:
     """
-    Return whether what waits may start.
+    Return whether a waiting execution may start.
 
-    Its process has an idle worker (rule 12), and nothing that is as urgent or more holds the
-    interpreter that it is to hold (rule 11).
+    Its process must have an idle worker (rule 12), and no execution that is as urgent or more may
+    hold the interpreter that it needs (rule 11).
     """
     interpreter = s.x_holds[entry[4]]
     if interpreter != 0 and s.scalars[N_HOLDING] > 0:
@@ -164,7 +164,7 @@ def may_start(t: Tables, s: State, entry: QueueEntry) -> bool:
 
 
 def first_waiting(t: Tables, s: State, process: int) -> int:
-    """Return what comes first of all that waits, or of one process where there are several."""
+    """Return the first waiting execution of all, or of one process if there are several."""
     first = -1
     for queue in (s.ready, s.held_back):
         for i in range(len(queue) if len(s.overtaking) > 2 else min(1, len(queue))):
@@ -179,16 +179,16 @@ def overtaking_pays(
     t: Tables, s: State, process: int, held: int, usual: int, preempts: bool
 ) -> bool:
     """
-    Return whether what waits first may overtake one that holds its process' interpreter (rule 11).
+    Return whether the first waiting execution may overtake a holder of its interpreter (rule 11).
 
-    The two would share the interpreter, and lose by that.  So it waits where that is short
-    beside the time that it has.  (Not beside what is left of that: when all are late, all
-    would overtake.)
+    The two would share the interpreter, which slows both down.  So the waiting execution is
+    deferred if its wait is short compared with its relative deadline (RAD minus release).  (Not
+    compared with the rest of that: if all are late, all would overtake.)
 
-    :param held: for how long that one has held it; ``usual``: for how long it does, ns.
-    :param preempts: whether it would be paused instead.
+    :param held: how long the holder has held the interpreter; ``usual``: its usual duration, ns.
+    :param preempts: whether the holder would be paused instead.
     """
-    # Of one that takes much longer than usual nothing is known; it may take twice as long.
+    # Nothing is known about a holder that takes much longer than usual; it may take twice as long.
     left = usual - held if held < LONGER * usual + LONG_NS else held
     if left < TURN_NS or preempts:
         return left >= TURN_NS
@@ -197,7 +197,7 @@ def overtaking_pays(
 
 
 def overtaking_pays_from(t: Tables, s: State, process: int, usual: int) -> int:
-    """Return how long one has held its process' interpreter when overtaking pays once more, ns."""
+    """Return after which time of holding the interpreter overtaking pays again, ns."""
     first = first_waiting(t, s, process)
     wait = 0 if first < 0 else -(-t.rad_offset[s.x_vertex[first]] // PATIENCE)
     return max(LONGER * usual + LONG_NS, TURN_NS, wait)
@@ -241,11 +241,11 @@ def lower_key(t: Tables, s: State, x: int, now: int) -> bool:
 
 
 def wait_for_poll(t: Tables, s: State, entry: QueueEntry) -> None:
-    """Let an execution wait at its entity for a poll (rule 9)."""
+    """Queue an execution at its entity until a poll (rule 9)."""
     x = entry[4]
     vertex = s.x_vertex[x]
     entity = t.entity[vertex]
-    if vertex < t.n_vertices:  # each topic of a sync is a subscription of its own
+    if vertex < t.n_vertices:  # each topic of a sync is a separate subscription
         leg = x - s.job_base[s.x_slot[x]] - t.region_offset[vertex]
         entity += t.leg_topic[t.first_leg[vertex] + leg]
     queue = s.entity_queue[entity]
@@ -255,7 +255,7 @@ def wait_for_poll(t: Tables, s: State, entry: QueueEntry) -> None:
 
 
 def poll(t: Tables, s: State) -> None:
-    """Begin a round: take the first of every entity into the ready queue, which is empty."""
+    """Begin a round: move the first of every entity to the ready queue, which is empty."""
     kept = 0
     for i in range(len(s.unpolled)):
         entity = s.unpolled[i]
@@ -267,7 +267,7 @@ def poll(t: Tables, s: State) -> None:
                 s.scalars[N_STALE] -= 1
             else:
                 heappush(s.ready, entry)
-                # What was aborted only goes there to be dropped.
+                # Aborted executions are moved only to be dropped.
                 waits = entity == t.n_entities or s.job_state[s.x_slot[entry[4]]] == ABORTED
         if queue:
             s.unpolled[kept] = entity

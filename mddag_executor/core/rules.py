@@ -1,83 +1,80 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The scheduling rules, all of them and only here (what concerns whole jobs is in ``jobs``).
+The scheduling rules, all of them and only here (those about whole jobs are in ``jobs``).
 
 Theory of operation
 -------------------
-A driver (live executor, replayer, simulator) reports what happened and when; the rules change the
-state and answer with decisions.  There is no clock, thread, ROS or file in here.  Every function
-takes the tables ``t`` and the state ``s``, and uses nothing but integer arithmetic, list indexing
-and ``heapq``, so that the same source runs on plain lists and can be compiled on arrays.
+A driver (live executor, replayer, simulator) reports events with their times; the rules change the
+state and return decisions.  There is no clock, thread, ROS or file here.  Every function receives
+the tables ``t`` and the state ``s``, and uses only integer arithmetic, list indexing and
+``heapq``, so that the same source runs on plain lists and compiled on arrays.
 
 1.  **Release.**  ``release_job`` opens job J_x^k of a DAG.  At most ``max_active_jobs`` jobs of a
-    DAG are open; the oldest expires to make room.  A job that is idle (nothing of it waits or
-    runs) and ``expire_after`` past its latest deadline can no longer complete: it expires too.
-2.  **Readiness.**  A vertex becomes ready when its join countdown reaches zero: when all its
+    DAG are open; the oldest expires to make room.  An idle job (no execution of it waits or runs)
+    also expires ``expire_after`` past its latest deadline.
+2.  **Readiness.**  A vertex becomes ready when its join countdown reaches zero: all its
     predecessors have completed (AND).  Vertices that several publishers trigger are several
-    vertices (OR), so the countdown is all there is.  Where sync callbacks run leg by leg (live),
-    each leg, the message of one vertex before it, is ready when that is there, and the countdown
-    is taken at its completion: the vertex completes with the leg that made it whole.
-3.  **Order.**  Ready executions wait in a heap by the key of the policy; the smallest goes first.
-    Ties that a policy leaves go by the *order*: one running number, given when an execution
-    becomes ready and again when it is put back.  At one instant, as in the paper's own program,
-    first come the completions, workers in ascending order, and of each its successors in the
-    reverse of the order in which its edges are listed; then the releases, DAGs in ascending
-    order; then, while workers are given out, what is preempted.
-4.  **Callback groups.**  Each group has at most one owner, from its first dispatch to its
-    completion (also while preempted or suspended).  What would run next but whose group is busy
-    is set aside in the group's own heap; when the owner completes, the group's smallest returns.
-    A group can also be a gate that lets its executions through one by one: the driver finds out
-    whether the owner may begin.  If so, it leaves the group for good (``leave_group``); if not,
-    it waits, owner still, so that none of the group passes it (``refuse``, then ``resume``).
-5.  **Workers.**  A fresh execution takes the idle worker with the lowest number (``schedule``),
-    or that of the worker that asks (``take``: live, it is warm).  With no worker idle and
-    preemption on, the running execution with the largest priority (on a tie the one with the
-    highest worker number) is put back, if its priority is strictly larger than the smallest
-    waiting one.  Migration is free; overheads are added to what is left to execute.
-6.  **Verdicts.**  A sink that completes after its absolute deadline (release plus its relative
-    deadline) is late; at the deadline is in time.  ``finish`` judges what is open when the run
-    ends: an absolute deadline at or before the end has been missed.  Each sink of a job gets one
-    verdict.  A driver with a clock also learns when a deadline passes (``deadlines``): the sink is
-    *overdue* until its verdict, which is not in time.  Jobs that are released less
-    than ``SKIP`` after the first one, or before ``JUDGE_FROM``, get no verdicts: a warm-up.
-    ``judge_from`` says that the run begins in earnest later: live, when all programs have started.
-7.  **Late jobs.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops what is left of it, as
-    soon as the miss is known: at a late completion, or when something of it comes first in the
-    ready queue after the deadline of a sink that is not done.  What has started runs on.
-    ``DEMOTE`` puts an execution behind all that can be in time, when it comes first in a queue and
-    none of the sinks that it leads to can be: the time plus the mean execution times on the
-    longest path to the sink is past its deadline.  Demoted executions go by their keys among
-    themselves.  An execution with sinks of both kinds has the earliest deadline of those that can
-    be in time as its RAD.  What runs keeps the key that it was dispatched with.
-8.  **Ends.**  A job ends in exactly one of completed, late, aborted, expired, failed.  It fails
-    when an execution of it fails (a callback lets an exception out): that vertex has not
-    delivered, so each sink that has not completed is missed.  After an abort executions of the
-    job that have not started are dropped; after an expiry or a failure they run (live: each
-    stands for a message, which is never lost silently) but make no further edge true and are not
-    judged.  What fails after its job has ended changes nothing.  The slot is free for the next
-    job when none of its executions waits, runs or is suspended.
-9.  **Polling.**  Under a policy that polls (``ros2``), the ready queue is what the last poll
-    found.  When an idle worker finds nothing to run there, it polls: the first waiting execution
-    of every entity (timer, subscription, …) becomes one round's queue.  What becomes ready later
-    waits for the next poll, and so does what is passed over because its group is busy when its
-    turn comes.  There is no preemption.
-10. **Several processes.**  Of a DAG whose callbacks run in several processes (live), a job has in
-    each of them the vertices that are *expected here*.  The others count as done before it begins:
-    they are not judged here and keep no job open.  A job ends when the sinks that are here have
-    completed, and the vertices that *lead out*, to one that is not here: what these publish goes
-    to another process, and belongs to the job as long as they run.
+    vertices (OR).  If sync callbacks run leg by leg (live), a leg is the message of one
+    predecessor and ready when that arrives.  The countdown happens at the leg's completion; the
+    last leg completes the vertex.
+3.  **Order.**  Ready executions wait in a heap by the key of the policy, smallest first.  Ties go
+    by the *order*, a running number given when an execution becomes ready or is put back.  At one
+    instant, as in the paper's own program, completions come first, by worker, and of each its
+    successors in reverse order of its edges; then releases, by DAG; then, during dispatch,
+    preempted executions.
+4.  **Callback groups.**  A group has at most one owner, from its first dispatch to its completion
+    (also while preempted or suspended).  An execution that comes first while its group is busy is
+    set aside in the group's heap; when the owner completes, the group's smallest returns.  A
+    user-defined group lets executions run one by one: if the owner may begin, it leaves the group
+    for good (``leave_group``); if not, it waits as the owner, so that no other one overtakes it
+    (``refuse``, then ``resume``).
+5.  **Workers.**  A fresh execution goes to the idle worker with the lowest number (``schedule``),
+    or to the worker that asks (``take``: live, cache-warm).  If no worker is idle and preemption
+    is on, the running execution with the largest priority (ties: the highest worker number) is put
+    back, if its priority is strictly larger than the smallest waiting one.  Migration is free;
+    overheads are added to the remaining execution time.
+6.  **Verdicts.**  A sink that completes after its absolute deadline (release plus relative
+    deadline) is late; at the deadline it is in time.  ``finish`` judges open jobs at the end of
+    the run: an absolute deadline at or before the end was missed.  Each sink of a job gets one
+    verdict.  For a driver with a clock (``deadlines``) a sink is *overdue* from its deadline to
+    its verdict, which is then not in time.  Jobs released less than ``SKIP`` after the first one
+    (warm-up), or before ``JUDGE_FROM``, get no verdicts; live, ``judge_from`` is called when all
+    programs have started.
+7.  **Late jobs.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops its waiting executions
+    once the miss is known: at a late completion, or when one of them comes first in the ready
+    queue after the deadline of an incomplete sink; started ones finish.  ``DEMOTE`` puts an
+    execution that comes first in a queue behind all that can be in time, if none of its sinks can
+    be: the time plus the mean execution times on the longest path to the sink is past its
+    deadline.  Demoted executions keep the order of their keys.  An execution with sinks of both
+    kinds has as RAD the earliest deadline of those that can be in time.  Running executions keep
+    their keys.
+8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
+    when an execution of it fails (its callback raises): each incomplete sink is missed.
+    Executions that have not started are dropped after an abort.  After an expiry or a failure they
+    run (live: each has a message, which is never lost silently), but make no further edge true and
+    are not judged.  Later failures change nothing.  The slot is free when no execution of the job
+    waits, runs or is suspended.
+9.  **Polling.**  Under a policy that polls (``ros2``) the ready queue is the result of the last
+    poll.  When an idle worker finds it empty, it polls: the first waiting execution of every
+    entity (timer, subscription, …) forms the next round.  Executions that become ready later wait
+    for the next poll, as do those whose group is busy when they come first.  There is no
+    preemption.
+10. **Several processes.**  If the callbacks of a DAG run in several processes (live), each process
+    expects some of a job's vertices *here*.  The others count as done: they are not judged here
+    and keep no job open.  A job ends when its sinks here have completed, and the vertices that
+    *lead out*, to a vertex elsewhere: their messages belong to the job until they end.
 11. **The interpreter.**  Python's lock lets one thread compute at a time.  An execution that holds
-    the interpreter (the driver says so, ``State.x_holds``) starts only if none on a worker whose
-    priority is the same or smaller holds it; until then it is held back, and others go past it.
-    One that is more urgent than all that hold it overtakes them, unless the driver says that
-    nothing does for the moment (``State.overtaking``, by ``queues.overtaking_pays``: where the
-    wait is short).  An execution that lends its worker, is suspended or turns out to wait
-    (``stop_holding``) holds it no more.
-12. **One machine, several processes.**  In virtual time one state can stand for all processes of a
-    run (``state.divide``).  Each has workers and an interpreter of its own, for which rules 5 and
-    11 hold by themselves; what finds none of its workers idle is held back.  There is no
-    preemption then, and no polling.
+    the interpreter (reported by the driver, ``State.x_holds``) starts only if no running execution
+    with the same or a smaller priority holds it.  Until then it is deferred, and others overtake
+    it.  If it is more urgent than all holders, it starts, unless the driver forbids it for the
+    moment (``State.overtaking``, from ``queues.overtaking_pays``: the wait is short).  An
+    execution that lends its worker, is suspended or turns out to wait (``stop_holding``) holds it
+    no more.
+12. **Several processes in virtual time.**  One state can represent all processes of a run
+    (``state.divide``).  Each has its own workers and interpreter, for which rules 5 and 11 hold
+    separately; an execution without an idle worker in its process is deferred.  There is no
+    preemption and no polling then.
 13. **Only the newest.**  Of a source or sink with ``keep: newest`` at most one execution waits:
     one that has not started is dropped when that of a later job becomes ready.  A job without its
     source is ``OUTDATED``; a dropped sink is not in time.
@@ -161,7 +158,7 @@ def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
 
 
 def _keep_newest(t: Tables, s: State, x: int, now: int) -> None:
-    """Drop the older one of two executions that wait where only the newest is kept (rule 13)."""
+    """Drop the older of two waiting executions if only the newest is kept (rule 13)."""
     vertex = s.x_vertex[x]
     before = s.newest_ready[vertex]
     s.newest_ready[vertex] = x
@@ -186,7 +183,7 @@ def ready_undeclared(
     t: Tables, s: State, key: KeyFunction, job: int, group: int, holds: int, now: int
 ) -> int:
     """
-    Make a callback ready that no DAG declares, as the one execution of a job of its own.
+    Make an undeclared callback ready, as the one execution of a separate job.
 
     :param job: the job's index; ``group`` and ``holds``: see ``State.x_group``, ``x_holds``.
     :return: the execution.
@@ -229,17 +226,17 @@ def drop(s: State, x: int, now: int) -> None:
     """
     Drop a waiting execution, for example because its queue is full; it never runs.
 
-    Its entry stays in a queue, stale, until it gets to the top or stale ones are the larger part.
-    An undeclared callback's job has nothing else, so it ends here.
+    Its entry remains in a queue as stale until it reaches the top or stale entries are the larger
+    part.  The job of an undeclared callback has no other execution, so it ends here.
     """
-    in_queue = s.x_state[x] == WAITING  # not what was refused
+    in_queue = s.x_state[x] == WAITING  # a refused execution is in no queue
     s.x_state[x] = DROPPED
     slot = s.x_slot[x]
     dag = s.job_dag[slot]
     s.decisions.append((DROP, dag, s.x_vertex[x], s.job_index[slot], x, now))
     group = s.x_group[x]
     if group >= 0 and (s.group_owner[group] == -1 or s.group_owner[group] == x):
-        _release_group(s, group)  # it may have stood in the ready queue for those of its group
+        _release_group(s, group)  # it may have been its group's entry in the ready queue
     if dag == len(s.free_slot) - 1:
         s.job_state[slot] = EXPIRED
     deactivate(s, slot)
@@ -251,12 +248,11 @@ def drop(s: State, x: int, now: int) -> None:
 
 def peek(t: Tables, s: State, now: int) -> int:
     """
-    Return the execution that goes next, or -1 when none may run.
+    Return the execution that is dispatched next, or -1 when none may run.
 
-    On the way, what cannot go next leaves the queue: dropped and aborted executions for good,
-    those whose group is busy into their group's heap (rule 4) or to the next poll (rule 9), those
-    that may not start into the heap of what is held back (rules 11 and 12).  Late ones go behind
-    (rule 7).
+    Entries that cannot be next leave the queue: dropped and aborted executions for good, those
+    with a busy group into the group's heap (rule 4) or to the next poll (rule 9), those that may
+    not start into the heap of deferred ones (rules 11 and 12).  Late ones are demoted (rule 7).
     """
     again = True
     divided = len(s.pool) > 0
@@ -273,7 +269,7 @@ def peek(t: Tables, s: State, now: int) -> int:
                 heappop(queue)
                 heappush(s.ready, s.x_key[x])
                 if group >= 0 and s.group_owner[group] == -1:
-                    _release_group(s, group)  # others of it may go first
+                    _release_group(s, group)  # others of the group may go first
                 queue = next_queue(t, s, False)
                 continue
             if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
@@ -289,7 +285,7 @@ def peek(t: Tables, s: State, now: int) -> int:
                 heappop(queue)
                 heappush(s.held_back, entry)
                 if group >= 0 and s.group_owner[group] == -1:
-                    _release_group(s, group)  # others of it may go first
+                    _release_group(s, group)  # others of the group may go first
                 queue = next_queue(t, s, False)
                 continue
             if s.job_state[slot] == OPEN:
@@ -303,7 +299,7 @@ def peek(t: Tables, s: State, now: int) -> int:
             again = True
         if not again or len(s.unpolled) == 0:
             return -1
-        again = False  # a poll that finds nothing but busy groups is the last
+        again = False  # a poll that finds only busy groups is the last
         poll(t, s)
 
 
@@ -318,7 +314,7 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
 
 
 def start_on(s: State, x: int, worker: int, now: int) -> None:
-    """Start an execution that is ready, and in no queue any more, on this idle worker."""
+    """Start a ready execution, which is no longer in a queue, on this idle worker."""
     s.x_state[x] = RUNNING
     s.x_worker[x] = worker
     s.scalars[N_HOLDING] += s.x_holds[x]
@@ -331,9 +327,9 @@ def start_on(s: State, x: int, worker: int, now: int) -> None:
 
 def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
     """
-    Dispatch one execution (rule 5) and return it, or -1 when the pool is as it should be.
+    Dispatch one execution (rule 5) and return it, or -1 when there is none to dispatch.
 
-    A driver calls this until it answers -1.
+    A driver calls this until it returns -1.
     """
     if s.scalars[N_IDLE] > 0 and len(s.pool) > 0:
         x = peek(t, s, now)
@@ -344,7 +340,7 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
             worker += 1
         return _begin(t, s, worker, now)
     if s.scalars[POLLING] != 0:
-        return -1  # only a worker that is free looks, and polls
+        return -1  # only an idle worker checks the queue, and polls
     x = peek(t, s, now)
     if x < 0 or s.scalars[PREEMPTIVE] == 0:
         return -1
@@ -364,7 +360,7 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
 
 
 def _begin(t: Tables, s: State, worker: int, now: int) -> int:
-    """Dispatch as ``take`` does; the dispatch takes time of its own."""
+    """Dispatch as ``take`` does, plus the dispatch overhead."""
     x = take(t, s, worker, now)
     if x >= 0:
         s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
@@ -372,7 +368,7 @@ def _begin(t: Tables, s: State, worker: int, now: int) -> int:
 
 
 def _put_back(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
-    """Put what is preempted into the ready queue again, with what is left of it (rules 3, 5)."""
+    """Put a preempted execution back into the ready queue with its remaining time (rules 3, 5)."""
     s.x_left[x] += s.scalars[SWITCH_OVERHEAD] - (now - s.x_started[x])
     s.scalars[ORDER] += 1
     slot = s.x_slot[x]
@@ -392,43 +388,43 @@ def _leave_worker(s: State, x: int) -> None:
 
 
 def progress(s: State, x: int, now: int) -> int:
-    """Return how far a running execution is, where it is known what it takes, ns."""
+    """Return the elapsed execution time of a running execution, if its duration is known, ns."""
     return s.x_cost[x] - s.x_left[x] + now - s.x_started[x]
 
 
 def lend(s: State, x: int) -> None:
-    """Give a running execution's worker free while it waits for something; it keeps its group."""
+    """Free a running execution's worker while it waits; it keeps its group."""
     _leave_worker(s, x)
 
 
 def stop_holding(s: State, x: int) -> None:
-    """Give the interpreter back for an execution that turns out not to hold it (rule 11)."""
+    """Release the interpreter for an execution that turns out not to hold it (rule 11)."""
     if s.x_worker[x] >= 0:
         s.scalars[N_HOLDING] -= s.x_holds[x]
     s.x_holds[x] = 0
 
 
 def suspend(s: State, x: int) -> None:
-    """Take a running execution off its worker until ``resume``; it keeps its group."""
+    """Suspend a running execution until ``resume``: it keeps its group, but no worker."""
     _leave_worker(s, x)
     s.x_state[x] = SUSPENDED
 
 
 def refuse(s: State, x: int) -> None:
-    """Take a running execution that may not begin off its worker until ``resume`` (rule 4)."""
+    """Suspend a running execution that may not begin until ``resume`` (rule 4)."""
     suspend(s, x)
     s.x_started[x] = -1
 
 
 def leave_group(s: State, x: int) -> None:
-    """Let a running execution go on without its group, which is free for the next (rule 4)."""
+    """Let a running execution go on without its group, which becomes free (rule 4)."""
     group = s.x_group[x]
     s.x_group[x] = -1
     _release_group(s, group)
 
 
 def resume(s: State, x: int) -> None:
-    """Put a suspended or refused execution back into the ready queue, under the key it had."""
+    """Put a suspended or refused execution back into the ready queue, with the same key."""
     s.x_state[x] = WAITING
     heappush(s.ready, s.x_key[x])
 
@@ -439,7 +435,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     """
     End a running execution (rules 2, 4, 6 and 7).
 
-    :return: whether its vertex has completed: False only for a leg that did not make it whole.
+    :return: whether its vertex has completed: False only for a leg that was not the last.
     """
     worker = s.x_worker[x]
     if worker >= 0:  # not _leave_worker: a call less for each execution
@@ -456,7 +452,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
             s.group_owner[group] = -1
     slot = s.x_slot[x]
     vertex = s.x_vertex[x]
-    if vertex == t.n_vertices:  # no DAG declares it, so its job has nothing else
+    if vertex == t.n_vertices:  # undeclared: its job has no other execution
         s.job_active[slot] = 0
         free_slot(s, slot)
         return True
@@ -474,7 +470,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
 
 
 def record(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
-    """End an execution as it was recorded: past the ready queue, its group and the workers."""
+    """End an execution as it was recorded: without ready queue, group and workers."""
     s.job_active[s.x_slot[x]] += 1
     return complete(t, s, key, x, now)
 

@@ -5,9 +5,9 @@ The state that the scheduling rules change, as columns.
 
 A *slot* holds one open job of one DAG and owns a region of *executions* ``x``: one for each vertex
 (or leg) of that DAG.  Slots of a DAG are recycled through a free list; open jobs of a DAG form a
-list in order of release.  Columns are plain lists for live use; a compiled driver makes them
-arrays.  ``scalars`` holds what would be plain integers, because a named tuple's cannot change.
-Plain Python reads the attributes of an object in half the time of a tuple's: see ``as_object``.
+list in order of release.  Columns are plain lists in a live run; a compiled driver makes them
+arrays.  ``scalars`` holds single integers, because fields of a named tuple cannot change.  In
+plain Python, attributes of an object are read in half the time of a tuple's: see ``as_object``.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any, NamedTuple, TypeVar
 
 from mddag_executor.core.tables import NEVER, Tables
 
-# States of an execution; what is refused is suspended, too.
+# States of an execution; a refused one is suspended, too.
 IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
 
-# States of a job.  Of the last six every ended job is in exactly one.
+# States of a job.  Every ended job is in exactly one of the last six.
 FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED, OUTDATED = range(8)
 
-# Where a vertex is expected to run; LEADS_OUT: here, and one right after it is not.
+# Where a vertex is expected to run; LEADS_OUT: here, and a successor is not.
 ELSEWHERE, HERE, LEADS_OUT = range(3)
 
 # Columns of ``scalars``.
@@ -37,40 +37,39 @@ BEHIND = NEVER
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  Each sink of a job is in time,
 # or late: it completed; or missed: it had not completed when the run ended past its deadline; or
-# its job was aborted, expired or failed, or the sink was dropped for a newer job's.  Before one of
-# these it may be announced that its deadline is over (overdue; not before in time), and that it
-# was demoted.  The deadline is that of the sink; the time that of the
-# decision, for a sink that completed the completion, else -1.  Instead of a vertex the end of a
-# job has -1, or NOT_JUDGED.
+# its job was aborted, expired or failed, or the sink was dropped for a newer job's.  Before that,
+# it may be reported overdue (its deadline is over; it is not in time then), or demoted.  The
+# deadline is that of the sink.  The time is that of the decision: for a completed sink the
+# completion, else -1.  The end of a job has -1, or NOT_JUDGED, instead of a vertex.
 (SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_DROPPED,
  JOB_END, DROP, SINK_OVERDUE, SINK_DEMOTED) = range(11)
 SINK_COMPLETED = (SINK_IN_TIME, SINK_LATE)
 NOT_JUDGED = -2
 
 QueueEntry = tuple[int, int, int, int, int]
-"""What the ready queue holds: the four integers of a key, then the execution."""
+"""An entry of the ready queue: the four integers of a key, then the execution."""
 
 Decision = tuple[int, int, int, int, int, int]
 Kind = TypeVar('Kind')
 
 
 class State(NamedTuple):
-    """All that changes during a run; made by ``new_state``."""
+    """Everything that changes during a run; made by ``new_state``."""
 
     scalars: list[int]
-    # ready queue (a heap), a heap with those that wait for the interpreter, and one heap for each
-    # callback group with those that wait for it
+    # heaps: the ready queue, the executions deferred for the interpreter or a worker, and for each
+    # callback group those that wait for it
     ready: list[QueueEntry]
     held_back: list[QueueEntry]
     group_heap: list[list[QueueEntry]]
     group_owner: list[int]
-    # under a policy that polls: a heap for each entity, and the entities that have any entry there
+    # under a policy that polls: a heap for each entity, and the entities with entries
     entity_queue: list[list[QueueEntry]]
     unpolled: list[int]
-    # workers: what each runs, and where processes have pools of their own, whose it is (from 1)
+    # workers: the execution of each, and, if processes have separate pools, its process (from 1)
     worker_x: list[int]
     pool: list[int]
-    # by interpreter, from 1: whether what is more urgent may overtake who holds it
+    # by interpreter, from 1: whether a more urgent execution may overtake its holder
     overtaking: list[int]
     # by DAG
     free_slot: list[int]
@@ -80,11 +79,11 @@ class State(NamedTuple):
     # whether some of its vertices are not expected here; by vertex: whether it is (see ``expect``)
     partial: list[int]
     expected: list[int]
-    # by vertex: the latest start (``Tables.latest_start``) with what is known of execution times,
-    # and the execution that became ready last, where only the newest is kept
+    # by vertex: the latest start (``Tables.latest_start``) with the known execution times, and,
+    # with ``keep: newest``, the execution that became ready last
     start_by: list[int]
     newest_ready: list[int]
-    # ``Tables.reach_start`` with what is known of execution times
+    # ``Tables.reach_start`` with the known execution times
     reach_by: list[int]
     # by slot
     job_dag: list[int]
@@ -94,7 +93,7 @@ class State(NamedTuple):
     job_state: list[int]
     job_sinks_left: list[int]
     job_late: list[int]
-    # what its latest starts count from: its release; NEVER: it goes on when it is late
+    # base of its latest starts: its release; NEVER: it continues when it is late
     job_hope: list[int]
     job_active: list[int]
     job_next: list[int]
@@ -113,9 +112,9 @@ class State(NamedTuple):
     x_started: list[int]
     x_left: list[int]
     x_cost: list[int]
-    # of a sink: the last job that was demoted
+    # of a sink: the last demoted job
     x_demoted: list[int]
-    # what was decided, for the driver to take away
+    # decisions that the driver has not fetched yet
     decisions: list[Decision]
 
 
@@ -126,7 +125,7 @@ _OBJECTS: dict[type, Any] = {
 
 
 def as_object(columns: Columns) -> Columns:
-    """Return the same columns as an object with these attributes, and no others."""
+    """Return the columns as an object with exactly these attributes."""
     result: Columns = _OBJECTS[type(columns)]()
     for name in columns._fields:
         setattr(result, name, getattr(columns, name))
@@ -134,7 +133,7 @@ def as_object(columns: Columns) -> Columns:
 
 
 def empty(kind: type[Kind]) -> Kind:
-    """Return a named tuple of columns that are all empty."""
+    """Return a named tuple of empty columns."""
     return kind(*([] for _ in kind._fields))    # type: ignore[attr-defined]
 
 
@@ -156,11 +155,11 @@ def new_state(
     :param preemptive: a smaller key takes the worker of a larger one.
     :param propagate: 1: completions make the graph's edges true at once (simulation); 0: messages
         do, leg by leg, and the driver makes each leg ready (live); 2: messages do, and the driver
-        reports each with ``rules.edge`` (rescheduling, where they take their time).
+        reports each with ``rules.edge`` (rescheduling, with message latency).
     :param dispatch_overhead: added to an execution each time it is dispatched, ns.
     :param switch_overhead: added to an execution each time it is preempted, ns.
-    :param polling: what becomes ready waits for a poll (see ``queues``); never with preemption.
-    :param urgency: what the policy's keys are: ``DEADLINE_KEYS``, ``START_KEYS`` or neither.
+    :param polling: ready executions wait for a poll (see ``queues``); never with preemption.
+    :param urgency: the kind of the policy's keys: ``DEADLINE_KEYS``, ``START_KEYS`` or neither.
     """
     state = empty(State)
     fill_state(
@@ -173,7 +172,7 @@ def fill_state(
     t: Tables, s: State, n_workers: int, preemptive: int, propagate: int, dispatch_overhead: int,
     switch_overhead: int, polling: int, urgency: int,
 ) -> None:
-    """Fill the columns of a state that is all empty; see ``new_state``."""
+    """Fill the columns of an empty state; see ``new_state``."""
     for _ in range(N_SCALARS):
         s.scalars.append(0)
     s.scalars[N_IDLE] = n_workers
@@ -209,7 +208,7 @@ def fill_state(
 
 
 def add_slot(t: Tables, s: State, dag: int) -> None:
-    """Give a DAG one more slot, with the region of executions that a job of it needs."""
+    """Add a slot to a DAG, with the region of executions that a job of it needs."""
     slot = len(s.job_dag)
     s.job_dag.append(dag)
     s.job_base.append(len(s.x_slot))
@@ -242,7 +241,7 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
 
 
 def divide(s: State, workers: list[int]) -> None:
-    """Give each process so many of the workers, and an interpreter (rule 12)."""
+    """Give each process its number of workers and an interpreter (rule 12)."""
     for process in range(len(workers)):
         for _ in range(workers[process]):
             s.pool.append(process + 1)
