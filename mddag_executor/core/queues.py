@@ -101,7 +101,7 @@ def next_queue(t: Tables, s: State, first: bool) -> list[QueueEntry]:
     """
     Return the queue whose first entry is dispatched first; empty if there is none.
 
-    Deferred executions count as soon as they may start (rules 11 and 12).
+    Deferred executions count once they may start (rules 11 and 12).
 
     :param first: no execution has been set aside since a resource became free.
     """

@@ -66,11 +66,11 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     *lead out*, to a vertex elsewhere: their messages belong to the job until they end.
 11. **The interpreter.**  Python's lock lets one thread compute at a time.  An execution that holds
     the interpreter (reported by the driver, ``State.x_holds``) starts only if no running execution
-    with the same or a smaller priority holds it.  Until then it is deferred, and others overtake
-    it.  If it is more urgent than all holders, it starts, unless the driver forbids it for the
-    moment (``State.overtaking``, from ``queues.overtaking_pays``: the wait is short).  An
-    execution that lends its worker, is suspended or turns out to wait (``stop_holding``) holds it
-    no more.
+    with the same or a smaller priority holds it.  Until then it is deferred
+    (``State.held_back``), and others overtake it.  If it is more urgent than all holders, it
+    starts, unless the driver forbids it for the moment (``State.overtaking``, from
+    ``queues.overtaking_pays``: the wait is short).  An execution that lends its worker, is
+    suspended or turns out to wait (``stop_holding``) holds it no more.
 12. **Several processes in virtual time.**  One state can represent all processes of a run
     (``state.divide``).  Each has its own workers and interpreter, for which rules 5 and 11 hold
     separately; an execution without an idle worker in its process is deferred.  There is no
@@ -360,7 +360,6 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
 
 
 def _begin(t: Tables, s: State, worker: int, now: int) -> int:
-    """Dispatch as ``take`` does, plus the dispatch overhead."""
     x = take(t, s, worker, now)
     if x >= 0:
         s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]

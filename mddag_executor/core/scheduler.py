@@ -41,7 +41,7 @@ class Scheduler:
         callback ready, and returns its execution.
     :ivar take: ``take(worker, now)`` dispatches the next execution on an idle worker and returns
         it; -1: there is none to run.
-    :ivar schedule: ``schedule(now)`` dispatches one execution where the rules want it and returns
+    :ivar schedule: ``schedule(now)`` dispatches one execution if the rules want it and returns
         it; -1: there is none to dispatch.
     :ivar complete: ``complete(x, now)`` ends a running execution; it returns False for a leg that
         did not complete its vertex.

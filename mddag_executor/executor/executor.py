@@ -312,7 +312,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._pool.report(self._engine.ready, work)
         else:
             self._new_tasks.append(work)
-        if not (is_spinning and self._pool.running):  # a spin that has just begun may not look
+        if not (is_spinning and self._pool.running):  # a spin that has just begun may not check
             self._at_once.ring()
         return task
 

@@ -251,7 +251,6 @@ def describe(error: BaseException) -> str:
 
 
 def _suggest(word: str, known: Iterable[str]) -> str:
-    """Return a remedy for an unknown word."""
     names = sorted(set(known))
     more = ', …' if len(names) > 10 else ''
     return did_you_mean(

@@ -141,12 +141,12 @@ class Ledger:
     """
     The observations of a run of synthetic nodes; as JSON, its ``vars`` are for ``of_processes``.
 
-    ``durations[dag][vertex]`` receives the duration of each body (ns),
-    ``completions[dag][vertex]`` of a sink (release, completion) in ns since the epoch,
-    ``delays[dag]`` of a timer that is a source its start and the delay after its release.
-    ``misattributed`` receives (vertex name, release by the message, release by the executor) if
-    these differ, ``unattributed`` the names of vertices that ran without a job, ``dropped_joins``
-    those of dropped joins.
+    * ``durations[dag][vertex]``: the duration of each body (ns).
+    * ``completions[dag][vertex]``, of a sink: (release, completion) in ns since the epoch.
+    * ``delays[dag]``, of a timer that is a source: its start, and the delay since its release.
+    * ``misattributed``: vertex name, release by the message and by the executor, if they differ.
+    * ``unattributed``: the names of vertices that ran without a job.
+    * ``dropped_joins``: the names of the vertices of dropped joins.
 
     :param keep: how many of the latest entries of each to keep; None: all.
     :ivar window: the readings at the beginning and the end of the measurement.
