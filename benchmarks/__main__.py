@@ -18,7 +18,7 @@ BENCHMARKS = {'live': live, 'core': core, 'replay': replay, 'evaluate': evaluate
 
 
 def run(argv: Sequence[str]) -> int:
-    """Parse a command line and make the benchmark that it names; return the exit status."""
+    """Parse a command line and run the named benchmark; return the exit status."""
     parser = Parser(
         prog='python -m benchmarks', allow_abbrev=False,
         description='Measure the executor, the core, the replayer and the batch evaluation.')

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Arguments that several benchmarks have."""
+"""Arguments of several benchmarks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mddag_executor.resources import find
 from msg_graph import TaskSet
 
 LIVE_SEED = 2
-"""Of the execution times of live runs: each deadline of the Autoware workload leaves room."""
+"""Seed of the execution times of live runs: every deadline of the Autoware workload has slack."""
 
 
 def add_graph(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +22,7 @@ def add_graph(parser: argparse.ArgumentParser) -> None:
 
 
 def load_workload(given: str | None) -> TaskSet:
-    """Return the task set of a declaration; None: of the paper's workload."""
+    """Return the task set of a declaration; None: the paper's workload."""
     return common.load_graph(str(find('config/autoware.yaml')) if given is None else given)
 
 

@@ -1,13 +1,13 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Measurements: what each is made of; making them one after the other, each in a process of its own.
+Runs measurements one after the other, each in a separate process.
 
-With repetitions all measurements are made in turn, and then all of them again: what disturbs the
-machine for a while hits every executor alike.  Of the repetitions the median of each figure is
-taken; messages are counted over all of them, so that no loss is hidden.
+With repetitions all measurements are made once, then all again, so a temporary disturbance of the
+machine affects every executor alike.  The result has the median of each figure; messages are
+counted over all repetitions, so that no loss is hidden.
 
-Nothing of ROS is imported here.
+This module imports nothing of ROS.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ PEERS = ('single', 'multi', 'events')
 """rclpy's SingleThreadedExecutor, MultiThreadedExecutor and EventsExecutor."""
 
 NONE = 'none'
-"""No executor: what the nodes of a declared load cost by themselves (see ``executors``)."""
+"""No executor: the cost of the nodes of a declared load themselves (see ``executors``)."""
 
 EXECUTORS = (OURS, *PEERS)
 ROBOT = 'robot'
-"""The load that is the ordinary nodes of an example."""
+"""The load of the ordinary nodes of an example."""
 LOADS = ('autoware', 'topics', 'entities', 'reference-system', ROBOT)
 DECLARED = {
     'autoware': 'config/autoware.yaml', 'reference-system': 'config/reference_system.yaml'}
-"""The loads that are synthetic nodes, and the declarations that ship for them."""
+"""The loads of synthetic nodes, and their declarations."""
 ROBOT_GRAPH = 'examples/robot/graph.yaml'
 PHASES = ('drawn', 'together')
-"""When the topics of a message load are published: each at a phase of its own, or all in a row."""
+"""When the topics of a message load are published: at drawn phases, or all in a row."""
 
 PATIENCE_S = 90.0
-"""What a process may take besides its window and warm-up: discovery and the end."""
+"""Allowed time of a process beyond its window and warm-up: discovery and the end."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,14 @@ class Spec:
     :ivar seconds: length of the measured window, after ``warm_up_s``.
     :ivar seed: of the execution times, or of the phases of the published topics.
     :ivar graph: path of the declaration, for declared loads.
-    :ivar utilisation: what its execution times are scaled to; None takes them as drawn.
+    :ivar utilisation: target to which its execution times are scaled; None: as drawn.
     :ivar bodies: how these execute, as ``execution.Mode``.
-    :ivar topics: how many topics are published, each with one subscription.
-    :ivar rate_hz: how often each is.
-    :ivar idle: how many subscriptions there are besides, whose topics nobody publishes.
+    :ivar topics: number of published topics, each with one subscription.
+    :ivar rate_hz: rate of each topic.
+    :ivar idle: number of additional subscriptions, to topics without publisher.
     :ivar phases: when the topics are published, one of ``PHASES``.
-    :ivar scale: of how much the robot's nodes compute.
-    :ivar process: which of the declared processes it is of; None: of all that there are.
+    :ivar scale: factor of the CPU time of the robot's nodes.
+    :ivar process: the declared process to measure; None: all.
     """
 
     load: str
@@ -104,11 +104,12 @@ class Spec:
 
 def parse_executors(text: str, policies: str | None = None) -> list[tuple[str, str]]:
     """
-    Return executors and policies that a comma separated list names.
+    Return executors and policies of a comma separated list.
 
     :param text: as ``rad,rad:fifo,multi``.
-    :param policies: comma separated; ours without a policy of its own runs with each of them.
-    :raises UsageError: on an unknown name, and one that stands there twice.
+    :param policies: comma separated; this executor, if named without policy, runs with each of
+        them.
+    :raises UsageError: for an unknown or repeated name.
     """
     default = ['rad'] if policies is None else [name.strip() for name in policies.split(',')]
     for name in default:
@@ -139,10 +140,10 @@ def measure(
     """
     Make one measurement in a new process; return its figures.
 
-    Of a declaration with ``processes:`` each is one, all at a time.
+    For a declaration with ``processes:`` each process is a new process, all at the same time.
 
-    :raises CrashError: when the process crashed, did not end and was killed, or gave no result.
-    :raises ChildError: when the measurement cannot be made.
+    :raises CrashError: if the process crashed, did not end and was killed, or gave no result.
+    :raises ChildError: if the measurement cannot be made.
     """
     names = _processes(spec)
     if len(names) > 1:
@@ -158,7 +159,7 @@ def measure(
 
 
 def _processes(spec: Spec) -> list[str]:
-    """Return the declared processes that a measurement is made of."""
+    """Return the declared processes of a measurement."""
     if spec.load not in DECLARED or spec.process is not None or spec.graph is None:
         return []
     try:
@@ -172,11 +173,11 @@ def run_all(
     warn: Callable[[str], None],
 ) -> list[dict[str, Any]]:
     """
-    Make all measurements in turn, ``repeat`` times; return a result for each of them.
+    Make all measurements one after the other, ``repeat`` times; return a result for each.
 
-    :param tick: gets now and then which one goes on, how many were made, and for how many s.
-    :param warn: gets each that crashed; its figures are None when it never succeeded.
-    :raises ChildError: when a measurement cannot be made, or when all of them crashed.
+    :param tick: receives regularly the present measurement, the number made, and its duration, s.
+    :param warn: receives each crashed measurement; if none succeeded, its figures are None.
+    :raises ChildError: if a measurement cannot be made, or all of them crashed.
     """
     runs: list[list[dict[str, Any]]] = [[] for _ in specs]
     made = 0
@@ -207,7 +208,7 @@ def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict
     """
     Return the result of a measurement from its repetitions.
 
-    :return: an object of ``live --json``; ``runs`` in it has the repetitions' figures.
+    :return: an object of ``live --json``; its ``runs`` has the repetitions' figures.
     """
     result: dict[str, Any] = {
         'load': spec.load, 'executor': spec.name, 'workers': spec.workers,
@@ -233,7 +234,7 @@ def combine(spec: Spec, runs: Sequence[dict[str, Any]], repeat: int = 1) -> dict
 
 
 def _median(values: Sequence[Any]) -> Any:
-    """Return the median of what is not None, also of each in dictionaries; whole where all are."""
+    """Return the median of values other than None, also within dictionaries; int if all are."""
     found = [value for value in values if value is not None]
     if not found:
         return None

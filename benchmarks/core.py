@@ -3,8 +3,8 @@
 """
 The benchmark `core`: CPU time of the scheduler core in plain Python, under each policy.
 
-This is what the core adds to each callback in a live run, and what simulation takes without numba.
-The machine decides about the figures, and whatever else it does: all are medians.
+The core adds this to each callback in a live run; it is also the time of simulation without numba.
+Figures depend on the machine and its other load: all are medians.
 """
 
 from __future__ import annotations

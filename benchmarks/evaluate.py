@@ -1,9 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The benchmark `evaluate`: how long a run takes, and a job of a vertex in task sets of any size.
+The benchmark `evaluate`: time of a run, and of a job of a vertex in task sets of any size.
 
-The machine decides about the figures, and whatever else it does: all are medians.
+Figures depend on the machine and its other load: all are medians.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ python -m benchmarks evaluate --runs 5000 --jobs 1,2,4 --repeat 5 --json evaluat
 
 SIZES = (10, 100, 1000, 10_000)
 CORES = ('compiled', 'plain')
-# Plain Python takes some 30 times as long; fewer say as much.
+# Plain Python takes about 30 times as long; fewer runs are enough.
 _PLAIN_SHARE = 50
 _VERTEX_JOBS = {'compiled': 200_000, 'plain': 20_000}
 

@@ -1,24 +1,23 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The executors that are compared, how they are spun, and when their callbacks start.
+The compared executors, how they are spun, and when their callbacks start.
 
 Theory of operation
 -------------------
-*No executor at all* (``NoExecutor``) shows what the nodes of a declaration cost by themselves.
-A thread for each timer waits until that is due and calls it.  Whoever
-publishes takes the message from each subscription of the topic, and runs its callback, in its own
-thread.  There is no queue, order, pool, callback group or attribution; nothing is passed
-from one thread to another.  What is left is what every executor pays for: waiting for timers,
-emulated execution, publishing, the middleware, taking messages, and the bodies themselves.  So the
-difference to an executor's CPU time is what that executor takes.  Callbacks that one message
-starts run one after the other, and so do all jobs of a DAG, so less is done in time; the cost of
-each callback hardly depends on that.
+*No executor at all* (``NoExecutor``) measures the cost of the nodes of a declaration themselves.
+A thread for each timer waits until it is due and calls it.  A publishing thread takes the message
+from each subscription of the topic, and runs its callback.  There is no queue, order, pool,
+callback group or attribution; no data passes between threads.  The rest is what every executor
+needs: waiting for timers, emulated execution, publishing, the middleware, taking messages, and
+callbacks.  So the additional CPU time of an executor is its own cost.  Callbacks of one message,
+and all jobs of a DAG, run one after the other, so fewer results are in time; the cost of each
+callback hardly depends on that.
 
 *Starts* of callbacks are noted in the same way under every executor: the callback of a
-subscription is replaced by one that reads the clock first, which costs about 1 us.  A list takes
-one tuple for each start; appending is one indivisible step in CPython, so there is no lock.
-(Timers of synthetic nodes note their starts themselves.)
+subscription is replaced by one that reads the clock first, which costs about 1 us.  Each start is
+one tuple in a list; appending is atomic in CPython, so there is no lock.  (Timers of synthetic
+nodes note their starts themselves.)
 """
 
 from __future__ import annotations
@@ -43,10 +42,10 @@ def make_executor(spec: Spec, task_set: TaskSet | None) -> Executor:
     """
     Make an executor.
 
-    :param task_set: the declared tasks, which only this executor makes use of.
+    :param task_set: the declared tasks, which only this executor uses.
     """
     if spec.executor == OURS:
-        # Here: the others are measured without a trace of this executor in the process.
+        # Imported here: the others are measured without this executor in the process.
         from mddag_executor.executor.executor import MultiDeadlineExecutor
         return MultiDeadlineExecutor(
             task_set, num_workers=spec.workers, policy=spec.policy, process=spec.process)
@@ -54,10 +53,10 @@ def make_executor(spec: Spec, task_set: TaskSet | None) -> Executor:
 
 
 class NoExecutor(Executor):
-    """Stands where an executor does; for a process that ends when it has been measured."""
+    """Replaces an executor, in a process that ends after the measurement."""
 
     def spin(self) -> None:
-        """Run the timers and subscriptions of the nodes that were added."""
+        """Run the timers and subscriptions of the added nodes."""
         nodes = self.get_nodes()
         take_where_published([s for node in nodes for s in node.subscriptions])
         for timer in [timer for node in nodes for timer in node.timers]:
@@ -70,7 +69,7 @@ class NoExecutor(Executor):
         while self.context.ok():
             left: int | None = timer.time_until_next_call()
             if left is None:
-                return  # it was cancelled, at the end
+                return  # cancelled at the end
             if left > 0:
                 time.sleep(left / 1e9)
                 continue
@@ -80,7 +79,7 @@ class NoExecutor(Executor):
 
 
 def take_where_published(subscriptions: list[Subscription]) -> None:
-    """Let every publisher of this process take from these, and run their callbacks."""
+    """Let every publisher of this process take from the subscriptions, and run callbacks."""
     by_topic: dict[str, list[tuple[Subscription, Any]]] = {}
     for subscription in subscriptions:
         by_topic.setdefault(subscription.topic_name, []).append(
@@ -123,8 +122,8 @@ def noting(
         append((now, now - info['source_timestamp']))
         callback(message)
 
-    # rclpy goes by the signature whether a callback wants message and info. Its EventsExecutor
-    # (7.1) then gives both in one tuple, which is why the second argument has a default.
+    # rclpy decides by the signature whether a callback gets message and info. Its EventsExecutor
+    # (7.1) then passes both in one tuple, so the second argument has a default.
     vars(on_message)['__signature__'] = inspect.Signature([
         inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY)
         for name in ('message', 'info')])
@@ -132,5 +131,5 @@ def noting(
 
 
 def within(starts: Iterable[Start], begin: int, end: int) -> list[int]:
-    """Return the latencies of what started in a window (ns since the epoch), ns."""
+    """Return the latencies of starts in a window (ns since the epoch), ns."""
     return [latency for at, latency in list(starts) if begin <= at <= end]

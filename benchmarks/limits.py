@@ -1,18 +1,17 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What Python's lock, its garbage collector and the system's scheduler let an executor do.
+Limits that the GIL, the garbage collector and the system's scheduler set to an executor.
 
-    python benchmarks/limits.py gil|gc|policy [--seconds 2] [--workers 7]
+python benchmarks/limits.py gil|gc|policy [--seconds 2] [--workers 7]
 
 * ``gil``: callbacks a second with one, two and all workers, for callbacks that wait (``sleep``),
-  that compute in C without the interpreter lock (``sha256``), and that compute in Python
-  (``python``), each about 5 ms long by itself; and how late an empty 10 ms timer runs meanwhile,
-  with one worker left free for it.
-* ``gc``: the longest collection and how late that timer runs in a program with a million objects,
-  with and without ``freeze_gc``.
-* ``policy``: how late that timer runs while other processes take every CPU, with the workers and
-  with the whole process under the normal and a real-time policy.
+  compute in C without the GIL (``sha256``), or compute in Python (``python``), each about 5 ms
+  long in isolation; and the lateness of an empty 10 ms timer meanwhile, with one worker left free.
+* ``gc``: the longest collection and the timer's lateness in a program with a million objects, with
+  and without ``freeze_gc``.
+* ``policy``: the timer's lateness while other processes use every CPU, with the workers and with
+  the whole process under the normal and a real-time policy.
 
 ``docs/machine.md`` names it.
 """
@@ -58,12 +57,12 @@ Body = Callable[[], None]
 
 
 def sleeping() -> Body:
-    """Return a body that waits, as one does that talks to a device or a GPU."""
+    """Return a body that waits, like one that uses a device or a GPU."""
     return lambda: time.sleep(BODY_S)
 
 
 def hashing() -> Body:
-    """Return a body that computes in C, without the interpreter lock."""
+    """Return a body that computes in C, without the GIL."""
     data = bytes(1 << 24)
     begin = time.thread_time()
     hashlib.sha256(data).digest()
@@ -115,7 +114,7 @@ class Lateness:
 
 
 def throughput(body: Body, workers: int, seconds: float) -> float:
-    """Return how many bodies a second a pool runs that always has enough of them."""
+    """Return the bodies a second that a pool runs if more are always ready."""
     done = [0] * (2 * workers)
     ending = threading.Event()
     executor = MultiDeadlineExecutor(num_workers=workers)
@@ -141,7 +140,7 @@ def throughput(body: Body, workers: int, seconds: float) -> float:
 def lateness(
     seconds: float, workers: int, body: Body | None = None, **arguments: Any
 ) -> dict[str, float]:
-    """Return how late an empty timer runs (us) while all workers but one run bodies."""
+    """Return the lateness of an empty timer (us) while all workers but one run bodies."""
     ending = threading.Event()
     watched = Lateness()
     executor = MultiDeadlineExecutor(loads(GRAPH), num_workers=workers, **arguments)
@@ -168,7 +167,7 @@ def lateness(
 
 
 def measure_gil(seconds: float, workers: int) -> list[dict[str, Any]]:
-    """Measure what workers give to each kind of body."""
+    """Measure the throughput of each kind of body by number of workers."""
     rows = []
     for name, make in BODIES.items():
         body = make()
@@ -182,7 +181,7 @@ def measure_gil(seconds: float, workers: int) -> list[dict[str, Any]]:
 
 
 class GcWatch:
-    """Notes how long each garbage collection takes, ns, while it is entered."""
+    """Notes the time of each garbage collection, ns, while it is entered."""
 
     def __init__(self) -> None:
         self.pauses: list[int] = []
@@ -204,7 +203,7 @@ class GcWatch:
 
 
 def measure_gc(seconds: float, workers: int) -> list[dict[str, Any]]:
-    """Measure the pauses of a program with many objects, which makes more all the time."""
+    """Measure the pauses of a program with many objects that allocates continuously."""
     kept = [(str(i), [i]) for i in range(OBJECTS // 2)]
     garbage: list[list[Any]] = []
 
@@ -219,7 +218,7 @@ def measure_gc(seconds: float, workers: int) -> list[dict[str, Any]]:
         with GcWatch() as watch:
             late = lateness(seconds, workers, body, freeze_gc=freeze)
             if freeze:
-                del watch.pauses[0]  # that of freeze_gc itself, before anything runs
+                del watch.pauses[0]  # the collection of freeze_gc itself, before anything runs
             longest = max(watch.pauses, default=0)
             gc.collect()
         rows.append({
@@ -232,7 +231,7 @@ def measure_gc(seconds: float, workers: int) -> list[dict[str, Any]]:
 
 
 def measure_policy(seconds: float, workers: int) -> list[dict[str, Any]]:
-    """Measure lateness beside busy processes under each policy that this process may use."""
+    """Measure lateness while processes compute, under each policy that this process may use."""
     busy = [subprocess.Popen([sys.executable, '-c', 'while True: pass'])
             for _ in range(os.cpu_count() or 1)]
     rows = []
@@ -244,7 +243,7 @@ def measure_policy(seconds: float, workers: int) -> list[dict[str, Any]]:
             arguments: dict[str, Any] = {}
             if threads is not None:
                 arguments = {'worker_policy': threads, 'worker_priority': PRIORITY}
-            if process is not None:  # threads made from here on inherit it
+            if process is not None:  # threads started from here on inherit it
                 _set_policy(process, PRIORITY)
             try:
                 late = lateness(seconds, workers, **arguments)

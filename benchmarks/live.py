@@ -1,9 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The benchmark `live`: executors of rclpy nodes side by side, each in a process of its own.
+The benchmark `live`: compares executors of rclpy nodes, each in a separate process.
 
-Everything that can be wrong with the command line is found before the first measurement.
+All errors of the command line are reported before the first measurement.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ TOPICS = ((20, 50.0), (50, 100.0))
 IDLE = (1, 10, 100, 1000)
 ENTITIES_RATE_HZ = 100.0
 
-# What an option belongs to; with any other load it is an error and not silently ignored.
+# Loads of each option; with another load an option is an error.
 _LOADS_OF_OPTIONS = {
     'graph': ('autoware', 'reference-system'), 'utilisation': ('autoware', 'reference-system'),
     'bodies': ('autoware', 'reference-system'), 'topics': ('topics',),
@@ -133,7 +133,7 @@ def _check(args: argparse.Namespace) -> None:
 
 @contextmanager
 def _graph(args: argparse.Namespace) -> Iterator[str | None]:
-    """Give the path of the declaration, checked with all utilisations; None: the load has none."""
+    """Yield the path of the declaration, checked with all utilisations; None: no declaration."""
     if args.load == ROBOT:
         yield str(find(ROBOT_GRAPH))
         return
@@ -170,7 +170,7 @@ def _utilisations(args: argparse.Namespace) -> Sequence[float | None]:
 def make_specs(
     args: argparse.Namespace, executors: Sequence[tuple[str, str]], graph: str | None
 ) -> list[Spec]:
-    """Return the measurements that a command line asks for, in the order of the table."""
+    """Return the measurements of a command line, in the order of the table."""
     variants: list[dict[str, Any]]
     if args.load == ROBOT:
         variants = [{'graph': graph, 'scale': scale} for scale in args.scale or [1.0]]
@@ -204,7 +204,7 @@ def _measure(specs: Sequence[Spec], repeat: int) -> list[dict[str, Any]]:
 
 
 def result_table(results: Sequence[dict[str, Any]]) -> str:
-    """Return the table for people: a row for each measurement."""
+    """Return the table for a terminal: a row for each measurement."""
     load = results[0]['load']
     if load == ROBOT:
         return robot_table(results)

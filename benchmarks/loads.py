@@ -1,19 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Measure an executor with a load, in this process.
+Measures an executor with a load, in this process.
 
 *Declared* loads are the synthetic nodes of a declaration.
 
-*Message* loads are subscriptions with empty callbacks.  Every message is counted: what was
-published and has not been run when nothing comes any more is lost.  The publishers are in another
-process, so the CPU time is that of receiving only: executor, middleware, interpreter, and reading
-the clock.
+*Message* loads are subscriptions with empty callbacks.  Every message is counted: published
+messages whose callback has not run when no more messages arrive are lost.  The publishers are in
+another process, so the CPU time is that of receiving only: executor, middleware, interpreter, and
+reading the clock.
 
-The *robot* is the ordinary nodes of ``examples/robot``.  They stamp what their sensors sample, on
-exact grids, and whoever ends a chain keeps a log of stamps.  *Due* are the points of a sink's grid
-whose deadline lies inside the measured window.  One is *on time* when it was done by its deadline;
-when nothing was done for it, it is *missing*.
+The *robot* is the ordinary nodes of ``examples/robot``.  Their sensors stamp samples on exact
+grids, and the node at the end of a chain logs the stamps.  *Due* are the points of a sink's grid
+whose deadline is inside the measured window.  A point is *in time* if it was done by its deadline,
+and *missing* if it was never done.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ HOT_PATH = 'hot_path'
 """Name of the path in a declaration whose latency is reported."""
 
 QUIET_S = 0.5
-"""When no callback has run for so long after the last publication, nothing comes any more."""
+"""After this time without callbacks, after the last publication, no messages are expected."""
 DRAIN_S = 10.0
 MIDDLEWARE = 'dds.'
-"""What the names of Fast DDS's threads begin with."""
+"""Prefix of the names of Fast DDS's threads."""
 
 PROGRAM = 'examples/robot/robot.py'
 
@@ -67,10 +67,10 @@ def run(spec: Spec) -> dict[str, Any]:
     """
     Make a measurement; return its figures.
 
-    :raises ChildError: when the run was over before anything was measured.
-    :raises mddag_executor.errors.MddagError: when declaration and execution times do not fit, and
-        when publishers and subscriptions do not find each other.
-    :raises msg_graph.GraphError: when the declaration is wrong.
+    :raises ChildError: if the run ended before anything was measured.
+    :raises mddag_executor.errors.MddagError: if declaration and execution times do not fit, or
+        publishers and subscriptions do not discover each other.
+    :raises msg_graph.GraphError: if the declaration is wrong.
     """
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     if spec.load == ROBOT:
@@ -80,9 +80,9 @@ def run(spec: Spec) -> dict[str, Any]:
 
 def run_declared(spec: Spec) -> dict[str, Any]:
     """
-    Run the nodes of a declaration under an executor, or those of one of its processes.
+    Run the nodes of a declaration, or of one of its processes, under an executor.
 
-    :return: the figures of ``result_of``; of one process what ``of_processes`` takes.
+    :return: the figures of ``result_of``; of one process the input of ``of_processes``.
     """
     plan = _plan(spec)
     task_set = plan.task_set
@@ -95,8 +95,8 @@ def run_declared(spec: Spec) -> dict[str, Any]:
         for subscription in node.subscriptions:
             subscription.callback = noting(starts, subscription.callback)
     run_nodes(executor, workload, spec.seconds, spec.warm_up_s)
-    # rclpy's EventsExecutor moves a timer on before it queues the call, so that calls in a backlog
-    # do not say for which due time they stand: only messages are counted there.
+    # rclpy's EventsExecutor advances a timer before it queues the call, so the due time of a call
+    # in a backlog is unknown: only messages are counted there.
     if spec.executor != 'events':
         starts += [start for delays in workload.ledger.delays for start in list(delays)]
     latencies = within(starts, *(reading.at_ns for reading in workload.ledger.window))
@@ -122,7 +122,7 @@ def result_of(plan: ExecutionPlan, ledger: Ledger, latencies: list[int]) -> dict
 
 
 def of_processes(spec: Spec, parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the figures of a run from what its processes returned."""
+    """Return the figures of a run from the results of its processes."""
     plan = _plan(spec)
     return result_of(
         plan, Ledger.of_processes(plan.task_set, [part['ledger'] for part in parts]),
@@ -133,9 +133,9 @@ def hot_path(task_set: TaskSet, result: dict[str, Any]) -> dict[str, Any] | None
     """
     Return the latency of the path ``hot_path``, from its source's release to its sink's end.
 
-    :param result: what ``measure`` made of the run.
-    :return: p50, p99 and max of the jobs that were due and completed, how many were due, and how
-        many of these are missing; None when the declaration has no such path within one DAG.
+    :param result: of ``measure``.
+    :return: p50, p99 and max of completed due jobs, and the numbers of due and missing jobs; None
+        if the declaration has no such path within one DAG.
     """
     path = next((path for path in task_set.paths if path.name == HOT_PATH), None)
     if path is None:
@@ -163,7 +163,7 @@ def run_messages(spec: Spec) -> dict[str, Any]:
         ``received`` and ``lost`` of the whole run.
     """
     executor = make_executor(spec, None)
-    # Topics of this process only, whoever else is in this domain.
+    # Topics of this process only, if others use this domain.
     prefix = f'/mddag_bench_{os.getpid()}'
     topics = [f'{prefix}/topic_{i}' for i in range(spec.topics)]
     node = quiet_node('/mddag_bench')
@@ -201,16 +201,16 @@ def run_messages(spec: Spec) -> dict[str, Any]:
 
 
 def _clocks() -> tuple[int, int, int | None]:
-    """Return the time, the CPU time of the process and that of its middleware's threads, ns."""
+    """Return the time, and the CPU time of the process and of its middleware's threads, ns."""
     return time.time_ns(), time.process_time_ns(), _middleware_cpu_ns()
 
 
 def _middleware_cpu_ns() -> int | None:
     """
-    Return the CPU time that the middleware's own threads have taken, ns.
+    Return the CPU time of the middleware's own threads, ns.
 
-    They receive and store messages, whatever the executor does.  None where the kernel does not
-    tell (no Linux), or where no thread has such a name (another middleware).
+    They receive and store messages independently of the executor.  None if the kernel does not
+    report it (no Linux), or no thread has such a name (another middleware).
     """
     times = []
     for task in Path('/proc/self/task').glob('*'):
@@ -218,7 +218,7 @@ def _middleware_cpu_ns() -> int | None:
             if (task / 'comm').read_text().startswith(MIDDLEWARE):
                 times.append(int((task / 'schedstat').read_text().split()[0]))
         except (OSError, ValueError, IndexError):
-            continue  # it has ended, or is not known
+            continue  # the thread has ended, or is unknown
     return sum(times) if times else None
 
 
@@ -227,7 +227,7 @@ def _subscribe(node: Node, topic: str, starts: list[Start]) -> Subscription:
 
 
 def _drain(session: UnfinishedSession, starts: list[Start], published: int) -> None:
-    """Wait until all messages were received, or none has come for a while."""
+    """Wait until all messages were received, or none arrived for some time."""
     last, quiet_since = -1, time.monotonic()
     end = time.monotonic() + DRAIN_S
     while len(starts) < published and time.monotonic() < end:
@@ -244,7 +244,7 @@ def run_robot(spec: Spec) -> dict[str, Any]:
     """
     Run the robot's nodes under an executor.
 
-    :return: for each sink what was due, on time, late and missing, and response times; the sums.
+    :return: by sink the numbers due, in time, late and missing, and response times; the sums.
     """
     assert spec.graph is not None
     task_set = load(spec.graph)
@@ -254,7 +254,7 @@ def run_robot(spec: Spec) -> dict[str, Any]:
         executor.add_node(node)
     session = UnfinishedSession(executor)
     with session:
-        ended = session.wait(spec.warm_up_s + 1.0)  # discovery takes a moment
+        ended = session.wait(spec.warm_up_s + 1.0)  # time for discovery
         begin, cpu = time.time_ns(), time.process_time_ns()
         ended = ended or session.wait(spec.seconds)
         end, cpu = time.time_ns(), time.process_time_ns() - cpu
@@ -281,7 +281,7 @@ def judge(
     task_set: TaskSet, logs: dict[str, Log], begin: int, end: int
 ) -> dict[str, dict[str, Any]]:
     """
-    Judge what was due in a window, by the nodes' logs.
+    Judge the results that were due in a window, by the nodes' logs.
 
     :param logs: for each sink (stamp, when it was done), ns.
     """

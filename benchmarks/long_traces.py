@@ -1,16 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Measurements of the replayer: how fast it reads and links, and how well it predicts.
+Measures the replayer: speed of reading and linking, and accuracy of predictions.
 
 Theory of operation
 -------------------
-The file to read is a simulated run of a declaration, written over and over with a pause between,
-each time later and with the next jobs' numbers; messages are recorded as the executor records
-them.  So it has the mixture of events of a live run, as long as is wanted.
+The trace is a simulated run of a declaration, repeated with a pause between, each time later and
+with the next jobs' numbers; messages are recorded as the executor records them.  So it has the
+mixture of events of a live run, of any length.
 
-Each reader is measured in a process of its own, with those that it starts itself: how long it
-takes, its CPU time, and its greatest memory.
+Each reader is measured in a separate process, including the processes that it starts: duration,
+CPU time, and maximum memory.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import TaskSet
 
 _TILE = 10_000_000_000      # ns simulated
-_PAUSE = 1_000_000_000      # ns after it, in which everything completes
+_PAUSE = 1_000_000_000      # ns after it, in which all jobs complete
 _BEGIN = 1_732_166_766_000_000_000
 _PROCESS = 1
-_ADDRESS = 1024     # times the place of a callback, so that its handles have others
+_ADDRESS = 1024     # times the index of a callback, so that handles differ
 _KINDS = ('job_release', 'dispatch', 'callback_start', 'callback_end', 'complete')
 Event = tuple[Any, ...]
 
 
 class Speed(NamedTuple):
-    """What reading took: events in the file (as far as read), seconds, greatest memory."""
+    """The cost of reading: events in the file (as far as read), seconds, maximum memory."""
 
     events: int
     elapsed_s: float
@@ -63,7 +63,7 @@ def write_long_trace(
     path: str, task_set: TaskSet, events: int, workers: int = 7, utilisation: float = 0.6,
     progress: Callable[[int], None] | None = None,
 ) -> int:
-    """Write a trace of at least so many events and return how many it has."""
+    """Write a trace of at least ``events`` events and return their number."""
     times = scale_execution_times(
         task_set, draw_execution_times(task_set, 0), workers, utilisation)
     load = periodic_load(task_set, times, _TILE)
@@ -111,9 +111,9 @@ def _shifted(tile: list[Event], number: int, jobs: list[int]) -> Iterator[Event]
 
 def _tile(task_set: TaskSet, load: Load, workers: int) -> list[Event]:
     """
-    Return the events of a simulated run, with those of its messages, as they are recorded live.
+    Return the events of a simulated run, with its messages, in the order of a live recording.
 
-    What belongs to an execution is recorded when it ends, one after the other.
+    The events of an execution are recorded when it ends, one after the other.
     """
     run = simulate(task_set, load, Settings(
         workers=workers, duration_ns=_TILE + _PAUSE, judge='completions'), log=True)
@@ -213,7 +213,7 @@ READERS: dict[str, Callable[[str, int], int]] = {
     'rosbags, undecoded': _rosbags,
 }
 OTHERS = ('mcap, undecoded', 'rosbags, undecoded')
-"""Those that stop after so many events: they are slow, and only their rate is of interest."""
+"""Readers that stop after a number of events: they are slow, and only their rate is reported."""
 
 
 def _in_child(name: str, path: str, limit: int, pipe: Any) -> None:
@@ -231,9 +231,9 @@ def _in_child(name: str, path: str, limit: int, pipe: Any) -> None:
 
 def measure(name: str, path: str, limit: int) -> Speed:
     """
-    Run one of ``READERS`` over a file in a process of its own.
+    Run one of ``READERS`` over a file in a separate process.
 
-    :param limit: events after which another's reader stops.
+    :param limit: number of events after which a reader of ``OTHERS`` stops.
     """
     context = multiprocessing.get_context('spawn')
     ours, theirs = context.Pipe(duplex=False)
@@ -266,12 +266,12 @@ class Agreement(NamedTuple):
 
     @property
     def median_error(self) -> float:
-        """Return predicted over recorded median, less one."""
+        """Return predicted over recorded median, minus one."""
         return self.predicted_median / self.recorded_median - 1
 
     @property
     def p99_error(self) -> float:
-        """Return predicted over recorded 99 % quantile, less one."""
+        """Return predicted over recorded 99 % quantile, minus one."""
         return self.predicted_p99 / self.recorded_p99 - 1
 
 
@@ -279,9 +279,9 @@ def agreements(
     recorded: Mapping[str, Any], predicted: Mapping[str, Any], ideal: Mapping[str, Any]
 ) -> list[Agreement]:
     """
-    Compare results, sink by sink; sinks without a completed job on a side are left out.
+    Compare results, sink by sink; without sinks that lack completed jobs on a side.
 
-    :param recorded: `dags` of a result of ``replay``, as the others of rescheduled ones.
+    :param recorded: `dags` of a result of ``replay``; the others: of rescheduled ones.
     """
     rows = []
     for dag_name, dag in recorded.items():

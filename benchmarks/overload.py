@@ -4,7 +4,7 @@
 The benchmark `overload`: the share of results in time at loads around and above the capacity.
 
 Each declaration is simulated with execution times that are drawn and scaled to the load.  The
-capacity is that of the workers, or, with `--interpreter`, of one interpreter that all callbacks
+capacity is that of the workers or, with `--interpreter`, of one interpreter that all callbacks
 hold.
 """
 
@@ -93,7 +93,7 @@ def _with_means(task_set: TaskSet, times: Sequence[Sequence[int]]) -> TaskSet:
 def _shares(
     args: argparse.Namespace, task_set: TaskSet, load: float, seed: int
 ) -> Iterator[tuple[str, float]]:
-    """Yield the share of results in time, by policy and what is done with late jobs."""
+    """Yield the share of results in time, by policy and handling of late jobs."""
     capacity = 1 if args.interpreter else args.workers
     times = scale_execution_times(task_set, draw_execution_times(task_set, seed), capacity, load)
     known = _with_means(task_set, times)

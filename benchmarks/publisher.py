@@ -1,16 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Publish topics at fixed rates from a process of its own, and count.
+Publishes topics at fixed rates from a separate process, and counts.
 
-Theory of operation: the process says that it is ready when each of its topics has a subscription,
-begins to publish on the first order, and stops on the second.  Then it says how many messages it
-published on each topic.  It cannot outlive the process that gives the orders.
+Theory of operation: the process reports that it is ready when each of its topics has a
+subscription, begins to publish on the first order, and stops on the second.  Then it reports the
+number of messages of each topic.  It ends when the ordering process ends.
 
-All topics have the same period.  With a seed their phases are drawn, so that messages come neither
-all at once nor evenly spaced; without one all are published in a row, each period.  What falls
-behind by more than a period leaves releases out: messages in a burst would be lost for want of
-queue depth, which is no fault of the executor that is measured.
+All topics have the same period.  With a seed their phases are drawn, so messages are neither
+simultaneous nor evenly spaced; otherwise all are published in a row, each period.  After a delay
+of more than a period releases are skipped: a burst would lose messages because of queue depth,
+which is not a fault of the measured executor.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from std_msgs.msg import Header
 
 class PublisherProcess:
     """
-    The process that publishes, seen from the one that measures; a context manager.
+    The publishing process, seen from the measuring process; a context manager.
 
-    :param topics: what it publishes.
+    :param topics: the published topics.
     """
 
     def __init__(self, topics: Sequence[str], rate_hz: float, seed: int | None) -> None:
@@ -54,7 +54,7 @@ class PublisherProcess:
         return self
 
     def __exit__(self, *args: object) -> None:
-        """End the process, whatever it does."""
+        """End the process."""
         self._process.kill()
         self._process.join()
 
@@ -62,20 +62,20 @@ class PublisherProcess:
         """
         Wait until all its topics have a subscription.
 
-        :raises ChildError: when the process ended instead.
+        :raises ChildError: if the process ended instead.
         """
         self._answer()
 
     def begin(self) -> None:
-        """Let it publish."""
-        with suppress(OSError):  # the missing answer shows it
+        """Order it to publish."""
+        with suppress(OSError):  # the missing answer shows the error
             self._orders.send(None)
 
     def finish(self) -> list[int]:
         """
-        Stop it and return how many messages it published on each topic.
+        Stop it and return the number of messages of each topic.
 
-        :raises ChildError: when the process ended before.
+        :raises ChildError: if the process ended before.
         """
         self.begin()
         counts: list[int] = self._answer()
@@ -92,7 +92,7 @@ class PublisherProcess:
 def _run(
     topics: Sequence[str], rate_hz: float, seed: int | None, orders: Connection
 ) -> None:
-    """Publish as ordered; the end of who gives the orders is an order, too."""
+    """Publish as ordered; the end of the ordering process is an order, too."""
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = quiet_node('/mddag_bench_publisher')
     publishers = [node.create_publisher(Header, topic, QOS) for topic in topics]
@@ -105,7 +105,7 @@ def _run(
         orders.recv()
         orders.send(publish(publishers, rate_hz, seed, orders.poll))
         orders.recv()
-        orders.recv()  # what was published last may have to be sent again
+        orders.recv()  # the last messages may have to be sent again
     os._exit(0)
 
 
@@ -114,9 +114,9 @@ def publish(
     is_to_stop: Callable[[float], bool],
 ) -> list[int]:
     """
-    Publish on all topics until asked to stop; return how often on each.
+    Publish on all topics until asked to stop; return the number of messages of each.
 
-    :param is_to_stop: waits for that so many seconds.
+    :param is_to_stop: waits for the given seconds.
     """
     period = round(1e9 / rate_hz)
     generator = random.Random(seed)

@@ -1,10 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The benchmark `replay`: how fast traces are read and linked, and how well reschedule predicts.
+The benchmark `replay`: speed of reading and linking traces, and accuracy of rescheduling.
 
-The machine decides about the figures, and whatever else it does: each reader has a process of its
-own, and the best of several runs counts.
+Figures depend on the machine and its other load: each reader has a separate process, and the best
+of several runs counts.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ python -m benchmarks replay --slack --utilisation 0.3 --seconds 10"""
 
 MEDIAN_LIMIT, P99_LIMIT = 0.05, 0.15
 _FEW = 100
-"""Sinks with fewer jobs are left out: their quantiles say little."""
+"""Sinks with fewer jobs are left out: their quantiles are not significant."""
 _WARM_UP_S = 2
-"""So much more is recorded and left out: who holds the interpreter is still learnt then."""
+"""Additional recorded time that is not judged, in which the GIL use of callbacks is measured."""
 _UTILISATION = {'sleep': [0.3, 0.6, 0.8]}
 _COMPUTING = [0.05, 0.08]
 """Callbacks that compute have one interpreter: 0.08 of seven workers is 0.56 of a core."""
@@ -182,8 +182,8 @@ def _accuracy(args: argparse.Namespace, folder: str) -> dict[str, Any]:
 def _record(
     graph: str, args: argparse.Namespace, utilisation: float | None, workers: int, path: str
 ) -> None:
-    """Record a live run, in a process of its own; without utilisation of the declared times."""
-    # The load is what the first number of workers would be utilised by: it stays the same.
+    """Record a live run, in a separate process; without utilisation with the declared times."""
+    # The load is the utilisation of the first number of workers: it stays the same.
     scaled = [] if utilisation is None else [
         '--utilisation', repr(utilisation * args.workers[0] / workers)]
     done = subprocess.run(
@@ -199,7 +199,7 @@ def _record(
 def _compared(
     recorded_before: str, path: str, utilisation: float, workers: int, recorded_workers: int
 ) -> dict[str, Any]:
-    """Return how well a run is predicted from a recording, which may be of that very run."""
+    """Return how well a run is predicted from a recording of the same or another run."""
     from benchmarks.long_traces import agreements
     from mddag_executor.replay import replay, reschedule
     skip = _WARM_UP_S * 1_000_000_000
@@ -218,7 +218,7 @@ def _row(row: Agreement) -> dict[str, Any]:
 
 
 def _summaries(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return a row for each setting and sink: of medians over the repeated runs."""
+    """Return a row for each setting and sink, with medians of the repeated runs."""
     from benchmarks.long_traces import Agreement
     found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for run in runs:

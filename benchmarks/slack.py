@@ -1,19 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-What `replay --slack` does: whether the slack that was found holds in live runs.
+The benchmark `replay --slack`: whether the slack that was found holds in live runs.
 
 Theory of operation
 -------------------
-The slack of a declaration with fixed execution times is found as `mddag slack GRAPH` does it.
-Then, for some callbacks, two live runs follow: with a little less than the factor (``HOLDS``) no
-deadline may be missed, with a little more (``BREAKS``) some deadline must be.
+The slack of a declaration with fixed execution times is found as by `mddag slack GRAPH`.  Then,
+for some callbacks, two live runs follow: with slightly less than the factor (``HOLDS``) no
+deadline may be missed, with slightly more (``BREAKS``) some deadline must be missed.
 
-The slack is that of callbacks that take what is declared, and of timers that are punctual.  A live
-run is neither: ``explain`` says of each late job how long callbacks ran beyond the declared time,
-how late the release was noticed, and how long the machine stood still.  A job that would not have
-been late without these (``DISTURBED``) says nothing of the slack, at either share.  What waited
-for a worker or for the interpreter counts.
+The slack assumes declared execution times and punctual timers.  A live run has neither:
+``explain`` reports for each late job how long callbacks ran beyond the declared time, how late the
+release was noticed, and how long the machine stalled.  A job that would not have been late without
+these (``DISTURBED``) is ignored, at either share.  Waiting for a worker or for the GIL counts.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from msg_graph import TaskSet
 
 HOLDS, BREAKS = 0.9, 1.1
 LEAST, MOST = 1.2, 30.0
-"""Factors that are tried: less is within what live runs differ by, more takes too long."""
+"""Range of tried factors: less is within the variation of live runs, more takes too long."""
 DISTURBED = frozenset(('ran long', 'released late', 'machine'))
 WARM_UP_NS = 1_000_000_000
 
@@ -100,7 +99,7 @@ def with_times(task_set: TaskSet, times: dict[str, int]) -> str:
     """Return a declaration with fixed execution times, ns, by callback."""
     import yaml
     text = 'tag:yaml.org,2002:str'
-    # As nodes, not as values: a name such as on or 0x10 stays what it is.
+    # As nodes, not as values: a name such as on or 0x10 is not changed.
     declaration = yaml.compose(task_set.text, yaml.SafeLoader)
     for node in _entries(declaration)['nodes'].value:
         of_node = _entries(node)
@@ -119,7 +118,7 @@ def _entries(node: Any) -> dict[str, Any]:
 
 
 def _misses(trace: str) -> tuple[int, int]:
-    """Return how many deadlines were missed, and how many more through disturbances."""
+    """Return the number of missed deadlines, and of additional ones through disturbances."""
     from mddag_executor.replay import replay
     jobs = replay(trace, skip=WARM_UP_NS).explanation.result()['jobs']
     count = [is_counted(job) for job in jobs]

@@ -1,19 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-How long simulation takes for each run, for each job of a vertex, and the core for each event.
+Measures the time of simulation per run and per job of a vertex, and of the core per event.
 
 Theory of operation
 -------------------
 ``time_core`` has two drivers of the same core in plain Python.  *Simulated*: ``engine.run`` over a
-periodic load in virtual time, with as many workers and as much waiting as the workload makes;
-whatever the engine takes is counted in.  *Live calls*: the live executor's calls of the core for
-each callback (release, ready, take, complete), leg by leg, one callback after the other, without
-clock, threads and messages.
+periodic load in virtual time, with the workload's parallelism and waiting; the engine's own time
+is included.  *Live calls*: the live executor's calls of the core for each callback (release,
+ready, take, complete), leg by leg, one callback after the other, without clock, threads and
+messages.
 
-An *event* is something that the core gets or decides: a release, a completion, a start or a
-preemption.  Times are CPU time of the thread, medians over repetitions; the garbage collector is
-off meanwhile, as its share depends on what else the process holds.
+An *event* is an input or a decision of the core: a release, a completion, a start or a preemption.
+Times are CPU time of the thread, medians over repetitions; the garbage collector is off meanwhile,
+because its share depends on other objects of the process.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ def time_runs(
     experiment: Experiment, runs: int, *, core: str, jobs: int, repeat: int
 ) -> dict[str, Any]:
     """
-    Measure how long each run and policy of an experiment takes.
+    Measure the time per run and policy of an experiment.
 
-    :param repeat: how often to do it, each time with its own draws; the medians are taken.
-    :return: for machines; ``ms`` is wall-clock time for each run and policy.
+    :param repeat: number of repetitions, each with its own draws; medians are returned.
+    :return: for JSON; ``ms`` is wall-clock time for each run and policy.
     """
     evaluate(experiment, jobs, jobs=jobs,
                            compiled=core == 'compiled')  # compiled or loaded, memory in place
@@ -71,7 +71,7 @@ def time_runs(
 
 def random_task_set(n_vertices: int) -> TaskSet:
     """
-    Make DAGs of about ten vertices, or more where there would be too many, that miss no deadline.
+    Make DAGs of about ten vertices (larger ones if there are too many), without misses.
 
     The normalised utilisation on ``WORKERS`` workers is 0.6.
     """
@@ -87,10 +87,10 @@ def time_vertex_jobs(
     n_vertices: int, *, core: str, vertex_jobs: int, repeat: int
 ) -> dict[str, Any]:
     """
-    Measure how long each job of a vertex takes under ``rad``, in a random task set.
+    Measure the time per job of a vertex under ``rad``, in a random task set.
 
-    :param vertex_jobs: about how many to simulate; each DAG has at least one job.
-    :return: for machines; ``ns`` of CPU time is the median over the repetitions.
+    :param vertex_jobs: approximate number to simulate; each DAG has at least one job.
+    :return: for JSON; ``ns`` of CPU time is the median over the repetitions.
     """
     task_set = random_task_set(n_vertices)
     rate = sum(len(dag.vertices) / dag.period_ns for dag in task_set.dags)
@@ -100,7 +100,7 @@ def time_vertex_jobs(
     done = sum(-(-duration_ns // dag.period_ns) * len(dag.vertices) for dag in task_set.dags)
     times = Draws(task_set, 0).times(0, 1)
     accepted = judge(settings, times)
-    assert np.all(accepted)  # else it ended early
+    assert np.all(accepted)  # otherwise it ended early
     return {'vertices': len(task_set.vertices), 'core': core, 'vertex_jobs': done,
             'ns': 1e9 * _seconds(lambda: judge(settings, times), repeat) / done}
 
@@ -114,9 +114,9 @@ def time_core(
 
     :param duration_ns: of virtual time.
     :param seed: of the execution times.
-    :return: for machines: counts, and us of CPU time for each event and vertex job.
-    :raises mddag_executor.core.PolicyError: when there is no such policy.
-    :raises SimulationError: when a callback declares no execution time.
+    :return: for JSON: counts, and us of CPU time for each event and vertex job.
+    :raises mddag_executor.core.PolicyError: if there is no such policy.
+    :raises SimulationError: if a callback declares no execution time.
     """
     settings = Settings(policy, workers, duration_ns, preemptive=None)
     tables = Tables.build(task_set)
@@ -160,7 +160,7 @@ def _seconds(work: Callable[[], object], repeat: int) -> float:
 
 def drive_live(tables: Tables, policy: str, load: Load) -> int:
     """
-    Make the core's calls of a live run: the jobs that are released at one instant, till their end.
+    Make the core's calls of a live run: jobs with the same release together, until they end.
 
     :param tables: with legs.
     :return: the number of vertex jobs that completed.
@@ -179,7 +179,7 @@ def drive_live(tables: Tables, policy: str, load: Load) -> int:
             if core.complete(x, now):
                 completed += 1
                 for after in successors[first[vertex]:first[vertex + 1]]:
-                    # Some leg of it: that which nobody has made ready yet.
+                    # A leg of the vertex that is not ready yet.
                     leg = core.execution(slot, after)
                     while state.x_state[leg] != IDLE:
                         leg += 1

@@ -305,7 +305,6 @@ class _Source:
         return table
 
     def _complete(self, table: Table, complete: Table) -> None:
-        """Fill in what executions completed."""
         table['leg'] = complete['leg']
         table['completes'] = np.where(complete['last_leg'], VERTEX, LEG)
         table['cpu'] = complete['cpu_time']

@@ -168,7 +168,6 @@ class System:
                 progress(count)
 
     def _number(self, event: Event, fields: Fields) -> int:
-        """Return the number of an event's callback."""
         return self._who.callback(event[2], fields['callback'], event[1]).number
 
     def _start(self, event: Event, fields: Fields) -> None:

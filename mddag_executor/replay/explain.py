@@ -78,7 +78,7 @@ class Explanation:
             self._in_stops[stop] += int(mine.sum())
         self._waited: dict[int, list[tuple[int, int]]] | None = None
 
-    # --- what is explained -----------------------------------------------------------------------
+    # --- input -----------------------------------------------------------------------------------
 
     def _missed(self, judged: Judged, chains: Chains) -> tuple[Table, Table]:
         """Return the misses, and the links of their chains."""

@@ -381,7 +381,7 @@ class ImportedRun(LinkObserver):
         if run.number >= 0:
             self._taken.add(run.number, message.number, run.start)
 
-    # --- what to say -----------------------------------------------------------------------------
+    # --- warnings --------------------------------------------------------------------------------
 
     @property
     def warnings(self) -> list[str]:

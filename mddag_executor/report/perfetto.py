@@ -133,7 +133,7 @@ class _Writer:
         self._verdicts()
         self._flush()
 
-    # --- what there is ---------------------------------------------------------------------------
+    # --- contents --------------------------------------------------------------------------------
 
     def _executions(self) -> None:
         columns, rows = executions(self._replay)

@@ -338,7 +338,7 @@ def heapify(heap):
         _sink(heap, place)
 
 
-# --- memory that is lent --------------------------------------------------------
+# --- memory of others --------------------------------------------------------------------------
 
 @njit
 def set_address(vector, address):

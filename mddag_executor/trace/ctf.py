@@ -440,7 +440,6 @@ class _Importer:
 
 
 def _legal(name: str) -> str:
-    """Return a name that ROS allows."""
     name = re.sub(r'[^A-Za-z0-9_]', '_', name).lstrip('_') or 'unnamed'
     return name if name[0].isalpha() else f'n{name}'
 

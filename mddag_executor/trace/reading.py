@@ -169,7 +169,7 @@ class Reading:
                 yield Message(known[channel], log_time, publish_time,
                               bytes(loaded.data[start + FIELDS - 4:start + _CONTENT + length]))
 
-    # --- where messages are ----------------------------------------------------------------------
+    # --- positions of messages -------------------------------------------------------------------
 
     def _messages(self, stream: BinaryIO) -> Iterator[tuple[_Loaded, _Places]]:
         """Yield the data of some blocks, and by channel the positions of its messages."""
@@ -313,7 +313,7 @@ class Reading:
         except ValueError as error:
             raise Damage(str(error), block.offset) from None
 
-    # --- what they say ---------------------------------------------------------------------------
+    # --- contents of messages --------------------------------------------------------------------
 
     def _decoded(self, loaded: _Loaded, found: _Places) -> Batch:
         """Return the events of some blocks; count undecodable ones."""
