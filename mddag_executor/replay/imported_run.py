@@ -313,7 +313,7 @@ class ImportedRun(LinkObserver):
         columns['order'][run.number] = self._next_order()
 
     def _ended(self, run: Execution) -> Ended:
-        """Return what ended; here each execution has one piece."""
+        """Return the ended execution; here each has one piece."""
         return Ended(0, True, run.start, run.end - run.start)
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
@@ -350,7 +350,7 @@ class ImportedRun(LinkObserver):
         return doubted
 
     def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
-        """Note the jobs of a callback whose fate becomes unknown."""
+        """Doubt jobs: those of a callback that ran for an unknown one, or all open ones."""
         if callback is None:
             self._doubts.discarded(time)
         elif (target := self.targets.get(callback.number)) is not None:
@@ -360,7 +360,7 @@ class ImportedRun(LinkObserver):
             self._active[(dag, job)] -= 1
 
     def sent(self, message: Publication) -> None:
-        """Remember the jobs of a publication."""
+        """Store a publication, and note that its job has sent it."""
         of = None if message.run is None else message.run.of
         if of is not None and (message.stamp or message.within):
             self._doubts.sent(of[0], of[2], message.topic)

@@ -455,7 +455,7 @@ class Joined:
             part.expected[which] = legs_here[place][dag]
 
     def _by_source(self, dag: Dag, release: int, part: _Part) -> int:
-        """Convert a release that is a stamp of another machine from the clock of that machine."""
+        """Return a release on the joined clock; a stamp counts by the source machine's clock."""
         if dag.release_from != 'header_stamp' or self._vertices[
                 dag.index][dag.source] in part.hosted.get(dag.index, self._vertices[dag.index]):
             return release
