@@ -33,6 +33,7 @@ HEADER = re.compile(
 THIRD_PARTY: dict[str, tuple[str | None, str | None]] = {
     'ament_index_python': ('ament_index_python', None),
     'action_msgs': ('action_msgs', None),
+    'argcomplete': ('python3-argcomplete', 'argcomplete'),
     'bokeh': (None, 'bokeh'),  # of the extra `report`
     'builtin_interfaces': ('builtin_interfaces', None),
     'diagnostic_msgs': ('diagnostic_msgs', None),

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from mddag_executor.core import NEVER, policy, PolicyError, rad_offsets, Tables
+from mddag_executor.core.tables import ABORT, CONTINUE
 from msg_graph import TaskSet
 import pytest
 
@@ -42,7 +43,7 @@ def test_columns_of_two_dags() -> None:
     assert tables.sink_deadline == [-1, 30 * US, -1, 25 * US, 40 * US, -1, 40 * US, -1]
     assert tables.sinks == [1, 3, 4, 6]
     assert tables.first_sink == [0, 3, 4, 4]
-    assert tables.on_late == [1, 0, 0]
+    assert tables.on_late == [ABORT, CONTINUE, CONTINUE]
     assert tables.max_active_jobs == [4, 9, NEVER]
     assert tables.expire_after == [7, 7, NEVER]
     assert tables.n_predecessors == [0, 1, 1, 2, 1, 0, 1, 0]

@@ -128,7 +128,7 @@ def test_a_hostile_declaration_in_a_trace(tmp_path: Path, field: str) -> None:
 def judge_with(tmp_path: Path, field: str, text: str) -> None:
     path = tmp_path / 'run.mcap'
     event = next(event for event in read_events(BAG) if event['_name'] == 'mddag:task_set')
-    with TraceFile(path) as file:
+    with TraceFile(path, overwrite=True) as file:
         file.add('task_set', event['_timestamp'], 1, 1, *(
             text if name == field else event.get(name, 0)
             for name, _ in EVENTS['mddag:task_set'].fields))

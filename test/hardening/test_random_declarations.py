@@ -30,8 +30,7 @@ TIMES = ['1us', '7us', '1ms', '10ms', '33.3ms', '999.999ms', '1s', '86400s', '14
 VERBS = (
     ('graph', 'check'), ('graph', 'analyse'),
     ('graph', 'draw', '-o', 'out.mmd'), ('graph', 'draw', '-o', 'out.dot'),
-    ('graph', 'assign-deadlines', '--runs', '2', '--jobs', '1', '--duration', '300us', '-o',
-     'out.yaml'),
+    ('graph', 'assign-deadlines', '--runs', '2', '--duration', '300us', '-o', 'out.yaml'),
     ('simulate', '--duration', '300us', '--workers', '2'),
     ('simulate', '--duration', '300us', '--policy', 'llf', '--preemptive', '--trace', 'out.mcap'),
     ('evaluate', '--runs', '2', '--duration', '300us', '--policies', 'rad', '--jobs', '1'),

@@ -406,7 +406,8 @@ def test_a_relative_topic_is_that_below_the_root(tmp_path: Path, storage: Storag
     assert Bag(relative, ['/points']).topics == {'/points', '/chatter'}
 
 
-def test_a_chunk_that_is_there_twice_is_used_once(tmp_path: Path) -> None:
+def test_a_chunk_too_many_or_too_few_is_told(tmp_path: Path) -> None:
+    """It is not mended: a bag with other chunks than its summary lists is damaged."""
     bag = tmp_path / 'bag.mcap'
     with bag.open('wb') as stream:
         writer = McapWriter(stream, chunk_size=60, compression=CompressionType.NONE)
@@ -419,17 +420,15 @@ def test_a_chunk_that_is_there_twice_is_used_once(tmp_path: Path) -> None:
     data = bag.read_bytes()
     chunks = [(start, end) for opcode, start, end in records_of(data) if opcode == Opcode.CHUNK]
     (start, _), (end, _) = chunks[3:5]
-    whole = list(Bag(bag, ['/points']).stamps['/points'].arrival)
-    for changed, says, lost in (
-        (data[:end] + data[start:end] + data[end:],
-         'chunks that are there twice were used once: 1', False),
-        (data[:start] + data[end:], '1 chunk is missing', True),
+    whole = len(Bag(bag, ['/points']).stamps['/points'].arrival)
+    for changed, says in (
+        (data[:end] + data[start:end] + data[end:], 'used all of the data, 6 chunks'),
+        (data[:start] + data[end:], 'used all of the data, 4 chunks'),
     ):
         bag.write_bytes(changed)
         read = Bag(bag, ['/points'])
-        arrivals = list(read.stamps['/points'].arrival)
-        assert arrivals == whole[:len(arrivals)]
-        assert (len(arrivals) < len(whole)) == lost
+        messages = len(read.stamps['/points'].arrival)
+        assert messages != whole
         assert [says in line for line in read.warnings] == [True]
 
 
