@@ -111,8 +111,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param graph: a declaration (path of a YAML file), a ``msg_graph.TaskSet``, or None.
     :param num_workers: threads of the pool; by default the declared number, else seven.
     :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
-    :param on_late: the treatment of late jobs of a DAG that does not declare it: ``demote``,
-        ``continue`` or ``abort``.
+    :param on_late: the treatment of late jobs of a DAG that does not declare it: ``continue``,
+        ``demote`` or ``abort``.
     :param context: the context of the executor, or None for the default one.
     :param trace: path of an MCAP file to record to, or None. If the file exists, the constructor
         raises, unless ``overwrite`` is true.
@@ -145,7 +145,7 @@ class MultiDeadlineExecutor(BareExecutor):
         num_workers: int | None = None,
         *,
         policy: str = 'rad',
-        on_late: str = 'demote',
+        on_late: str = 'continue',
         context: Context | None = None,
         trace: str | os.PathLike[str] | None = None,
         on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,
