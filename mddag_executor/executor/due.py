@@ -62,7 +62,7 @@ class DueTimes:
         Handle everything due by now; return the functions to call without the lock.
 
         :param now: the time on the trace's clock.
-        :param since: since when the calling thread has waited in the epoll, on the trace's clock.
+        :param since: since when a thread has waited in the epoll, on the trace's clock; or now.
         """
         pool, monotonic = self._pool, now - self._offset
         self._notice_stop(monotonic, since - self._offset)

@@ -486,7 +486,8 @@ class WorkerPool:
             if self.muting.until and not engine.holders:
                 self.muting.end(self.running)
             if (expired or self.timers.has_jumped) and self.running:
-                timed = self.due.handle(now, me.waits_since if has_waited else now)
+                timed = self.due.handle(
+                    now, self._waited_since(me.waits_since if has_waited else now))
             found = not is_last and not timed and self._choose(me, now, bool(events))
             if not found or self.polling or expired or now - self._updated_at > BRIEF_NS:
                 self._updated_at = now
@@ -497,6 +498,16 @@ class WorkerPool:
         if calls or timed:
             self._call(calls + timed)
         return self._turn(me, []) if timed else found
+
+    def _waited_since(self, mine: int) -> int:
+        """
+        Return since when any thread has waited in the epoll.
+
+        :param mine: since when the calling one has, or now.
+        """
+        if not self.polling:
+            return mine
+        return min([mine, *(each.waits_since for each in self._threads if each.is_polling)])
 
     def _do_deferred(self) -> None:
         """Call the functions that waited for the lock."""

@@ -157,9 +157,8 @@ def test_three_commands_from_a_robot_to_a_verdict(folder: Path, mddag: Mddag) ->
     done = mddag('replay', 'a.mcap', 'g.yaml', '--json', 'r.json')
     assert done.returncode == 0, done.stderr
     ran = int(re.findall(r'/detector: detect \(subscription /image\) (\d+)', '\n'.join(lines))[0])
-    verdicts = counts(json.loads(Path('r.json').read_text())['dags']['/camera']['sinks'][
-        '/detector:detect'])
-    assert verdicts.in_time + verdicts.late == ran > 0
+    sink = json.loads(Path('r.json').read_text())['dags']['/camera']['sinks']['/detector:detect']
+    assert sink['completed'] == ran > 0  # on a busy machine the last one may not get to run
 
 
 @pytest.mark.parametrize(('tolerate', 'status'), [('1 of 1000', 1), ('999 of 1000', 0)])
