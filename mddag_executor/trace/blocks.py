@@ -42,6 +42,7 @@ MAX_CHUNK = 256 * 1024 * 1024
 _PLAIN_BLOCK = 256 * 1024
 _CHUNK_HEAD = 1024              # bytes; more than the head of a chunk
 _FOOTER_SIZE = records.RECORD.size + records.FOOTER_CONTENT.size + len(records.MAGIC)
+_LZ4_PIECE_BYTES = 4 * 1024 * 1024
 _REMEDY = 'give a trace written by this program or another MCAP recording'
 
 
@@ -248,12 +249,27 @@ def _decompress(data: bytes, compression: str, room: memoryview) -> bool:
         with zstandard.ZstdDecompressor().stream_reader(data) as reader:
             return reader.readinto(room) == size and not reader.read(1)
     if compression == 'lz4' and (size or data):
-        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
-    elif compression not in ('', 'zstd', 'lz4'):
+        return _decompress_lz4(data, room)
+    if compression not in ('', 'zstd', 'lz4'):
         raise ValueError(f'the compression of a chunk, {compression[:20]!r}, is unknown')
     if len(data) == size:
         room[:] = data
     return len(data) == size
+
+
+def _decompress_lz4(data: bytes, room: memoryview) -> bool:
+    """Do the same piece by piece, so that memory is needed for the buffer only."""
+    frame = lz4.frame.LZ4FrameDecompressor()
+    filled = 0
+    while True:
+        piece = frame.decompress(data, max_length=_LZ4_PIECE_BYTES)
+        data = b''
+        if filled + len(piece) > len(room):
+            return False
+        room[filled:filled + len(piece)] = piece
+        filled += len(piece)
+        if frame.eof or frame.needs_input:
+            return filled == len(room)
 
 
 def read_summary(stream: BinaryIO, size: int) -> tuple[bool, Summary | None]:

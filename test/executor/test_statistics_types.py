@@ -24,12 +24,13 @@ nodes:
 
 
 def check(value: Any, hint: Any, place: str) -> None:
-    """Find out whether a value has the type that is declared, with all keys and no other."""
+    """Find out whether a value has the type that is declared, no key missing or more."""
     if is_typeddict(hint):
         hints = get_type_hints(hint)
-        assert isinstance(value, dict) and set(value) == set(hints), place
-        for key, inner in hints.items():
-            check(value[key], inner, f'{place}.{key}')
+        assert isinstance(value, dict), place
+        assert hint.__required_keys__ <= set(value) <= set(hints), place
+        for key, inner in value.items():
+            check(inner, hints[key], f'{place}.{key}')
     elif get_origin(hint) in (Union, UnionType):
         kinds = [each for each in get_args(hint) if each is not NoneType]
         if value is not None:
