@@ -113,6 +113,9 @@ setup(
             'colcon-package-selection',
             'colcon-ros',
             'colcon-test-result',
+            # the examples of docs/tables.md
+            'duckdb',
+            'pandas',
             # new versions have new findings
             'mypy==2.4.1',
             *ros('jazzy', 'test-msgs'),

@@ -110,7 +110,7 @@ def test_the_report_opens_and_shows_it(browser: Any, folder: Path) -> None:
     text = browser.execute_script('return document.body.innerText')
     assert 'imported 12 threads ran callbacks' in ' '.join(text.split())
     assert re.search(r'target\s+47 of 56\s+all\s+46', text)
-    assert re.search(r'/filter_node:callback_0\s+49\s', text)
+    assert re.search(r'\bfilter_node:callback_0\s+49\s', text)
     names = pages.bars(browser, 'a')
     assert len(names) == 480 and names.count(FILTER) == 49
     starts = [left for left, name in zip(pages.bars(browser, 'left'), names) if name == FILTER]
