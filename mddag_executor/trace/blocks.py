@@ -227,7 +227,7 @@ def load(stream: BinaryIO, block: Block, room: memoryview) -> bytes:
     if len(read) < block.after - block.data_offset:
         raise Damage('the file has become shorter', block.offset)
     try:
-        fits = _decompress(read[:length], block.compression, room)
+        fits = _decompress(memoryview(read)[:length], block.compression, room)
     except (zstandard.ZstdError, RuntimeError, MemoryError):
         raise Damage('a chunk cannot be decompressed', block.offset) from None
     except ValueError as error:
@@ -239,7 +239,7 @@ def load(stream: BinaryIO, block: Block, room: memoryview) -> bytes:
     return read[length:]
 
 
-def _decompress(data: bytes, compression: str, room: memoryview) -> bool:
+def _decompress(data: memoryview, compression: str, room: memoryview) -> bool:
     """Decompress data into a buffer; return whether it fills the buffer exactly."""
     size = len(room)
     if compression == 'zstd' and (size or data):
@@ -249,7 +249,7 @@ def _decompress(data: bytes, compression: str, room: memoryview) -> bool:
         with zstandard.ZstdDecompressor().stream_reader(data) as reader:
             return reader.readinto(room) == size and not reader.read(1)
     if compression == 'lz4' and (size or data):
-        return _decompress_lz4(data, room)
+        return _decompress_lz4(bytes(data), room)
     if compression not in ('', 'zstd', 'lz4'):
         raise ValueError(f'the compression of a chunk, {compression[:20]!r}, is unknown')
     if len(data) == size:
