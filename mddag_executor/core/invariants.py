@@ -109,6 +109,9 @@ def _groups(t: Tables, s: State) -> Iterator[str]:
 def _slots(t: Tables, s: State) -> Iterator[str]:
     active_slots = 0
     for slot, dag in enumerate(s.job_dag):
+        if dag == t.n_dags:
+            active_slots += s.x_state[s.job_base[slot]] in ACTIVE
+            continue
         if s.job_state[slot] == FREE:
             if s.job_active[slot] != 0:
                 yield f'slot {slot} is free, and {s.job_active[slot]} executions are active'
@@ -132,18 +135,20 @@ def _slots(t: Tables, s: State) -> Iterator[str]:
         active_slots += active
     if active_slots != sum(map(s.x_state.count, ACTIVE)):
         yield 'executions of free slots are active'
+    unused = sorted(s.job_base[slot] for slot, dag in enumerate(s.job_dag)
+                    if dag == t.n_dags and s.x_state[s.job_base[slot]] not in ACTIVE)
+    if sorted(s.undeclared) != unused:
+        yield f'the undeclared executions {unused} are unused, noted are {sorted(s.undeclared)}'
 
 
 def _open_jobs(t: Tables, s: State) -> Iterator[str]:
     of_dag: dict[tuple[int, int], set[int]] = {}
     for slot, dag in enumerate(s.job_dag):
         of_dag.setdefault((dag, s.job_state[slot]), set()).add(slot)
-    for dag in range(t.n_dags + 1):
+    for dag in range(t.n_dags):
         free = _chain(s.job_next, s.free_slot[dag], len(s.job_dag))
         if len(free) != len({*free}) or {*free} != of_dag.get((dag, FREE), set()):
             yield f'the list of free slots of DAG {dag} is {free}'
-        if dag == t.n_dags:
-            continue  # undeclared jobs are in no list
         jobs = _chain(s.job_next, s.oldest[dag], len(s.job_dag))
         back = _chain(s.job_previous, s.newest[dag], len(s.job_dag))
         if jobs != back[::-1] or {*jobs} != of_dag.get((dag, OPEN), set()):

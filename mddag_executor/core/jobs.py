@@ -37,21 +37,6 @@ from mddag_executor.core.state import (
 from mddag_executor.core.tables import DEMOTE, NEVER, Tables
 
 
-def open_undeclared(s: State, dag: int, job: int, release: int) -> int:
-    """
-    Open the job of an undeclared callback; return its slot, or -1 as ``release_job``.
-
-    It has one execution and is not judged, so it is in no list of open jobs.
-    """
-    slot = s.free_slot[dag]
-    if slot >= 0:
-        s.free_slot[dag] = s.job_next[slot]
-        s.job_index[slot] = job
-        s.job_release[slot] = release
-        s.job_state[slot] = OPEN
-    return slot
-
-
 def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int) -> int:
     """
     Open a job (rule 1) and return its slot, or -1 when the DAG needs one more slot first.
@@ -59,8 +44,6 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     :param job: index of the job in its DAG, from 0.
     :param release: time its source became due, ns; not later than ``now``.
     """
-    if dag == t.n_dags:
-        return open_undeclared(s, dag, job, release)
     expire_idle(t, s, dag, now)
     if s.n_open[dag] >= t.max_active_jobs[dag]:
         expire_job(t, s, s.oldest[dag], now)
@@ -110,8 +93,7 @@ def expect(t: Tables, s: State, dag: int, here: list[int]) -> None:
 def _leave_out(t: Tables, s: State, slot: int) -> None:
     """Leave out of a new job what is not expected here, as if it had completed (rule 10)."""
     dag = s.job_dag[slot]
-    last = t.n_vertices + 1 if dag == t.n_dags else t.first_vertex[dag + 1]
-    for vertex in range(t.first_vertex[dag], last):
+    for vertex in range(t.first_vertex[dag], t.first_vertex[dag + 1]):
         if s.expected[vertex] == ELSEWHERE:
             s.x_pending[s.job_base[slot] + t.region_offset[vertex]] = -1
             if t.sink_deadline[vertex] >= 0:

@@ -89,13 +89,12 @@ from mddag_executor.core.jobs import (
     close_job,
     deactivate,
     fail_job,
-    free_slot,
     judge,
     outdate_job,
     outdate_sink,
     overdue,
 )
-from mddag_executor.core.policies import KeyFunction
+from mddag_executor.core.policies import Key, KeyFunction
 from mddag_executor.core.queues import (
     add_stale,
     idle_worker,
@@ -115,7 +114,6 @@ from mddag_executor.core.state import (
     DONE,
     DROP,
     DROPPED,
-    EXPIRED,
     LATE,
     LEADS_OUT,
     N_HOLDING,
@@ -141,18 +139,9 @@ def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     """Put an execution into the ready queue (rule 3)."""
     slot = s.x_slot[x]
     s.job_active[slot] += 1
-    s.x_ready[x] = now
-    s.x_started[x] = -1
     s.x_left[x] = s.x_cost[x]
-    s.scalars[ORDER] += 1
-    k = key(t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], s.scalars[ORDER])
-    entry = (k[0], k[1], k[2], k[3], x)
-    s.x_key[x] = entry
-    s.x_state[x] = WAITING
-    if s.scalars[POLLING] == 0:
-        heappush(s.ready, entry)
-    else:
-        wait_for_poll(t, s, entry)
+    order = s.scalars[ORDER] = s.scalars[ORDER] + 1
+    _enqueue(t, s, x, key(t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], order))
     if t.keep_newest[s.x_vertex[x]] != 0:
         _keep_newest(t, s, x, now)
 
@@ -183,35 +172,31 @@ def ready_undeclared(
     t: Tables, s: State, key: KeyFunction, job: int, group: int, holds: int, now: int
 ) -> int:
     """
-    Make an undeclared callback ready, as the one execution of a separate job.
+    Make an undeclared callback ready: it is not judged, and has no job to account for.
 
-    :param job: the job's index; ``group`` and ``holds``: see ``State.x_group``, ``x_holds``.
+    :param job: its index, for the key; ``group``, ``holds``: see ``State.x_group``, ``x_holds``.
     :return: the execution.
     """
-    dag = t.n_dags
-    if s.free_slot[dag] < 0:
-        add_slot(t, s, dag)
-    slot = s.free_slot[dag]
-    s.free_slot[dag] = s.job_next[slot]
-    s.job_index[slot] = job
-    s.job_release[slot] = now
-    s.job_state[slot] = OPEN
-    s.job_active[slot] = 1
-    x = s.job_base[slot]
+    if len(s.undeclared) == 0:
+        add_slot(t, s, t.n_dags)
+    x = s.undeclared.pop()
     s.x_group[x] = group
     s.x_holds[x] = holds
-    s.x_ready[x] = now
-    s.x_started[x] = -1
-    s.scalars[ORDER] += 1
-    k = key(t, t.n_vertices, now, job, s.scalars[ORDER])
+    order = s.scalars[ORDER] = s.scalars[ORDER] + 1
+    _enqueue(t, s, x, key(t, t.n_vertices, now, job, order))
+    return x
+
+
+def _enqueue(t: Tables, s: State, x: int, k: Key) -> None:
+    """Let a fresh execution wait with its key."""
     entry = (k[0], k[1], k[2], k[3], x)
     s.x_key[x] = entry
+    s.x_started[x] = -1
     s.x_state[x] = WAITING
     if s.scalars[POLLING] == 0:
         heappush(s.ready, entry)
     else:
         wait_for_poll(t, s, entry)
-    return x
 
 
 def edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int) -> None:
@@ -227,7 +212,7 @@ def drop(s: State, x: int, now: int) -> None:
     Drop a waiting execution, for example because its queue is full; it never runs.
 
     Its entry remains in a queue as stale until it reaches the top or stale entries are the larger
-    part.  The job of an undeclared callback has no other execution, so it ends here.
+    part.
     """
     in_queue = s.x_state[x] == WAITING  # a refused execution is in no queue
     s.x_state[x] = DROPPED
@@ -237,9 +222,10 @@ def drop(s: State, x: int, now: int) -> None:
     group = s.x_group[x]
     if group >= 0 and (s.group_owner[group] == -1 or s.group_owner[group] == x):
         _release_group(s, group)  # it may have been its group's entry in the ready queue
-    if dag == len(s.free_slot) - 1:
-        s.job_state[slot] = EXPIRED
-    deactivate(s, slot)
+    if dag == len(s.free_slot):
+        s.undeclared.append(x)
+    else:
+        deactivate(s, slot)
     if in_queue:
         add_stale(s)
 
@@ -317,12 +303,14 @@ def start_on(s: State, x: int, worker: int, now: int) -> None:
     """Start a ready execution, which is no longer in a queue, on this idle worker."""
     s.x_state[x] = RUNNING
     s.x_worker[x] = worker
-    s.scalars[N_HOLDING] += s.x_holds[x]
     s.x_started[x] = now
     s.worker_x[worker] = x
     s.scalars[N_IDLE] -= 1
-    if s.x_group[x] >= 0:
-        s.group_owner[s.x_group[x]] = x
+    if s.x_holds[x] != 0:
+        s.scalars[N_HOLDING] += s.x_holds[x]
+    group = s.x_group[x]
+    if group >= 0:
+        s.group_owner[group] = x
 
 
 def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
@@ -440,8 +428,9 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     if worker >= 0:  # not _leave_worker: a call less for each execution
         s.worker_x[worker] = -1
         s.x_worker[x] = -1
-        s.scalars[N_HOLDING] -= s.x_holds[x]
         s.scalars[N_IDLE] += 1
+        if s.x_holds[x] != 0:
+            s.scalars[N_HOLDING] -= s.x_holds[x]
     s.x_state[x] = DONE
     group = s.x_group[x]
     if group >= 0 and s.group_owner[group] == x:
@@ -449,12 +438,11 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
             _release_group(s, group)
         else:
             s.group_owner[group] = -1
-    slot = s.x_slot[x]
     vertex = s.x_vertex[x]
-    if vertex == t.n_vertices:  # undeclared: its job has no other execution
-        s.job_active[slot] = 0
-        free_slot(s, slot)
+    if vertex == t.n_vertices:
+        s.undeclared.append(x)
         return True
+    slot = s.x_slot[x]
     head = s.job_base[slot] + t.region_offset[vertex]
     whole = True
     if s.scalars[PROPAGATE] == 0 and t.n_predecessors[vertex] > 0:

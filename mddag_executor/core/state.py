@@ -71,6 +71,8 @@ class State(NamedTuple):
     pool: list[int]
     # by interpreter, from 1: whether a more urgent execution may overtake its holder
     overtaking: list[int]
+    # the executions of undeclared callbacks that may be used again
+    undeclared: list[int]
     # by DAG
     free_slot: list[int]
     oldest: list[int]
@@ -108,7 +110,6 @@ class State(NamedTuple):
     x_holds: list[int]
     x_worker: list[int]
     x_key: list[QueueEntry]
-    x_ready: list[int]
     x_started: list[int]
     x_left: list[int]
     x_cost: list[int]
@@ -197,7 +198,7 @@ def fill_state(
         add_group(s)
     for _ in range(n_workers):
         s.worker_x.append(-1)
-    for _ in range(t.n_dags + 1):
+    for _ in range(t.n_dags):
         s.free_slot.append(-1)
         s.oldest.append(-1)
         s.newest.append(-1)
@@ -208,21 +209,31 @@ def fill_state(
 
 
 def add_slot(t: Tables, s: State, dag: int) -> None:
-    """Add a slot to a DAG, with the region of executions that a job of it needs."""
+    """
+    Add a slot to a DAG, with the region of executions that a job of it needs.
+
+    A slot of the undeclared DAG has one execution, which is used again; its columns of a job never
+    change.
+    """
     slot = len(s.job_dag)
     s.job_dag.append(dag)
     s.job_base.append(len(s.x_slot))
     s.job_index.append(-1)
     s.job_release.append(0)
-    s.job_state.append(FREE)
+    s.job_state.append(FREE if dag < t.n_dags else OPEN)
     s.job_sinks_left.append(0)
     s.job_late.append(0)
     s.job_hope.append(NEVER)
     s.job_active.append(0)
-    s.job_next.append(s.free_slot[dag])
+    s.job_next.append(-1)
     s.job_previous.append(-1)
-    s.free_slot[dag] = slot
-    last = t.n_vertices + 1 if dag == t.n_dags else t.first_vertex[dag + 1]
+    last = t.n_vertices + 1
+    if dag < t.n_dags:
+        s.job_next[slot] = s.free_slot[dag]
+        s.free_slot[dag] = slot
+        last = t.first_vertex[dag + 1]
+    else:
+        s.undeclared.append(s.job_base[slot])
     for vertex in range(t.first_vertex[dag], last):
         for _ in range(t.n_legs[vertex]):
             s.x_slot.append(slot)
@@ -233,7 +244,6 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_state.append(IDLE)
             s.x_pending.append(0)
             s.x_worker.append(-1)
-            s.x_ready.append(0)
             s.x_started.append(-1)
             s.x_left.append(0)
             s.x_cost.append(0)

@@ -213,13 +213,19 @@ def release_load(
     """Release the i-th job of a load, with its execution times."""
     dag = load.dags[i]
     job = load.jobs[i]
+    cost = load.cost_base[dag] + job * load.cost_stride[dag]
+    if dag == t.n_dags:
+        x = rules.ready_undeclared(
+            t, s, key, job, -1, load.holds[cost] if len(load.holds) > 0 else 0, now)
+        s.job_index[s.x_slot[x]] = job
+        s.x_cost[x] = s.x_left[x] = load.costs[cost]
+        return
     release = load.releases[i] if len(load.releases) > 0 else now
     slot = jobs.release_job(t, s, dag, job, release, now)
     if slot < 0:
         add_slot(t, s, dag)
         slot = jobs.release_job(t, s, dag, job, release, now)
     base = s.job_base[slot]
-    cost = load.cost_base[dag] + job * load.cost_stride[dag]
     source = t.region_offset[t.source[dag]]
     if len(load.fates) > 0:
         if load.fates[cost + source] == SKIPPED:

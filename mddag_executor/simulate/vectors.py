@@ -258,6 +258,16 @@ def _overload_append(vector: Any, value: Any) -> Any:
     return append
 
 
+@overload_method(VectorType, 'pop', strict=False)
+def _overload_pop(vector: Any) -> Any:
+    def pop(vector):
+        length = _get_word(vector, 1) - 1
+        _set_word(vector, 1, length)
+        return _load(vector, length)
+
+    return pop
+
+
 @overload_method(VectorType, 'clear', strict=False)
 def _overload_clear(vector: Any) -> Any:
     return lambda vector: _set_word(vector, 1, 0)

@@ -58,7 +58,7 @@ def test_an_undeclared_callback_that_fails_is_judged_by_nobody() -> None:
     x = undeclared(scheduler, 0, -1, 1)
     assert scheduler.take(0, 1) == x
     rules.fail(scheduler.tables, scheduler.state, scheduler.policy.key, x, 2)
-    assert scheduler.decisions() == [] and scheduler.state.job_state[0] == FREE
+    assert scheduler.decisions() == [] and scheduler.state.undeclared == [x]
 
 
 def test_a_stuck_job_does_not_keep_younger_ones_from_expiring() -> None:

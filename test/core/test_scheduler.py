@@ -116,17 +116,3 @@ def test_queues_stay_bounded_when_what_waits_longest_is_dropped_for_ever(grouped
         scheduler.complete(order[-1], 4_000)
     assert order == waiting
     assert scheduler.take(0, 4_000) == -1
-
-
-def test_an_undeclared_job_of_a_load_is_in_no_list_and_its_slot_is_used_again() -> None:
-    scheduler = live()
-    undeclared_dag = scheduler.tables.n_dags
-    slots = []
-    for job in range(3):
-        slot = scheduler.release(undeclared_dag, job, job, job)
-        x = scheduler.execution(slot, scheduler.tables.n_vertices)
-        assert run_one(scheduler, x, job)
-        slots.append(slot)
-    assert slots == [slots[0]] * 3
-    assert scheduler.state.oldest[undeclared_dag] == -1
-    assert scheduler.decisions() == []
