@@ -45,7 +45,7 @@ def checked(text: str, wanted: TaskSet) -> str:
 
 def without_lines(task_set: TaskSet) -> TaskSet:
     """Return the task set without line numbers."""
-    nowhere = {callback.key: {'line': 0, 'file': None} for callback in task_set.callbacks}
+    nowhere = {callback.key: {'line': 0} for callback in task_set.callbacks}
     return replace(task_set.with_callbacks(nowhere), text='')
 
 
@@ -72,11 +72,7 @@ def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Table[str, int]) 
     :param task_set: the task set of the text.
     :param deadlines: by the callback's key, ns.
     """
-    try:
-        result = _with_deadlines(text, deadlines)
-    except KeyError:  # the declaration has several files
-        raise _refused(task_set.file) from None
-    return checked(result, with_deadlines(task_set, deadlines))
+    return checked(_with_deadlines(text, deadlines), with_deadlines(task_set, deadlines))
 
 
 def _callbacks(text: str) -> Iterator[tuple[str, Any, dict[str, Any]]]:

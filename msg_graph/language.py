@@ -22,7 +22,6 @@ from collections.abc import Callable
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
 import math
-import os
 import re
 from typing import Any
 
@@ -33,14 +32,9 @@ from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
 Schema = dict[str, Any]
 
-ARGUMENT = re.compile(r'[A-Za-z_][A-Za-z0-9_]*')
-ARGUMENT_USE = rf'\$\({ARGUMENT.pattern}\)'
-"""An argument of the file in a value; the JSON Schema allows it in all values."""
-
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _OF = re.compile(r'[ \t]*([0-9]{1,6})[ \t]+of[ \t]+([0-9]{1,6})[ \t]*')
 _INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
-_USE: Schema = {'type': 'string', 'pattern': ARGUMENT_USE}
 _ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
 _WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
 
@@ -237,7 +231,7 @@ def name(what: Name) -> Kind:
     return text(what.check, {
         # YAML reads some short names as numbers, and this program does not.
         'type': 'string' if what.is_global else ['string', 'integer'],
-        'pattern': f'^(?:{what.pattern.pattern})$|{ARGUMENT_USE}', 'maxLength': what.longest})
+        'pattern': f'^(?:{what.pattern.pattern})$', 'maxLength': what.longest})
 
 
 def choice(*words: str, missing: str | None = '') -> Kind:
@@ -248,8 +242,7 @@ def choice(*words: str, missing: str | None = '') -> Kind:
         return (f'{shown(word)} is not known',
                 did_you_mean(word, words, f'use {", ".join(words)}'))
 
-    return text(
-        check, {'anyOf': [{'enum': list(words)}, _USE]}, words[0] if missing == '' else missing)
+    return text(check, {'enum': list(words)}, words[0] if missing == '' else missing)
 
 
 def items(form: Schema) -> Kind:
@@ -295,7 +288,7 @@ def texts(item: Kind, least: int = 0, *too_few: str) -> Kind:
 
 def numbers(**bounds: int) -> Kind:
     """Return the kind of a non-empty list of finite numbers."""
-    trees = items({'anyOf': [{'type': 'number', **bounds}, _USE]})
+    trees = items({'type': 'number', **bounds})
 
     def read(entry: Entry, key: str, value: Tree) -> list[float]:
         found = []
@@ -335,8 +328,7 @@ def whole(least: int, most: int) -> Kind:
                               f'write a number from {least} to {most}')
         return int(value.text)
 
-    return Kind(read, {'anyOf': [
-        {'type': 'integer', 'minimum': least, 'maximum': most}, _USE]})
+    return Kind(read, {'type': 'integer', 'minimum': least, 'maximum': most})
 
 
 def truth() -> Kind:
@@ -346,19 +338,7 @@ def truth() -> Kind:
             raise entry.error(key, f'{shown(key)} is {_described(value)}', 'write true or false')
         return value.text == 'true'
 
-    return Kind(read, {'anyOf': [{'type': 'boolean'}, _USE]})
-
-
-def pairs(value_kind: Kind) -> Kind:
-    """Return the kind of a mapping of texts: key, text and line of each."""
-    def read(entry: Entry, key: str, value: Tree) -> list[tuple[str, str, int]]:
-        if not isinstance(value, Mapping):
-            raise entry.error(key, f"'{key}' is no mapping", f'write {key}: {{name: value}}')
-        keys = dict.fromkeys(value.entries, Key(value_kind, ''))
-        inner = Entry(value, entry.file, f"{entry.name}: '{key}'", keys)
-        return [(each, inner.get(each), inner.line_of(each)) for each in keys]
-
-    return Kind(read, {'type': 'object', 'additionalProperties': value_kind.schema}, [])
+    return Kind(read, {'type': 'boolean'})
 
 
 def kind_of(tree: Tree) -> str:
@@ -381,13 +361,6 @@ def _check_format(given: str) -> tuple[str, str] | None:
     return f'{shown(given)} is no known version of the format', f"write 'mddag: {FORMAT}'"
 
 
-def _check_file(path: str) -> tuple[str, str] | None:
-    if os.path.isabs(path) or path.startswith('~') or '\0' in path or not path:
-        return (f'{shown(path)} is no relative path',
-                'write it as seen from the file that includes it')
-    return None
-
-
 def weakly_hard() -> Kind:
     """Return the kind of 'N of M': at most N misses in any M results in a row."""
     def read(entry: Entry, key: str, value: Tree) -> WeaklyHard:
@@ -402,7 +375,7 @@ def weakly_hard() -> Kind:
                 'tolerate at least 1 miss, and fewer than all')
         return WeaklyHard(misses, of)
 
-    return Kind(read, {'type': 'string', 'pattern': f'^(?:{_OF.pattern})$|{ARGUMENT_USE}',
+    return Kind(read, {'type': 'string', 'pattern': f'^(?:{_OF.pattern})$',
                        'examples': ['1 of 100']})
 
 
@@ -428,15 +401,17 @@ def _read_execution_time(entry: Entry, key: str, value: Tree) -> ExecutionTime:
 
 def _read_processes(entry: Entry, key: str, value: Tree) -> dict[str, dict[str, int]]:
     """Return the nodes of each process, with their lines."""
+    if not isinstance(value, Mapping):
+        raise entry.error(key, f"'{key}' is no mapping", f'write {key}: {{NAME: [/node, …], …}}')
+    nodes = texts(name(NODE))
+    inner = Entry(value, entry.file, f"{entry.name}: '{key}'", dict.fromkeys(
+        value.entries, Key(nodes, '')))
     found: dict[str, dict[str, int]] = {}
-    for process, _, line in _NODES_BY_PROCESS.read(entry, key, value):
+    for process in value.entries:
         wrong = PROCESS.check(process)
         if wrong is not None:
-            problem, remedy = wrong
-            raise GraphError(entry.file, line, f'{entry.name}: {shown(key)}: {problem}', remedy)
-        nodes = value.entries[process] if isinstance(value, Mapping) else None
-        assert isinstance(nodes, Sequence)
-        found[process] = {each.text: each.line for each in nodes.items if isinstance(each, Scalar)}
+            raise inner.error(process, *wrong)
+        found[process] = {node: inner.line_of(process, node) for node in inner.get(process)}
     return found
 
 
@@ -467,11 +442,9 @@ def _mapping(keys: dict[str, Key]) -> Schema:
                            for word, key in keys.items()}}
 
 
-_NODES_BY_PROCESS = pairs(texts(name(NODE)))
 _PROCESSES = Kind(_read_processes, {
-    **_NODES_BY_PROCESS.schema, 'propertyNames': {'pattern': f'^(?:{PROCESS.pattern.pattern})$'}},
-    {})
-_VALUES = pairs(text(lambda _: None, {'type': ['string', 'number', 'boolean', 'null']}))
+    'type': 'object', 'additionalProperties': texts(name(NODE)).schema,
+    'propertyNames': {'pattern': f'^(?:{PROCESS.pattern.pattern})$'}}, {})
 
 QUANTILES = {
     'quantiles_us': Key(numbers(minimum=0), 'Quantiles in us, rising.', needed=True),
@@ -482,10 +455,6 @@ _EXECUTION_TIME = Kind(_read_execution_time, {'oneOf': [time().schema, _mapping(
 FILE = {
     'mddag': Key(text(_check_format, {'enum': [int(FORMAT), FORMAT]}),
                  'Version of the format.', needed=True),
-    'arguments': Key(_VALUES,
-                     'Arguments of this file, $(name) in its values, with their defaults.'),
-    'include': Key(_entries('include'),
-                   'Files whose nodes and paths come before those of this one.'),
     'workers': Key(whole(1, MOST_WORKERS), 'Number of workers that the system is made for.'),
     'nodes': Key(_entries('node'),
                  'The nodes; a node may have several entries, and their order counts for ties.',
@@ -493,13 +462,6 @@ FILE = {
     'processes': Key(_PROCESSES, 'The processes that the nodes run in, each with its nodes; those '
                      'that are not named run in the first.'),
     'paths': Key(_entries('path'), 'End-to-end paths over trigger and queue edges.'),
-}
-INCLUDE = {
-    'file': Key(text(_check_file, {'type': 'string'}), 'The file, as seen from this one.',
-                needed=True),
-    'namespace': Key(name(NODE), 'Put before all names of the included file.'),
-    'remap': Key(pairs(name(TOPIC)), 'Names of the included file and what they become.'),
-    'set': Key(_VALUES, 'Values of the arguments of the included file.'),
 }
 NODE_KEYS = {
     'node': Key(name(NODE), 'Fully qualified name of the node.', needed=True),
@@ -542,7 +504,7 @@ CALLBACK_KEYS = {
 PATH_KEYS = {
     'name': Key(name(PATH), 'Name of the path.', needed=True),
     'callbacks': Key(texts(text(check_key, {'type': 'string', 'pattern': (
-        f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$|{ARGUMENT_USE}')}),
+        f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$')}),
         2, 'a path of one callback', 'give at least 2'),
         "The callbacks along it, each as '/node:callback'.", needed=True),
 }
@@ -555,10 +517,7 @@ def schema() -> Schema:
         'title': 'mddag declaration',
         'description': 'Nodes, their callbacks and what starts them, with periods and deadlines.',
         **_mapping(FILE),
-        'required': ['mddag'],
-        'anyOf': [{'required': ['nodes']}, {'required': ['include']}],
         'definitions': {
-            'include': {'oneOf': [INCLUDE['file'].kind.schema, _mapping(INCLUDE)]},
             'node': _mapping(NODE_KEYS),
             'callback': {**_mapping(CALLBACK_KEYS),
                          'oneOf': [{'required': [key]} for key in TRIGGERS]},
@@ -566,7 +525,7 @@ def schema() -> Schema:
             'time': {
                 'type': 'string',
                 'pattern': rf'^[ \t]*\+?([0-9]+(\.[0-9]*)?|\.[0-9]+)[ \t]*({"|".join(UNITS)})'
-                           rf'[ \t]*$|{ARGUMENT_USE}',
+                           r'[ \t]*$',
                 'examples': ['100ms', '20us', '1.5s'],
             },
         },

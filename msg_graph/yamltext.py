@@ -33,7 +33,6 @@ _NOT_YAML = re.compile('[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-
 _PLAIN_TAGS = (None, '!')
 _ENDS = (yaml.SequenceEndEvent, yaml.MappingEndEvent)
 _PLAIN = re.compile(r'[/A-Za-z_][/A-Za-z0-9_.-]*')
-_SIMPLE = re.compile(r'[+-]?[A-Za-z0-9_/.][A-Za-z0-9_/. +-]*')
 _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
 
 
@@ -64,12 +63,6 @@ class Sequence:
         self.items: list[Tree] = []
         self.size = 1
 
-    def with_items(self, items: list[Tree]) -> Sequence:
-        """Return a list with the same lines and other items."""
-        result = Sequence(self.line)
-        result.items, result.size = items, self.size
-        return result
-
 
 class Mapping:
     """Trees by key, in file order, and the line of each key."""
@@ -81,12 +74,6 @@ class Mapping:
         self.entries: dict[str, Tree] = {}
         self.key_lines: dict[str, int] = {}
         self.size = 1
-
-    def with_entries(self, entries: dict[str, Tree]) -> Mapping:
-        """Return a mapping with the same lines and other values."""
-        result = Mapping(self.line)
-        result.entries, result.key_lines, result.size = entries, self.key_lines, self.size
-        return result
 
 
 Tree = Scalar | Sequence | Mapping
@@ -110,28 +97,6 @@ def decode(data: bytes, file: str) -> str:
 def plain_scalar(text: str) -> str:
     """Return a name (without quotes in it), quoted if YAML would read it as another type."""
     return text if _PLAIN.fullmatch(text) and text.lower() not in _WORDS else f"'{text}'"
-
-
-def yaml_lines(tree: Tree) -> list[str]:
-    """Return the lines of a text with an equal tree; its scalars must have one line each."""
-    if isinstance(tree, Scalar):
-        simple = tree.plain and _SIMPLE.fullmatch(tree.text)
-        return [tree.text if simple else "'" + tree.text.replace("'", "''") + "'"]
-    if isinstance(tree, Sequence) and all(isinstance(item, Scalar) for item in tree.items):
-        return [f'[{", ".join(line for item in tree.items for line in yaml_lines(item))}]']
-    lines = []
-    if isinstance(tree, Sequence):
-        for item in tree.items:
-            first, *rest = yaml_lines(item)
-            lines += [f'- {first}', *(f'  {line}' for line in rest)]
-        return lines
-    for key, value in tree.entries.items():
-        first, *rest = yaml_lines(value)
-        if isinstance(value, Mapping) or first.startswith('- '):
-            lines += [f'{key}:', f'  {first}', *(f'  {line}' for line in rest)]
-        else:
-            lines.append(f'{key}: {first}')
-    return lines
 
 
 def parse_yaml(text: str, file: str) -> Tree | None:

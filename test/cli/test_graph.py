@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 import subprocess
 
-import msg_graph
+from benchmarks import autoware_multi
 import pytest
 
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
@@ -31,7 +31,7 @@ paths:
 
 def test_standard_input_and_output(call: Mddag, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)
-    text = msg_graph.load(CONFIG / 'autoware_multi.yaml').text
+    text = autoware_multi.task_set().text
     done = call('graph', 'check', '-', '--json', '-', stdin=text)
     assert done.returncode == 0
     warned = [line.partition(': its deadline is longer than its period, and ')[0]

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from benchmarks import autoware_multi
 from msg_graph import load, model, TaskSet
 import pytest
 
@@ -23,12 +24,11 @@ def autoware() -> TaskSet:
 
 @pytest.fixture(scope='module')
 def multi() -> TaskSet:
-    return load(CONFIG / 'autoware_multi.yaml')
+    return autoware_multi.task_set()
 
 
-@pytest.mark.parametrize('file', ['autoware.yaml', 'autoware_multi.yaml'])
-def test_the_graph_is_that_of_the_facts(file: str) -> None:
-    tasks = load(CONFIG / file)
+def test_the_graph_is_that_of_the_facts(autoware: TaskSet) -> None:
+    tasks = autoware
     assert [dag.name for dag in tasks.dags] == list(DAGS)
     assert (len(tasks.dags), len(tasks.vertices), len(tasks.callbacks)) == (11, 86, 84)
     assert tasks.workers == 7
@@ -41,9 +41,8 @@ def test_the_graph_is_that_of_the_facts(file: str) -> None:
             assert vertex.successors == tuple(
                 int(after) for before, after in listed if int(before) == vertex.index)
         assert dag.sinks == tuple(facts.deadlines)
-        if file == 'autoware.yaml':
-            assert [dag.vertices[i].deadline_ns for i in dag.sinks] == [
-                deadline * MS for deadline in facts.deadlines.values()]
+        assert [dag.vertices[i].deadline_ns for i in dag.sinks] == [
+            deadline * MS for deadline in facts.deadlines.values()]
         assert dag.source == 0
         assert dag.vertices[0].callback.kind == 'timer'
         for vertex in dag.vertices:
@@ -60,9 +59,8 @@ def test_load_is_that_of_the_paper(autoware: TaskSet) -> None:
     assert sum(share for share in shares if share) / 7 == pytest.approx(0.729, abs=0.001)
 
 
-@pytest.mark.parametrize('file', ['autoware.yaml', 'autoware_multi.yaml'])
-def test_paths_run_end_to_end(file: str) -> None:
-    tasks = load(CONFIG / file)
+def test_paths_run_end_to_end(autoware: TaskSet) -> None:
+    tasks = autoware
     assert len(tasks.queue_edges) == 32
     paths = {path.name: path.callbacks for path in tasks.paths}
     assert set(paths) == {

@@ -4,9 +4,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from msg_graph import GraphError, load, loads, Process
+from msg_graph import GraphError, loads, Process
 from msg_graph.edit import load_processes, with_processes
 import pytest
 
@@ -78,14 +76,3 @@ def test_a_file_of_its_own() -> None:
         with pytest.raises(GraphError) as caught:
             load_processes(text, 'p.yaml', tasks)
         assert says in str(caught.value)
-
-
-def test_those_of_an_included_file_do_not_count(tmp_path: Path) -> None:
-    (tmp_path / 'inner.yaml').write_text(HEAD + 'processes: {inner: [/a], other: [/b]}\n')
-    top = tmp_path / 'top.yaml'
-    top.write_text('mddag: 1\ninclude: [inner.yaml]\n')
-    assert load(top).processes == ()
-    top.write_text('mddag: 1\ninclude: [inner.yaml]\nprocesses: {x: [/b], y: [/c]}\n')
-    tasks = load(top)
-    assert tasks.processes == (Process('x', ('/a', '/b')), Process('y', ('/c',)))
-    assert loads(tasks.text).processes == tasks.processes

@@ -14,6 +14,7 @@ from pathlib import Path
 import re
 import subprocess
 
+from benchmarks import autoware_multi
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.report import dot, mermaid
@@ -148,7 +149,7 @@ def test_graphviz_reads_hostile_names_as_they_are() -> None:
 
 
 def test_the_workload() -> None:
-    result = picture(msg_graph.load(ROOT / 'config' / 'autoware_multi.yaml'))
+    result = picture(autoware_multi.task_set())
     boxes = result.boxes
     assert (len(result.dags), len(boxes), len({box.mark for box in boxes})) == (11, 86, 86)
     assert {arrow.start for arrow in result.arrows} <= {box.mark for box in boxes}

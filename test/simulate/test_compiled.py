@@ -16,6 +16,7 @@ import random
 import subprocess
 import sys
 
+from benchmarks import autoware_multi
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import POLICIES, Tables
@@ -163,10 +164,9 @@ def test_runs_do_not_disturb_one_another(
     assert found.tolist() == plain.tolist()
 
 
-@pytest.mark.parametrize('name', ['autoware.yaml', 'autoware_multi.yaml'])
 @pytest.mark.parametrize('policy', POLICIES)
-def test_autoware(name: str, policy: str) -> None:
-    task_set = load(CONFIG / name)
+def test_autoware(policy: str) -> None:
+    task_set = autoware_multi.task_set()
     times = Draws(task_set, 11).times(0, 3).tolist()
     row = times[2]
     split, place = [], 0
