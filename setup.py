@@ -18,9 +18,8 @@ DOCS = [
 ]
 EXPORT = ['pyarrow>=14']
 REPORT = ['bokeh>=3.6']
-TOP = ['rich>=13']
 TEST_LIVE = [
-    *BATCH, *TOP, 'hypothesis', 'jsonschema', 'pytest>=7.4', 'pytest-timeout', 'pytest-xdist']
+    *BATCH, 'hypothesis', 'jsonschema', 'pytest>=7.4', 'pytest-timeout', 'pytest-xdist']
 
 
 def ros(distribution: str, *packages: str) -> list[str]:
@@ -101,8 +100,6 @@ setup(
         'ros': ros('jazzy', *ROS),
         # instead of `ros`
         'ros-kilted': ros('kilted', *ROS),
-        # mddag top
-        'top': TOP,
         'test': [
             *DASK,
             *DOCS,

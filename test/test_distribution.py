@@ -22,8 +22,7 @@ import pytest
 TOP = Path(__file__).resolve().parent.parent
 NAME = 'mddag_executor'
 SHARE = f'share/{NAME}'
-OPTIONAL = ('bokeh', 'distributed', 'llvmlite', 'matplotlib', 'numba', 'perfetto', 'pyarrow',
-            'rich')
+OPTIONAL = ('bokeh', 'distributed', 'llvmlite', 'matplotlib', 'numba', 'perfetto', 'pyarrow')
 ROS = ('ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'launch', 'launch_ros',
        'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'rosidl_parser', 'std_msgs')
 BLOCKER = """
@@ -108,7 +107,6 @@ def test_works_without_anything_optional(tmp_path: Path) -> None:
 @pytest.mark.parametrize(('missing', 'extra', 'commands'), [
     ('bokeh', 'report', ['simulate graph.yaml --report out.html',
                          f'replay {TRACE} --report out.html']),
-    ('rich', 'top', ['top']),
     ('pyarrow', 'export', [f'export {TRACE} -o out.parquet']),
     ('matplotlib', 'batch', ['evaluate graph.yaml --runs 2 --plot out.png']),
     ('distributed', 'dask', ['evaluate graph.yaml --runs 2 --dask tcp://127.0.0.1:9']),
@@ -129,7 +127,7 @@ def test_says_in_one_line_what_is_missing(
 # --- start-up ------------------------------------------------------------------------------------
 
 HEAVY = {'bokeh', 'ctypes', 'distributed', 'llvmlite', 'lz4', 'matplotlib', 'mcap', 'numba',
-         'numpy', 'perfetto', 'pyarrow', 'rclpy', 'rich', 'rosbags', 'ruamel', 'yaml',
+         'numpy', 'perfetto', 'pyarrow', 'rclpy', 'rosbags', 'ruamel', 'yaml',
          'zstandard'}
 
 

@@ -52,7 +52,6 @@ THIRD_PARTY: dict[str, tuple[str | None, str | None]] = {
     'pyarrow': (None, 'pyarrow'),  # of the extra `export`
     'rcl_interfaces': ('rcl_interfaces', None),
     'rclpy': ('rclpy', None),
-    'rich': (None, 'rich'),  # of the extra `top`
     'ros2cli': ('ros2cli', None),
     'rosbags': ('python3-rosbags-pip', 'rosbags'),
     'rosgraph_msgs': ('rosgraph_msgs', None),

@@ -4,8 +4,8 @@
 The verb `top`: the states of executors on `/diagnostics`, live in a terminal.
 
 It only listens, so it watches processes on any machine that ROS reaches, and costs them nothing.
-Statuses of others on the topic are left out. On a terminal the picture is renewed in place (with
-rich, the extra `top`); elsewhere, or with `--once`, it is printed as plain tables.
+Statuses of others on the topic are left out. On a terminal the tables are renewed in place;
+elsewhere, or with `--once`, they are printed as a whole.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-import os
+import shutil
 import sys
 import time
 
 from mddag_executor.cli import common, options
-from mddag_executor.errors import MddagError, UsageError
-from mddag_executor.report.board import Board, KEYS, picture, plain
+from mddag_executor.errors import MddagError
+from mddag_executor.report.board import Board, tables
 
 EXAMPLE = """\
 mddag top
@@ -27,6 +27,12 @@ mddag top --once --json - | jq '.statuses[] | select(.level != "OK")'"""
 
 TOPIC = '/diagnostics'
 INTERVAL_S = 1.0
+# ECMA-48 and xterm: another screen without cursor, and back; to the first line; clear the rest
+_ENTER, _LEAVE = '\x1b[?1049h\x1b[?25l', '\x1b[?25h\x1b[?1049l'
+_HOME, _TO_END, _BELOW = '\x1b[H', '\x1b[K', '\x1b[J'
+_WAITING = """\
+waiting for an executor to publish its state: mddag run does, and a program with
+diagnostics_period (Ctrl-C ends)"""
 PATIENCE_NS = 10_000_000_000
 
 
@@ -48,8 +54,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Listen and show."""
     live = sys.stdout.isatty() and not args.once and common.wants_tables(args)
-    if live:
-        _check_rich()
     board = Board()
     seconds = None if args.duration is None else args.duration / 1e9
     with _listening(board) as spin:
@@ -57,7 +61,7 @@ def main(args: argparse.Namespace) -> int:
             if args.once:
                 _wait(spin, board, args.timeout / 1e9)
             elif live:
-                _show_live(_ticks(spin, board, seconds, args.timeout / 1e9), board, seconds)
+                _show_live(_ticks(spin, board, seconds, args.timeout / 1e9), board)
             else:
                 _print_now_and_then(
                     _ticks(spin, board, seconds, args.timeout / 1e9), board,
@@ -69,17 +73,8 @@ def main(args: argparse.Namespace) -> int:
             f'{TOPIC}: no executor has published its state here: start one with '
             'mddag run, or with diagnostics_period, and check ROS_DOMAIN_ID')
     if common.write_result(args, board.result()) and args.once:
-        print(plain(board.statuses()), end='')
+        print(tables(board.statuses()), end='')
     return 0
-
-
-def _check_rich() -> None:
-    try:
-        import rich  # noqa: F401
-    except ImportError:
-        raise UsageError(
-            'top: it shows live pictures with rich, which is not installed: pip install '
-            "'mddag_executor[top]', or use --once") from None
 
 
 def _wait(spin: Callable[[float], None], board: Board, seconds: float) -> None:
@@ -92,52 +87,24 @@ def _wait(spin: Callable[[float], None], board: Board, seconds: float) -> None:
         spin(0.1)
 
 
-def _show_live(ticks: Iterator[None], board: Board, seconds: float | None) -> None:
-    from rich.console import Console
-    from rich.live import Live
-    from rich.text import Text
-    console = Console()
-    waiting = Text(
-        'waiting for an executor to publish its state: mddag run does, and a program with '
-        f'diagnostics_period ({KEYS})')
-    with _keys() as pressed, Live(
-            waiting, console=console, auto_refresh=False, screen=seconds is None) as screen:
-        for _ in ticks:
-            statuses = board.statuses()
-            screen.update(
-                picture(statuses, console.width) if statuses else waiting, refresh=True)
-            if 'q' in pressed():
-                return
-
-
-@contextmanager
-def _keys() -> Iterator[Callable[[], str]]:
-    """Give a function that returns what was typed since; nothing if there is no terminal."""
-    if not sys.stdin.isatty():
-        yield str
-        return
-    import select
-    import termios
-    import tty
-    number = sys.stdin.fileno()
-    before = termios.tcgetattr(number)
-    tty.setcbreak(number)
-
-    def typed() -> str:
-        ready = select.select([number], [], [], 0)[0]
-        return os.read(number, 1024).decode('utf-8', 'replace') if ready else ''
-
+def _show_live(ticks: Iterator[None], board: Board) -> None:
+    print(_ENTER, end='')
     try:
-        yield typed
+        for _ in ticks:
+            columns, lines = shutil.get_terminal_size()
+            statuses = board.statuses()
+            text = tables(statuses, columns) if statuses else _WAITING
+            shown = ''.join(f'{line}{_TO_END}\n' for line in text.splitlines()[:lines - 1])
+            print(f'{_HOME}{shown}{_BELOW}', end='', flush=True)
     finally:
-        termios.tcsetattr(number, termios.TCSADRAIN, before)
+        print(_LEAVE, end='', flush=True)
 
 
-def _print_now_and_then(ticks: Iterator[None], board: Board, tables: bool) -> None:
+def _print_now_and_then(ticks: Iterator[None], board: Board, wanted: bool) -> None:
     for _ in ticks:
         statuses = board.statuses()
-        if statuses and tables:
-            print(plain(statuses), flush=True)
+        if statuses and wanted:
+            print(tables(statuses), flush=True)
 
 
 def _ticks(
@@ -145,7 +112,7 @@ def _ticks(
 ) -> Iterator[None]:
     """Listen; yield once an interval until the time is over, or nothing has arrived in time."""
     begin = time.monotonic()
-    due = begin + INTERVAL_S
+    due = begin
     while seconds is None or (passed := time.monotonic() - begin) < seconds:
         spin(0.1)
         if seconds is not None and passed > patience_s and not board.statuses():

@@ -4,7 +4,6 @@
 The newest ``/diagnostics`` of executors, and tables of them.
 
 The statuses are those of ``mddag_executor.executor.diagnostics``; others on the topic are ignored.
-On a terminal rich draws the tables (the extra ``top``), otherwise they are plain text.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 GONE = 'GONE'
 GONE_AFTER_S = 5.0
 MOST_STATUSES = 1000
-_STYLES = {'OK': 'green', 'WARN': 'yellow', 'ERROR': 'bold red', 'STALE': 'magenta', GONE: 'dim'}
 
 
 class Column(NamedTuple):
@@ -41,20 +39,18 @@ _DAG_COLUMNS = (
     Column('missed', 'window_missed'), Column('p99', 'response_p99_ms', 'ms'),
     Column('of deadline', 'deadline_used_max', '%'), Column('p50', 'response_p50_ms', 'ms'),
     Column('max', 'response_max_ms', 'ms'), Column('jobs', 'jobs'),
-    Column('period', 'period_ms', 'ms'), Column('least margin', 'margin_min_ms', 'ms'),
-    Column('message', 'message'))
+    Column('period', 'period_ms', 'ms'), Column('least margin', 'margin_min_ms', 'ms'))
 _POOL_COLUMNS = (
     Column('workers of', 'name'), Column('state', 'level'), Column('busy', 'busy_ratio', '%'),
     Column('CPU', 'cpu_ratio', '%'), Column('idle', 'idle_workers'), Column('queue', 'queue'),
     Column('dropped', 'dropped'), Column('per s', 'callbacks_per_s'),
     Column('us each', 'cpu_us_per_callback'), Column('compute', 'computing'),
-    Column('skipped', 'skipped'), Column('no job', 'unattributed'), Column('message', 'message'))
+    Column('skipped', 'skipped'), Column('no job', 'unattributed'))
+_MESSAGE = Column('message', 'message')
 _PROCESS = Column('process', 'process')
 _WORDS = ('process', 'name', 'level', 'message')
 _LEAST = 3          # minimum number of columns
-_MESSAGE = 20       # minimum width of the message column
 _MOST_MESSAGES = 5  # messages of statuses that are not OK, below the tables
-KEYS = 'q or Ctrl-C: quit'
 
 
 @dataclass(frozen=True)
@@ -145,71 +141,37 @@ def _cell(status: Status, column: Column) -> str:
 
 
 def columns_that_fit(
-    columns: Sequence[Column], rows: Sequence[Status], width: int | None
+    columns: Sequence[Column], rows: Sequence[Status], width: int
 ) -> list[Column]:
-    """
-    Return the columns that fit on a terminal.
-
-    The process is shown if there are several.
-
-    :param width: of the terminal; None: unlimited.
-    """
-    kept = [*([_PROCESS] if width is None or len({s.process for s in rows}) > 1 else []), *columns]
+    """Return the columns that fit on a terminal; the process only if there are several."""
+    kept = [*([_PROCESS] if len({s.process for s in rows}) > 1 else []), *columns]
 
     def needed(column: Column) -> int:
-        widest = max((len(_cell(s, column)) for s in rows), default=0)
-        return max(len(column.title), min(widest, _MESSAGE) if column.key == 'message' else widest)
+        return max(len(column.title), *(len(_cell(s, column)) for s in rows), 0)
 
-    while width is not None and len(kept) > _LEAST and (
-            sum(needed(column) + 2 for column in kept) - 2 > width):
+    while len(kept) > _LEAST and sum(needed(column) + 2 for column in kept) - 2 > width:
         kept.pop()
     return kept
 
 
-def plain(statuses: list[Status]) -> str:
-    """Return both tables as text, with all columns."""
-    return '\n'.join(
-        table([column.title for column in columns],
-              ([_cell(s, column) for column in columns] for s in rows))
-        for columns, rows in (
-            (columns_that_fit(_DAG_COLUMNS, of_dags(statuses), None), of_dags(statuses)),
-            (columns_that_fit(_POOL_COLUMNS, of_pools(statuses), None), of_pools(statuses))))
-
-
-def picture(statuses: list[Status], width: int) -> Any:
+def tables(statuses: list[Status], width: int | None = None) -> str:
     """
-    Return both tables, messages and keys for rich; no text is interpreted as markup.
+    Return the tables of DAGs and workers.
 
-    :param width: of the terminal.
+    :param width: of a terminal: only the columns that fit, and the messages below; None: all.
     """
-    from rich.console import Group
-    from rich.text import Text
-    parts: list[Any] = []
-    messages = []
+    parts = []
     for every, rows in ((_DAG_COLUMNS, of_dags(statuses)), (_POOL_COLUMNS, of_pools(statuses))):
-        columns = columns_that_fit(every, rows, width)
-        parts += [_rich(columns, rows), Text('')]
-        if columns[-1].key != 'message':
-            messages += [s for s in rows if s.level != 'OK']
-    for s in messages[:_MOST_MESSAGES]:
-        parts.append(Text(printable(f'{s.level} {s.name}: {s.message}'), overflow='ellipsis',
-                          no_wrap=True, style=_STYLES.get(s.level, '')))
-    return Group(*parts, Text(KEYS, style='dim'))
-
-
-def _rich(columns: Sequence[Column], rows: Sequence[Status]) -> Any:
-    from rich.table import Table
-    from rich.text import Text
-    made = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style='bold')
-    for column in columns:
-        name, message = column.key == 'name', column.key == 'message'
-        made.add_column(
-            Text(column.title), justify='left' if column.key in _WORDS else 'right',
-            no_wrap=not name, overflow='fold' if name else 'ellipsis',
-            min_width=None if name or message else max(
-                (len(_cell(s, column)) for s in rows), default=0))
-    for s in rows:
-        style = _STYLES.get(s.level, '')
-        made.add_row(*(Text(_cell(s, column), style=style if column.key == 'level' else '')
-                       for column in columns))
-    return made
+        columns = [_PROCESS, *every, _MESSAGE]
+        if width is not None:
+            columns = columns_that_fit(every, rows, width)
+        parts.append(table(
+            [column.title for column in columns],
+            ([_cell(s, column) for column in columns] for s in rows),
+            marked=[width is not None and s.level not in ('OK', GONE) for s in rows],
+            most=width))
+    if width is not None:
+        parts.append(''.join(
+            printable(f'{s.level} {s.name}: {s.message}')[:width] + '\n'
+            for s in [s for s in statuses if s.level != 'OK'][:_MOST_MESSAGES]))
+    return '\n'.join(parts)

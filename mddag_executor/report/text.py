@@ -81,7 +81,8 @@ def is_coloured(stream: TextIO | None = None) -> bool:
 
 
 def table(
-    header: Sequence[str], rows: Iterable[Sequence[Cell]], marked: Sequence[bool] = ()
+    header: Sequence[str], rows: Iterable[Sequence[Cell]], marked: Sequence[bool] = (),
+    most: int | None = None,
 ) -> str:
     """
     Return an aligned table; columns of numbers (also with a unit) are right-aligned.
@@ -92,6 +93,7 @@ def table(
     :param header: the titles of the columns
     :param rows: their cells; None is printed as `-`, a float with two decimals
     :param marked: rows that are red if colours are available
+    :param most: maximum width instead of these
     """
     body = [[_cell(cell) for cell in row] for row in rows]
     for row in body:
@@ -104,7 +106,7 @@ def table(
     names = [i for i, column in enumerate(columns)
              if not right[i] and not any(' ' in cell for cell in column)]
     widths = _fitting([max(len(line[i]) for line in lines) for i in range(len(header))], names,
-                      NARROW if len(body) <= _FEW_ROWS else WIDTH)
+                      most or (NARROW if len(body) <= _FEW_ROWS else WIDTH))
     lines = [[shortened(cell, width) for cell, width in zip(line, widths)] for line in lines]
     texts = ['  '.join(
         cell.rjust(width) if is_right else cell.ljust(width)
