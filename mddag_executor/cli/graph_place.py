@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = """\
 mddag graph place config/autoware.yaml --processes 2 --cpus 2 --utilisation 0.2 -o placed.yaml
-mddag graph place graph.yaml --processes 3 --trace run.mcap --apart /lidar,/camera -o placed.yaml
+mddag graph place graph.yaml --processes 3 --trace run.mcap -o placed.yaml
 mddag run placed.yaml --node my_robot/lidar --node my_robot/camera --node my_robot/control"""
 DESCRIPTION = """\
 Pack the nodes of a declaration into processes by the time for which they need the interpreter of
@@ -44,29 +44,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--trace', metavar='TRACE', type=options.Input, action='append', default=[],
         help='use the execution times of a recorded run, and which callbacks compute in Python '
         'there (default: as declared); repeat it for the traces of several processes')
-    add('--utilisation', type=options.positive_float, metavar='U',
-        help='scale declared execution times to this normalised utilisation, sum(C/T)/workers')
+    options.add(parser, '--execution-times', '--utilisation', only='without --trace: ')
     options.add_seed(parser, 'seed of the drawn execution times', int)
-    add('--together', metavar='NODE,NODE…', action='append', default=[],
-        help='nodes that run in one process; repeat it for more groups')
-    add('--apart', metavar='NODE,NODE…', action='append', default=[],
-        help='nodes of which no two run in one process; repeat it for more groups')
     options.add(parser, 'graph', '--duration', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
     """Place nodes."""
+    from mddag_executor.cli.simulate import execution_times
     from mddag_executor.laboratory.placement import Placing
     from mddag_executor.laboratory.prediction import cost_of, improve, Predictor, PUBLISH_NS
     from msg_graph import Process
     from msg_graph.edit import with_processes
-    if args.trace and args.utilisation is not None:
-        raise UsageError('--utilisation: recorded execution times are not scaled: leave it out')
+    for option in ('utilisation', 'execution_times'):
+        if args.trace and getattr(args, option) is not None:
+            raise UsageError(f'--{option.replace("_", "-")}: execution times are those of '
+                             '--trace: leave one of them out')
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)
     times, judged = _recorded(args.trace, task_set) if args.trace else (
-        _drawn(args, task_set, workers, args.seed), task_set)
-    placing = Placing(judged, args.processes, times, _groups(args.together), _groups(args.apart))
+        execution_times(args, task_set, workers), task_set)
+    placing = Placing(judged, args.processes, times)
     cpus = args.cpus or defaults.processors()
     predictor = Predictor(judged, workers, cpus, args.policy, args.duration,
                           0 if args.trace else PUBLISH_NS)
@@ -90,20 +88,6 @@ def main(args: argparse.Namespace) -> int:
         for text in _lines(result):
             print(text, file=stream)
     return 0
-
-
-def _groups(given: Sequence[str]) -> list[list[str]]:
-    return [[node.strip() for node in group.split(',')] for group in given]
-
-
-def _drawn(
-    args: argparse.Namespace, task_set: TaskSet, workers: int, seed: int
-) -> list[list[int]]:
-    from mddag_executor.simulate import draw_execution_times, scale_execution_times
-    times = draw_execution_times(task_set, seed)
-    if args.utilisation is None:
-        return times
-    return scale_execution_times(task_set, times, workers, args.utilisation)
 
 
 def _recorded(traces: list[str], task_set: TaskSet) -> tuple[list[list[int]], TaskSet]:

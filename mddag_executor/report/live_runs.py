@@ -90,7 +90,7 @@ def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
     yield (
         f'measured by the nodes, {measured["window_ns"] / 1e9:.1f} s after a warm-up of '
         f'{measured["warm_up_ns"] / 1e9:g} s: {measured["sink_jobs_due"]} due, '
-        f'{measured["on_time"]} on time ({percent(measured["on_time"], measured["sink_jobs_due"])}'
+        f'{measured["on_time"]} in time ({percent(measured["on_time"], measured["sink_jobs_due"])}'
         f'), {measured["late"]} late, {measured["missing"]} missing')
     cpu = measured['cpu_us_per_callback']
     yield (

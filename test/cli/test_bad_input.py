@@ -130,8 +130,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # placement
     ('graph place g.yaml --processes 4 -o out.yaml',
      '--processes 4: there are only 2 nodes to place, or groups of nodes: give fewer processes'),
-    ('graph place g.yaml --processes 2 --together /x -o out.yaml', "node '/x': g.yaml does not d"),
-    ('graph place g.yaml --processes 1 --apart /n,/m -o out.yaml', '--apart /n,/m: these are 2 n'),
     ('graph place g.yaml --processes 1 --trace run.mcap --utilisation 0.2 -o out.yaml',
      '--utilisation: recorded execution times are not scaled: leave it out'),
     # recordings

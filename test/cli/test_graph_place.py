@@ -9,7 +9,6 @@ import json
 from pathlib import Path
 import subprocess
 
-from msg_graph import load
 import pytest
 
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
@@ -23,14 +22,6 @@ nodes:
   - node: /c
     callbacks: [{name: t, timer: 100ms, deadline: 100ms, execution_time: 10ms}]
 """
-
-
-def test_rules_of_the_user(graph: Path, call: Mddag) -> None:
-    place = ['graph', 'place', 'graph.yaml', '--processes', '2', '-o', 'placed.yaml']
-    assert call(*place, '--together', '/a, /b').returncode == 0
-    assert load('placed.yaml').process_of('/a') == load('placed.yaml').process_of('/b')
-    assert call(*place, '--apart', '/a,/c', '--apart', '/b,/c').returncode == 0
-    assert [p.nodes for p in load('placed.yaml').processes] == [('/a', '/b'), ('/c',)]
 
 
 def test_times_of_a_recorded_run(graph: Path, call: Mddag) -> None:

@@ -46,7 +46,6 @@ def run(graph: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     'replay run.mcap --report run.html --json run.html',
     'diff run.mcap run.mcap graph.yaml --json graph.yaml',
     'explain run.mcap --json run.mcap',
-    'slack run.mcap --report run.mcap',
     'graph from-trace run.mcap -o run.mcap',
     'graph from-caret graph.yaml --trace run.mcap -o run.mcap',
     'graph place graph.yaml --processes 2 --trace run.mcap -o run.mcap',

@@ -4,12 +4,10 @@
 
 from __future__ import annotations
 
-from itertools import combinations, product
+from itertools import product
 
-from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.placement import Placing
 from msg_graph import loads, TaskSet
-import pytest
 
 MS = 1_000_000
 
@@ -58,25 +56,6 @@ def test_what_does_not_hold_the_interpreter_weighs_nothing() -> None:
     assert {'/n1'} in placed(tasks, 2, *times) or {'/n2'} in placed(tasks, 2, *times)
 
 
-def test_together_and_apart() -> None:
-    times = (50, 50, 10, 10)
-    tasks = workload(*times)
-    assert {'/n0', '/n1'} <= placed(tasks, 2, *times, together=[('/n0', '/n1')])[0]
-    first, second = placed(tasks, 2, *times, apart=[('/n2', '/n3')])
-    assert ('/n2' in first) != ('/n3' in first)
-    with pytest.raises(UsageError, match='together'):
-        placed(tasks, 2, *times, together=[('/n0', '/n1'), ('/n1', '/n2')],
-               apart=[('/n0', '/n2')])
-    with pytest.raises(UsageError, match='/n0,/n1,/n2: these are 3 nodes for 2 processes'):
-        placed(tasks, 2, *times, apart=[('/n0', '/n1', '/n2')])
-    with pytest.raises(UsageError, match='cannot keep'):
-        placed(tasks, 2, *times, apart=[('/n0', '/n1'), ('/n1', '/n2'), ('/n0', '/n2')])
-    with pytest.raises(UsageError, match='does not declare'):
-        placed(tasks, 2, *times, together=[('/n0', '/n9')])
-    with pytest.raises(UsageError, match='only 4 nodes'):
-        placed(tasks, 5, *times)
-
-
 def test_no_process_is_without_a_node_where_nothing_is_declared_to_take_time() -> None:
     times = (0, 0, 0, 0)
     assert sorted(len(nodes) for nodes in placed(workload(*times), 3, *times)) == [1, 1, 2]
@@ -92,22 +71,3 @@ nodes:
 """)
     placing = Placing(tasks, 2, [[4 * MS, MS], [4 * MS, MS]])
     assert [p.nodes for p in placing.processes(placing.place())] == [('/a', '/b'), ('/c',)]
-
-
-def test_one_node_too_many_to_keep_apart_is_found_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which of the empty processes a node comes into does not matter: no search through all."""
-    times = (10.0,) * 11
-    tried = 0
-    cost = Placing._cost
-
-    def counted(self: Placing, place: dict[int, int]) -> tuple[float, float]:
-        nonlocal tried
-        tried += 1
-        assert tried < 1000
-        return cost(self, place)
-
-    monkeypatch.setattr(Placing, '_cost', counted)
-    pairs = list(combinations([f'/n{i}' for i in range(11)], 2))
-    with pytest.raises(UsageError, match='10 processes cannot keep all these nodes apart'):
-        placed(workload(*times), 10, *times, apart=pairs)
-    assert len(placed(workload(*times), 11, *times, apart=pairs)) == 11
