@@ -136,7 +136,7 @@ def scan(stream: BinaryIO, start: int, size: int) -> tuple[list[Block], Damage |
     try:
         _scan(stream.fileno(), start, size, blocks)
     except Damage as damage:
-        return blocks, damage
+        return blocks, damage.with_traceback(None)      # whose frames would keep the data
     return blocks, None
 
 

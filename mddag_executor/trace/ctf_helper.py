@@ -27,18 +27,21 @@ import json
 import os
 import signal
 import sys
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 PATIENCE_S = 60     # seconds until the next row; on some damage babeltrace2 2.0 hangs
 
-Member = tuple[str, str, Callable[[Any], Any]]      # name, type, getter from the payload
+Member = tuple[str, str, Callable[[Any, Any], Any]]
+"""Name, type, and getter from a structure: its native field, and its object of bt2."""
 
 
 def rows_to(stream: BinaryIO) -> Callable[..., None]:
     """Return a function that writes a row to a binary stream."""
+    encode = json.JSONEncoder(separators=(',', ':')).encode
+
     def add(*row: Any) -> None:
         signal.alarm(0)             # no limit while the importer reads
-        stream.write(json.dumps(row, separators=(',', ':')).encode('ascii') + b'\n')
+        stream.write(encode(row).encode('ascii') + b'\n')
         signal.alarm(PATIENCE_S)    # SIGALRM ends a hanging process
 
     return add
@@ -102,24 +105,55 @@ def member(cls: Any) -> tuple[str, Callable[[Any], Any]]:
     return f'{base}[{length or ""}]', convert_all
 
 
-def members(cls: Any, prefix: str = '') -> list[Member]:
-    """Return the members of a structure's class; nested structures are flattened."""
+def members(native: Any, cls: Any, prefix: str = '') -> list[Member]:
+    """
+    Return the members of a structure's class; nested structures are flattened.
+
+    :param native: the functions of babeltrace2 itself; its objects take ten times as long.
+    """
     found: list[Member] = []
     if cls is None:
         return found
     for place, name in enumerate(cls):
         inner = cls[name].field_class
         if 'Structure' in type(inner).__name__:
-            found += [(deeper, kind, _within(place, get))
-                      for deeper, kind, get in members(inner, f'{prefix}{name}_')]
+            found += [(deeper, kind, _within(native, place, get))
+                      for deeper, kind, get in members(native, inner, f'{prefix}{name}_')]
         else:
             kind, convert = member(inner)
-            found.append((prefix + name, kind, _within(place, convert)))
+            value = _plain_value(native, type(inner).__name__)
+            get = (lambda _, field, place=place, convert=convert:
+                   convert(field().member_at_index(place))) if value is None else (
+                lambda pointer, _, place=place, value=value:
+                    value(native.field_structure_borrow_member_field_by_index_const(
+                        pointer, place)))
+            found.append((prefix + name, kind, get))
     return found
 
 
-def _within(place: int, get: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    return lambda field: get(field.member_at_index(place))
+def _plain_value(native: Any, kind: str) -> Callable[[Any], Any] | None:
+    """Return the native getter of a number's or text's class; None: it needs its object."""
+    if 'String' in kind:
+        return native.field_string_get_value
+    if 'Integer' in kind or 'Enumeration' in kind:
+        return native.field_integer_unsigned_get_value if 'Unsigned' in kind \
+            else native.field_integer_signed_get_value
+    return None
+
+
+def _within(native: Any, place: int, get: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    inner = native.field_structure_borrow_member_field_by_index_const
+    return lambda pointer, field: get(
+        inner(pointer, place), lambda: field().member_at_index(place))
+
+
+class _Class(NamedTuple):
+    """A class of events: its number, itself, and the getters of fields and identity."""
+
+    number: int
+    cls: Any
+    getters: list[Callable[[Any, Any], Any]]
+    identity: list[Callable[[Any, Any], Any] | None]
 
 
 class Session:
@@ -129,8 +163,13 @@ class Session:
         """Pass each row to `add`."""
         self._bt2 = bt2
         self._add = add
+        native = self._native = import_module('bt2.native_bt')
+        self._event_of = native.message_event_borrow_event_const
+        self._class_of = native.event_borrow_class_const
+        self._payload_of = native.event_borrow_payload_field_const
+        self._context_of = native.event_borrow_common_context_field_const
         # By address of the event's class, which is kept so that its address is not reused.
-        self._known: dict[int, tuple[int, Any, list[Callable[[Any], Any]]]] = {}
+        self._known: dict[int, _Class] = {}
 
     def read(self, paths: list[str]) -> None:
         """Write a row for each event below the folders, in the order of time."""
@@ -143,26 +182,29 @@ class Session:
                 self._discarded(message)
 
     def _event(self, message: Any) -> None:
-        event = message.event
-        known = self._known.get(event.cls.addr)
+        event = self._event_of(message._ptr)
+        known = self._known.get(int(self._class_of(event)))
         if known is None:
-            known = self._define(event)
-        number, _, getters = known
-        payload = event.payload_field
-        context = event.common_context_field
+            known = self._define(message.event)
+        payload, context = self._payload_of(event), self._context_of(event)
         self._add(
-            'event', number, message.default_clock_snapshot.ns_from_origin,
-            *[_pick(context, names) for names in _IDENTITY], [get(payload) for get in getters])
+            'event', known.number, message.default_clock_snapshot.ns_from_origin,
+            *[get and get(context, lambda: message.event.common_context_field)
+              for get in known.identity],
+            [get(payload, lambda: message.event.payload_field) for get in known.getters])
 
-    def _define(self, event: Any) -> tuple[int, Any, list[Callable[[Any], Any]]]:
+    def _define(self, event: Any) -> _Class:
         cls = event.cls         # belongs to one trace
         environment = event.stream.trace.environment
         session = [str(environment[name]) if name in environment else '' for name in SESSION]
-        fields = members(cls.payload_field_class)
-        number = len(self._known)
-        known = number, cls, [get for _, _, get in fields]
-        self._known[cls.addr] = known
-        self._add('class', number, cls.name or '', [field[:2] for field in fields], session)
+        fields = members(self._native, cls.payload_field_class)
+        context = {name: get for name, _, get in members(
+            self._native, cls.stream_class.event_common_context_field_class)}
+        known = self._known[cls.addr] = _Class(
+            len(self._known), cls, [get for _, _, get in fields],
+            [next((context[name] for name in names if name in context), None)
+             for names in _IDENTITY])
+        self._add('class', known.number, cls.name or '', [field[:2] for field in fields], session)
         return known
 
     def _discarded(self, message: Any) -> None:
@@ -181,14 +223,6 @@ SESSION = ('hostname', 'trace_name', 'trace_creation_datetime')
 
 # Process, thread and name: of user space first, then of the kernel.
 _IDENTITY = (('vpid', 'pid'), ('vtid', 'tid'), ('procname',))
-
-
-def _pick(context: Any, names: tuple[str, ...]) -> Any:
-    """Return the first available context of these names, or None."""
-    for name in names if context is not None else ():
-        if name in context:
-            return str(context[name]) if name == 'procname' else int(context[name])
-    return None
 
 
 def reason(error: BaseException) -> str:

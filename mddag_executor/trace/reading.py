@@ -207,6 +207,7 @@ class Reading:
         # a head can be read at any record, even a short one
         room = begins[-1] + _HEAD.itemsize
         if len(self._buffer) < room:
+            self._buffer.clear()    # frees its memory: batches that refer to it are over
             try:
                 self._buffer = bytearray(room)
             except MemoryError:
