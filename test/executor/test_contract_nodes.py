@@ -204,7 +204,7 @@ def test_entities_that_a_callback_makes_run(make_executor, make_node):
 
     first = node.create_timer(0.005, make)
     with Spinning(executor) as spinning:
-        assert wait_for(lambda: all(ran.values()), 10.0), ran
+        assert wait_for(lambda: all(ran.values()), 10.0), (ran, spinning.error)
     assert spinning.error is None
     for made in kept:
         made.destroy()

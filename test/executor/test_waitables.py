@@ -190,6 +190,12 @@ class Pair(Waitable):
         self._places: list[int] = []
         self._ready: list[Any] = []
 
+    def __enter__(self) -> None:
+        pass  # the test destroys none; rclpy of Kilted wants this method
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
     def get_num_entities(self) -> NumberOfEntities:
         return NumberOfEntities(num_subs=len(self.subscriptions))
 
