@@ -55,7 +55,7 @@ LIVE_TESTS := test/executor test/hosting test/rerun test/examples test/hardening
 	$(addprefix test/cli/test_,$(addsuffix .py,demo graph_systems rerun run top))
 
 # With another rclpy than the index has: RCLPY is a folder with its package rclpy/, the extension
-# compiled against include/ and lib/ of the environment.
+# compiled against the headers of ros-jazzy-rclpy (in another environment: .ci/slim removes them).
 test-jazzy: env
 ifneq ($(wildcard $(RCLPY)/rclpy/__init__.py),)
 	@PYTHONPATH='$(abspath $(RCLPY))' $(BIN)/python -m pytest $(PYTEST_ARGS) $(LIVE_TESTS)
@@ -63,10 +63,13 @@ else
 	@echo 'test-jazzy: skipped: RCLPY=$(RCLPY): no rclpy/ there: set it to that of a compiled rclpy'
 endif
 
-# Public programs under rclpy's executor and under this one; PUBLIC is a folder with their sources.
+# Public programs under rclpy's executor and under this one; PUBLIC is a folder with their sources,
+# and install/ with what else they import (colcon build --merge-install, pip install --prefix).
 test-public: env
 ifneq ($(and $(PUBLIC),$(wildcard $(PUBLIC)/*/.)),)
-	@$(BIN)/python test/endurance/public_programs.py '$(PUBLIC)'
+	@at='$(abspath $(PUBLIC))/install' && \
+		PYTHONPATH="$$(echo "$$at"/lib/python3*/site-packages)" LD_LIBRARY_PATH="$$at/lib" \
+		$(BIN)/python test/endurance/public_programs.py '$(PUBLIC)'
 else
 	@echo 'test-public: skipped: PUBLIC=$(PUBLIC): no sources there: clone demos, diagnostics, … into it'
 endif

@@ -7,7 +7,8 @@ Public programs under rclpy's executor and under this one: what they publish is 
 
 SOURCES is a folder with the sources of the packages, one folder for each repository.  Programs
 are run from there.  What they import beyond that (interfaces, libraries) must be importable
-already; a program whose imports or sources are missing is skipped with a line that says so.
+already (``make test-public`` adds ``SOURCES/install``); a program whose imports or sources are
+missing is skipped with a line that says so.
 
 Each program runs twice with the same inputs, once with its own executor, once as ``mddag run
 --node`` hosts it.  A node of this script counts the messages of every topic for some seconds,
