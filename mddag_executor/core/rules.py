@@ -241,10 +241,10 @@ def peek(t: Tables, s: State, now: int) -> int:
     not start into the heap of deferred ones (rules 11 and 12).  Late ones are demoted (rule 7).
     """
     again = True
-    divided = len(s.pool) > 0
     while True:
-        plain = s.scalars[N_STALE] == 0 and len(s.held_back) == 0
-        queue = s.ready if plain else next_queue(t, s, True)
+        queue = s.ready
+        if s.held_back or s.scalars[N_STALE] > 0:
+            queue = next_queue(t, s, True)
         while queue:
             entry = queue[0]
             x = entry[4]
@@ -266,7 +266,7 @@ def peek(t: Tables, s: State, now: int) -> int:
                     wait_for_poll(t, s, entry)
                 queue = next_queue(t, s, False)
                 continue
-            if ((divided or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
+            if ((s.pool or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
                     and not may_start(t, s, entry)):
                 heappop(queue)
                 heappush(s.held_back, entry)
@@ -274,6 +274,8 @@ def peek(t: Tables, s: State, now: int) -> int:
                     _release_group(s, group)  # others of the group may go first
                 queue = next_queue(t, s, False)
                 continue
+            if s.x_vertex[x] == t.n_vertices:
+                return x
             if s.job_state[slot] == OPEN:
                 if t.on_late[s.job_dag[slot]] != ABORT or not overdue(t, s, slot, now):
                     return x
@@ -294,7 +296,7 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     x = peek(t, s, now)
     if x < 0:
         return -1
-    heappop(s.ready if len(s.ready) > 0 and s.ready[0][4] == x else s.held_back)
+    heappop(s.ready if s.ready and s.ready[0][4] == x else s.held_back)
     start_on(s, x, worker, now)
     return x
 
@@ -434,10 +436,9 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     s.x_state[x] = DONE
     group = s.x_group[x]
     if group >= 0 and s.group_owner[group] == x:
+        s.group_owner[group] = -1
         if s.group_heap[group]:
             _release_group(s, group)
-        else:
-            s.group_owner[group] = -1
     vertex = s.x_vertex[x]
     if vertex == t.n_vertices:
         s.undeclared.append(x)

@@ -15,7 +15,7 @@ While a callback runs that usually takes no longer than this, no other thread is
 Waking a thread costs 60 to 140 us while a callback computes.
 """
 
-GUARD_NS = 2_000_000
+GUARD_NS = 4_000_000
 """
 The longest that a ready callback waits because another one was expected to end.
 

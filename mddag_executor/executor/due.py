@@ -43,6 +43,8 @@ class DueTimes:
         self._calls: list[tuple[int, int, Callable[[], None]]] = []
         self._n_calls = 0
         self._gil_check = GilCheck()
+        # the next deadline, on the trace's clock, when the timerfd was set
+        self.deadline = NEVER
         # whether the timerfd may be set to a time at which nothing is due
         self._may_expire_early = False
         self._seen = monotonic_ns(), process_time_ns()
@@ -53,8 +55,9 @@ class DueTimes:
         self.arm(now)
 
     def call_at(self, at: int, function: Callable[[], None]) -> None:
-        """Call a function at a time, without the lock; the caller arms the timerfd."""
+        """Call a function at a time, without the lock."""
         self._n_calls += 1
+        self._timers.has_new = True
         heappush(self._calls, (at, self._n_calls, function))
 
     def handle(self, now: int, since: int) -> list[Callable[[], None]]:
@@ -84,38 +87,24 @@ class DueTimes:
             calls.append(heappop(self._calls)[2])
         return calls
 
-    def update(self, now: int, has_expired: bool, has_found: bool) -> None:
-        """
-        Set the timerfd if necessary, at the end of a turn.
-
-        :param has_expired: the timerfd has expired.
-        :param has_found: there is an execution to run.
-        """
-        if has_expired or self._may_expire_early and not has_found or self._is_due_earlier(now):
-            self.arm(now)
-
-    def _is_due_earlier(self, now: int) -> bool:
-        """Return whether anything may be due before the timerfd expires."""
-        at = self._timer.at or NEVER
+    def is_early(self, now: int) -> bool:
+        """Return whether nothing may be due at the set time, or a GIL check before it."""
         engine = self._engine
-        deadline = engine.deadlines.next
         return bool(
-            self._timers.has_new
-            or deadline < NEVER and deadline - self._offset < at
-            or self._calls and self._calls[0][0] < at
-            or engine.holders and engine.has_waiting
-            and at > now + self._check_after(engine.holders[0]) + FIRST_CHECK_NS)
+            self._may_expire_early
+            or engine.holders and engine.has_waiting and (self._timer.at or NEVER)
+            > now + self._check_after(engine.holders[0]) + FIRST_CHECK_NS)
 
     def arm(self, now: int) -> None:
         """Set the timerfd to the next due time."""
         pool = self._pool
+        deadline = self.deadline = self._engine.deadlines.next
         if not pool.running:
             self._timer.arm(0)
             return
         offset = self._offset
         self._timers.has_new = False
         at = [pool.muting.next_timer()]
-        deadline = self._engine.deadlines.next
         if deadline < NEVER:
             at.append(deadline - offset + 1)
         if self._calls:

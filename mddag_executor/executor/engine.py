@@ -348,6 +348,12 @@ class Engine:
         state = self._state
         return bool(state.ready or state.held_back or state.unpolled)
 
+    def waits_since(self, now: int) -> int:
+        """Return since when the most urgent of the ready executions has waited; now: none does."""
+        ready = self._state.ready
+        work = self._work.get(ready[0][4]) if ready else None
+        return now if work is None else work.ready_ns
+
     @property
     def idle_workers(self) -> int:
         """Return the number of workers that run nothing."""

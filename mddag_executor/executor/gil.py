@@ -50,7 +50,9 @@ WAITS = 0.5
 SHORT_NS = 2_000
 """A callback that usually computes for less than half of this is not worth ordering."""
 LATELY = 8
-"""Averages cover about this many executions; one in this many short executions is measured."""
+"""Averages cover about this many executions."""
+SELDOM = 32
+"""One in this many short executions is measured (8 us) if the callback's GIL habit is known."""
 UNCLEAR_RUNS = 8
 """After this many inconclusive executions, one runs as if it held the GIL."""
 
@@ -108,7 +110,9 @@ class GilHabit:
         self.mean_ns += (own - self.mean_ns) // runs
         if not self.is_declared:
             self._learn(wall, own, others, starved, runs)
-        self.rests = LATELY - 1 if self.is_known and not self._is_trial else 0
+        self.rests = 0
+        if self.is_known and not self._is_trial:
+            self.rests = (SELDOM if runs == LATELY else LATELY) - 1
 
     def _learn(self, wall: int, own: int, others: int, starved: bool, runs: int) -> None:
         usual = 0 if self._is_trial else self.holds

@@ -53,7 +53,7 @@ class Gate:
         self._entity = entity
         self._passed = passed
 
-    def step(self, work: Work) -> Any:
+    def step(self, work: Work, must_check: bool = True) -> Any:
         """
         Run a step of an execution as ``Work.step`` does, if the group lets it.
 
@@ -66,7 +66,7 @@ class Gate:
             self._passed(work)
         waits_for = None
         try:
-            waits_for = work.step()
+            waits_for = work.step(must_check)
         finally:
             if waits_for is None:
                 group.ending_execution(entity)

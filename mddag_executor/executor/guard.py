@@ -21,6 +21,7 @@ class Guard:
     A time at which to wake a thread; all methods but ``collect`` need the engine's lock.
 
     :param expired: called when the time expires; it calls ``end``.
+    :ivar is_set: whether a time is set.
     """
 
     urgency = -1
@@ -28,22 +29,19 @@ class Guard:
 
     def __init__(self, expired: Callable[[], None]) -> None:
         self._timer = TimerFd()
+        self.is_set = False
         self.fd = self._timer.fd
         self.collect = expired
 
-    @property
-    def is_set(self) -> bool:
-        """Return whether a time is set."""
-        return self._timer.at > 0
-
     def set(self, at: int) -> None:
         """Set the time (monotonic ns), unless one is set."""
-        if not self._timer.at:
+        if not self.is_set:
+            self.is_set = True
             self._timer.arm(at)
 
     def end(self) -> None:
         """Note that the time has expired."""
-        self._timer.at = 0
+        self.is_set = False
 
     def close(self) -> None:
         """Close the descriptor, once."""

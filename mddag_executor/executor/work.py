@@ -81,7 +81,6 @@ class Work:
     :ivar x: the execution in the core; -1 before it is ready and after it has ended.
     :ivar origin: its vertex and job; None if it is undeclared.
     :ivar worker: its current or last worker.
-    :ivar must_check: whether the entity may be destroyed, or its timer cancelled, by now.
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar cpu_ns: its CPU time.
     :ivar yields: how many times in a row its coroutine has yielded without awaiting a future.
@@ -89,7 +88,7 @@ class Work:
 
     __slots__ = (
         'entity', 'function', 'args', 'then', 'x', 'coroutine', 'origin', 'worker',
-        'must_check', 'ready_ns', 'cpu_ns', 'yields')
+        'ready_ns', 'cpu_ns', 'yields')
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -102,18 +101,18 @@ class Work:
         self.coroutine: Any = None
         self.origin: Origin | None = None
         self.x = self.worker = -1
-        self.must_check = True
         self.ready_ns = self.cpu_ns = self.yields = 0
 
-    def step(self) -> Any:
+    def step(self, must_check: bool = True) -> Any:
         """
         Run, or continue; return None when it has finished, else what it waits for.
 
+        :param must_check: the entity may be destroyed, or its timer cancelled, by now.
         :raises Destroyed: if it must not run any more.
         :raises BaseException: the exception of the callback.
         """
         if self.coroutine is None:
-            if self.must_check:
+            if must_check:
                 self._check()
             result = self.function(*self.args)
             if type(result) is not types.CoroutineType:
@@ -151,7 +150,7 @@ class TaskWork(Work):
 
     __slots__ = ()
 
-    def step(self) -> Any:
+    def step(self, must_check: bool = True) -> Any:
         """Run the task once; return None when it is done."""
         task: Any = self.function
         task.waits_for = None

@@ -191,8 +191,7 @@ class WorkerPool:
         self._parked: list[WorkerThread] = []
         self._visitors: list[WorkerThread] = []
         self.polling = 0
-        # when the epoll was last polled, and the timerfd last set
-        self._polled_at = self._updated_at = 0
+        self._polled_at = 0  # when the epoll was last polled
         self._waiting_calls = 0
         self._bell_rings = False
         self._closed = False
@@ -204,6 +203,8 @@ class WorkerPool:
         self._last = 0
         # the thread that last dispatched a short callback
         self._leader: WorkerThread | None = None
+        # what it ran when the guard was set
+        self._guarded: Work | None = None
         self._misses = 0
         self.muting = Muting(engine, self.loop, self.timers, inbox)
         self.due = DueTimes(self, context_ended)
@@ -280,24 +281,41 @@ class WorkerPool:
         """Wake a thread if an idle worker may start an execution; the caller holds the lock."""
         if not self.running:
             return
-        if self.engine.may_start_more(self._last):
-            running = current.running
-            if running is not None and running.pool is self and running.is_brief():
-                self.guard.set(self._last - self._offset + GUARD_NS)
-            else:
-                self._wake_one()
+        running = current.running
+        if running is not None and running.pool is self and running.is_brief():
+            if not self.guard.is_set:
+                self._guard(self._last - self._offset)
+        elif self.engine.may_start_more(self._last):
+            self._wake_one()
         elif self.engine.holders and self.engine.idle_workers and self.engine.has_waiting:
             self.due.check_holder(monotonic_ns())
 
+    def _guard(self, now: int) -> None:
+        """Let a thread start what waits if a short callback runs longer than expected."""
+        guard, at = self.guard, now + GUARD_NS
+        if not guard.is_set and not (self.polling and 0 < self.loop.timer.at <= at):
+            self._guarded = None if self._leader is None else self._leader.work
+            guard.set(at)
+
     def _guard_expired(self) -> None:
-        """Wake a thread because a short callback runs longer than expected."""
+        """
+        Wake a thread because a short callback runs longer than expected.
+
+        As long as short callbacks end in time, and the ready ones do not wait, none is woken.
+        """
         with self.lock:
             now = self.tick()
             self.guard.end()
-            self._leader = None
-            if self.running and not self.polling:
+            leader, self._leader = self._leader, None
+            if not self.running:
+                return
+            if (leader is not None and leader.is_brief() and leader.work is not self._guarded
+                    and self.engine.waits_since(now) > now - GUARD_NS):
+                self._leader = leader
+                self._guard(now - self._offset)
+            elif not self.polling:
                 self._admit()
-            elif self.running and self.engine.may_start_more(now):
+            elif self.engine.may_start_more(now):
                 self._wake_one()
 
     def _wake_one(self) -> None:
@@ -453,11 +471,7 @@ class WorkerPool:
         expired = False
         if events:
             arrived, asking, expired = self.loop.sources(events)
-            for source in asking:
-                if self.running:
-                    source.collect()
-                else:
-                    self.loop.announce(source)  # for the next spin
+            self._collect(asking)
         if self._deferred:
             self._do_deferred()
         calls: list[Callable[[], None]] = []
@@ -468,36 +482,41 @@ class WorkerPool:
             if now < self._last:
                 now = self._last
             self._last = self.inbox.now = now
-            has_waited = me.work is None
-            if me.is_polling:
+            since = now
+            work = me.work
+            if work is not None:
+                self._report_end(me, work, now, calls)
+            elif me.is_polling:
+                since = me.waits_since
                 me.is_polling = False
                 self.polling -= 1
                 if not self.polling:
                     self._all_left.set()
-            if me.work is not None:
-                self._report_end(me, me.work, now, calls)
             if events:
                 self._bell_rings = False  # the waiting thread may have received it
-                for source in arrived:
-                    if self.running:
-                        source.collect()
-                    else:
-                        self.loop.announce(source)
+                self._collect(arrived)
             if self.muting.until and not engine.holders:
                 self.muting.end(self.running)
             if (expired or self.timers.has_jumped) and self.running:
-                timed = self.due.handle(
-                    now, self._waited_since(me.waits_since if has_waited else now))
+                timed = self.due.handle(now, self._waited_since(since))
             found = not is_last and not timed and self._choose(me, now, bool(events))
-            if not found or self.polling or expired or now - self._updated_at > BRIEF_NS:
-                self._updated_at = now
-                self.due.update(now - self._offset, expired, found)
+            if (expired or self.timers.has_new or engine.deadlines.next < self.due.deadline
+                    or not found and self.due.is_early(now - self._offset)):
+                self.due.arm(now - self._offset)
             if self._misses != engine.verdicts.missed:
                 self._misses = engine.verdicts.missed
                 calls.append(self.missed)
         if calls or timed:
             self._call(calls + timed)
         return self._turn(me, []) if timed else found
+
+    def _collect(self, sources: list[ChannelSource]) -> None:
+        """Collect from sources, or leave what arrived to the next spin."""
+        for source in sources:
+            if self.running:
+                source.collect()
+            else:
+                self.loop.announce(source)
 
     def _waited_since(self, mine: int) -> int:
         """
@@ -536,16 +555,19 @@ class WorkerPool:
         me.worker = work.worker
         me.work = work
         holders = engine.holders
-        if holders and (holders[0].entity.habit.mean_ns >= LONG_NS or self.muting.until):
-            self.muting.update(now, self.running)
+        if holders:
+            if holders[0].entity.habit.mean_ns >= LONG_NS or self.muting.until:
+                self.muting.update(now, self.running)
+            if engine.has_waiting and self.due.is_early(now - self._offset):
+                self.due.arm(now - self._offset)
         if self._is_stepping:
             pass
         elif work.entity.wall_ns <= BRIEF_NS:
             self._leader = me
             if not self.polling and not self.guard.is_set:
                 self._admit()
-            elif not work.entity.habit.holds and engine.may_start_more(now):
-                self.guard.set(now - self._offset + GUARD_NS)
+            elif not (self.guard.is_set or work.entity.habit.holds) and engine.has_waiting:
+                self._guard(now - self._offset)
         elif not self.polling:
             self._admit()
         elif engine.may_start_more(now):
@@ -571,7 +593,7 @@ class WorkerPool:
         else:
             me.is_parked = True
             if is_left_to_leader and self.running and not self.polling:
-                self.guard.set(monotonic_ns() + GUARD_NS)
+                self._guard(self._last - self._offset)
             if not self._closed:
                 self._parked.append(me)
 
@@ -591,22 +613,28 @@ class WorkerPool:
         work = me.work
         assert work is not None
         entity = work.entity
-        if self.is_current and not entity.may_be_gone:
-            work.must_check = False
+        must_check = entity.may_be_gone or not self.is_current
         me.published = 0
         habit = entity.habit
         if not habit.rests or self.engine.record is not None:
-            self._execute_measured(me, work, entity)
+            self._execute_measured(me, work, entity, must_check)
             return
         habit.rests -= 1
         start = monotonic_ns()
         try:
-            me.waits_for = work.step() if entity.gate is None else entity.gate.step(work)
+            me.waits_for = (
+                work.step(must_check) if entity.gate is None
+                else entity.gate.step(work, must_check))
         except BaseException as error:
             me.raised = error
-        self._note_times(me, entity, start, monotonic_ns())
+        end = monotonic_ns()
+        me.start, me.end = start + self._offset, end + self._offset
+        if end - start > BRIEF_NS or me.published:
+            self._note_times(entity, start, end, me.published)
 
-    def _execute_measured(self, me: WorkerThread, work: Work, entity: Entity) -> None:
+    def _execute_measured(
+        self, me: WorkerThread, work: Work, entity: Entity, must_check: bool
+    ) -> None:
         """Run the execution, and measure how long this thread and others compute meanwhile."""
         habit = entity.habit
         is_known = habit.rests > 0
@@ -617,7 +645,9 @@ class WorkerPool:
             process, preempted = process_time_ns(), times_preempted()
         own, start = thread_time_ns(), monotonic_ns()
         try:
-            me.waits_for = work.step() if entity.gate is None else entity.gate.step(work)
+            me.waits_for = (
+                work.step(must_check) if entity.gate is None
+                else entity.gate.step(work, must_check))
         except BaseException as error:
             me.raised = error
         end = monotonic_ns()
@@ -626,10 +656,15 @@ class WorkerPool:
             habit.ran(end - start, own, process_time_ns() - process - own,
                       times_preempted() > preempted)
         work.cpu_ns += own
-        self._note_times(me, entity, start, end)
+        me.start, me.end = start + self._offset, end + self._offset
+        self._note_times(entity, start, end, me.published)
+        if entity.is_nested != habit.holds and entity.classify is not None:
+            with self.lock:
+                entity.classify()
 
-    def _note_times(self, me: WorkerThread, entity: Entity, start: int, end: int) -> None:
-        """Note when (monotonic ns) a thread's execution began and ended."""
+    @staticmethod
+    def _note_times(entity: Entity, start: int, end: int, published: int) -> None:
+        """Note how long an execution took, and when it published (monotonic ns; 0: it did not)."""
         wall = end - start
         if wall > BRIEF_NS:
             entity.habit.rests = 0  # long callbacks are measured each time
@@ -637,9 +672,8 @@ class WorkerPool:
             entity.wall_ns += (wall - entity.wall_ns) >> 3
         else:
             entity.wall_ns = wall
-        if me.published:
-            entity.tail_ns += (end - me.published - entity.tail_ns) >> 3
-        me.start, me.end = start + self._offset, end + self._offset
+        if published:
+            entity.tail_ns += (end - published - entity.tail_ns) >> 3
 
     def _report_end(
         self, me: WorkerThread, work: Work, now: int, calls: list[Callable[[], None]]
@@ -662,8 +696,6 @@ class WorkerPool:
             engine.ask_again()
         if entity.removed:
             self.entities_changed()  # the registry can forget it now
-        if entity.is_nested != entity.habit.holds and entity.classify is not None:
-            entity.classify()
 
     def _report_unusual_end(
         self, me: WorkerThread, work: Work, now: int, calls: list[Callable[[], None]]
