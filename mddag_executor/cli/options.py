@@ -60,7 +60,6 @@ seed = _number(int, lambda value: 0 <= value < 2 ** 64, 'an integer from 0 to 2*
 number = _number(float, math.isfinite, 'a number')
 positive_float = _number(float, lambda value: 0 < value < math.inf, 'a number above zero')
 not_negative = _number(float, lambda value: 0 <= value < math.inf, 'a number from 0 up')
-ratio = _number(float, lambda value: 0 <= value <= 1, 'a number from 0 to 1')
 
 
 def or_zero(kind: Callable[[str], int]) -> Callable[[str], int]:
