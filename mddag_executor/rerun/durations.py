@@ -5,14 +5,15 @@ How long callbacks and messages take in virtual time.
 
 Theory of operation
 -------------------
+A job takes the times of the job of a load with the nearest release, at most half a period away. If
+there is none, each vertex takes the median of its times.
+
+*Recorded*: the load is that of a recording, whose k-th job is not always the k-th of the rerun.
+The time from a vertex's end to the arrival of its message is the recorded one, too; it is negative
+if the callback published before its end.
+
 *Fixed* (declared, drawn, or from a file of execution times): each vertex takes the same time in
 every job. Its messages leave at its end and arrive at once.
-
-*Recorded*: the k-th job of the rerun is not always the k-th of the recording. A job takes the
-times of the recorded job of its DAG with the nearest release, at most half a period away. If there
-is none, each vertex takes the median of its recorded times. The time from a vertex's end to the
-arrival of its message is the recorded one, too; it is negative if the callback published before
-its end.
 """
 
 from __future__ import annotations
@@ -21,48 +22,20 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 from mddag_executor.core import quantile, Tables
-from mddag_executor.replay.load import RecordedLoad
-from mddag_executor.simulate.load import as_lists, edge_numbers, needs_python
+from mddag_executor.simulate.load import as_lists, edge_numbers, Load, needs_python
 
 
-class FixedDurations:
+class Durations:
     """
-    The same time in every job; all times are in ns, vertices are global.
+    Times of jobs; all times are in ns, vertices are global.
 
-    :param times: the execution time of each vertex, by DAG and local index.
-    :ivar at_once: whether messages take no time.
+    :ivar recorded: whether the load is recorded; if not, messages take no time.
     """
 
-    at_once = True
-
-    def __init__(self, times: Sequence[Sequence[int]]) -> None:
-        self._times = [time for row in times for time in row]
-
-    def execution(self, dag: int, vertex: int, release: int) -> int:
-        """Return how long a vertex executes."""
-        return self._times[vertex]
-
-    def transport(self, dag: int, before: int, after: int, release: int) -> int:
-        """Return 0: messages take no time."""
-        return 0
-
-    def computed(self, dag: int, vertex: int, release: int) -> int:
-        """Return all of its time: it computes throughout."""
-        return self._times[vertex]
-
-    def holds(self, vertex: int) -> bool:
-        """Return False: nothing is recorded."""
-        return False
-
-
-class RecordedDurations:
-    """The times of the job of a recording that was released at about the same time."""
-
-    at_once = False
-
-    def __init__(self, tables: Tables, work: RecordedLoad) -> None:
+    def __init__(self, tables: Tables, load: Load, recorded: bool) -> None:
+        self.recorded = recorded
         self._tables = tables
-        self._load = load = as_lists(work.load)
+        self._load = load = as_lists(load)
         self._releases: list[list[tuple[int, int]]] = [[] for _ in range(tables.n_dags)]
         for dag, job, release in zip(load.dags, load.jobs, load.releases or load.times):
             if dag < tables.n_dags:
@@ -73,9 +46,9 @@ class RecordedDurations:
         self._usual: dict[tuple[int, int], int] = {}
 
     def first_release(self, dag: int) -> int | None:
-        """Return when the first job of a DAG was released; None: there was none."""
+        """Return when the first job of a DAG was released in the recording; None: unknown."""
         rows = self._releases[dag]
-        return rows[0][0] if rows else None
+        return rows[0][0] if rows and self.recorded else None
 
     def execution(self, dag: int, vertex: int, release: int) -> int:
         """Return how long a vertex of the job with that release executed."""
@@ -87,7 +60,7 @@ class RecordedDurations:
     def transport(self, dag: int, before: int, after: int, release: int) -> int:
         """Return how long after the end of a vertex its message arrived."""
         edge = self._edges.get((before, after))
-        if edge is None:
+        if edge is None or not self.recorded:
             return 0
         load = self._load
         return self._value(load.delays, load.delay_base[dag] + edge, load.delay_stride[dag], dag,
@@ -136,6 +109,3 @@ class RecordedDurations:
             return -1
         at, job = min(near, key=lambda row: abs(row[0] - release))
         return job if abs(at - release) * 2 <= self._tables.period[dag] else -1
-
-
-Durations = FixedDurations | RecordedDurations

@@ -20,9 +20,9 @@ from mddag_executor.errors import UsageError
 from mddag_executor.replay.bags import Bag, is_ordinary
 from mddag_executor.replay.load import LoadBuilder
 from mddag_executor.replay.run import open_recording
-from mddag_executor.rerun.durations import Durations, FixedDurations, RecordedDurations
+from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError
-from mddag_executor.simulate import draw_execution_times, read_execution_times
+from mddag_executor.simulate import draw_execution_times, periodic_load, read_execution_times
 from mddag_executor.trace.channels import Topic
 from msg_graph import TaskSet
 
@@ -124,10 +124,6 @@ class RerunInput(NamedTuple):
     messages: MessageBag | None
     times: Durations
 
-    def first_release(self, dag: int) -> int | None:
-        """Return when the first job of a DAG was released in the recorded run; None: unknown."""
-        return self.times.first_release(dag) if isinstance(self.times, RecordedDurations) else None
-
     @property
     def pauses(self) -> list[tuple[int, int]]:
         """Return from when to when no messages came."""
@@ -161,20 +157,25 @@ def open_input(
             '--times declared, or a trace or a file of execution times')
     run = None if bag else _recorded(path, task_set, name)
     if times == DECLARED:
-        taken: Durations = FixedDurations(draw_execution_times(task_set, seed, undeclared=0))
+        taken = _fixed(task_set, draw_execution_times(task_set, seed, undeclared=0))
     elif times == RECORDED and run is not None:
         taken = run.times
     elif os.path.isdir(times) or _begins_as_mcap(times):
         taken = _recorded(times, task_set, times).times
     else:
         with open(times, encoding='utf-8') as file:
-            taken = FixedDurations(read_execution_times(task_set, file.read(), times))
+            taken = _fixed(task_set, read_execution_times(task_set, file.read(), times))
     messages = _messages(path, name)
     if messages is not None and messages.start is not None and messages.end is not None:
         return RerunInput(name, messages.start, messages.end, messages, taken)
     if run is None:
         raise UsageError(f'{name}: no message is recorded in it: record it with ros2 bag record')
     return run._replace(times=taken)
+
+
+def _fixed(task_set: TaskSet, times: list[list[int]]) -> Durations:
+    """Return the same times for every job."""
+    return Durations(Tables.build(task_set), periodic_load(task_set, times, 1), recorded=False)
 
 
 def _messages(path: str, name: str) -> MessageBag | None:
@@ -200,4 +201,4 @@ def _recorded(path: str, task_set: TaskSet, name: str) -> RerunInput:
     start = run.end if run.start is None else run.start
     return RerunInput(
         name, min(start, head.time or start), run.end, None,
-        RecordedDurations(tables, builder.build()))
+        Durations(tables, builder.build().load, recorded=True))

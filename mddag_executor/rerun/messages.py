@@ -220,14 +220,14 @@ class Messages:
 
     def _earliest(self, outlet: Outlet, origin: Origin, release: int) -> int:
         """Return when the first subscription gets a message, after its execution's end."""
-        if self._times.at_once:
+        if not self._times.recorded:
             return 0
         return min((self._delay(inlet, origin, release) for inlet in self._inlets_of(outlet)),
                    default=0)
 
     def _delay(self, inlet: Inlet, origin: Origin | None, release: int) -> int:
         target = None if origin is None else inlet.entity.targets.get(origin.vertex)
-        if origin is None or target is None or self._times.at_once:
+        if origin is None or target is None:
             return 0
         return self._times.transport(origin.dag, origin.vertex, target[0], release)
 

@@ -40,7 +40,6 @@ from mddag_executor.rerun.actions import Actions
 from mddag_executor.rerun.clocks import VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.discovery import Discovery
-from mddag_executor.rerun.durations import RecordedDurations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.executor import NodeHolder, RerunHost
 from mddag_executor.rerun.inputs import RerunInput
@@ -178,9 +177,8 @@ class Rerun:
         clock.loop = self._holder.loop = loop
         self._holders = self._held()
         if settings.cpus is not None or self._holders:
-            python = isinstance(source.times, RecordedDurations) and source.times.python
             loop.computing = SharedCpus(
-                self._engine, settings.cpus, python, loop.start, loop.ended)
+                self._engine, settings.cpus, source.times.python, loop.start, loop.ended)
         self._registry = Registry(task_set, self._engine, self._engine.leave_group)
         self._messages = Messages(
             loop, source.times, self._outputs, task_set, self._recorder, self._warn)
@@ -192,7 +190,7 @@ class Rerun:
         self._discovery = Discovery(
             loop, self._holder, self._messages, source.topics,
             lambda: {} if recording is None else recording.kinds, self._warn)
-        self._timers = Timers(loop, source.first_release)
+        self._timers = Timers(loop, source.times.first_release)
         self._host = RerunHost(loop)
         if self._recorder is not None:
             self._recorder.entities((), [self._holder.task_entity])

@@ -27,7 +27,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 import sys
 import threading
 import time
@@ -37,6 +36,8 @@ _LOOK_S = 0.05
 _LONGEST_LOOK_S = 1.0
 """More time between two looks is that of a process that was stopped."""
 _COMPUTES = 10
+_LITTLE = 0.1
+"""A process that uses less than this share of a CPU waits."""
 _END_S = 2.0
 """RunThreads have this much real time to end when the run is over."""
 
@@ -52,7 +53,7 @@ class RunThread:
     """
 
     __slots__ = ('name', 'until', 'deadline', 'place', 'execution', 'came_true', 'lock', 'ident',
-                 'clock', 'folder', 'leaves', 'ended')
+                 'leaves', 'ended')
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -64,8 +65,6 @@ class RunThread:
         self.lock = threading.Lock()
         self.lock.acquire()
         self.ident = 0
-        self.clock = -1
-        self.folder = Path()
         self.leaves = False
         self.ended = False
 
@@ -134,8 +133,6 @@ class RunThreads:
     def _begin(self, run_thread: RunThread) -> None:
         self._here.run_thread = run_thread
         run_thread.ident = threading.get_ident()
-        run_thread.folder = Path(f'/proc/self/task/{threading.get_native_id()}')
-        run_thread.clock = time.pthread_getcpuclockid(run_thread.ident)
         run_thread.lock.acquire()
 
     # --- driving ---------------------------------------------------------------------------------
@@ -280,8 +277,7 @@ class _StallWatch:
     """
     Finds out whether a run thread keeps virtual time from advancing for too long.
 
-    Only the time counts in which the run thread waits, or that of its CPU: the machine may be
-    busy.
+    It waits while the process uses little CPU time, else it computes.
     """
 
     def __init__(
@@ -292,40 +288,28 @@ class _StallWatch:
         self._patience_s = patience_s
         self._seen: object = None
         self._owner: RunThread | None = None
-        self._looked_at = time.monotonic()
-        self._cpu_s = self._waited_s = self._computed_s = 0.0
+        self._looked_at, self._cpu_s = time.monotonic(), time.process_time()
+        self._waited_s = self._computed_s = 0.0
 
     def look(self) -> None:
-        before, owner = self._owner, self._run_threads.owner
-        now = time.monotonic()
-        passed_s, self._looked_at = min(now - self._looked_at, _LONGEST_LOOK_S), now
-        self._owner = None
-        if owner is None or owner.clock == -1:
-            return
-        try:
-            cpu_s = time.clock_gettime(owner.clock)
-        except OSError:
-            return  # its thread has just ended
-        computed_s, self._owner, self._cpu_s = cpu_s - self._cpu_s, owner, cpu_s
+        now, cpu_s, owner = time.monotonic(), time.process_time(), self._run_threads.owner
+        passed_s = min(now - self._looked_at, _LONGEST_LOOK_S)
+        computes = cpu_s - self._cpu_s > _LITTLE * passed_s
+        before, self._owner = self._owner, owner
+        self._looked_at, self._cpu_s = now, cpu_s
         seen = self._progress()
-        if seen != self._seen:
+        if owner is None or seen != self._seen:
             self._seen, self._waited_s, self._computed_s = seen, 0.0, 0.0
-        elif owner is before:
-            self._computed_s += computed_s
-            if not is_runnable(owner.folder):
-                self._waited_s += max(0.0, passed_s - computed_s)
-            if self._waited_s > self._patience_s:
-                raise Stalled(owner, 'blocking', self._patience_s)
+        elif owner is not before:
+            pass
+        elif computes:
+            self._computed_s += passed_s
             if self._computed_s > _COMPUTES * self._patience_s:
                 raise Stalled(owner, 'computing', _COMPUTES * self._patience_s)
-
-
-def is_runnable(folder: Path) -> bool:
-    """Return whether a thread runs or waits for a CPU, by its folder in /proc (proc(5))."""
-    try:
-        return (folder / 'stat').read_bytes().rpartition(b')')[2].split()[0] == b'R'
-    except (OSError, IndexError):
-        return False
+        else:
+            self._waited_s += passed_s
+            if self._waited_s > self._patience_s:
+                raise Stalled(owner, 'blocking', self._patience_s)
 
 
 def code_position(ident: int) -> str:

@@ -11,6 +11,7 @@ import threading
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from mddag_executor.core import Tables
 from mddag_executor.replay import replay
 from mddag_executor.rerun import (
     assert_same,
@@ -21,9 +22,11 @@ from mddag_executor.rerun import (
     RerunError,
     Result,
 )
+from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.inputs import MessageBag, RerunInput
 from mddag_executor.rerun.message_types import canonical
 from mddag_executor.rerun.run import Rerun, Settings
+from mddag_executor.simulate import Load
 from msg_graph import load
 import numpy
 import pytest
@@ -137,10 +140,8 @@ def test_recorded_times_come_from_a_trace(bag: str, graph: Path, tmp_path: Path)
         100.0 * i + 10 for i in range(20)]
 
 
-class Early:
+class Early(Durations):
     """Each callback takes 10 ms and publishes 4 ms before its end."""
-
-    at_once = False
 
     def execution(self, dag: int, vertex: int, release: int) -> int:
         return 10 * MS
@@ -148,18 +149,13 @@ class Early:
     def transport(self, dag: int, before: int, after: int, release: int) -> int:
         return -4 * MS
 
-    def computed(self, dag: int, vertex: int, release: int) -> int:
-        return 10 * MS
-
-    def holds(self, vertex: int) -> bool:
-        return False
-
 
 @pytest.mark.parametrize('cpus', [None, 2])
 def test_what_was_published_early_leaves_early(bag: str, graph: Path, cpus: int | None) -> None:
     recording = MessageBag(bag)
     assert recording.start is not None and recording.end is not None
-    source = RerunInput('bag', recording.start, recording.end, recording, Early())
+    source = RerunInput('bag', recording.start, recording.end, recording, Early(
+        Tables.build(load(str(graph))), Load([], [], [], [], [0], [0]), recorded=True))
     result = Rerun(source, load(str(graph)), Settings(workers=2, cpus=cpus)).run(
         lambda: programs([Filter, Sink]))
     assert [time for time, _ in published(result, '/filtered')][:2] == [6, 106]
