@@ -78,18 +78,18 @@ class GilHabit:
     Whether one callback holds the GIL while it runs.
 
     :param declared: the declared value; None: it is measured.
-    :ivar holds: 1 or 0, for its next execution.
+    :ivar holds: 1 or 0, for its next execution; ``computes``: the same, also if it is short.
     :ivar mean_ns: recent average of its executions' CPU time.
     :ivar is_known: whether ``holds`` is declared, or has been measured.
     :ivar rests: how many of its next executions need not be measured.
     """
 
-    __slots__ = ('holds', 'mean_ns', 'is_known', 'is_declared', 'rests', 'share',
+    __slots__ = ('holds', 'computes', 'mean_ns', 'is_known', 'is_declared', 'rests', 'share',
                  '_unclear', '_runs', '_is_trial')
 
     def __init__(self, declared: bool | None = None) -> None:
         self.is_declared = self.is_known = declared is not None
-        self.holds = int(declared or False)
+        self.holds = self.computes = int(declared or False)
         self.mean_ns = 0
         self.rests = 0
         self.share: float | None = None if declared is None else float(declared)
@@ -138,7 +138,8 @@ class GilHabit:
         self.share = part if share is None else share + (part - share) / runs
         self.is_known = True
         least, short = (WAITS, SHORT_NS // 2) if usual else (COMPUTES, 2 * SHORT_NS)
-        self.holds = int(self.share >= least and self.mean_ns >= short)
+        self.computes = int(self.share >= least)
+        self.holds = int(self.computes and self.mean_ns >= short)
 
 
 class Schedule(NamedTuple):

@@ -4,8 +4,8 @@
 Muting: while a callback holds the GIL for long, callbacks that cannot start wake no thread.
 
 Waking a thread costs 60 to 140 us while a callback computes.  The callbacks that could start are
-known beforehand: those that do not hold the GIL, or whose relative deadline is below a bound (see
-``Engine.overtaking_bound``).  The sources of all others are switched off (``loop``), and their
+known beforehand: those that do not compute, or whose relative deadline is below a bound (see
+``Engine.overtaking_bound``).  Short ones compute, too: each needs the GIL to start.  The sources of all others are switched off (``loop``), and their
 timers do not count for the timerfd.  Their arrivals are collected when muting ends.
 """
 
@@ -62,8 +62,10 @@ class Muting:
         habit = entity.habit
         if not habit.is_known:
             return
-        entity.is_nested = habit.holds
-        urgency = urgency_of(self._engine.relative_deadline(entity)) if habit.holds else ALWAYS
+        entity.is_nested = habit.computes
+        urgency = ALWAYS
+        if habit.computes:
+            urgency = urgency_of(self._engine.relative_deadline(entity))
         self._loop.move(source, urgency)
 
     def next_timer(self) -> int:
@@ -73,5 +75,5 @@ class Muting:
 
     def _could_start(self, entity: Entity) -> bool:
         habit = entity.habit
-        return (not habit.holds or not habit.is_known
+        return (not habit.computes or not habit.is_known
                 or self._engine.relative_deadline(entity) < self._bound)

@@ -658,7 +658,7 @@ class WorkerPool:
         work.cpu_ns += own
         me.start, me.end = start + self._offset, end + self._offset
         self._note_times(entity, start, end, me.published)
-        if entity.is_nested != habit.holds and entity.classify is not None:
+        if entity.is_nested != habit.computes and entity.classify is not None:
             with self.lock:
                 entity.classify()
 
