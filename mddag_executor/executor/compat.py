@@ -41,6 +41,15 @@ RCL_ERRORS = (InvalidHandle, RCLError)
 """Errors that rclpy raises for objects whose context has ended, among others."""
 
 
+def alive(entity: Any) -> bool:
+    """Return whether a node or an entity has not been destroyed."""
+    try:
+        with entity.handle:
+            return True
+    except InvalidHandle:
+        return False
+
+
 # --- taking --------------------------------------------------------------------------------------
 
 def message_taker(subscription: Any) -> Callable[[], tuple[Any, dict[str, Any]] | None]:

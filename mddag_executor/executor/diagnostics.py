@@ -40,7 +40,7 @@ from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
     from diagnostic_msgs.msg import DiagnosticArray
-    from mddag_executor.executor.miss_notifier import MissNotifier
+    from mddag_executor.executor.misses import MissNotifier
     from mddag_executor.executor.recorder import Recorder
     from mddag_executor.executor.registry import Registry
     from mddag_executor.executor.workers import WorkerPool

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from heapq import heappop, heappush
+import os
 from time import monotonic_ns, process_time_ns
 from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER
 from mddag_executor.executor.bounds import AGAIN_NS, BRIEF_NS, STOP_NS
 from mddag_executor.executor.gil import FIRST_CHECK_NS, GilCheck, LAST_CHECK_NS
+from mddag_executor.executor.listeners import TimerFd
 from mddag_executor.executor.work import Work
 
 if TYPE_CHECKING:
@@ -168,3 +170,46 @@ class DueTimes:
             late = now - max(at, seen, since) - (cpu - used)
             if late >= STOP_NS:
                 self._pool.stopped(now - late, now)
+
+
+class Guard:
+    """
+    A time at which to wake a thread because a callback runs longer than expected.
+
+    All methods but ``collect`` need the engine's lock.  The guard has a separate timerfd, which
+    the spinning thread waits for.  Setting and clearing a time for each callback would cost more
+    than the callback (9 us on a virtual machine).  So the time is set once, and neither changed
+    nor cleared until it expires.
+
+    :param expired: called when the time expires; it calls ``end``.
+    :ivar is_set: whether a time is set.
+    """
+
+    urgency = -1
+    is_counted = asks_others = False
+
+    def __init__(self, expired: Callable[[], None]) -> None:
+        self._timer = TimerFd()
+        self.is_set = False
+        self.fd = self._timer.fd
+        self.collect = expired
+
+    def set(self, at: int) -> None:
+        """Set the time (monotonic ns), unless one is set."""
+        if not self.is_set:
+            self.is_set = True
+            self._timer.arm(at)
+
+    def end(self) -> None:
+        """Note that the time has expired."""
+        self.is_set = False
+
+    def close(self) -> None:
+        """Close the descriptor, once."""
+        fd, self.fd, self._timer.fd = self.fd, -1, -1
+        if fd >= 0:
+            os.close(fd)
+
+    def __del__(self) -> None:
+        """Close the descriptor of an executor that was never shut down."""
+        self.close()

@@ -45,8 +45,7 @@ from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.gil import short_switch_interval
 from mddag_executor.executor.inbox import Inbox
-from mddag_executor.executor.miss_log import MissLog
-from mddag_executor.executor.miss_notifier import MissNotifier
+from mddag_executor.executor.misses import MissLog, MissNotifier
 from mddag_executor.executor.name_check import NameCheck
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry

@@ -5,8 +5,9 @@ Muting: while a callback holds the GIL for long, callbacks that cannot start wak
 
 Waking a thread costs 60 to 140 us while a callback computes.  The callbacks that could start are
 known beforehand: those that do not compute, or whose relative deadline is below a bound (see
-``Engine.overtaking_bound``).  Short ones compute, too: each needs the GIL to start.  The sources of all others are switched off (``loop``), and their
-timers do not count for the timerfd.  Their arrivals are collected when muting ends.
+``Engine.overtaking_bound``).  Short ones compute, too: each needs the GIL to start.  The sources
+of all others are switched off (``loop``), and their timers do not count for the timerfd.  Their
+arrivals are collected when muting ends.
 """
 
 from __future__ import annotations

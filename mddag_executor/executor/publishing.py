@@ -28,7 +28,7 @@ of an executor here.
 from __future__ import annotations
 
 import threading
-from typing import Any, Protocol
+from typing import Any
 
 from mddag_executor.executor.jobs import NO_ORIGIN, Publication, PublisherState
 from mddag_executor.executor.work import current
@@ -37,27 +37,60 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 
-class Delivery(Protocol):
-    """The subscriptions of one executor on a topic that publishing threads take from."""
+class LocalDelivery:
+    """
+    The subscriptions on one topic that publishing threads of this process take from.
+
+    :param sources: their sources (``sources.SubscriptionSource``).
+    :param pool: the ``WorkerPool``.
+    """
+
+    __slots__ = ('sources', '_pool', '_is_held')
+
+    def __init__(self, sources: tuple[Any, ...], pool: Any) -> None:
+        self.sources = sources
+        self._pool = pool
+        self._is_held = False
 
     def hold(self) -> None:
-        """Pause announcements."""
-
-    def collect_published(self, publication: Publication | None) -> None:
-        """Collect arrivals announced since ``hold``, and resume announcements."""
+        """Pause announcements, if they would wake a thread that waits in the epoll."""
+        if self._pool.polling:
+            self._pool.loop.hold(self.sources)
+            self._is_held = True  # set last: a thread that ends it meanwhile may be too early
 
     def listen_again(self, subscription: Any) -> None:
         """Announce a subscription again after the middleware has replaced its reader."""
+        for source in self.sources:
+            if source.entity.rclpy is subscription:
+                source.listen()
+
+    def collect_published(self, publication: Publication | None) -> None:
+        """Collect arrivals announced since ``hold``, and resume announcements."""
+        pool = self._pool
+        running = current.running
+        if running is None or running.pool is not pool:
+            publication = None  # of another executor, with other jobs
+        if not pool.is_inside():
+            with pool.lock:
+                pool.tick()
+                posted = False
+                for source in self.sources:
+                    posted |= source.collect_published(publication)
+                if posted:
+                    pool.wake_for_more()
+        if self._is_held:
+            self._is_held = False
+            pool.loop.release(self.sources)
 
 
 _STATE = '_mddag_publisher_state'
-_deliveries: dict[str, tuple[Delivery, ...]] = {}
+_deliveries: dict[str, tuple[LocalDelivery, ...]] = {}
 _lock = threading.Lock()
 _installed = False
 
 
-def replace_delivery(topic: str, old: Delivery | None, new: Delivery | None) -> None:
-    """Replace the ``Delivery`` of publishing threads on a topic; None: there is none."""
+def replace_delivery(topic: str, old: LocalDelivery | None, new: LocalDelivery | None) -> None:
+    """Replace the ``LocalDelivery`` of publishing threads on a topic; None: there is none."""
     with _lock:
         several = [each for each in _deliveries.get(topic, ()) if each is not old]
         if new is not None:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 import threading
 from typing import Any
 import weakref
@@ -24,20 +24,43 @@ from mddag_executor.executor.entity import (
     WAITABLE,
 )
 from mddag_executor.executor.groups import decides_itself, Gate
-from mddag_executor.executor.snapshot import EntitySet
 from mddag_executor.executor.sources import SERVICE_DEPTH
 from mddag_executor.executor.work import Work
 from msg_graph import binding, Callback, TaskSet
 from msg_graph.duration import exact_duration
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.event_handler import EventHandler, QoSSubscriptionEventType
 from rclpy.exceptions import InvalidHandle
-from rclpy.qos import HistoryPolicy, qos_policy_name_from_kind
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy
 
-_INCOMPATIBLE = QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS
+LISTS = {
+    'timers': TIMER, 'subscriptions': SUBSCRIPTION, 'services': SERVICE, 'clients': CLIENT,
+    'guards': GUARD, 'waitables': WAITABLE}
+"""The kinds of a node's entities, by the names of its properties."""
 
-KINDS = (TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE)
-"""In the order of ``snapshot.LISTS``."""
+EntitySet = dict[Node, tuple[list[Any], ...]]
+"""The entities of each node, for each of ``LISTS``, in the order of creation."""
+
+
+def snapshot(nodes: Iterable[Node]) -> EntitySet:
+    """
+    Return the entities that these nodes have now.
+
+    Nodes notify an executor that their entities have changed (``Executor.wake``), but not how.
+
+    :param nodes: may be changed by other threads meanwhile, which must cause another snapshot, as
+        rclpy's nodes do by waking their executor.
+    """
+    return {node: tuple(_listed(node, name) for name in LISTS) for node in nodes}
+
+
+def _listed(node: Node, name: str) -> list[Any]:
+    """List entities until the list is unchanged: a concurrent removal may hide the next entity."""
+    before: list[Any] | None = None
+    found = list(getattr(node, name))
+    while found != before:
+        before, found = found, list(getattr(node, name))
+    return found
 
 
 class Registry:
@@ -93,7 +116,7 @@ class Registry:
                 name = self._name(node)
             except InvalidHandle:
                 continue  # destroyed after it was listed
-            for kind, some in zip(KINDS, lists):
+            for kind, some in zip(LISTS.values(), lists):
                 for rclpy_entity in some:
                     key = id(rclpy_entity)
                     entity = self.by_id.get(key)
@@ -213,14 +236,6 @@ class Registry:
     def subscriptions(self) -> list[Entity]:
         """Return the current subscriptions."""
         return [entity for entity in self.by_id.values() if entity.kind == SUBSCRIPTION]
-
-    def note_event(self, handler: EventHandler, status: Any) -> None:
-        """Note a QoS event: the policy because of which a subscription gets no messages."""
-        if status is None or handler.event_type != _INCOMPATIBLE:
-            return
-        for entity in self.subscriptions():
-            if handler in entity.rclpy.event_handlers:
-                entity.incompatible_qos = qos_policy_name_from_kind(status.last_policy_kind)
 
     def timers(self) -> list[Entity]:
         """Return the current timers."""

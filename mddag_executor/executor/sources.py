@@ -26,7 +26,6 @@ from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import Publication
 from mddag_executor.executor.listeners import clear_listener, MANY, set_listener
 from mddag_executor.executor.loop import ALWAYS, EventLoop
-from mddag_executor.executor.snapshot import alive
 from mddag_executor.executor.work import Work
 from rclpy.exceptions import InvalidHandle
 
@@ -116,7 +115,7 @@ class Source:
                 if not self.take_one():
                     return
         except compat.RCL_ERRORS as error:
-            if alive(entity.rclpy):
+            if compat.alive(entity.rclpy):
                 self._arrivals.failed(error)
             return
         except Exception as error:

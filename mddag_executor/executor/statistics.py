@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import cast, TYPE_CHECKING
 
 from mddag_executor.core.tally import counts, never_due
-from mddag_executor.executor.miss_notifier import MissNotifier
+from mddag_executor.executor.misses import MissNotifier
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
 from mddag_executor.executor.statistics_types import CallbackCounts, Statistics, Stops

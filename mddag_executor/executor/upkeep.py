@@ -15,14 +15,12 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.executor import publishing
 from mddag_executor.executor.at_once import AtOnce
 from mddag_executor.executor.compat import (
     ends_sleep,
     is_builtin,
     is_of_wait_for_message,
 )
-from mddag_executor.executor.delivery import LocalDelivery
 from mddag_executor.executor.entity import (
     CLIENT,
     Entity,
@@ -33,12 +31,17 @@ from mddag_executor.executor.entity import (
     WAITABLE,
 )
 from mddag_executor.executor.listeners import ListenerError
+from mddag_executor.executor.publishing import LocalDelivery, replace_delivery
 from mddag_executor.executor.recorder import Recorder
-from mddag_executor.executor.registry import Registry
-from mddag_executor.executor.snapshot import is_qos_event, snapshot
+from mddag_executor.executor.registry import Registry, snapshot
 from mddag_executor.executor.sources import ClientSource, ServiceSource, SubscriptionSource
 from mddag_executor.executor.timers import TimerSource
-from mddag_executor.executor.waitables import EventsSource, WaitableSource, WaitSetThread
+from mddag_executor.executor.waitables import (
+    EventsSource,
+    is_qos_event,
+    WaitableSource,
+    WaitSetThread,
+)
 from mddag_executor.executor.workers import WorkerPool
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
@@ -196,7 +199,7 @@ class Upkeep:
     def _deliver(self, topic: str, sources: tuple[SubscriptionSource, ...]) -> None:
         """Let publishing threads of this process collect for these subscriptions of a topic."""
         new = LocalDelivery(sources, self._pool) if sources else None
-        publishing.replace_delivery(topic, self._deliveries.pop(topic, None), new)
+        replace_delivery(topic, self._deliveries.pop(topic, None), new)
         if new is not None:
             self._deliveries[topic] = new
 
@@ -280,8 +283,6 @@ class Upkeep:
             return None
         except ListenerError:
             return None
-        if isinstance(source, EventsSource):
-            source.note = self._registry.note_event
         with pool.lock:
             pool.loop.add(source)
         try:

@@ -34,6 +34,7 @@ from mddag_executor.executor.shutdown import call_at_shutdown, is_over, join, st
 from mddag_executor.executor.waitsets import FilledSet
 from mddag_executor.executor.work import Work
 from rclpy.context import Context
+from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
 from rclpy.waitable import Waitable
@@ -172,18 +173,20 @@ class WaitableSource:
                      partial(self._post_noted, early, checks + 1))
 
 
+def is_qos_event(waitable: Waitable) -> bool:
+    """Return whether a waitable is an ``EventHandler`` that waits and takes as rclpy's does."""
+    kind = type(waitable)
+    return isinstance(waitable, EventHandler) and all(
+        getattr(kind, name) is getattr(EventHandler, name)
+        for name in ('add_to_wait_set', 'is_ready', 'take_data', 'get_num_entities'))
+
+
 _known: weakref.WeakKeyDictionary[Entity, list[int]] = weakref.WeakKeyDictionary()
 """The counts of each QoS event at the last take."""
 
 
 class EventsSource(WaitableSource):
-    """
-    QoS events (rclpy's ``EventHandler``) that share a descriptor.
-
-    :ivar note: called with each event and its status.
-    """
-
-    note: Callable[[Any, Any], None]
+    """QoS events (rclpy's ``EventHandler``) that share a descriptor."""
 
     def _collect(self) -> None:
         found: list[Work] = []
@@ -197,7 +200,6 @@ class EventsSource(WaitableSource):
             _known[entity] = counts
             if counts != before or any(
                     value for name, value in values.items() if name.endswith('_change')):
-                self.note(event, status)
                 found.append(Work(entity, event.execute, (status,)))
 
         self._set.wait(None, take)

@@ -13,7 +13,7 @@ Theory of operation
 3.  *Waking others.*  If more than one execution may start, one waiting thread is woken, which does
     the same.  No thread is woken while a *short* callback runs, because its thread will be free in
     time.  A callback is short if it usually ends within ``BRIEF_NS``, or within ``BRIEF_NS`` of a
-    publication that it has made.  If it runs longer, the guard (``guard``) wakes another thread.
+    publication that it has made.  If it runs longer, the guard (``due``) wakes another thread.
 4.  *Admission to the epoll.*  A spin begins with one waiting thread.  Another one is admitted when
     an execution starts and no thread waits.  All other threads are parked, each on its own lock,
     which is released exactly once for each admission.  A thread that wakes for an execution that
@@ -52,12 +52,11 @@ from mddag_executor.executor.bounds import (
 )
 from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.debugging import engine_lock
-from mddag_executor.executor.due import DueTimes
+from mddag_executor.executor.due import DueTimes, Guard
 from mddag_executor.executor.engine import Engine, LONG_NS
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import times_preempted
 from mddag_executor.executor.groups import Refused
-from mddag_executor.executor.guard import Guard
 from mddag_executor.executor.inbox import Inbox
 from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
 from mddag_executor.executor.muting import Muting

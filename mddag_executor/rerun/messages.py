@@ -24,11 +24,10 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
-from mddag_executor.executor.compat import callback_type, WITH_INFO
+from mddag_executor.executor.compat import alive, callback_type, WITH_INFO
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import header_stamp, Origin
 from mddag_executor.executor.recorder import Recorder
-from mddag_executor.executor.snapshot import alive
 from mddag_executor.executor.work import Work
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError

@@ -29,9 +29,9 @@ from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import WAITABLE
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.recorder import Recorder
-from mddag_executor.executor.registry import Registry
+from mddag_executor.executor.registry import Registry, snapshot
 from mddag_executor.executor.shutdown import is_over
-from mddag_executor.executor.snapshot import is_qos_event, snapshot
+from mddag_executor.executor.waitables import is_qos_event
 from mddag_executor.executor.work import Work
 from mddag_executor.hosting.host import Guest
 from mddag_executor.hosting.loading import describe, Program, ros_arguments

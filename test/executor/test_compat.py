@@ -13,7 +13,8 @@ from typing import Any
 import weakref
 
 from mddag_executor.executor import compat, listeners, waitsets
-from mddag_executor.executor.snapshot import alive, is_qos_event
+from mddag_executor.executor.compat import alive
+from mddag_executor.executor.waitables import is_qos_event
 import pytest
 import rclpy
 from rclpy.action import ActionClient, ActionServer

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Reports missed deadlines to the user's handler, in a separate thread.
+Reports missed deadlines: in the log, and to the user's handler, in a separate thread.
 
 Theory of operation
 -------------------
@@ -26,10 +26,11 @@ from typing import TYPE_CHECKING
 from mddag_executor.executor.bounds import END_S, LOG_EVERY_S
 from mddag_executor.executor.shutdown import join, stop_at_exit
 from mddag_executor.text import counted
+from msg_graph.errors import printable
 from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
-    from mddag_executor.executor.verdicts import DeadlineMiss
+    from mddag_executor.executor.verdicts import DeadlineMiss, Verdicts
 
 MOST_WAITING = 256
 """The most misses queued for the handler: at 10 ms each, the last one is reported 2.5 s late."""
@@ -124,3 +125,31 @@ class MissNotifier:
             get_logger('mddag_executor').warning(
                 f'on_deadline_miss: {counted(new, "miss was", "misses were")} not reported, as '
                 'it has not returned in time: have it return sooner')
+
+
+class MissLog:
+    """Writes missed deadlines to the log, at a limited rate."""
+
+    def __init__(self, verdicts: Verdicts) -> None:
+        self._verdicts = verdicts
+        self._lock = threading.Lock()
+        self._logged = 0
+        self._at = 0.0
+
+    def write(self) -> None:
+        """Log the misses since the last line, if any; from any thread, without a lock."""
+        if self._verdicts.missed == self._logged or not self._lock.acquire(blocking=False):
+            return
+        try:
+            now, count = time.monotonic(), self._verdicts.missed - self._logged
+            if self._logged and now - self._at < LOG_EVERY_S:
+                return
+            dag, sink, job, deadline_ns = self._verdicts.last_missed()
+            since = f' within {now - self._at:.0f} s, the last' if self._logged else ''
+            get_logger('mddag_executor').warning(printable(
+                f'{counted(count, "deadline")} missed{since}: {sink}, {deadline_ns / 1e6:g} ms, '
+                f'job {job} of {dag}'))
+            self._logged += count
+            self._at = now
+        finally:
+            self._lock.release()
