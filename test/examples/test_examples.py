@@ -101,7 +101,7 @@ def test_services_and_actions() -> None:
     assert service == 'service: calibrated'
     assert action == 'action: [0, 1, 1, 2, 3, 5, 8, 13, 21, 34, 55, 89]'
     steps, undeclared = re.fullmatch(
-        r'control: (\d+) steps, \d+ late; (\d+) undeclared callbacks beside it', control).groups()
+        r'control: (\d+) steps, \d+ late; (\d+) undeclared callbacks', control).groups()
     # The service takes 100 ms and the action 200: control went on every 20 ms meanwhile.
     assert int(steps) >= 10
     assert int(undeclared) >= 13

@@ -1,9 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A service and an action beside a control loop with a deadline, all on one executor.
+A service and an action next to a control loop with a deadline, all on one executor.
 
-    python examples/services_and_actions/beside.py
+    python examples/services_and_actions/control.py
 
 A callback that waits in a synchronous service call lends its worker to a spare thread until the
 answer is there, so it can't block the answer, even with one worker.
@@ -98,7 +98,7 @@ def main() -> None:
     statistics = executor.statistics()
     sink = statistics['dags']['control']['sinks']['/controller:step']
     print(f"control: {sink['completed']} steps, {sink['late']} late; "
-          f"{statistics['undeclared']} undeclared callbacks beside it")
+          f"{statistics['undeclared']} undeclared callbacks")
 
 
 if __name__ == '__main__':
