@@ -379,8 +379,7 @@ class Engine:
             return None
         work = self._work.pop(x)
         entity = work.entity
-        if x in entity.waiting:  # else it was suspended
-            del entity.waiting[x]
+        entity.waiting.pop(x, None)  # a suspended one was removed before
         work.worker = worker
         if state.x_holds[x]:
             self.holders.append(work)

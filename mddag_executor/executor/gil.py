@@ -40,7 +40,7 @@ import os
 from resource import getrusage, RUSAGE_THREAD
 import sys
 import threading
-from time import clock_gettime_ns, process_time_ns, pthread_getcpuclockid
+from time import clock_gettime_ns, process_time_ns, pthread_getcpuclockid, thread_time_ns
 from typing import NamedTuple
 
 COMPUTES = 0.8
@@ -140,6 +140,36 @@ class GilHabit:
         least, short = (WAITS, SHORT_NS // 2) if usual else (COMPUTES, 2 * SHORT_NS)
         self.computes = int(self.share >= least)
         self.holds = int(self.computes and self.mean_ns >= short)
+
+
+class Measurement:
+    """
+    The CPU times during an execution.
+
+    :param habit: it is updated at the end, unless it rests.
+    """
+
+    __slots__ = ('_habit', '_process', '_preempted', '_own')
+
+    def __init__(self, habit: GilHabit) -> None:
+        self._habit = habit
+        if not habit.rests:
+            self._process, self._preempted = process_time_ns(), times_preempted()
+        self._own = thread_time_ns()
+
+    def end(self, wall: int) -> int:
+        """
+        Return the CPU time of the calling thread, ns.
+
+        :param wall: the duration of the execution, ns.
+        """
+        own = thread_time_ns() - self._own
+        if self._habit.rests:
+            self._habit.rests -= 1
+        else:
+            self._habit.ran(wall, own, process_time_ns() - self._process - own,
+                            times_preempted() > self._preempted)
+        return own
 
 
 class Schedule(NamedTuple):

@@ -15,6 +15,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.executor import publishing
 from mddag_executor.executor.at_once import AtOnce
 from mddag_executor.executor.compat import (
     ends_sleep,
@@ -31,7 +32,6 @@ from mddag_executor.executor.entity import (
     WAITABLE,
 )
 from mddag_executor.executor.listeners import ListenerError
-from mddag_executor.executor.publishing import LocalDelivery, replace_delivery
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry, snapshot
 from mddag_executor.executor.sources import ClientSource, ServiceSource, SubscriptionSource
@@ -80,7 +80,7 @@ class Upkeep:
         self._lock = threading.RLock()
         self._refresh_at = 0.0
         self._sources: dict[Entity, AnySource | WaitableSource] = {}
-        self._deliveries: dict[str, LocalDelivery] = {}
+        self._deliveries: dict[str, publishing.LocalDelivery] = {}
         self._events: WaitableSource | None = None
         self._unlistened: list[Entity] = []
         # entities without listener which the next refresh may find again
@@ -198,8 +198,8 @@ class Upkeep:
 
     def _deliver(self, topic: str, sources: tuple[SubscriptionSource, ...]) -> None:
         """Let publishing threads of this process collect for these subscriptions of a topic."""
-        new = LocalDelivery(sources, self._pool) if sources else None
-        replace_delivery(topic, self._deliveries.pop(topic, None), new)
+        new = publishing.LocalDelivery(sources, self._pool) if sources else None
+        publishing.replace_delivery(topic, self._deliveries.pop(topic, None), new)
         if new is not None:
             self._deliveries[topic] = new
 

@@ -37,7 +37,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 import threading
-from time import monotonic_ns, process_time_ns, thread_time_ns
+from time import monotonic_ns
 from typing import Any
 
 from mddag_executor.clocks import TraceClock
@@ -55,7 +55,7 @@ from mddag_executor.executor.debugging import engine_lock
 from mddag_executor.executor.due import DueTimes, Guard
 from mddag_executor.executor.engine import Engine, LONG_NS
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.gil import times_preempted
+from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.groups import Refused
 from mddag_executor.executor.inbox import Inbox
 from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
@@ -79,13 +79,13 @@ class WorkerThread:
     :ivar published: when the running callback first published (monotonic ns); 0: not yet.
     :ivar start: when the execution that has just ended began; ``end``: when it ended; both on the
         trace's clock.
-    :ivar waits_for: the future that this execution waits for, if it goes on later; ``raised``: its
-        exception.
+    :ivar outcome: its exception, or the future that it waits for, if it goes on later; None: it
+        has finished.
     """
 
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
                  'is_polling', 'is_parked', 'has_lent', 'pool', 'engine', 'start', 'end',
-                 'waits_for', 'raised', 'waits_since')
+                 'outcome', 'waits_since')
 
     def __init__(self, pool: WorkerPool, thread: threading.Thread | None) -> None:
         self.pool = pool
@@ -99,8 +99,7 @@ class WorkerThread:
         self.waits = self.has_lent = self.is_polling = False
         self.is_parked = True
         self.published = self.start = self.end = self.waits_since = 0
-        self.waits_for: Any = None
-        self.raised: BaseException | None = None
+        self.outcome: Any = None
 
     def begin(self) -> None:
         """Note the ids of the calling thread."""
@@ -214,10 +213,7 @@ class WorkerPool:
 
     def tick(self) -> int:
         """Return the engine's time now; it never decreases.  The caller holds the lock."""
-        now = monotonic_ns() + self._offset
-        if now < self._last:
-            now = self._last
-        self._last = self.inbox.now = now
+        now = self._last = self.inbox.now = monotonic_ns() + self._offset
         return now
 
     def report(self, event: Callable[..., None], *args: Any) -> None:
@@ -477,11 +473,8 @@ class WorkerPool:
         timed: list[Callable[[], None]] = []
         engine = self.engine
         with self.lock:
-            now = monotonic_ns() + self._offset  # inlined tick: saves a call for each execution
-            if now < self._last:
-                now = self._last
-            self._last = self.inbox.now = now
-            since = now
+            # inlined tick: saves a call for each execution
+            now = since = self._last = self.inbox.now = monotonic_ns() + self._offset
             work = me.work
             if work is not None:
                 self._report_end(me, work, now, calls)
@@ -502,7 +495,7 @@ class WorkerPool:
             if (expired or self.timers.has_new or engine.deadlines.next < self.due.deadline
                     or not found and self.due.is_early(now - self._offset)):
                 self.due.arm(now - self._offset)
-            if self._misses != engine.verdicts.missed:
+            if (expired or not found) and self._misses != engine.verdicts.missed:
                 self._misses = engine.verdicts.missed
                 calls.append(self.missed)
         if calls or timed:
@@ -615,51 +608,27 @@ class WorkerPool:
         must_check = entity.may_be_gone or not self.is_current
         me.published = 0
         habit = entity.habit
+        measurement = None
         if not habit.rests or self.engine.record is not None:
-            self._execute_measured(me, work, entity, must_check)
-            return
-        habit.rests -= 1
+            measurement = Measurement(habit)
         start = monotonic_ns()
         try:
-            me.waits_for = (
+            me.outcome = (
                 work.step(must_check) if entity.gate is None
                 else entity.gate.step(work, must_check))
         except BaseException as error:
-            me.raised = error
+            me.outcome = error
         end = monotonic_ns()
         me.start, me.end = start + self._offset, end + self._offset
-        if end - start > BRIEF_NS or me.published:
-            self._note_times(entity, start, end, me.published)
-
-    def _execute_measured(
-        self, me: WorkerThread, work: Work, entity: Entity, must_check: bool
-    ) -> None:
-        """Run the execution, and measure how long this thread and others compute meanwhile."""
-        habit = entity.habit
-        is_known = habit.rests > 0
-        process = preempted = 0
-        if is_known:
+        if measurement is None:
             habit.rests -= 1
         else:
-            process, preempted = process_time_ns(), times_preempted()
-        own, start = thread_time_ns(), monotonic_ns()
-        try:
-            me.waits_for = (
-                work.step(must_check) if entity.gate is None
-                else entity.gate.step(work, must_check))
-        except BaseException as error:
-            me.raised = error
-        end = monotonic_ns()
-        own = thread_time_ns() - own
-        if not is_known:
-            habit.ran(end - start, own, process_time_ns() - process - own,
-                      times_preempted() > preempted)
-        work.cpu_ns += own
-        me.start, me.end = start + self._offset, end + self._offset
-        self._note_times(entity, start, end, me.published)
-        if entity.is_nested != habit.computes and entity.classify is not None:
-            with self.lock:
-                entity.classify()
+            work.cpu_ns += measurement.end(end - start)
+            if entity.is_nested != habit.computes and entity.classify is not None:
+                with self.lock:
+                    entity.classify()
+        if measurement is not None or me.published or end - start > BRIEF_NS:
+            self._note_times(entity, start, end, me.published)
 
     @staticmethod
     def _note_times(entity: Entity, start: int, end: int, published: int) -> None:
@@ -684,11 +653,11 @@ class WorkerPool:
         """
         engine, entity = self.engine, work.entity
         me.work = None
-        if me.waits_for is None and me.raised is None and not me.has_lent:
+        if me.outcome is None and not me.has_lent:
             entity.busy_ns += me.end - me.start
             engine.finished(work, me.start, me.end, now, me.vtid, work.worker)
             if self.callback_ended is not None:
-                calls.append(partial(self._settle_end, work, None, None))
+                calls.append(partial(self._settle_end, work, None))
         elif not self._report_unusual_end(me, work, now, calls):
             return
         if engine.to_ask_again:
@@ -705,54 +674,53 @@ class WorkerPool:
         :return: whether it ran: its callback group may have refused it.
         """
         engine, entity = self.engine, work.entity
-        waits_for, raised, start, end = me.waits_for, me.raised, me.start, me.end
-        me.waits_for = me.raised = None
-        worker = work.worker
+        outcome, start, end, worker = me.outcome, me.start, me.end, work.worker
+        me.outcome = None
         if me.has_lent:
             worker = -1
             me.has_lent = False
             self._waiting_calls -= 1
-        if waits_for is not None or raised is not None or self.callback_ended is not None:
-            calls.append(partial(self._settle_end, work, waits_for, raised))
-        if isinstance(raised, Refused):
+        if outcome is not None or self.callback_ended is not None:
+            calls.append(partial(self._settle_end, work, outcome))
+        if isinstance(outcome, Refused):
             engine.refused(work, now)
             return False
         entity.busy_ns += end - start
-        if raised is None and waits_for is None:
+        if outcome is None:
             engine.finished(work, start, end, now, me.vtid, worker)
-        elif waits_for is not None:
+        elif not isinstance(outcome, BaseException):
             engine.suspended(work, start, end, me.vtid, worker)
         elif self._context_ended():  # this may destroy nodes, too
             engine.left_open(
-                work, start, end, me.vtid, worker, not isinstance(raised, Destroyed))
-        elif isinstance(raised, Destroyed):
+                work, start, end, me.vtid, worker, not isinstance(outcome, Destroyed))
+        elif isinstance(outcome, Destroyed):
             engine.destroyed(work, now)
         else:
             engine.finished(work, start, end, now, me.vtid, worker, True)
         return True
 
-    def _settle_end(self, work: Work, waits_for: Any, raised: BaseException | None) -> None:
+    def _settle_end(self, work: Work, outcome: Any) -> None:
         """Resume a suspended execution later, or report an exception; without the lock."""
-        if waits_for is not None:
-            if waits_for is NEXT_TURN or not hasattr(waits_for, 'add_done_callback'):
-                if self._is_stepping:
-                    self._of_next_step.append(work)
-                    return
-                work.yields += 1
-                rest = min(work.yields * YIELD_STEP_NS, MOST_YIELD_NS)
-                self.call_at(monotonic_ns() + rest, partial(self.resume, work))
-            else:
-                work.yields = 0
-                self.adopt(waits_for)
-                waits_for.add_done_callback(QuickCallback(partial(self.resume, work)))
-        elif isinstance(raised, Refused):
+        if isinstance(outcome, Refused):
             self.call_at(monotonic_ns() + AGAIN_NS, self._ask_again)
-        elif isinstance(raised, Destroyed):
+        elif isinstance(outcome, Destroyed):
             pass
-        elif self.callback_ended is not None and self.callback_ended(work.entity.rclpy, raised):
-            pass
-        elif raised is not None:
-            self._fail(raised)
+        elif outcome is None or isinstance(outcome, BaseException):
+            handled = self.callback_ended is not None and self.callback_ended(
+                work.entity.rclpy, outcome)
+            if outcome is not None and not handled:
+                self._fail(outcome)
+        elif outcome is NEXT_TURN or not hasattr(outcome, 'add_done_callback'):
+            if self._is_stepping:
+                self._of_next_step.append(work)
+                return
+            work.yields += 1
+            rest = min(work.yields * YIELD_STEP_NS, MOST_YIELD_NS)
+            self.call_at(monotonic_ns() + rest, partial(self.resume, work))
+        else:
+            work.yields = 0
+            self.adopt(outcome)
+            outcome.add_done_callback(QuickCallback(partial(self.resume, work)))
 
     def _ask_again(self) -> None:
         with self.lock:
@@ -819,7 +787,7 @@ class WorkerPool:
             found = self._turn(me, events)
             while found:
                 self._execute(me)
-                is_refused = isinstance(me.raised, Refused)
+                is_refused = isinstance(me.outcome, Refused)
                 self._turn(me, [], is_last=True)
                 if not is_refused:
                     return True
