@@ -148,6 +148,15 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # running nodes
     ('run --synthetic sleep', '--synthetic: it is about the nodes of a declaration: give a GRAPH'),
     ('run g.yaml --node a/b --utilisation 1', '--utilisation: it scales synthetic nodes only: ad'),
+    ('run g.yaml', 'mddag run: one of the arguments --node --synthetic is required'),
+    ('run g.yaml --synthetic sleep --ros-args -r x', '--ros-args -r x: '),
+    ('run g.yaml --node nowhere:main', '--node nowhere:main: there is no module'),
+    ('run no_times.yaml --synthetic sleep --utilisation 0.5', 'no_times.yaml'),
+    ('run --node a:b --processes 2', '--processes: it is about the nodes of a declaration'),
+    ('run --node a:b --process x', '--process: it is about the nodes of a declaration'),
+    ('run --node a:b --fail-on-miss', '--fail-on-miss: without a GRAPH no deadline is judged'),
+    ('run --node nowhere:main --trace r.mcap', '--node nowhere:main: there is no module'),
+    ('run g.yaml --synthetic sleep --diagnostics 1ms', 'diagnostics_period: 1000000 ns is too s'),
     ('run g.yaml --synthetic sleep --processes 0', '--processes 0: give 1 or more, or a file'),
 ])
 def test_bad_input(

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The verb `evaluate`: table, JSON, figure, Ctrl-C, and bad input in one line."""
+"""The verbs `evaluate` and `generate`: pictures, several declarations, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import subprocess
 import sys
 import time
 
-import numpy as np
+from msg_graph import load
+from msg_graph.model import load_of
 import pytest
 
 from .helpers import caller
@@ -32,24 +33,6 @@ nodes:
         deadline: 20ms
         execution_time: {quantiles_us: [10000, 10000, 14000, 14000], percent: [0, 50, 50.01, 100]}
 """
-BATCH = pytest.importorskip('matplotlib', reason='the extra batch is not there')
-
-
-def test_json(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = call(
-        capsys, graph, '--runs', 20, '--seed', 4, '--json', '-', '--duration', '1s',
-        '--overhead', '10us', '--jobs', 1)
-    assert (status, err) == (0, '')
-    result = json.loads(out)
-    assert result['runs'] == 20 and result['elapsed_s'] >= 0
-    assert result['bins'] == [0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0]
-    assert list(result['acceptance']) == ['rad', 'rm', 'wc', 'fifo']
-    assert (result['seed'], result['workers'], result['overhead_ns']) == (4, 1, 10_000)
-    assert result['duration_ns'] == 10 ** 9
-    again = json.loads(call(
-        capsys, graph, '--runs', 20, '--seed', 4, '--json', '-', '--duration', '1s',
-        '--overhead', '10us', '--jobs', 2)[1])
-    assert {**again, 'elapsed_s': 0, 'jobs': 0} == {**result, 'elapsed_s': 0, 'jobs': 0}
 
 
 @pytest.mark.parametrize(('ending', 'start'), [
@@ -68,16 +51,6 @@ def test_figure(
     if ending == 'svg':
         for text in (b'normalised utilisation', b'acceptance ratio'):
             assert b'<!-- ' + text in pictures[0]
-
-
-def test_samples(graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.savez(tmp_path / 's.npz', **{'/n:a': [9_000_000], '/n:b': [1, 2]})
-    status, out, _ = call(capsys, graph, '--runs', 5, '--samples', 's.npz', '--json', '-')
-    assert status == 0
-    result = json.loads(out)
-    assert result['samples'] is True
-    assert result['counts'][8] == 5  # 0.9 + 1 us / 20 ms
-    assert result['acceptance']['rad'][8] == 0.0  # 9 ms, and a deadline of 5 ms
 
 
 def group_seconds(group: int) -> float:
@@ -149,3 +122,24 @@ def test_several_graphs(
     assert 0 < result['graphs'][0]['accepted']['rad'] < 20
     assert result['graphs'][1]['utilisation'] < 0.5 < result['graphs'][0]['utilisation']
     assert b'3 task sets' in (tmp_path / 'out.svg').read_bytes()
+
+
+call_generate = caller('generate')
+pytestmark = pytest.mark.usefixtures('folder')
+
+
+def test_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / 'again').mkdir()  # an empty one is taken
+    for name in ('sets', 'again'):
+        status, out, err = call_generate(
+            capsys, '--sets', 5, '--utilisation', '0.2:0.6', '--workers', 3, '-o', name)
+        assert (status, out, err) == (0, '', '')
+    files = sorted((folder / 'sets').iterdir())
+    assert [file.name for file in files] == [f'set_{i:04d}.yaml' for i in range(5)]
+    for i, file in enumerate(files):
+        task_set = load(file)
+        total = sum(load_of(dag) or 0 for dag in task_set.dags)
+        assert total / 3 == pytest.approx(0.2 + 0.1 * i, abs=1e-5)
+        assert file.read_bytes() == (folder / 'again' / file.name).read_bytes()
+    assert len({file.read_text() for file in files}) == 5
+    assert sorted(path.name for path in folder.iterdir()) == ['again', 'sets']

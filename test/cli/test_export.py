@@ -11,7 +11,6 @@ import os
 from pathlib import Path
 import subprocess
 import sys
-from typing import Any
 
 from mddag_executor.cli import main as program
 from mddag_executor.recording.tables import TABLES
@@ -49,19 +48,6 @@ def trace(graph: Path, tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(('name', 'start'), [
-    ('out.csv', b'dag,job,vertex,worker'), ('out.CSV', b'dag,'), ('out.parquet', b'PAR1'),
-    ('out.pftrace', b'\x0a')])
-def test_a_file_of_each_form(
-    trace: Path, tmp_path: Path, name: str, start: bytes, capsys: pytest.CaptureFixture[str]
-) -> None:
-    if name.endswith('parquet'):
-        pytest.importorskip('pyarrow', reason='pyarrow is not installed')
-    out = tmp_path / name
-    assert call(capsys, 'export', trace, '-o', out) == (0, f'exported: {out}\n', '')
-    assert out.read_bytes().startswith(start)
-
-
 def test_a_report_of_each_kind(
     graph: Path, trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,25 +62,6 @@ def test_a_report_of_each_kind(
         page = out.read_text()
         assert f'<h1>{name}: ' in page and page.endswith('</html>\n')
         assert not list(tmp_path.glob('.*.part'))
-
-
-def test_a_report_that_fails_leaves_the_old_file(
-    trace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    html = pytest.importorskip('mddag_executor.report.html')
-    pytest.importorskip('bokeh', reason='Bokeh is not installed')
-    out = tmp_path / 'out.html'
-    out.write_text('old')
-
-    def failing(file: Any, data: Any) -> None:
-        file.write(b'half')
-        raise OSError(28, 'No space left on device', str(out))
-
-    monkeypatch.setattr(html, 'write', failing)
-    status, _, err = call(capsys, 'replay', trace, '--report', out)
-    assert status == 2 and 'no space left' in err
-    assert out.read_text() == 'old' and not list(tmp_path.glob('.*.part'))
 
 
 def test_diff(
@@ -173,24 +140,6 @@ def test_a_folder_replaces_an_earlier_export_only(
     file.write_text('notes')
     status, _, error = call(capsys, 'export', DEMO, '-o', f'{file}/')
     assert status == 2 and error.startswith(f'error: {file}: there is a file already')
-
-
-def test_an_export_that_stops_leaves_what_was_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
-    out = tmp_path / 'tables'
-    out.mkdir()
-    (out / 'releases.parquet').write_bytes(b'old')
-
-    def stopped(recording: object, folder: Path) -> None:
-        (folder / 'releases.parquet').write_bytes(b'half')
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr('mddag_executor.recording.frames.write_tables', stopped)
-    call(capsys, 'export', DEMO, '-o', f'{out}/')
-    assert os.listdir(tmp_path) == ['tables']
-    assert (out / 'releases.parquet').read_bytes() == b'old'
 
 
 @pytest.mark.parametrize('command', [

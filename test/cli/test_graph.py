@@ -1,31 +1,32 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The verb `graph check`."""
+"""The verbs `graph check`, `place`, `analyse`, `draw`, `from-caret` and `schema`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import json
 from pathlib import Path
+import shutil
 import subprocess
+import sys
 
 from benchmarks import autoware_multi
+from msg_graph.language import schema
 import pytest
 
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 GRAPH = """\
-mddag: 1
+mddag: 1  # the robot
 nodes:
-  - node: /n
-    callbacks:
-      - {name: t, timer: 10ms, publishes: [/a], dag: one, execution_time: 2ms}
-      - {name: x, subscription: /a, deadline: 5ms, execution_time: {quantiles_us: [1000, 3000]}}
-      - {name: y, subscription: /a, deadline: 50ms, reads: [x], execution_time: 5ms}
-      - {name: u, timer: 20ms, deadline: 20ms}
-paths:
-  - {name: p, callbacks: ['/n:t', '/n:x', '/n:y']}
+  - node: /a
+    callbacks: [{name: t, timer: 100ms, deadline: 40ms, execution_time: 30ms}]
+  - node: /b
+    callbacks: [{name: t, timer: 100ms, deadline: 40ms, execution_time: 30ms}]
+  - node: /c
+    callbacks: [{name: t, timer: 100ms, deadline: 100ms, execution_time: 10ms}]
 """
 
 
@@ -83,3 +84,112 @@ def test_what_cannot_hold_is_warned_of(
     else:
         assert any(line.startswith(f'warning: {says}') for line in done.stderr.splitlines())
     assert 'dags' in json.loads(done.stdout)
+
+
+def test_times_of_a_recorded_run(graph: Path, call: Mddag) -> None:
+    Path('times.json').write_text(json.dumps(
+        {f'/{n}': {f'/{n}:t': us} for n, us in (('a', 45_000), ('b', 5_000), ('c', 40_000))}))
+    recorded = call('simulate', 'graph.yaml', '--execution-times', 'times.json', '--trace',
+                    'run.mcap', '--duration', '1s')
+    assert recorded.returncode == 0, recorded.stderr
+    run = call('graph', 'place', 'graph.yaml', '--processes', '2', '--trace', 'run.mcap',
+               '-o', 'placed.yaml', '--json', 'out.json')
+    assert run.returncode == 0, run.stderr
+    result = json.loads(Path('out.json').read_text())
+    assert sorted(result['loads']) == pytest.approx([0.45, 0.45], abs=0.01)
+
+
+GRAPH_ANALYSE = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 10ms, deadline: 5ms, execution_time: {quantiles_us: [1000, 2000, 9000]}}
+"""
+
+
+def test_ci_learns_of_deadlines_that_cannot_hold(call: Mddag) -> None:
+    for budget, status in (('mean', 0), ('max', 1)):
+        done = call('graph', 'analyse', '-', '--budget', budget, '--fail-on-unschedulable',
+                    stdin=GRAPH_ANALYSE)
+        assert (done.returncode, done.stderr) == (status, '')
+        assert ('no scheduler can keep' in done.stdout) == bool(status)
+
+
+@pytest.mark.needs('graphviz')
+@pytest.mark.parametrize(('ending', 'begin'), [
+    ('svg', b'<?xml'), ('png', b'\x89PNG'), ('pdf', b'%PDF')])
+def test_graphviz(call: Mddag, tmp_path: Path, ending: str, begin: bytes) -> None:
+    text = (CONFIG / 'autoware.yaml').read_text()
+    done = call('graph', 'draw', '-', '-o', f'o.{ending}', cwd=tmp_path, stdin=text)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    assert (tmp_path / f'o.{ending}').read_bytes().startswith(begin)
+
+
+@pytest.mark.needs('graphviz')
+def test_a_large_graph(call: Mddag, tmp_path: Path) -> None:
+    lines = ['mddag: 1', 'nodes:']
+    for dag in range(60):
+        lines += [f'  - node: /n{dag}', '    callbacks:',
+                  f'      - {{name: c, timer: 10ms, publishes: [/t{dag}]}}']
+        lines += [f'      - {{name: c{i}, subscription: /t{dag}, deadline: 20ms}}'
+                  for i in range(20)]
+    done = call('graph', 'draw', '-', '-o', 'o.svg', cwd=tmp_path, stdin='\n'.join(lines))
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    text = (tmp_path / 'o.svg').read_text()
+    assert text.count('class="edge"') == 60 * 20
+
+
+def test_without_graphviz(
+        call: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('PATH', str(Path(sys.executable).parent))
+    if shutil.which('dot') is not None:
+        pytest.skip('Graphviz lies beside Python')
+    done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "error: o.svg: this needs Graphviz, and its program 'dot' is not there: install it with "
+        "'sudo apt install graphviz', or name an OUT.dot or OUT.mmd\n")
+
+
+def test_graphviz_that_fails(
+        call: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / 'dot'
+    program.write_text('#!/bin/sh\ncat >/dev/null\necho no fonts >&2\nexit 3\n')
+    program.chmod(0o755)
+    monkeypatch.setenv('PATH', f'{tmp_path}:/usr/bin:/bin')
+    done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith('error: o.svg: Graphviz failed (no fonts): ')
+    assert not (tmp_path / 'o.svg').exists()
+
+
+TEXT = """\
+nodes:
+- node_name: /a
+  callbacks:
+  - {callback_name: /a/callback_0, callback_type: timer_callback, period_ns: 5000000}
+"""
+
+
+def test_from_caret(call: Mddag, tmp_path: Path) -> None:
+    (tmp_path / 'arch.yaml').write_text(TEXT)
+    done = call('graph', 'from-caret', 'arch.yaml', '-o', 'g.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout == "1 blank to fill in, marked 'FILL IN'\n"
+    done = call('graph', 'check', 'g.yaml', cwd=tmp_path)
+    assert done.returncode == 2
+    assert 'deadline: is a blank to fill in (a sink' in done.stderr
+    text = (tmp_path / 'g.yaml').read_text()
+    done = call('graph', 'check', '-', stdin=text.replace('# deadline: 5ms', 'deadline: 5ms'))
+    assert (done.returncode, done.stderr) == (0, '')
+
+
+def test_schema(call: Mddag, tmp_path: Path) -> None:
+    done = call('graph', 'schema')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert json.loads(done.stdout) == schema()
+    done = call('graph', 'schema', '-o', 's.json', cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, '')
+    assert json.loads((tmp_path / 's.json').read_text()) == schema()

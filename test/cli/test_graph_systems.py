@@ -254,18 +254,6 @@ def test_a_coroutine_is_one_execution_however_often_it_is_resumed(
     assert counts == {'ask': str(asked + 1), 'inner': str(2 * asked), 'outer': str(asked)}
 
 
-def test_from_caret_with_a_trace(call: Mddag, tmp_path: Path) -> None:
-    (tmp_path / 'a.yaml').write_text(ARCHITECTURE)
-    done = call('graph', 'from-caret', 'a.yaml', '--trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (0, "2 blanks to fill in, marked 'FILL IN'\n")
-    assert done.stderr == f'warning: {BAG}: 1 of the 2 callbacks of a.yaml did not run\n'
-    text = (tmp_path / 'g.yaml').read_text()
-    assert len(re.findall(r'# measured in \d+ executions\n        execution_time: {quant', text)
-               ) == 1
-    done = call('graph', 'from-caret', '-', '--trace', '-', stdin=ARCHITECTURE)
-    assert (done.returncode, done.stdout) == (2, '')
-
-
 def test_from_ros_where_nothing_runs(mddag: Mddag, tmp_path: Path) -> None:
     pytest.importorskip('rclpy')
     done = mddag('graph', 'from-ros', '--timeout', '0.3', '-o', 'g.yaml', cwd=tmp_path)

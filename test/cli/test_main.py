@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from contextlib import nullcontext
 import os
 from pathlib import Path
 import re
@@ -13,9 +14,12 @@ import subprocess
 import sys
 from types import ModuleType
 
-from mddag_executor import __version__
+from mddag_executor import __version__, defaults
 from mddag_executor.cli import main as program
 from mddag_executor.errors import InputError, MddagError, UsageError
+from mddag_executor.simulate import Settings
+from mddag_executor.simulate.run import check
+from msg_graph import GraphError, loads
 import pytest
 
 Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
@@ -84,16 +88,6 @@ def test_a_defect_keeps_its_traceback(verb, capsys: pytest.CaptureFixture[str],
     assert program.main(['probe']) == 70
     err = capsys.readouterr().err
     assert 'Traceback' in err and 'in action' in err and 'a defect' in err
-
-
-def test_debugging_shows_the_traceback_of_bad_input(
-        verb, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv('MDDAG_DEBUG', '1')
-    verb(fail_with(InputError('a.yaml', 'no source', 'add a timer')))
-    assert program.main(['probe']) == 2
-    err = capsys.readouterr().err
-    assert 'Traceback' in err
-    assert err.endswith('error: a.yaml: no source: add a timer\n')
 
 
 def test_an_interrupt_is_quiet(verb, capsys: pytest.CaptureFixture[str]) -> None:
@@ -203,22 +197,6 @@ def test_completion(tmp_path: Path) -> None:
     assert completed('mddag graph place g.yaml --pro') == {'--processes'}
 
 
-def test_help_imports_nothing_heavy() -> None:
-    code = ('import sys\n'
-            'from mddag_executor.cli.main import main\n'
-            'try:\n'
-            "    main(['--help'])\n"
-            'except SystemExit as stop:\n'
-            '    assert stop.code == 0\n'
-            "heavy = {'rclpy', 'numpy', 'yaml', 'mcap', 'rosbags', 'zstandard', 'asyncio'}\n"
-            "own = {'msg_graph', 'mddag_executor.core', 'mddag_executor.trace'}\n"
-            'assert not (heavy | own) & set(sys.modules), (heavy | own) & set(sys.modules)\n')
-    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
-                            check=False)
-    assert result.returncode == 0, result.stderr
-    assert 'Laboratory:' in result.stdout
-
-
 def test_module_and_program_are_the_same(mddag: Mddag) -> None:
     result = mddag('--version')
     assert (result.returncode, result.stdout) == (0, f'mddag {__version__}\n')
@@ -259,3 +237,32 @@ def test_a_full_disk_is_one_line(how: str) -> None:
     lines = [line for line in done.stderr.splitlines() if not line.startswith('warning: ')]
     assert (done.returncode, len(lines)) == (2, 1)
     assert lines[0].startswith(f'error: {place}: no space left on device: ')
+
+
+ONE = 'nodes: [{node: /n, callbacks: [{name: t, timer: 1s, deadline: 1s, execution_time: 1us}]}]\n'
+
+
+def test_the_number_of_workers() -> None:
+    text = 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, timer: 1s, deadline: 1s}]}]\n'
+    assert defaults.workers(None, loads(text)) == 7
+    assert defaults.workers(None, loads(text + 'workers: 3\n')) == 3
+    assert defaults.workers(2, loads(text + 'workers: 3\n')) == 2
+
+
+def test_the_limit_of_workers_is_the_same_everywhere(tmp_path: Path) -> None:
+    from mddag_executor.executor.settings import resolve
+    graph = tmp_path / 'g.yaml'
+    simulate = ['simulate', str(graph), '--duration', '1us', '--workers']
+    for workers, status in ((4096, 0), (4097, 2)):
+        refused = nullcontext() if status == 0 else pytest.raises((MddagError, GraphError))
+        graph.write_text(f'mddag: 1\nworkers: {workers}\n' + ONE)
+        assert program.main(['graph', 'check', str(graph)]) == status
+        graph.write_text('mddag: 1\n' + ONE)
+        assert program.main([*simulate, str(workers)]) == status
+        assert program.main(
+            ['generate', '--workers', str(workers), '--utilisation', '0.001', '-o',
+             str(tmp_path / 'made.yaml')]) == status
+        with refused:
+            resolve(str(graph), workers, 1)
+        with refused:
+            check(Settings(workers=workers))

@@ -6,11 +6,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import json
+import os
 from pathlib import Path
+import stat
 import subprocess
 import sys
 
+from mddag_executor.cli import common
 from mddag_executor.cli import main as program
+from mddag_executor.errors import InputError
 from mddag_executor.trace import TraceError, TraceFile, TraceWriter
 import pytest
 
@@ -181,3 +185,52 @@ def test_rerun_in_python_keeps_what_is_there(run: Path) -> None:
         with pytest.raises(MddagError, match=f'it cannot be both recording and {name}'):
             rerun(run, 'graph.yaml', [], overwrite=True, **{name: run})
     assert Path('precious.mcap').read_text() == 'precious'
+
+
+@pytest.mark.parametrize('value', [{'a': float('nan')}, {'a': object()}])
+def test_what_json_lacks_leaves_no_file(tmp_path: Path, value: object) -> None:
+    with pytest.raises((ValueError, TypeError)):
+        common.write_json(str(tmp_path / 'result.json'), value)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize('error', [RuntimeError, KeyboardInterrupt])
+def test_a_failed_output_leaves_what_was_there(tmp_path: Path, error: type) -> None:
+    path = tmp_path / 'out.bin'
+    path.write_bytes(b'before')
+    with pytest.raises(error), common.output_file(str(path)) as file:
+        file.write(b'half')
+        raise error
+    assert path.read_bytes() == b'before'
+    assert os.listdir(tmp_path) == ['out.bin']
+
+
+def test_an_output_keeps_links_and_permissions(tmp_path: Path) -> None:
+    target, link = tmp_path / 'target', tmp_path / 'link'
+    target.write_text('before')
+    target.chmod(0o640)
+    link.symlink_to('target')
+    common.write_text(str(link), 'after')
+    assert link.is_symlink()
+    assert target.read_text() == 'after'
+    assert stat.S_IMODE(target.stat().st_mode) == 0o640
+
+
+def test_an_output_may_be_a_pipe(tmp_path: Path) -> None:
+    pipe = tmp_path / 'pipe'
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        common.check_output(str(pipe))
+        common.write_text(str(pipe), 'through')
+        assert os.read(reader, 100) == b'through'
+    finally:
+        os.close(reader)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason='root may write everywhere')
+def test_a_folder_without_write_permission(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(InputError, match='cannot be written to'):
+        common.check_output(str(tmp_path / 'new.json'))

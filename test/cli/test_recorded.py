@@ -9,8 +9,6 @@ import csv
 import io
 import json
 from pathlib import Path
-import subprocess
-import sys
 from typing import Any
 
 from mddag_executor.cli import main as program
@@ -50,33 +48,6 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
     status = program.main([*arguments])
     output = capsys.readouterr()
     return status, output.out, output.err
-
-
-OPENINGS = """
-import sys
-from mddag_executor.cli import main
-count = 0
-def hook(event, given):
-    global count
-    count += event == 'open' and given[0] == sys.argv[1]
-sys.addaudithook(hook)
-for arguments in sys.argv[2:]:
-    count = 0
-    assert main.main([sys.argv[1] if each == 'TRACE' else each for each in arguments.split()]) == 0
-    print('openings:', count)
-"""
-
-
-def test_a_trace_is_opened_once(files: dict[str, str], tmp_path: Path) -> None:
-    commands = ('replay TRACE', 'replay TRACE --reschedule', 'explain TRACE', 'slack TRACE',
-                f'export TRACE -o {tmp_path}/out.csv')
-    for name in ('own.mcap', 'imported.mcap'):
-        graph = '' if name == 'own.mcap' else f' {files["graph.yaml"]}'
-        output = subprocess.run(
-            [sys.executable, '-c', OPENINGS, files[name],
-             *(each.replace('TRACE', f'TRACE{graph}') for each in commands)],
-            capture_output=True, check=True, text=True).stdout
-        assert output.count('openings: 1\n') == output.count('openings: ') == len(commands)
 
 
 def sink(result: Any) -> Any:

@@ -78,16 +78,16 @@ def test_the_same_each_time_also_beside_busy_processes(drive: Path) -> None:
     text = (drive / 'graph.yaml').read_text()
     (drive / 'overload.yaml').write_text(
         text.replace('execution_time: 8ms', 'execution_time: 130ms'))
-    busy = [subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(4)]
+    busy = [subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(2)]
     try:
         found = {
             digest(drive, 'overload.yaml', *NODES, '--workers', '7', PYTHONHASHSEED=str(i))
-            for i in range(3)}
+            for i in range(2)}
     finally:
         for each in busy:
             each.kill()
             each.wait()
-    found |= {digest(drive, 'overload.yaml', *NODES, '--workers', '7') for _ in range(3)}
+    found.add(digest(drive, 'overload.yaml', *NODES, '--workers', '7'))
     assert len(found) == 1
     assert found != {digest(drive, 'graph.yaml', *NODES)}
 

@@ -63,22 +63,6 @@ def test_it_is_the_same_program(
     assert capsys.readouterr().err.startswith('error: mddag: ')
 
 
-@pytest.mark.parametrize(('arguments', 'shows'), [
-    (['--version'], 'mddag 1.'), (['--help'], 'usage: mddag '),
-    (['replay', '--help'], 'usage: mddag replay ')])
-def test_help_and_version(
-    ros2: SimpleNamespace, arguments: list[str], shows: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        ros2.main(*arguments)
-    assert ended.value.code == 0
-    assert capsys.readouterr().out.startswith(shows)
-
-
-def test_the_list_of_commands_has_a_line_for_it(ros2: SimpleNamespace) -> None:
-    assert ros2.summary.strip() and '\n' not in ros2.summary.strip()
-
-
 def test_completion_is_that_of_mddag(
     ros2: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:

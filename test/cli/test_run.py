@@ -12,10 +12,8 @@ import signal
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 from typing import Any
 
-from mddag_executor.cli import run
 from mddag_executor.core.tally import counts, total
 from mddag_executor.report.tables import percent, sink_table
 from mddag_executor.trace import read_events, TraceError, TraceReader
@@ -40,34 +38,6 @@ nodes:
 
 
 # --- bad input -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['graph.yaml'], 'one of the arguments --node --synthetic is required'),
-    (['graph.yaml', '--synthetic', 'sleep', '--trace', 'no/such/dir/x.mcap'],
-     'no/such/dir/x.mcap: there is no directory no/such/dir'),
-    (['graph.yaml', '--synthetic', 'sleep', '--trace', '-'], 'name a file'),
-    (['graph.yaml', '--synthetic', 'sleep', '--ros-args', '-r', 'x'], '--ros-args -r x: '),
-    (['graph.yaml', '--node', 'nowhere:main'], '--node nowhere:main: there is no module'),
-    (['untimed.yaml', '--synthetic', 'sleep', '--utilisation', '0.5'], 'declare execution_time'),
-    (['--node', 'a:b', '--processes', '2'], '--processes: it is about the nodes of a declaration'),
-    (['--node', 'a:b', '--fail-on-miss'], '--fail-on-miss: without a GRAPH no deadline is judged'),
-    (['--node', 'a:b', '--process', 'x'], '--process: it is about the nodes of a declaration'),
-    (['--node', 'nowhere:main', '--trace', 'r.mcap'], '--node nowhere:main: there is no module'),
-])
-def test_bad_input_is_one_line_and_starts_nothing(
-    graph: Path, call: Mddag, arguments: list[str], message: str
-) -> None:
-    Path('untimed.yaml').write_text(
-        'mddag: 1\nnodes:\n  - node: /a\n    callbacks: [{name: a, timer: 1ms, deadline: 1ms}]\n')
-    before = set(Path('.').iterdir())
-    process = call('run', *arguments)
-    assert process.returncode == 2
-    assert process.stdout == ''
-    assert process.stderr.startswith('error: ')
-    assert message in process.stderr
-    assert process.stderr.count('\n') == 1
-    assert set(Path('.').iterdir()) == before
 
 
 def test_the_declaration_comes_from_standard_input(graph: Path, mddag: Mddag) -> None:
@@ -317,28 +287,6 @@ nodes:
     assert json.loads(Path('out.json').read_text())['stops']['total_ns'] < 500_000_000
 
 
-def test_a_later_sigint_interrupts_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Ending:
-        stops = 0
-
-        def stop(self, hurried: bool) -> None:
-            self.stops += 1
-
-    before = signal.getsignal(signal.SIGINT)
-    ending, now = Ending(), iter([10.0, 10.4, 12.0])
-    monkeypatch.setattr(run, 'time', SimpleNamespace(monotonic=lambda: next(now)))
-    try:
-        with run.Signals() as signals:
-            signals.end_of(ending)  # type: ignore[arg-type]
-            signal.raise_signal(signal.SIGINT)
-            signal.raise_signal(signal.SIGINT)
-            assert ending.stops == 2
-            with pytest.raises(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def test_the_names_of_synthetic_nodes_are_those_of_the_declaration(
     graph: Path, mddag: Mddag
 ) -> None:
@@ -353,15 +301,6 @@ def test_the_names_of_synthetic_nodes_are_those_of_the_declaration(
     assert {each['kind'] for each in result['drift']} <= {'rate'}
 
 
-def test_two_workers_are_a_bound(graph: Path, mddag: Mddag) -> None:
-    process = mddag(
-        'run', graph, '--synthetic', 'sleep', '--utilisation', '0.9', '--workers', '2',
-        '--duration', '1s', '--json', '-')
-    result = json.loads(process.stdout)
-    assert result['workers'] == 2
-    assert result['measured']['utilisation'] == pytest.approx(0.9, abs=0.001)
-
-
 # --- tables --------------------------------------------------------------------------------------
 
 
@@ -369,20 +308,6 @@ def sink(completed: int, late: int = 0, **more: Any) -> dict[str, Any]:
     return {
         'relative_deadline_ns': 30_000_000, 'completed': completed, 'late': late, 'expired': 0,
         'response_ns': {'min': 1, 'median': 2_000_000, 'p99': 3_000_000, 'max': 4_000_000}, **more}
-
-
-def test_the_table_has_a_row_for_each_sink() -> None:
-    text = sink_table({
-        'one': {'sinks': {'/long/way/node:a': sink(10), '/other/node:a': sink(10)}},
-        'two': {'sinks': {'/x/lonely:b': sink(0, response_ns=None)}}})
-    lines = text.splitlines()
-    assert len(lines) == 4
-    assert lines[1].split() == ['one', 'way/node:a', '10', '100.00', '%', '0', '2', 'ms',
-                                '3', 'ms', '4', 'ms', '30', 'ms']
-    assert lines[2].split()[0] == 'other/node:a'
-    assert lines[3].split() == ['two', 'lonely:b', '0', '-', '0', '-', '-', '-', '30', 'ms']
-    assert 'aborted' not in text
-    assert 'aborted' in sink_table({'a': {'sinks': {'/x:a': sink(1, aborted=2)}}})
 
 
 def test_what_missed_most_comes_first_and_is_red_on_a_terminal(
@@ -465,3 +390,36 @@ def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(
     assert any('bad' in line and "open('/calibration/lidar.yaml')" in after
                for line, after in zip(lines, lines[1:]))
     assert 'FileNotFoundError' in lines[-1]
+
+
+PROGRAM = """
+import threading, time
+from mddag_executor.cli.stuck import dump_when_stuck
+from mddag_executor.hosting.session import Session
+
+
+class Executor:
+    def spin(self):
+        time.sleep(0.05)
+    def shutdown(self, timeout_sec):
+        time.sleep({takes})
+
+with dump_when_stuck({patience}) as ends:
+    with Session(Executor(), on_end=ends) as session:
+        session.wait(None)
+print('end')
+time.sleep(0.7)  # it is over: nothing more is told
+"""
+
+
+@pytest.mark.parametrize(('patience', 'takes', 'times'), [(20.0, 0.0, 0), (0.5, 1.5, 1)])
+def test_an_end_that_takes_too_long_tells_where_each_thread_stands(
+    patience: float, takes: float, times: int
+) -> None:
+    process = subprocess.run(
+        [sys.executable, '-c', PROGRAM.format(patience=patience, takes=takes)],
+        capture_output=True, text=True, timeout=60, check=True)
+    assert process.stdout == 'end\n'
+    assert process.stderr.count('Timeout') == times
+    assert process.stderr.count('in shutdown') == times
+    assert process.stderr.count(' in end') == times

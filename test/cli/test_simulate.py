@@ -14,7 +14,6 @@ import subprocess
 import sys
 from typing import Any
 
-from mddag_executor import __version__
 from mddag_executor.cli.main import main
 import pytest
 
@@ -49,33 +48,6 @@ def result_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[st
     assert (status, captured.err) == (0, '')
     result: dict[str, Any] = json.loads(captured.out)
     return result
-
-
-def test_the_result_for_machines(capsys: pytest.CaptureFixture[str], graph: Path) -> None:
-    # tick 0-2, near on worker 0 2-3, far on worker 1 2-10: all in time.
-    result = result_of(capsys, graph, '--policy', 'rad', '--duration', '30ms')
-    assert result == {
-        'mddag': __version__, 'format': 2, 'policy': 'rad', 'on_late': 'continue', 'workers': 2,
-        'preemptive': False,
-        'duration_ns': 30_000_000,
-        'utilisation': 0.55, 'deadline_missed': False, 'first_miss': None, 'never_due': [],
-        'dags': {'lidar': {
-            'jobs': 3,
-            'ends': {'completed': 3, 'late': 0, 'aborted': 0, 'expired': 0, 'failed': 0,
-                     'dropped': 0},
-            'sinks': {
-                '/filter:near': {
-                    'relative_deadline_ns': 5_000_000, 'completed': 3, 'late': 0, 'overdue': 0,
-                    'expired': 0, 'failed': 0, 'aborted': 0, 'dropped': 0,
-                    'response_ns': {'min': 3_000_000, 'median': 3_000_000, 'p99': 3_000_000,
-                                    'max': 3_000_000}},
-                '/filter:far': {
-                    'relative_deadline_ns': 12_000_000, 'completed': 3, 'late': 0, 'overdue': 0,
-                    'expired': 0, 'failed': 0, 'aborted': 0, 'dropped': 0,
-                    'response_ns': {'min': 10_000_000, 'median': 10_000_000,
-                                    'p99': 10_000_000, 'max': 10_000_000}}}}},
-        'file': str(graph), 'judge': 'horizon', 'seed': 0, 'ended_ns': 30_000_000,
-        'trace': None}
 
 
 def test_execution_times_from_a_file(
@@ -114,40 +86,6 @@ def test_what_is_asked_for_is_done(
     stopped = result_of(capsys, graph, '--workers', 1, '--stop-at-first-miss')
     assert stopped['ended_ns'] == stopped['first_miss']['completed_ns'] == 33_000_000
     assert stopped['deadline_missed'] is True
-
-
-@pytest.mark.parametrize(('workers', 'status'), [(1, 1), (2, 0)])
-def test_fail_on_miss(graph: Path, workers: int, status: int) -> None:
-    command = ['simulate', str(graph), '--workers', str(workers), '--json', '/dev/null']
-    assert main(command) == 0
-    assert main([*command, '--fail-on-miss']) == status
-
-
-def test_a_trace_that_the_replayer_reads(
-    capsys: pytest.CaptureFixture[str], graph: Path, tmp_path: Path
-) -> None:
-    trace = tmp_path / 'run.mcap'
-    simulated = result_of(
-        capsys, graph, '--workers', 1, '--duration', '100ms', '--trace', trace)
-    assert simulated['trace'] == str(trace)
-    assert main(['replay', str(trace), '--json', '-']) == 0
-    captured = capsys.readouterr()
-    assert captured.err == ''
-    replayed = json.loads(captured.out)
-    for sink, values in simulated['dags']['lidar']['sinks'].items():
-        found = replayed['dags']['lidar']['sinks'][sink]
-        assert {key: found[key] for key in values} == values
-    assert [path.name for path in tmp_path.iterdir() if 'part' in path.name] == []
-
-
-def test_standard_input(call: Mddag, graph: Path, times: Path) -> None:
-    plain = call('simulate', graph, '--execution-times', times, '--json', '-')
-    first = call('simulate', '-', '--execution-times', times, '--json', '-', stdin=GRAPH)
-    second = call('simulate', graph, '--execution-times', '-', '--json', '-',
-                  stdin=json.dumps(TIMES))
-    assert (first.returncode, first.stderr, second.returncode) == (0, '', 0)
-    assert second.stdout == plain.stdout
-    assert json.loads(first.stdout)['dags'] == json.loads(plain.stdout)['dags']
 
 
 def test_a_disk_that_gets_full_leaves_nothing_and_promises_nothing(graph: Path) -> None:

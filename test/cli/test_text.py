@@ -7,7 +7,7 @@ from __future__ import annotations
 import io
 
 from hypothesis import given, strategies
-from mddag_executor.cli.text import format_ns, one_line, printable, Progress, table, warn
+from mddag_executor.cli.text import format_ns, one_line, printable, Progress
 from msg_graph import errors
 import pytest
 
@@ -48,15 +48,6 @@ def test_no_control_character_reaches_the_terminal(text: str) -> None:
         assert printable(text) == text
 
 
-def test_tables_align_names_left_and_numbers_right() -> None:
-    text = table(['sink', 'late', 'p99', 'share', 'first'],
-                 [['/a:b', 3, '9.5 ms', 99.5, None],
-                  ['/longer:c', 12, '100 ms', 100.0, 'x']])
-    assert text == ('sink       late     p99   share  first\n'
-                    '/a:b          3  9.5 ms   99.50  -\n'
-                    '/longer:c    12  100 ms  100.00  x\n')
-
-
 class Terminal(io.StringIO):
 
     def isatty(self) -> bool:
@@ -87,19 +78,6 @@ def test_progress_waits_two_seconds() -> None:
         progress.update(20)
         assert '100 %' in stream.getvalue()
     assert stream.getvalue().endswith('\r'), 'the line is wiped'
-
-
-def test_progress_is_quiet_where_nobody_looks() -> None:
-    stream, clock = io.StringIO(), Clock()
-    with Progress('simulating', 10, stream=stream, clock=clock) as progress:
-        clock.now += 10
-        progress.update(3)
-    assert stream.getvalue() == ''
-
-
-def test_a_warning_is_one_harmless_line(capsys: pytest.CaptureFixture[str]) -> None:
-    warn('a\n  b\x1b[31m')
-    assert capsys.readouterr() == ('', 'warning: a b\\x1b[31m\n')
 
 
 def test_both_packages_make_names_harmless_alike() -> None:

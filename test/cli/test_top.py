@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from mddag_executor.cli.top import _ticks
-from mddag_executor.report.board import Board, GONE_AFTER_S, of_dags, tables
+from mddag_executor.report.board import Board, GONE_AFTER_S, tables
 from msg_graph import load
 import pytest
 
@@ -42,17 +42,6 @@ POOL = {'idle_workers': '5', 'callbacks_per_s': '12.5', 'busy_ratio': '0.250'}
 
 
 # --- what is shown -------------------------------------------------------------------------------
-
-
-def test_the_newest_status_of_each_process_is_shown():
-    board = Board()
-    board.take(array(('b/2', 'mddag: x', 0, DAG), ('a/1', 'mddag: x', 1, DAG)))
-    board.take(array(('a/1', 'mddag: x', 2, {**DAG, 'jobs': '8'}), ('a/1', 'mddag: w', 0, POOL)))
-    assert [(s.process, s.level) for s in board.statuses()] == [
-        ('a/1', 'OK'), ('a/1', 'ERROR'), ('b/2', 'OK')]
-    text = tables(board.statuses())
-    assert re.search(r'a/1 +mddag: x +ERROR .* +8 +20.000 ms ', text)
-    assert re.search(r'a/1 +mddag +OK +25 % +- +5 .* +12.5 ', text)
 
 
 def test_a_process_that_says_nothing_any_more_is_gone():
@@ -182,19 +171,3 @@ def test_nobody_to_hear(call: Mddag):
     board = Board()
     list(_ticks(spent.append, board, 3600.0, 0.05))     # gives up long before an hour
     assert spent
-
-
-def test_run_takes_no_strange_period(call: Mddag, tmp_path: Path):
-    (tmp_path / 'graph.yaml').write_text(GRAPH)
-    for value, message in (('1', 'has no unit'), ('1ms', 'too short'), ('never', 'never')):
-        done = call('run', str(tmp_path / 'graph.yaml'), '--synthetic', 'sleep',
-                    '--diagnostics', value)
-        assert done.returncode == 2 and message in done.stderr
-
-
-def test_processes_share_one_list_of_dags():
-    board = Board()
-    board.take(array(('h/up', 'mddag: x', 0, DAG), ('h/up', 'mddag: z', 0, DAG),
-                     ('h/down', 'mddag: y', 0, DAG), ('h/down', 'mddag: x', 1, DAG)))
-    assert [(s.name, s.process) for s in of_dags(board.statuses())] == [
-        ('mddag: x', 'h/down'), ('mddag: x', 'h/up'), ('mddag: y', 'h/down'), ('mddag: z', 'h/up')]
