@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from mddag_executor.replay import replay, reschedule
-from mddag_executor.replay.linker import Execution, Linker, LinkObserver, Publication
 from mddag_executor.replay.paths import Paths
 from mddag_executor.replay.run import open_recording
-from mddag_executor.trace import import_ctf, TraceReader
+from mddag_executor.trace import import_ctf
 from msg_graph import loads, TaskSet
 import pytest
 
@@ -74,37 +73,6 @@ def graph() -> TaskSet:
     return loads(GRAPH, 'sample.yaml')
 
 
-class Links(LinkObserver):
-    """Keeps what the linker says."""
-
-    def __init__(self) -> None:
-        self.runs: list[Execution] = []
-        self.messages: list[Publication] = []
-        self.arrived: dict[tuple[int, str], int] = {}
-
-    def began(self, run: Execution, message: Publication | None) -> None:
-        if message is not None:
-            self.arrived[(id(message), run.callback.label)] = run.start
-
-    def over(self, run: Execution) -> None:
-        self.runs.append(run)
-
-    def sent(self, message: Publication) -> None:
-        self.messages.append(message)
-
-
-@pytest.fixture(scope='module')
-def seen(trace: Path, graph: TaskSet) -> tuple[Links, Paths]:
-    recording = open_recording(trace, graph)
-    seen = Links()
-    linker = Linker(recording.who, seen)
-    for event in TraceReader(trace).layout_events(linker.events):
-        linker.take(event)
-    linker.finish()
-    assert recording.warnings == []
-    return seen, Paths(recording)
-
-
 def rows(name: str) -> Iterator[tuple[int | None, ...]]:
     with open(CARET / name, encoding='utf-8') as stream:
         lines = csv.reader(stream)
@@ -113,25 +81,8 @@ def rows(name: str) -> Iterator[tuple[int | None, ...]]:
             yield tuple(int(cell) if cell else None for cell in line)
 
 
-def test_callbacks(seen: tuple[Links, Paths]) -> None:
-    found = [(run.start, run.end) for run in seen[0].runs
-             if run.callback.label == '/filter_node subscription /topic1']
-    expected = list(rows('cb_filter_node_callback_0.csv'))
-    assert found == expected
-    assert len(found) == 49
-
-
-def test_communication(seen: tuple[Links, Paths]) -> None:
-    found = [(m.rclcpp, m.rcl, m.dds, m.stamp,
-              seen[0].arrived.get((id(m), '/filter_node subscription /topic1')))
-             for m in seen[0].messages if m.topic == '/topic1']
-    expected = list(rows('comm_topic1.csv'))
-    assert found == expected
-    assert len(found) == 49
-
-
-def test_path(seen: tuple[Links, Paths]) -> None:
-    columns = [flow.columns for flow in flows(seen[1])]
+def test_path(trace: Path, graph: TaskSet) -> None:
+    columns = [flow.columns for flow in flows(Paths(open_recording(trace, graph)))]
     found = [(c[0][0], c[1][1], c[1][0], c[2][1], c[3][0], c[4][1], c[5][0], c[6][1])
              for c in columns]
     # of the three times of each publication the first

@@ -1,18 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts from tables are those of the scheduler core that is fed event by event."""
+"""Verdicts from tables are those of the scheduler core, and those of each part of a recording."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 import tempfile
+from typing import Any
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mddag_executor.core.state import DROP, JOB_END
-from mddag_executor.recording.tables import ABORTED, EXPIRED, FAILED, Recording, WITHDRAWN
-from mddag_executor.replay import open_recording
+from mddag_executor.recording.tables import ABORTED, EXPIRED, FAILED, Recording, Table, WITHDRAWN
+from mddag_executor.replay import open_recording, Replay, ReplayError
 from mddag_executor.replay.deadlines import Judged
 from msg_graph import loads
 import numpy as np
@@ -95,11 +96,93 @@ def test_verdicts_of_any_tables(seed: int, data: st.DataObject) -> None:
     check(changed)
 
 
-@pytest.mark.parametrize('text', ['deadline: 12ms', 'deadline: 18ms'])
-def test_the_oracle_sees_a_difference(tmp_path: Path, text: str) -> None:
-    """Another deadline is another verdict: the comparison can fail."""
-    path = tmp_path / 'run.mcap'
-    VirtualRun(path, loads(SMALL, 'g.yaml'), 3, duration=500 * MS)
-    recording = open_recording(path)
-    stricter = open_recording(path, loads(SMALL.replace(text, 'deadline: 1ms'), 'g.yaml'))
-    assert Judged(recording).tally.result() != Oracle(stricter).tally.result()
+COLUMNS = ['kind', 'dag', 'sink', 'job', 'release', 'deadline', 'completed']
+
+
+def verdicts(replay: Replay) -> list[Any]:
+    found: list[Any] = sorted(replay.judged.verdicts[COLUMNS].tolist())
+    return found
+
+
+def links(table: Table, column: str, other: Table, *names: str) -> list[Any]:
+    """Return the rows that a column refers to."""
+    rows = table[column]
+    found: list[Any] = other[list(names)][rows[rows >= 0]].tolist()
+    return found
+
+
+def chains_of(jobs: list[dict[str, Any]]) -> list[Any]:
+    """Return of misses what does not depend on other jobs."""
+    return sorted(
+        (each['sink'], each['job'], list(dict.fromkeys(part['vertex'] for part in each['parts'])))
+        for each in jobs)
+
+
+def check_parts(recording: Recording, borders: list[int]) -> None:
+    """Compare the parts between borders with the whole."""
+    whole = Replay(recording)
+    start = recording.start or 0
+    found = []
+    for begin, end in zip(borders, borders[1:]):
+        part = Replay(recording.cut(begin, end))
+        of_part = verdicts(part)
+        found += of_part
+        assert all(start + begin <= each[4] < start + end for each in of_part)
+        assert part.chains.breakdown().keys() == {each[2] for each in of_part if each[6] >= 0}
+        expected = [each for each in whole.explanation.result()['jobs'] if start + begin <= each[
+            'release_ns'] < start + end]
+        assert chains_of(part.explanation.result()['jobs']) == chains_of(expected)
+        assert not part.judged.contradictions
+        check_rows(recording, part.recording, start + begin, start + end)
+    assert sorted(found) == verdicts(whole)
+
+
+def check_rows(whole: Recording, part: Recording, begin: int, end: int) -> None:
+    """All that ran within the part is in it, and rows refer to what they did."""
+    ran = whole.executions
+    inside = ran[(ran['start'] >= begin) & (ran['end'] < end) & (ran['start'] >= 0)]
+    columns = ['callback', 'dag', 'vertex', 'job', 'start', 'end', 'worker', 'completes']
+    missing = set(inside[columns].tolist()).difference(part.executions[columns].tolist())
+    assert not missing
+    by = ('callback', 'start', 'end')
+    sent = whole.publications[np.isin(whole.publications['time'], part.publications['time'])]
+    assert set(links(part.publications, 'execution', part.executions, *by)) <= set(
+        links(sent, 'execution', whole.executions, *by))
+    assert (part.publications['execution'] < len(part.executions)).all()
+    for time, row in part.publications[['time', 'execution']].tolist():
+        if row >= 0:
+            assert part.executions['start'][row] <= time <= part.executions['end'][row]
+
+
+@given(declarations(), st.integers(0, 2**32), st.integers(1, 4), st.integers(1, 25),
+       st.lists(st.integers(1, 150), max_size=3, unique=True))
+@settings(max_examples=60)
+@example(SMALL + PATHS, 1, 2, 20, [40, 90])
+def test_parts_of_any_run(
+    text: str, seed: int, workers: int, longest: int, borders: list[int]
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'run.mcap')
+        VirtualRun(path, loads(text, 'g.yaml'), seed, workers, longest=longest * MS,
+                   shut_down=seed % 3 > 0)
+        recording = open_recording(path)
+    length = recording.end - (recording.start or 0)
+    inner = [border * MS for border in sorted(borders) if border * MS < length]
+    check_parts(recording, [0, *inner, 2 ** 62])
+
+
+def test_parts_of_a_bag() -> None:
+    recording = open_recording(BAGS / 'demo_short.mcap')
+    check_parts(recording, [0, 200 * MS, 210 * MS, 900 * MS, 1400 * MS, 2 ** 62])
+    part = recording.cut(200 * MS, 500 * MS)
+    assert part.start == (recording.start or 0) + 200 * MS and 0 < len(part.executions) < len(
+        recording.executions) / 2
+
+
+def test_ranges_that_cannot_be() -> None:
+    recording = open_recording(BAGS / 'demo_short.mcap')
+    for begin, end in ((-1, 5), (5, 5)):
+        with pytest.raises(ValueError, match='is no range of time'):
+            recording.cut(begin, end)
+    with pytest.raises(ReplayError, match='it ends 1.4.. s after its first release'):
+        recording.cut(10 ** 12, 2 ** 62)

@@ -67,48 +67,6 @@ def engine(
     return starts, done
 
 
-def test_messages_take_their_time() -> None:
-    assert engine([0, 0, 0]) == (
-        [(0, 0, 0), (4000, 0, 1), (6000, 0, 2), (50_000, 0, 3)], [(2, 9000), (3, 51_000)])
-    assert engine([MS, 0, 2 * MS])[0][:3] == [(0, 0, 0), (5000, 0, 1), (9000, 0, 2)]
-    # the last of the messages that a join waits for decides
-    assert engine([MS, 20 * MS, 2 * MS])[0][:3] == [(0, 0, 0), (5000, 0, 1), (24_000, 0, 2)]
-
-
-def test_a_callback_may_publish_before_its_end() -> None:
-    starts, done = engine([-3 * MS, 0, -MS])
-    assert starts[:3] == [(0, 0, 0), (1000, 1, 1), (4000, 0, 2)]
-    assert done[0] == (2, 7000)
-    # not before its start
-    assert engine([-30 * MS, 0, 0])[0][:2] == [(0, 0, 0), (0, 1, 1)]
-    # preempted, its end is not known in advance: the message is there with it
-    assert engine([-3 * MS, 0, 0], preemptive=True)[0][1] == (4000, 0, 1)
-
-
-def test_a_worker_is_free_while_a_message_is_on_its_way() -> None:
-    starts, _ = engine([5 * MS, 0, 0], workers=1, late=5 * MS)
-    assert starts == [(0, 0, 0), (5000, 0, 3), (9000, 0, 1), (11_000, 0, 2)]
-
-
-def test_preemption() -> None:
-    starts, done = engine([0, 0, 0], workers=1, preemptive=True, late=MS)
-    assert starts == [(0, 0, 0), (1000, 0, 3), (2000, 0, 0), (5000, 0, 1), (7000, 0, 2)]
-    assert done == [(3, 2000), (2, 10_000)]
-
-
-def test_the_horizon() -> None:
-    assert engine([0, 0, 0], horizon=9 * MS)[1] == [(2, 9000)]
-    assert engine([0, 0, 0], horizon=9 * MS - 1)[1] == []
-    assert engine([10 * MS, 0, 0], horizon=12 * MS)[0] == [(0, 0, 0)]
-
-
-def test_a_message_of_a_job_that_has_ended_is_ignored() -> None:
-    """With one job open at a time the second expires the first while its message is on its way."""
-    starts, done = engine([20 * MS, 0, 0], jobs=6, bound=1)
-    assert [vertex for _, _, vertex in starts].count(1) == 1
-    assert [vertex for vertex, _ in done] == [2, 3]
-
-
 def record(path: Path, delay: int, wake: int, ready_early: int = 0) -> None:
     """Record three jobs of a chain of three, with these overheads, ns."""
     text = """\

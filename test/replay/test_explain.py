@@ -225,26 +225,6 @@ def test_all_misses_of_any_run_are_explained(tmp_path: Path, seed: int, workers:
                 assert each['ns'] <= workers * (job['until_ns'] - job['release_ns'])
 
 
-def test_recorded_stops_are_stalls(tmp_path: Path) -> None:
-    path = tmp_path / 'run.mcap'
-
-    class Stopped(Planned):
-
-        def _run(self) -> None:
-            for begin in range(1_000, 26_001, 1_000):   # noticed 15 ms late, as live
-                time = START_TIME + begin * MS
-                self._at(time - 1, lambda now: self.record(
-                    'stop', now, 3, now - 35 * MS, now))
-            super()._run()
-
-    # a callback that runs alone: only the record tells that it stood still
-    Stopped(path, loads(VICTIM, 'g.yaml'), stops=(1_000 * MS, 52 * MS),
-            records_stops=False)
-    result = explained(path)
-    assert len(result['stalls']) == 26
-    assert result['causes']['machine'] == result['missed'] > 25
-
-
 def test_what_people_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     declaration, plan = PLANS['waited']
     path = str(tmp_path / 'run.mcap')

@@ -4,12 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+import random
 from typing import Any
 
-from mddag_executor.recording.tables import LEG, VERTEX
+from mddag_executor.errors import MddagError
 from mddag_executor.replay import replay, ReplayError, reschedule
-from mddag_executor.replay.run import open_recording
+from mddag_executor.trace import EventType, TraceFile, TraceReader
 from msg_graph import loads, TaskSet
 import pytest
 
@@ -190,24 +192,6 @@ def test_what_the_tracer_discarded_is_not_held_against_a_job(
     assert [line for line in warnings if line.startswith('the tracer discarded 50 events')]
 
 
-def test_a_lost_link_is_said_and_its_job_is_not_judged(
-    recorded: Recorded, graph: TaskSet
-) -> None:
-    names = recorded.names()
-    bound = [place for place, name in enumerate(names) if 'bind' in name]
-    first = bound[0]        # the first image's source timestamp
-    recorded.run(PLAN, 5, 3000 * MS, 3001 * MS)
-    recorded.run(GRAB, 1, 3007 * MS, 3008 * MS)
-    result, warnings = result_of(recorded.write(but=[first]), graph)
-    sink = result['dags']['/camera']['sinks']['/fuse:join']
-    assert (sink['completed'], sink['expired']) == (N - 1, 0)
-    assert result['dags']['/camera']['unjudged'] == 1
-    assert [line for line in warnings if '/detect subscription /image (1)' in line] == [
-        '1 execution for a message whose publication is not known (not all of its topic have a '
-        'source timestamp in it): of no job and no path: /detect subscription /image (1)']
-    assert [line for line in warnings if 'periods of timers' in line]
-
-
 def test_late_and_off_the_grid(tmp_path: Path) -> None:
     graph = loads('mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n'
                   '      - {name: t, timer: 10ms, deadline: 5ms}\n', 'graph.yaml')
@@ -299,27 +283,6 @@ def test_reschedule_keeps_releases_times_and_groups(recorded: Recorded, graph: T
         reschedule(path)
 
 
-def test_without_a_graph(recorded: Recorded) -> None:
-    outcome = replay(recorded.write())
-    result = outcome.result()
-    assert (outcome.warnings, result['dags'], outcome.tally.missed) == ([], {}, False)
-    assert result['recorded_callbacks']['/fuse subscription /imu'] == {
-        'executions': N, 'unfinished': 0, 'busy_ns': N * 3 * MS, 'shortest_ns': 3 * MS,
-        'longest_ns': 3 * MS}
-    imu = next(each for each in result['communications'] if each['topic'] == '/imu')
-    assert (imu['publisher'], imu['callback'], imu['sent'], imu['arrived']) == (
-        '/imu', '/fuse subscription /imu', N, N)
-    assert imu['latency_ns']['median'] == 3 * MS
-    assert result['recording']['start_ns'] == BEGIN + 50 * MS
-
-
-def test_a_graph_of_other_nodes(recorded: Recorded) -> None:
-    other = loads('mddag: 1\nnodes:\n  - node: /x\n    callbacks:\n'
-                  '      - {name: t, timer: 10ms, deadline: 5ms}\n', 'x.yaml')
-    with pytest.raises(ReplayError, match='none of the callbacks of x.yaml is in it'):
-        replay(recorded.write(), other)
-
-
 def test_a_graph_without_the_namespace_gets_a_question(recorded: Recorded) -> None:
     other = loads('mddag: 1\nnodes:\n  - node: /robot/fuse\n    callbacks:\n'
                   '      - {name: t, timer: 50ms, deadline: 5ms}\n', 'x.yaml')
@@ -345,13 +308,6 @@ def test_cut_anywhere_it_says_something_or_judges_what_is_there(
                 assert sink['late'] == sink['expired'] == 0, (stop, name)
 
 
-def test_the_last_leg_makes_a_sync_callback_whole(recorded: Recorded, graph: TaskSet) -> None:
-    table = open_recording(recorded.write(), graph).executions
-    join = [v.name for v in graph.vertices].index('/fuse:join')
-    told = table[table['vertex'] == join][['job', 'leg', 'completes']].tolist()
-    assert told == [each for job in range(N) for each in ((job, 1, LEG), (job, 0, VERTEX))]
-
-
 def test_a_job_whose_end_is_lost_keeps_no_other_from_expiring(tmp_path: Path) -> None:
     recorded = Recorded(tmp_path / 'lost.mcap')
     recorded.node(1, '/camera')
@@ -371,3 +327,75 @@ def test_a_job_whose_end_is_lost_keeps_no_other_from_expiring(tmp_path: Path) ->
     result = replay(recorded.write([lost]), loads(CAMERA, 'g.yaml')).result()
     sink = result['dags']['/camera']['sinks']['/detect:run']
     assert (sink['expired'], sink['late'], sink['completed']) == (19, 1, 20)
+
+
+SEEDS = 60
+_VALUES = (0, 1, -1, 2 ** 63 - 1, -2 ** 63, 2 ** 64 - 1, 11, 12, 100, 30_012)
+_TEXTS = ('', '/', '/camera', 'x' * 5000, '\x1b[2J\n', '/camera\n')
+
+
+def mutated(source: Path, target: Path, seed: int) -> Path:
+    """Write a recording with events left out, doubled, in other places, or with other values."""
+    rng = random.Random(seed)
+    reader = TraceReader(source)
+    events: list[tuple[Any, ...]] = list(reader.layout_events(None))
+    with TraceFile(target, overwrite=True) as file:
+        for layout, time, pid, tid, *values in _shuffled(events, rng):
+            kinds = []
+            for place, (field, value) in enumerate(zip(layout.fields, values)):
+                kind = 'string' if isinstance(value, str) else \
+                    'bool' if isinstance(value, bool) else 'int64'
+                if rng.random() < 0.03:
+                    if kind == 'string':
+                        values[place] = rng.choice(_TEXTS)
+                    elif kind == 'int64':
+                        values[place] = max(-2 ** 63, min(2 ** 63 - 1, rng.choice(_VALUES)))
+                kinds.append((field, kind))
+            if rng.random() < 0.01:
+                place = rng.randrange(len(kinds)) if kinds else 0
+                del kinds[place:place + 1], values[place:place + 1]
+            if rng.random() < 0.02:
+                time = rng.choice((0, 1, time + 10 ** 9, 2 ** 62, 2 ** 63 - 1))
+            provider, _, name = layout.name.partition(':')
+            key = file.define(EventType(provider, name, tuple(kinds)))
+            file.extend(((key, time, tid, *values),), pid)
+    return target
+
+
+def _shuffled(events: list[tuple[Any, ...]], rng: random.Random) -> Iterator[tuple[Any, ...]]:
+    for event in events:
+        chance = rng.random()
+        if chance < 0.02:
+            continue
+        yield event
+        if chance > 0.98:
+            yield rng.choice(events)
+
+
+@pytest.mark.parametrize('first', range(0, SEEDS, 20))
+def test_anything_in_it(
+    recorded: Recorded, graph: TaskSet, tmp_path: Path, first: int
+) -> None:
+    source = recorded.write()
+    replayed = 0
+    for seed in range(first, first + 20):
+        path = mutated(source, tmp_path / f'{seed}.mcap', seed)
+        try:
+            result = replay(path, graph).result()
+        except MddagError:
+            continue
+        replay(path).result()
+        try:
+            reschedule(path, graph, policy='fifo').result()
+        except MddagError as error:
+            assert 'execution_time' in str(error)
+        replayed += 1
+        for dag in result['dags'].values():
+            for sink in dag['sinks'].values():
+                assert 0 <= sink['completed'] <= dag['jobs']
+                response = sink['response_ns']
+                assert response is None or 0 <= response['min'] <= response['max']
+        for path_result in result['paths'].values():
+            for figures in (path_result['data_age'], path_result['reaction_time']):
+                assert figures is None or 0 <= figures['min'] <= figures['max']
+    assert replayed > 15

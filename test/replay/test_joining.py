@@ -12,7 +12,6 @@ from mddag_executor.core import NEVER
 from mddag_executor.core.tally import counts
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.clocks import offsets
-from mddag_executor.replay.joining import label_of
 from mddag_executor.trace import TraceFile
 import pytest
 
@@ -152,7 +151,7 @@ def two_machines(folder: Path, late: int, back: bool = True, stranger: bool = Fa
 
 @pytest.mark.parametrize('late', [0, 3 * MS, -3 * MS, 40_000 * MS, -40_000 * MS])
 def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(
-        tmp_path: Path, late: int, mddag: Any) -> None:
+        tmp_path: Path, late: int, call: Any) -> None:
     paths = two_machines(tmp_path, late)
     result = replay(paths).result()
     warning, = result['warnings']
@@ -163,7 +162,7 @@ def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(
     assert (verdicts.due, verdicts.in_time, verdicts.late) == (3, 2, 1)
     assert sink(result)['response_ns']['max'] == 10 * MS - 100_000
 
-    run = mddag('replay', *paths, '--offset', f'down={-late}ns', '--json', '-')
+    run = call('replay', *paths, '--offset', f'down={-late}ns', '--json', '-')
     assert run.stderr == '' and '"max": 10000000' in run.stdout
     reversed_paths = replay(paths[::-1]).result()
     assert counts(sink(reversed_paths)).in_time == 2 and sink(
@@ -199,22 +198,12 @@ def test_one_machine_has_one_clock_whatever_it_was_set_to(tmp_path: Path) -> Non
     (['up=1ms'], "up is on the first trace's machine"),
 ])
 def test_offsets_that_cannot_be_are_one_line(
-        tmp_path: Path, mddag: Any, offsets: list[str], message: str) -> None:
+        tmp_path: Path, call: Any, offsets: list[str], message: str) -> None:
     paths = two_machines(tmp_path, 0)
-    run = mddag('replay', *paths, *(f'--offset={each}' for each in offsets))
+    run = call('replay', *paths, *(f'--offset={each}' for each in offsets))
     assert run.returncode == 2 and message in run.stderr and run.stderr.count('\n') == 1
-    one = mddag('replay', paths[0], '--offset', 'up=1ms')
+    one = call('replay', paths[0], '--offset', 'up=1ms')
     assert one.returncode == 2 and 'one trace has one clock' in one.stderr
-
-
-def test_what_follows_without_a_stamp_is_another_job(tmp_path: Path) -> None:
-    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
-    up.runs(0, MS)
-    down.runs(2 * MS, 3 * MS)
-    result = replay([up.end(100 * MS), down.end(100 * MS)]).result()
-    assert result['dags']['chain']['jobs'] == 2
-    verdicts = counts(sink(result))
-    assert (verdicts.due, verdicts.in_time, verdicts.late) == (2, 1, 1)
 
 
 def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(
@@ -232,43 +221,6 @@ def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(
     assert (verdicts.due, verdicts.in_time, verdicts.late) == (4, 1, 3)
 
 
-def test_jobs_that_had_failed_did_not_end_with_a_process_that_was_killed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    # the second one of /a's callbacks never runs for what the first one failed to publish
-    graph = GRAPH.replace('dag: chain}', 'dag: chain}, {name: keep, subscription: /x, deadline: '
-                          '8ms}')
-    up, down = Trace(tmp_path, 'up', 0, graph=graph), Trace(tmp_path, 'down', 2, graph=graph)
-    up.add('hosted', 0, 0, '0,1')
-    for i in range(4):
-        up.runs(i * 10 * MS, i * 10 * MS + MS, fails=i < 3)
-    down.runs(30 * MS, 33 * MS)
-    status, out, _ = caller('replay')(
-        capsys, up.end(None), down.end(100 * MS), '--json', '-')
-    warning, = json.loads(out)['warnings']
-    assert status == 0
-    assert warning.endswith('it ends 0.068 s before the run; 1 job ended with it: chain 3')
-
-
-def test_a_lent_worker_counts_for_no_other_process(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
-    up.runs(0, 0, 2 * MS, worker=-1)
-    down.runs(0, 3 * MS, MS)
-    _, out, _ = caller('replay')(capsys, up.end(9 * MS), down.end(9 * MS), '--json', '-')
-    use = json.loads(out)['worker_use']
-    assert (use['lent_ns'], use['busy_ns']) == (2 * MS, {'2': MS})
-
-
-def test_jobs_are_judged_once_all_judge(tmp_path: Path) -> None:
-    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1, judges_from=5 * MS)
-    for i in range(3):
-        up.runs(i * 10 * MS, i * 10 * MS + MS)
-        down.runs(i * 10 * MS, i * 10 * MS + 3 * MS)
-    assert counts(sink(replay([up.end(90 * MS), down.end(90 * MS)]).result())).due == 2
-
-
 def test_who_is_started_again_or_never_judged_keeps_no_job_from_being_judged(
         tmp_path: Path) -> None:
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
@@ -281,15 +233,6 @@ def test_who_is_started_again_or_never_judged_keeps_no_job_from_being_judged(
     result = replay([up.end(90 * MS), down.end(None), again.end(90 * MS), killed.end(None)])
     verdicts = counts(sink(result.result()))
     assert (verdicts.due, verdicts.in_time, verdicts.late) == (6, 4, 2)
-
-
-def test_a_joined_run_is_rescheduled(tmp_path: Path) -> None:
-    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
-    for i in range(3):
-        up.runs(i * 10 * MS, i * 10 * MS + MS)
-        down.runs(i * 10 * MS, i * 10 * MS + 3 * MS)
-    outcome = reschedule([up.end(90 * MS), down.end(90 * MS)], workers=1)
-    assert counts(sink(outcome.result())).in_time == 3
 
 
 TWO = """
@@ -313,28 +256,28 @@ def two(tmp_path: Path) -> list[str]:
 
 
 def test_each_process_has_its_workers_and_interpreter_again(
-        two: list[str], tmp_path: Path, mddag: Any) -> None:
+        two: list[str], tmp_path: Path, call: Any) -> None:
     outcome = reschedule(two)
     assert [(p.name, p.nodes) for p in outcome.processes] == [('up', ('/a',)), ('down', ('/b',))]
     assert (outcome.workers, outcome.settings.workers) == (4, 2) and not outcome.tally.missed
     assert outcome.worker_names == ['up 0', 'up 1', 'down 0', 'down 1']
     assert reschedule(two, cpus=1).tally.missed
 
-    run = mddag('replay', *two, '--reschedule')
+    run = call('replay', *two, '--reschedule')
     assert '18 in time' in run.stdout and '4 workers in 2 processes' in run.stdout
-    assert '9 late' in mddag('replay', *two, '--reschedule', '--processes', '1').stdout
+    assert '9 late' in call('replay', *two, '--reschedule', '--processes', '1').stdout
     for given in ('processes: {p: [/a, /b]}', 'processes: {p: [/a], q: [/b]}'):
         (tmp_path / 'placed.yaml').write_text(given)
         late = '9 late' if 'q:' not in given else ' 0 late'
-        run = mddag('replay', *two, '--reschedule', '--processes', tmp_path / 'placed.yaml')
+        run = call('replay', *two, '--reschedule', '--processes', tmp_path / 'placed.yaml')
         assert late in run.stdout, (given, run.stdout, run.stderr)
     (tmp_path / 'graph.yaml').write_text(TWO + 'processes: {p: [/a, /b]}')
-    assert '9 late' in mddag('replay', *two, tmp_path / 'graph.yaml', '--reschedule').stdout
+    assert '9 late' in call('replay', *two, tmp_path / 'graph.yaml', '--reschedule').stdout
 
 
 def test_slack_is_found_with_the_workers_and_interpreter_of_each(
-        two: list[str], tmp_path: Path, mddag: Any) -> None:
-    run = mddag('slack', *two, '--json', '-')
+        two: list[str], tmp_path: Path, call: Any) -> None:
+    run = call('slack', *two, '--json', '-')
     result = json.loads(run.stdout)
     assert (run.returncode, result['processes'], result['left_out']) == (0, 2, [])
     # 5 ms may become 8 ms in both, side by side
@@ -342,14 +285,14 @@ def test_slack_is_found_with_the_workers_and_interpreter_of_each(
         result['load']['factor'], *(each['factor'] for each in result['callbacks'].values())))
     assert result['workers'] == {'given': 2, 'least': 1, 'breaks': None}
     (tmp_path / 'graph.yaml').write_text(TWO + 'processes: {p: [/a, /b]}')
-    run = mddag('slack', *two, tmp_path / 'graph.yaml')     # all in one
+    run = call('slack', *two, tmp_path / 'graph.yaml')     # all in one
     assert 'left out, because they miss' in run.stdout
-    assert '1 of 2 workers in each process are enough' in mddag('slack', *two).stdout
-    refused = mddag('slack', *two, '--offset', 'none=1ms')
+    assert '1 of 2 workers in each process are enough' in call('slack', *two).stdout
+    refused = call('slack', *two, '--offset', 'none=1ms')
     assert refused.returncode == 2 and 'there is no trace of none' in refused.stderr
 
 
-def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path: Path, mddag: Any) -> None:
+def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path: Path, call: Any) -> None:
     for folder, takes in (('before', 2), ('after', 7)):
         (tmp_path / folder).mkdir()
         up, down = Trace(tmp_path / folder, 'up', 0), Trace(tmp_path / folder, 'down', 1)
@@ -359,18 +302,18 @@ def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path: Path, mddag: Any) -> 
         up.end(100 * MS)
         down.end(100 * MS)
     before, after = tmp_path / 'before', tmp_path / 'after'
-    assert '3 in time' in mddag('replay', before).stdout
-    assert '3 late' in mddag('explain', after).stdout
-    run = mddag('diff', before, after, '--fail-on-worse', '--json', '-')
+    assert '3 in time' in call('replay', before).stdout
+    assert '3 late' in call('explain', after).stdout
+    run = call('diff', before, after, '--fail-on-worse', '--json', '-')
     found = json.loads(run.stdout)
     sides = [found['dags']['chain']['sinks']['/b:take'][side] for side in 'ab']
     assert run.returncode == 1 and [side['late'] for side in sides] == [0, 3]
     Trace(before, 'other', 0, graph=TWO).end(MS)
-    refused = mddag('diff', before, after)
+    refused = call('diff', before, after)
     assert refused.returncode == 2 and 'another declaration' in refused.stderr
 
 
-def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, mddag: Any) -> None:
+def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, call: Any) -> None:
     trace = Trace(tmp_path, 'whole', 0, graph=TWO)
     for i in range(9):
         for trace.dag in range(2):
@@ -378,8 +321,8 @@ def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, mddag: Any) 
                        ready=i * 12 * MS)
             trace.job -= not trace.dag
     path = trace.end(100 * MS)
-    assert ' 0 late' not in mddag('replay', path, '--reschedule').stdout
-    assert ' 0 late' in mddag('replay', path, '--reschedule', '--processes', '2').stdout
+    assert ' 0 late' not in call('replay', path, '--reschedule').stdout
+    assert ' 0 late' in call('replay', path, '--reschedule', '--processes', '2').stdout
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
@@ -391,8 +334,8 @@ def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, mddag: Any) 
     (['--reschedule', '--preemptive'], 'preemption is known of one process only'),
 ])
 def test_bad_placements_are_one_line(
-        two: list[str], mddag: Any, arguments: list[str], message: str) -> None:
-    run = mddag('replay', *two, *arguments)
+        two: list[str], call: Any, arguments: list[str], message: str) -> None:
+    run = call('replay', *two, *arguments)
     assert (run.returncode, run.stdout) == (2, '')
     assert message in run.stderr and run.stderr.count('\n') == 1
 
@@ -409,7 +352,7 @@ def test_traces_of_different_runs_are_refused(tmp_path: Path) -> None:
         replay([up, empty])
 
 
-def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path: Path, mddag: Any) -> None:
+def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path: Path, call: Any) -> None:
     paths = {}
     for run, begin in (('one', 0), ('two', 200 * MS)):
         for vertex, name in enumerate(('up', 'down')):
@@ -418,12 +361,12 @@ def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path: Path, mddag
             paths[run, name] = trace.end(begin + 90 * MS)
     for order in (['down', 'up'], ['up', 'down']):
         given = [paths[run, name] for run in ('one', 'two') for name in order]
-        run = mddag('replay', *given) if order[0] == 'up' else mddag('replay', tmp_path)
+        run = call('replay', *given) if order[0] == 'up' else call('replay', tmp_path)
         assert (run.returncode, run.stdout, run.stderr.count('\n')) == (2, '', 1)
         assert run.stderr == (
             f'error: {given[2]}: it is of another run than {given[0]}: no trace goes on from one '
             'to the other: give the traces of one run: {} {}, or {} {}\n'.format(*given))
-    one = mddag('replay', paths['one', 'up'], paths['one', 'down'])
+    one = call('replay', paths['one', 'up'], paths['one', 'down'])
     assert '1 in time' in one.stdout and not one.stderr
 
     # one that was started again was not there at the same time as the first one
@@ -439,27 +382,21 @@ def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path: Path, mddag
         replay([twin.end(50 * MS), paths['one', 'up'], long.path])
 
 
-def test_a_process_that_was_started_again_has_its_name(tmp_path: Path) -> None:
-    assert [label_of(f'/x.y/{name}.mcap') for name in (
-        'up', 'run.up', 'run.up.2', 'up.2', '2', 'drive')] == [
-            'up', 'up', 'up.2', 'up.2', '2', 'drive']
-
-
-def test_the_command_takes_several_traces(tmp_path: Path, mddag: Any) -> None:
+def test_the_command_takes_several_traces(tmp_path: Path, call: Any) -> None:
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
     up.runs(0, MS)
     down.runs(0, 3 * MS)
     paths = up.end(90 * MS), down.end(90 * MS)
     graph = tmp_path / 'graph.yaml'
     graph.write_text(GRAPH.replace('8ms', '3ms'))
-    assert '1 in time' in mddag('replay', *paths).stdout
-    assert '1 late' in mddag('replay', *paths, graph).stdout
-    assert 'misses' in mddag('explain', *paths, graph).stdout
+    assert '1 in time' in call('replay', *paths).stdout
+    assert '1 late' in call('replay', *paths, graph).stdout
+    assert 'misses' in call('explain', *paths, graph).stdout
     out = tmp_path / 'out.csv'
-    assert mddag('export', *paths, '-o', out).returncode == 0
+    assert call('export', *paths, '-o', out).returncode == 0
     assert [line.split(',')[2:4] for line in out.read_text().splitlines()[1:]] == [
         ['/a:tick', '0'], ['/b:take', '2']]
-    refused = mddag('replay', paths[0], '-', paths[1])
+    refused = call('replay', paths[0], '-', paths[1])
     assert refused.returncode == 2 and 'standard input' in refused.stderr
 
 

@@ -162,14 +162,6 @@ def test_overwritten_messages_are_said(recorded: Recorded) -> None:
     assert warnings == ['1 message overwritten in a ring buffer, never taken: /image (1)']
 
 
-def test_a_callback_in_several_threads_at_once(recorded: Recorded) -> None:
-    recorded.run(CAMERA, 1, 100 * MS, 130 * MS)
-    recorded.run(CAMERA, 2, 110 * MS, 120 * MS)
-    got, warnings = linked(recorded.write())
-    assert [run[1:] for run in got.runs] == [(110 * MS, 120 * MS), (100 * MS, 130 * MS)]
-    assert not [line for line in warnings if 'have no' in line]
-
-
 def test_a_callback_inside_another(recorded: Recorded) -> None:
     recorded.timer(13, 2, 10 * MS)
     recorded.run(CAMERA, 1, 100 * MS, 130 * MS)
@@ -287,12 +279,3 @@ def test_what_else_the_thread_writes_is_not_the_publication(recorded: Recorded) 
     assert warnings == [
         '2 executions for a message whose publication is not known (not all of its topic have a '
         'source timestamp in it): of no job and no path: /detector subscription /image (2)']
-
-
-def test_a_message_from_outside_is_said_to_be_not_in_it(recorded: Recorded) -> None:
-    recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
-    recorded.publish(IMAGE, 1, 101 * MS)
-    recorded.receive(DETECT, 2, 305 * MS, 306 * MS, 77)
-    assert linked(recorded.write())[1] == [
-        '1 execution for a message whose publication is not in it: of no job and no path: '
-        '/detector subscription /image (1)']

@@ -1,17 +1,30 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""End-to-end flows and response times, by hand and against slow ones."""
+"""End-to-end flows and response times: by hand, against slow ones, in traces of this executor."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.cli import main as program
+from mddag_executor.core import quantile
 from mddag_executor.recording import tables
 from mddag_executor.recording.entities import Entities, Node, Publisher
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import Recording, Rows
-from mddag_executor.replay.paths import Paths
+from mddag_executor.replay import replay
+from mddag_executor.replay.paths import figures, Paths
+from mddag_executor.replay.spread import spread
 from msg_graph import loads
+import numpy as np
+import pytest
 
+from .cases_by_hand import slow_cases
 from .flows import flows
+from .recorded import BEGIN, Recorded
 
 GRAPH = """\
 mddag: 1
@@ -202,3 +215,121 @@ def test_what_is_kept_may_be_of_unknown_origin() -> None:
     use = d.run('/b:use', 6)            # reads the unknown one: nobody knows how old it is
     d.send('/b:use', use, '/u', 7)
     assert d.starts() == [[1, 2, None, None, None]]
+
+
+Record = tuple[int, int | None]
+RECORDS = st.lists(st.tuples(
+    st.integers(0, 15), st.one_of(st.none(), st.integers(0, 25))), max_size=14)
+LONG = st.lists(st.tuples(
+    st.integers(0, 60), st.one_of(st.none(), st.integers(0, 80))), max_size=50)
+
+
+def statistics(times: list[int]) -> dict[str, Any] | None:
+    if not times:
+        return None
+    ordered = sorted(times)
+    return {'count': len(ordered), 'min': ordered[0],
+            'mean': round(sum(ordered) / len(ordered)), 'median': quantile(ordered, 0.5),
+            'p99': quantile(ordered, 0.99), 'max': ordered[-1]}
+
+
+def told(records: list[Record]) -> dict[str, Any]:
+    return figures(
+        np.array([start for start, _ in records], dtype=np.int64),
+        np.array([-1 if end is None else end for _, end in records], dtype=np.int64))
+
+
+@given(st.one_of(RECORDS, LONG))
+def test_cases(records: list[Record]) -> None:
+    found = told(records)
+    every = {**found['response_time'], 'data_age': found['data_age']}
+    expected = {case: [time for _, time in responses]
+                for case, responses in slow_cases(records).items()}
+    arrived = [(start, end) for start, end in records if end is not None and end >= start]
+    expected['data_age'] = [
+        end - max(first for first, output in arrived if output == end)
+        for end in {end for _, end in arrived}]
+    for case, times in every.items():
+        assert times == statistics(expected[case]), case
+    assert found['reaction_time'] == found['response_time']['worst_with_external_latency']
+
+
+def test_response_times_of_some_flows() -> None:
+    # 10 -> 30; 20 is overtaken; 40 -> 70; 50 is lost; 60 -> 90, and 60 -> 120 again
+    found = told([(10, 30), (20, None), (40, 70), (50, None), (60, 90), (60, 120)])
+    cases = found['response_time']
+    assert cases['all'] == {
+        'count': 4, 'min': 30, 'mean': 38, 'median': 30, 'p99': 50, 'max': 50}
+    assert cases['best'] == statistics([30, 30])
+    assert cases['worst'] == statistics([50, 40])
+    assert cases['worst_with_external_latency'] == statistics([50, 50])
+    assert found['data_age'] == statistics([20, 30, 30, 60])
+
+
+@given(st.lists(st.integers(-2**62, 2**62) | st.integers(-5000, 5000), max_size=60))
+def test_a_spread(times: list[int]) -> None:
+    assert spread(np.array(times, dtype=np.int64)) == statistics(times)
+
+
+TOP = Path(__file__).resolve().parent.parent.parent
+DEMO = TOP / 'bags' / 'demo_short.mcap'
+MS = 1_000_000
+
+GRAPH_OWN = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks: [{name: send, timer: 100ms, publishes: [/t], execution_time: 1ms}]
+  - node: /b
+    callbacks:
+      - {name: keep, subscription: /t, deadline: 90ms, execution_time: 2ms}
+      - {name: use, timer: 50ms, reads: [keep], deadline: 20ms, execution_time: 1ms}
+paths:
+  - {name: kept, callbacks: ['/a:send', '/b:keep', '/b:use']}
+"""
+
+
+@pytest.fixture
+def simulated(tmp_path: Path) -> Path:
+    graph = tmp_path / 'graph.yaml'
+    graph.write_text(GRAPH_OWN)
+    trace = tmp_path / 'run.mcap'
+    assert program.main(['simulate', str(graph), '--policy', 'rad', '--workers', '4',
+                         '--duration', '500ms', '--trace', str(trace)]) == 0
+    return trace
+
+
+def test_a_simulated_trace(simulated: Path) -> None:
+    path = replay(simulated).result()['paths']['kept']
+    assert path['hops'] == ['trigger', 'variable']
+    # sent 1 ms after each 100 ms, used with 50 and 100 ms after it; what is sent last is not used
+    # a second time within the 500 ms
+    assert (path['flows'], path['arrived']) == (9, 9)
+    assert path['data_age'] == {
+        'count': 9, 'min': 49 * MS, 'mean': round((5 * 49 + 4 * 99) * MS / 9),
+        'median': 49 * MS, 'p99': 99 * MS, 'max': 99 * MS}
+    assert path['reaction_time'] == {
+        'count': 3, 'min': 149 * MS, 'mean': 149 * MS, 'median': 149 * MS, 'p99': 149 * MS,
+        'max': 149 * MS}
+    # from the start of the sender to the end of its user
+    assert path['whole']['data_age']['min'] == 51 * MS
+
+
+def test_a_coroutine_is_one_execution(tmp_path: Path) -> None:
+    r = Recorded(tmp_path / 'coroutine.mcap')
+    r.add('mddag:task_set', 0, 1, GRAPH_OWN, 'g.yaml', 'rad', 2, 100 * MS, 0, False)
+    r.node(1, '/a')
+    r.publisher(100, 1, '/t')
+    r.add('mddag:job_release', 10, 1, 0, 0, BEGIN + 10)
+    for start in (20, 40):          # suspended in between
+        r.add('mddag:dispatch', start, 1, 5, 0, 0, 0, 0, BEGIN + 10, 0)
+        r.run(5, 1, start, start + 10)
+    r.add('ros2:rclcpp_publish', 45, 1, 100, 0x50, 0)
+    r.add('mddag:complete', 51, 1, 5, 0, 0, 0, True, BEGIN + 50, 0)
+    r.add('mddag:dispatch', 60, 1, 6, 0, 1, 0, 0, BEGIN + 55, 0)
+    r.run(6, 1, 60, 70)
+    r.add('mddag:dispatch', 80, 1, 7, 1, 0, 0, 0, BEGIN + 75, 0)
+    r.run(7, 1, 80, 90)
+    path = replay(r.write()).result()['paths']['kept']
+    assert path['data_age']['max'] == 80 - 45
+    assert path['whole']['data_age']['max'] == 90 - 20

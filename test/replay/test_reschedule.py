@@ -13,7 +13,7 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core import PolicyError, Tables, Tally
+from mddag_executor.core import PolicyError, Tally
 from mddag_executor.core.state import Decision, new_state
 from mddag_executor.errors import UsageError
 from mddag_executor.replay import replay, ReplayError, reschedule
@@ -29,13 +29,10 @@ from ..cli.helpers import caller
 from ..replay.helpers import (
     add_execution,
     begin_trace,
-    Chances,
     declarations,
     end_trace,
     MS,
-    small,
     START_TIME,
-    VirtualRun,
     VPID,
 )
 from ..replay.simulated import executions, loose, write_simulated
@@ -127,20 +124,6 @@ def starts(log: list[LogEntry]) -> list[tuple[int, int, int, int]]:
     """Return time in ms, worker, vertex and job of each start in a log."""
     return [((time - START_TIME) // MS, worker, vertex, job)
             for time, kind, worker, _, vertex, job in log if kind == START]
-
-
-def test_fewer_workers_miss_what_more_keep(tmp_path: Path) -> None:
-    path = tmp_path / 'a.mcap'
-    task_set = small()
-    load = random_load(task_set, 1, 4 * MS, 0)
-    log, _, decisions = schedule(task_set, load, 'rad', 4, START_TIME + 1000 * MS)
-    write_simulated(path, task_set, load, log, decisions, workers=4, end=START_TIME + 1000 * MS)
-    assert reschedule(path).workers == 4
-    assert not reschedule(path).tally.missed
-    alone = reschedule(path, workers=1)
-    assert alone.tally.missed
-    assert {entry[2] for entry in alone.log} == {0}
-    assert sum(sink.late for sink in alone.tally.sinks.values()) > 5
 
 
 TWO = """\
@@ -348,37 +331,6 @@ nodes:
     assert (breakdown['suspended_ns'], breakdown['executing_ns']) == (18 * MS, 5 * MS + 6 * MS)
 
 
-@pytest.mark.parametrize('seed', range(5))
-def test_a_run_with_losses_is_rescheduled_whole(tmp_path: Path, seed: int) -> None:
-    """Messages that were lost and jobs that expired do not matter: only releases and times do."""
-    path = tmp_path / 'a.mcap'
-    driven = VirtualRun(path, small(), seed, longest=2 * MS, chances=Chances(skipped=0))
-    outcome = reschedule(path, workers=8)
-    assert outcome.warnings == []
-    released = sum(driven.tally.jobs)
-    assert sum(outcome.tally.jobs) == released
-    assert all(sink.expired == sink.aborted == 0 for sink in outcome.tally.sinks.values())
-    ends = [sum(kinds.values()) for kinds in outcome.tally.ends]
-    assert sum(ends) >= released - 3  # but for those that were open at the end
-
-
-def test_jobs_are_called_as_in_the_recording(tmp_path: Path) -> None:
-    """Inside the engine jobs are counted from 0; a trace may begin with any."""
-    path = tmp_path / 'a.mcap'
-    with TraceFile(path, overwrite=True) as file:
-        file.add('task_set', START_TIME, VPID, 1, TWO, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
-        for job in (2**40, 2**40 + 7):
-            file.add('job_release', START_TIME + job % 8 * MS, VPID, 1, 1, job,
-                     START_TIME + job % 8 * MS)
-        start, end = START_TIME + 8 * MS, START_TIME + 14 * MS
-        add_execution(file, start, end, 1, 0, 2**40 + 7, vpid=VPID, thread=8)
-        file.add('shutdown', START_TIME + 60 * MS, VPID, 1, START_TIME + 60 * MS)
-    outcome = reschedule(path)
-    assert outcome.result()['first_miss']['job'] == 2**40
-    assert [outcome.recorded_job(e[3], e[5]) for e in outcome.log if e[1] == END] == [
-        2**40, 2**40 + 7]
-
-
 def test_settings_that_can_not_be(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     write_two(path)
@@ -396,12 +348,6 @@ def test_settings_that_can_not_be(tmp_path: Path) -> None:
         with pytest.raises(ReplayError, match=says):
             reschedule(path)
         replay(path).result()
-
-
-def test_tables_without_groups_stay_as_they_are() -> None:
-    from mddag_executor.replay.reschedule import with_groups
-    tables = Tables.build(loads(TIMER_AND_MESSAGE.replace('dag: b', 'dag: b, group: g'), 'g.yaml'))
-    assert with_groups(tables, {}, {}, declared_first=False) == tables
 
 
 def test_a_preemptive_run_stays_one(tmp_path: Path) -> None:
@@ -491,16 +437,6 @@ def test_what_was_stretched_by_the_interpreter_is_taken_back(tmp_path: Path) -> 
     # what waited for nobody else keeps its waiting
     of_python(path, [(0, 0, 20, 10, True)])
     assert responses(path, workers=1) == [20]
-
-
-def test_one_that_was_not_known_to_compute_does_so_all_the_same(tmp_path: Path) -> None:
-    """At first nobody knows who holds the interpreter: they take turns, in each what-if, too."""
-    path = tmp_path / 'a.mcap'
-    later = [(dag, start, start + 10, 10, True) for start in (100, 120) for dag in (0,)]
-    later += [(1, start, start + 10, 10, True) for start in (140, 160)]
-    of_python(path, [(0, 0, 19, 10, False), (1, 0, 20, 10, False), *later])
-    assert responses(path, workers=1) == [10, 20]
-    assert responses(path, workers=3) == [19, 20]
 
 
 def test_what_computes_without_the_interpreter_shares_the_cpus(tmp_path: Path) -> None:

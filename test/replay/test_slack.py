@@ -112,18 +112,6 @@ nodes:
     assert 'left out, because they miss every deadline already: /every:run' in out
 
 
-def test_what_is_left_out_and_expires_hides_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    graph = tmp_path / 'g.yaml'
-    graph.write_text(BY_HAND.replace('deadline: 8ms', 'deadline: 2ms').replace(
-        'timer: 10ms,', 'timer: 10ms, max_active_jobs: 2,').replace(
-        'deadline: 100ms, execution_time: 100us', 'deadline: 90ms, execution_time: 10ms'))
-    _, result = slack_of(capsys, str(graph))
-    assert result['left_out'] == ['/b:last']
-    assert result['load']['breaks'] == '/c:alone' and result['load']['factor'] <= 9
-
-
 def test_where_nothing_was_due_nothing_is_proven(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -180,15 +168,3 @@ def test_windows_find_what_plain_bisection_finds(
     for callback, one in found[1].items():
         if one.factor is not None:
             assert search.miss(callback, one.factor) is None
-
-
-def test_where_every_sink_misses_nothing_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    graph = tmp_path / 'g.yaml'
-    graph.write_text(BY_HAND.replace('8ms', '2ms').replace(
-        'timer: 100ms, deadline: 100ms', 'timer: 100ms, deadline: 50us'))
-    assert program.main(['slack', str(graph)]) == 0
-    out = capsys.readouterr().out
-    assert 'every sink misses every deadline already' in out
-    assert 'times' not in out.splitlines()[-1]

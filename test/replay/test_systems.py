@@ -12,7 +12,7 @@ from mddag_executor.errors import InputError
 from mddag_executor.replay import replay
 from mddag_executor.replay.drafting import System
 from mddag_executor.trace import TraceFile
-from msg_graph import load, loads
+from msg_graph import loads
 from msg_graph.caret import declaration_from_caret
 from msg_graph.draft import declaration_of, LEFT_OUT, MARK
 import pytest
@@ -177,32 +177,6 @@ def test_a_recorded_declaration_gives_names_and_deadlines() -> None:
         (d.name, d.period_ns, d.edges, [v.name for v in d.vertices]) for d in before.dags]
     assert [v.deadline_ns for v in again.vertices] == [v.deadline_ns for v in before.vertices]
     assert MARK not in text.split('mddag: 1')[1]
-
-
-def test_a_recorded_sync_callback_has_its_times() -> None:
-    """So that what comes of it can be simulated."""
-    task_set = loads(declaration_of(System(BAGS / 'demo_short.mcap').draft()))
-    assert all(callback.execution_time for callback in task_set.callbacks)
-    sync = next(callback for callback in task_set.callbacks if callback.kind == 'sync')
-    declared = load(BAGS.parent / 'config' / 'autoware.yaml').callback(sync.key)
-    assert sync.execution_time is not None and declared.execution_time is not None
-    # the executions that made it whole, and not those that only kept a message
-    assert sync.execution_time.quantiles_ns[0] > declared.execution_time.quantiles_ns[0] / 2
-
-
-def test_a_recorded_run_as_declared_has_no_drift() -> None:
-    replayed = replay(BAGS / 'demo_short.mcap')
-    assert replayed.task_set.callbacks
-    assert replayed.drift() == []
-
-
-def test_drift_of_a_recorded_run_against_another_declaration() -> None:
-    text = replay(BAGS / 'demo_short.mcap').task_set.text
-    other = loads(text.replace('timer: 100ms', 'timer: 150ms'))
-    found = replay(BAGS / 'demo_short.mcap', other).drift()
-    slower = [dag.vertices[dag.source].callback.key for dag in other.dags
-              if dag.period_ns == 150 * MS]
-    assert {each.callback for each in found if each.kind == 'rate'} == set(slower) != set()
 
 
 def test_drift_of_an_imported_recording(recorded: Path) -> None:

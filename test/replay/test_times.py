@@ -15,7 +15,6 @@ from typing import Any
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import replay, Reschedule, reschedule
 from mddag_executor.replay.bags_reschedule import reschedule_bag
@@ -63,10 +62,6 @@ def rescheduled(path: Path, graph: str = GRAPH) -> Reschedule:
     return outcome
 
 
-def test_the_constants_are_one() -> None:
-    assert times.NEVER == NEVER
-
-
 @pytest.mark.parametrize('storage', STORAGES)
 @pytest.mark.parametrize('odd', [2**62, 2**62 - 1, 2**63 - 1, BEGIN ^ 2**58, 0, BEGIN + 900 * S])
 def test_a_message_at_a_time_that_cannot_be(
@@ -101,14 +96,6 @@ def test_any_bit_of_a_header_stamp(place: int, bit: int) -> None:
         outcome = rescheduled(scans(Path(folder, 'bag'), arrivals(), stamps=stamps), BY_HEADER)
     response = outcome.result()['dags']['/lidar']['sinks']['/detector:detect']['response_ns']
     assert response['max'] <= 2 * times.GAP_NS
-
-
-def test_header_stamps_of_another_clock(tmp_path: Path) -> None:
-    stamps = [12 * S + k * 25 * MS for k in range(N)]
-    outcome = rescheduled(scans(tmp_path / 'bag', arrivals(), stamps=stamps), BY_HEADER)
-    assert [line.split(': ', 1)[1] for line in outcome.warnings] == [
-        f'{N} of {N} messages of /points (std_msgs/msg/Header) with a header stamp years before '
-        'the arrival: released at the arrival']
 
 
 def test_a_pause_has_no_jobs_of_timers(tmp_path: Path) -> None:

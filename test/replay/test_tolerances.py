@@ -72,11 +72,6 @@ def test_without_a_tolerance_each_miss_counts(missed: list[bool]) -> None:
     assert bool(found) == (any(missed) or not missed)
 
 
-def test_a_burst_is_of_consecutive_jobs_in_whatever_order_they_are_told() -> None:
-    assert longest_run([]) == 0
-    assert longest_run([7, 5, 6, 6, 9]) == 3
-
-
 @given(st.lists(st.integers(0, 30)))
 def test_the_longest_burst(numbers: list[int]) -> None:
     there = ''.join('x' if number in numbers else ' ' for number in range(31))
@@ -209,19 +204,6 @@ def test_a_failed_job_is_told_wherever_verdicts_are(
     assert jobs.read_text().count(',failed') == 1
 
 
-def test_junit_on_the_command_line(
-    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / 'out.xml'
-    assert program.main(['replay', str(trace), '--junit', str(out)]) == 0
-    case = ElementTree.parse(out).getroot().find('testsuite/testcase')
-    assert case is not None and case.find('failure') is not None
-    assert case.attrib == {'classname': '/n', 'name': '/n:a', 'time': '0.009000000'}
-    capsys.readouterr()
-    assert program.main(['replay', str(trace), '--junit', '-']) == 0
-    ElementTree.fromstring(capsys.readouterr().out)
-
-
 @pytest.mark.parametrize('mode', [[], ['--reschedule']])
 def test_a_warm_up_is_left_out(
     trace: Path, tmp_path: Path, mode: list[str], capsys: pytest.CaptureFixture[str]
@@ -278,24 +260,6 @@ def test_where_nothing_was_due_nothing_is_proven(
     assert failure is not None and 'no job was due' in failure.attrib['message']
     assert program.main([*arguments, '--json', '-']) == 0
     assert json.loads(capsys.readouterr().out)['never_due'] == ['/n:a']
-
-
-def test_a_sink_that_was_never_due_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    graph = tmp_path / 'g.yaml'
-    graph.write_text(GRAPH.replace('8ms}', '8ms, execution_time: 1ms}') + """\
-  - node: /slow
-    callbacks: [{name: a, timer: 10s, deadline: 8s, execution_time: 200ms}]
-""")
-    arguments = ['simulate', str(graph), '--fail-on-miss']
-    assert program.main([*arguments, '--duration', '100ms']) == 0
-    assert 'never due, so not judged: 1 sink: /slow:a\n' in capsys.readouterr().out
-    graph.write_text(GRAPH.replace('8ms}', '8ms, execution_time: 7ms}'))
-    assert program.main([*arguments, '--duration', '5ms']) == 1
-    assert capsys.readouterr().err == (
-        f'error: {graph}: no job was due at any sink, so no deadline was judged: '
-        'simulate for longer\n')
 
 
 def test_a_run_in_which_nothing_was_due_is_no_better(

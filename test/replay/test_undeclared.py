@@ -259,19 +259,6 @@ def test_timers_are_released_on_their_grid_if_they_keep_to_one(
     assert '6 executions of timers off the grid' in warning and '/radar timer' in warning
 
 
-def test_a_run_that_was_killed_is_judged_at_its_last_instant(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = Run(tmp_path)
-    run.runs(GRAB, 0, 0, 2 * MS, MS)
-    run.detects(MS + 9 * US, MS + 99 * US)
-    run.runs(GRAB, 100 * MS, 100 * MS, 102 * MS, 101 * MS)
-    result = run.result(capsys)
-    assert 'the end of the run is not recorded' in ' '.join(result['warnings'])
-    sink = result['dags']['/camera']['sinks']['/detect:run@/camera']
-    assert (sink['completed'], sink['late'], sink['expired']) == (1, 0, 0)
-
-
 def test_a_job_that_is_open_at_the_end_is_judged_by_that(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,7 +3,7 @@
 """
 Live runs in which deadlines are missed for one known reason, and what `mddag explain` says.
 
-    python test/replay/known_causes.py --misses 100
+    python benchmarks/known_causes.py --misses 100
 
 Theory of operation
 -------------------

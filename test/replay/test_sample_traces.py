@@ -1,11 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""
-Results of version 1.0.0, to the last digit.
-
-But for what was mended since: rescheduled, a job whose timer skipped it is skipped again
-(``virtual_run_rescheduled``).
-"""
+"""The sample traces in `bags/` and results that have been the same since version 1.0.0."""
 
 from __future__ import annotations
 
@@ -13,16 +8,56 @@ import json
 from pathlib import Path
 from typing import Any
 
+from benchmarks import autoware_multi
 from mddag_executor.cli import main as program
 from mddag_executor.core.tally import total
-from msg_graph import loads
+from mddag_executor.replay import replay, reschedule
+from msg_graph import load, loads
 import pytest
 
 from .helpers import Chances, MS, PATHS, SMALL, VirtualRun
 from .recorded import CAMERA, four_jobs
 from .test_ordinary_bags import BY_HEADER, write_bag
 
-BAGS = Path(__file__).resolve().parents[2] / 'bags'
+TOP = Path(__file__).resolve().parent.parent.parent
+BAGS = TOP / 'bags'
+DEMO = BAGS / 'demo_short.mcap'
+
+
+def test_every_trace_is_told_of_in_the_readme() -> None:
+    text = (BAGS / 'README.md').read_text(encoding='utf-8')
+    assert [path.name for path in BAGS.glob('*.mcap') if f'`{path.name}`' not in text] == []
+    assert 100_000 < DEMO.stat().st_size < 600_000
+
+
+def counted(result: dict[str, Any]) -> dict[str, Any]:
+    """Return by DAG its jobs and how many of each sink completed."""
+    return {name: (dag['jobs'], [sink['completed'] for sink in dag['sinks'].values()])
+            for name, dag in result['dags'].items()}
+
+
+def test_the_demo_under_the_shipped_declarations() -> None:
+    """The declarations may change; as long as they have these callbacks they can judge."""
+    recorded = replay(DEMO)
+    assert recorded.warnings == []
+    for task_set in (load(TOP / 'config' / 'autoware.yaml'), autoware_multi.task_set()):
+        assert counted(replay(DEMO, task_set).result()) == counted(recorded.result())
+
+
+def test_the_demo_rescheduled() -> None:
+    """As recorded one job was late, for overheads; four workers would not have been enough."""
+    same = reschedule(DEMO)
+    assert sum(sink.late for sink in same.tally.sinks.values()) == 1
+    assert same.tally.first_miss is not None
+    assert same.tally.first_miss['vertex'].endswith('twist2accel:callback_0')
+    assert not reschedule(DEMO, overheads=False).tally.missed
+    four = reschedule(DEMO, workers=4)
+    assert four.tally.missed
+    again = reschedule(DEMO, workers=4)
+    assert four.result() == again.result()
+
+
+BAGS_EXPECTED = Path(__file__).resolve().parents[2] / 'bags'
 EXPECTED = Path(__file__).with_name('expected')
 IMPORTED = CAMERA + """\
 paths:
@@ -35,7 +70,7 @@ RESCHEDULED = '--reschedule --workers 1 --policy fifo --overheads none --skip 50
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the recordings that are not in the repository."""
     monkeypatch.chdir(tmp_path)
-    Path('demo.mcap').symlink_to(BAGS / 'demo_short.mcap')
+    Path('demo.mcap').symlink_to(BAGS_EXPECTED / 'demo_short.mcap')
     Path('four.yaml').write_text(IMPORTED)
     four_jobs(Path('four.mcap'))
     abort = SMALL.replace('timer: 20ms,', 'timer: 20ms, on_late: abort,') + PATHS

@@ -1,0 +1,269 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What is estimated from a recording: isolated execution times, latencies, use of the pool."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mddag_executor.core import NEVER
+from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.head import Head
+from mddag_executor.recording.tables import EXECUTIONS, Recording, rows
+from mddag_executor.replay import alone as module
+from mddag_executor.replay import replay
+from mddag_executor.replay.alone import alone, colder, Recorded
+from mddag_executor.replay.dispatches import Dispatches
+from mddag_executor.replay.noticed import Noticed
+from mddag_executor.replay.usage import group_waits, PoolUse
+from mddag_executor.simulate.intakes import Costs
+from mddag_executor.simulate.machine import SWITCH_NS
+from mddag_executor.trace import TraceFile
+import numpy as np
+import pytest
+from pytest import approx, MonkeyPatch
+
+from .helpers import add_execution, MS, small, START_TIME
+
+Ran = tuple[float, float, float, int]
+"""When it could start, what it took, its CPU time (-1: not known); whose lock it has, 0: none."""
+
+
+def of(
+    *ran: Ran, cpus: int = 0, here: Sequence[int] | None = None,
+    callbacks: Sequence[int] | None = None, workers: int = NEVER,
+) -> list[float]:
+    """Return what executions would have taken alone; all in ms."""
+    could, took, cpu, held = (np.array(column) for column in zip(*ran))
+    times = [np.rint(each * 1e6).astype(np.int64) for each in (could, took)]
+    cpu = np.where(cpu < 0, -1, np.rint(cpu * 1e6)).astype(np.int64)
+    interpreter = np.array(here) if here is not None else np.maximum(held, 1)
+    callback = np.arange(len(ran)) if callbacks is None else np.array(callbacks)
+    warm = np.zeros(len(ran), dtype=np.bool_)
+    found = alone(Recorded(*times, cpu, held > 0, interpreter, callback, warm), cpus, workers)
+    return [float(each) for each in np.round(found / 1e6, 1)]
+
+
+def test_two_that_held_it_at_the_same_time() -> None:
+    # they took turns, the first one had the first
+    assert of((0, 19, 10, 1), (0, 20, 10, 1)) == [10, 10]
+    # one was overtaken by another
+    assert of((0, 13, 10, 1), (2, 6, 3, 1)) == approx([10, 3], abs=0.1)
+    # in processes of their own they had nothing to share
+    assert of((0, 13, 10, 1), (2, 6, 3, 2)) == [13, 6]
+
+
+def test_what_the_machine_does_not_explain_is_its_own() -> None:
+    assert of((0, 20, 10, 1), (30, 20, 20, 1)) == [20, 20]
+    assert of((0, 20, -1, 0), (0, 20, 10, 0)) == [20, 20]
+
+
+def test_one_that_waits_got_the_lock_late() -> None:
+    # it needs the lock for 0.3 ms when it goes on
+    waits = (0, 6, 0.4, 0)
+    assert of(waits, (4, 20, 19.7, 1)) == [5, 19.7]
+    assert of(waits, (7, 20, 20, 1)) == [6, 20]
+    assert of(waits, (4, 20, 20, 1), here=[1, 2]) == [6, 20]
+
+
+def test_cpus_that_were_busy() -> None:
+    assert of((0, 17, 10, 0), (0, 20, 10, 0), cpus=1) == approx([10, 10], abs=1.2)
+    assert of((0, 20, 10, 0), (0, 20, 10, 0), cpus=3) == [20, 20]
+    assert of((0, 20, 10, 0), (0, 20, 10, 0)) == [20, 20]
+
+
+def test_what_takes_more_where_the_worker_had_slept() -> None:
+    """Of the second callback too little is known: the difference is that of the first."""
+    callback = np.array([0] * 10 + [1, 1])
+    warm = np.array([True, False] * 6)
+    took = np.array([100, 130] * 5 + [500, 10])
+    assert colder(callback, warm, took).tolist() == [-30, 30] * 5 + [-30, 5]
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(
+    st.integers(0, 10), st.integers(0, 10), st.integers(-1, 10), st.integers(0, 2)),
+    min_size=1, max_size=20), st.integers(0, 3), st.integers(1, 5), st.integers(1, 30),
+    st.integers(1, 4))
+def test_never_longer_and_alone_never_less_than_it_computed(
+    ran: list[Ran], cpus: int, callbacks: int, window: int, workers: int
+) -> None:
+    """Also where the windows part what runs."""
+    with MonkeyPatch.context() as patch:
+        patch.setattr(module, 'WINDOW', window)
+        found = of(
+            *ran, cpus=cpus, callbacks=[i % callbacks for i in range(len(ran))],
+            workers=workers)
+    for (_, took, cpu, _), alone_ in zip(ran, found):
+        assert min(cpu, took) <= alone_ <= took
+
+
+Executions = list[tuple[int, 'int | None', int, int, int]]
+"""Worker, group, when it was ready, its start and its end."""
+
+
+def dispatches(n_workers: int, executions: Executions) -> Dispatches:
+    worker, group, ready, start, end = (
+        np.array([-1 if each is None else each for each in column], dtype=np.int64)
+        for column in zip(*executions))
+    return Dispatches(n_workers, worker, group, ready, start, end, np.ones_like(worker))
+
+
+def late(n_workers: int, *executions: tuple[int, int | None, int, int, int]) -> list[int]:
+    return dispatches(n_workers, [*executions]).late().tolist() if executions else []
+
+
+@pytest.mark.parametrize(('workers', 'executions', 'expected'), [
+    # an idle worker could have started it at once
+    (2, [(0, None, 100, 130, 500)], [30]),
+    # all are busy: it waits for its worker
+    (1, [(0, None, 0, 0, 400), (0, None, 100, 430, 500)], [0, 30]),
+    # its worker is busy, another one is idle
+    (2, [(0, None, 0, 0, 400), (0, None, 350, 430, 500)], [0, 80]),
+    # the idle worker is that of an execution which was ready before
+    (2, [(0, None, 0, 0, 400), (1, None, 90, 150, 420), (0, None, 100, 430, 500)], [0, 60, 30]),
+    # it waits for its group
+    (7, [(0, 5, 0, 0, 400), (1, 5, 100, 410, 500)], [0, 10]),
+    # meanwhile others occupy the workers
+    (2, [(0, 5, 0, 0, 400), (0, None, 390, 400, 500), (0, 5, 100, 510, 600),
+         (1, None, 0, 0, 600)], [0, 0, 10, 0]),
+    # an unknown worker is not waited for
+    (1, [(-1, None, 0, 0, 400), (-1, None, 100, 430, 500)], [0, 330]),
+])
+def test_by_hand(workers: int, executions: Executions, expected: list[int]) -> None:
+    assert late(workers, *executions) == expected
+
+
+def test_a_worker_is_warm_that_has_only_just_ended_another() -> None:
+    found = dispatches(2, [
+        (worker, None, 1000 * start, 1000 * start, 1000 * end) for worker, start, end in (
+            (0, 500, 510), (0, 600, 700), (1, 710, 720), (0, 801, 810))])
+    assert found.warm().tolist() == [False, True, False, False]
+
+
+@given(st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), max_size=20))
+def test_a_schedule_without_overhead_has_none(jobs: list[tuple[int, int]]) -> None:
+    free = [0, 0, 0]
+    executions = []
+    for ready, takes in sorted(jobs):  # first come, first served
+        worker = free.index(min(free))
+        start = max(ready, free[worker])
+        free[worker] = start + takes
+        executions.append((worker, None, ready, start, free[worker]))
+    assert late(3, *executions) == [0] * len(jobs)
+
+
+def test_waiting_for_what_computes_is_not_late() -> None:
+    """Three that compute, one after the other; a fourth overtakes; one that only waits."""
+    ms = 1_000_000
+    first, overtakes, second, waits, third = range(5)
+    found = dispatches(5, [
+        (0, None, 0, 30, 10 * ms), (3, None, 4 * ms, 5 * ms + 7, 6 * ms),
+        (1, None, 0, 10 * ms + 50, 20 * ms), (4, None, 12 * ms, 13 * ms + 9, 22 * ms),
+        (2, None, 15 * ms, 20 * ms + 60, 30 * ms)])
+    # who overtakes and who only waits could begin at once; the machine tells why they did not
+    assert found.late([first, second, third, overtakes]).tolist() == [
+        30, ms + 7, 50, ms + 9, 60]
+    assert waits == 3
+
+
+TIMER, MESSAGE = 200_000, 400_000
+
+
+def recorded(count: int) -> tuple[Recorded, Noticed]:
+    """
+    Return executions of 5 ms of CPU time, one each 20 ms, and what was noticed.
+
+    In turn: a timer while one computes, a message, nothing; a timer and a message where nothing
+    computes.
+    """
+    could, took, due, ready, timer = [], [], [], [], []
+    for turn in range(count):
+        begin = 20 * MS * turn
+        what = turn % 3
+        could.append(begin)
+        took.append(5 * MS + (TIMER, MESSAGE, 0)[what])
+        if what < 2:
+            due.append(begin + MS)
+            ready.append(begin + MS + SWITCH_NS + 150_000)
+            timer.append(what == 0)
+        due += [begin + 10 * MS, begin + 15 * MS]
+        ready += [begin + 10 * MS + 120_000, begin + 15 * MS + 180_000]
+        timer += [True, False]
+    one = np.ones(count, dtype=np.int64)
+    return Recorded(
+        np.array(could), np.array(took), 5 * MS * one, one > 0, one, one, one > 0), Noticed(
+        np.array(due), np.array(ready), np.ones(len(due), dtype=np.int64), np.array(timer))
+
+
+def test_who_computes_and_what_is_ready_show_what_noticing_took() -> None:
+    ran, noticed = recorded(60)
+    costs = noticed.costs(ran)
+    assert costs == Costs(TIMER, 120_000, MESSAGE, 150_000, Costs().send_ns)
+
+
+def test_what_an_intake_did_ends_when_it_had_done_all() -> None:
+    ran, noticed = recorded(60)
+    costs = noticed.costs(ran)
+    did = noticed.executions(costs)
+    rest = np.where(noticed.timer, costs.timer_rest, costs.message_rest)
+    assert (did.could + did.took == noticed.ready + rest).all()
+    assert (did.could <= noticed.due).all() and did.locks.all()
+    assert (did.took >= did.cpu).all()
+
+
+STEP = PoolUse.FIRST_STEP_NS
+SPANS = st.lists(st.tuples(st.integers(0, 10 ** 13), st.integers(0, 10 ** 11)), max_size=30)
+
+
+@given(SPANS)
+def test_no_time_is_lost_and_steps_are_few(spans: list[tuple[int, int]]) -> None:
+    starts = np.array([start for start, _ in spans], dtype=np.int64)
+    took = np.array([each for _, each in spans], dtype=np.int64)
+    result = PoolUse(starts, starts + took).result()
+    assert sum(result['busy_ns']) == int(took.sum())
+    assert len(result['busy_ns']) <= PoolUse.MOST_STEPS
+    busy = [(start, start + took) for start, took in spans if took]
+    if busy:
+        assert result['start_ns'] <= min(busy)[0] < result['start_ns'] + result['step_ns']
+        assert result['step_ns'] % STEP == 0
+
+
+def test_waits_for_the_group() -> None:
+    groups = Entities(by_address=True)
+    groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 50, 'mutually_exclusive'))
+    groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 60, 'reentrant'))
+    for entity, group in ((1, 50), (2, 50), (3, 60)):
+        groups.take(('ros2:rcl_timer_init', 0, 0, 0, entity, 5))
+        groups.take(('ros2:rclcpp_timer_callback_added', 0, 0, 0, entity, entity))
+        groups.take(('ros2_caret:callback_group_add_timer', 0, 0, 0, group, entity))
+    pieces = [(1, 0, 2, 10), (2, 4, 12, 20), (3, 5, 20, 30), (1, 8, 25, 30), (9, 0, 40, 41)]
+    callback, ready, start, end = (list(column) for column in zip(*pieces))
+    task_set = small()
+    recording = Recording(
+        'by hand', Head(0, '', '', 'rad', 1, 0, 0, False), task_set, task_set, groups,
+        executions=rows(EXECUTIONS, len(pieces), callback=callback, vertex=-1, ready=ready,
+                        began=start, start=start, end=end))
+    # the second from 4 to 10; the last of the group from 8 to 10 and from 12 to 20
+    assert group_waits(recording).tolist() == [0, 6, 0, 10, 0]
+
+
+def test_what_computed_and_held_the_interpreter(tmp_path: Path) -> None:
+    """Executions whose CPU time is not recorded are left out."""
+    path, text = tmp_path / 'a.mcap', 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, ' \
+        'timer: 100ms, deadline: 50ms}]}]'
+    took = [(4, 3, True), (2, 0, False), (9, None, False)]
+    with TraceFile(path) as file:
+        file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
+        for job, (busy, cpu, held) in enumerate(took):
+            start = START_TIME + job * 100 * MS
+            end = start + busy * MS
+            file.add('job_release', start, 1, 1, 0, job, start)
+            add_execution(file, start, end, 0, 0, job,
+                          computed=() if cpu is None else (cpu * MS, held))
+    use = replay(path).result()['callbacks']['/n:a']
+    assert (use['executions'], use['measured'], use['measured_busy_ns']) == (3, 2, 6 * MS)
+    assert (use['cpu_ns'], use['held_interpreter']) == (3 * MS, 1)
