@@ -171,7 +171,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 def test_colcon_test_runs_the_tests(workspace: Path):
     done = colcon(
         workspace, 'test', '--packages-select', NAME, '--return-code-on-test-failure',
-        '--pytest-args', 'test/msg_graph/test_duration.py')
+        '--pytest-args', 'test/msg_graph/test_model.py')
     assert done.returncode == 0, done.stdout + done.stderr
     done = colcon(workspace, 'test-result', '--all')
     assert done.returncode == 0 and '0 errors, 0 failures' in done.stdout

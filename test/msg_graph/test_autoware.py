@@ -59,22 +59,6 @@ def test_load_is_that_of_the_paper(autoware: TaskSet) -> None:
     assert sum(share for share in shares if share) / 7 == pytest.approx(0.729, abs=0.001)
 
 
-def test_paths_run_end_to_end(autoware: TaskSet) -> None:
-    tasks = autoware
-    assert len(tasks.queue_edges) == 32
-    paths = {path.name: path.callbacks for path in tasks.paths}
-    assert set(paths) == {
-        'lidar_to_control', 'obstacle_to_control', 'lidar_to_pose', 'imu_to_control',
-        'vehicle_to_control'}
-    assert all(path[-1] == '/pacmod_interface:callback_04' for path in paths.values())
-    dags = []
-    for key in paths['lidar_to_control']:
-        dag, = {tasks.dags[v.dag].name for v in tasks.vertices if v.callback.key == key}
-        if dag not in dags[-1:]:
-            dags.append(dag)
-    assert dags == ['top_lidar', 'perception', 'planning', 'control']
-
-
 def test_only_deadlines_differ(autoware: TaskSet, multi: TaskSet) -> None:
     assert multi.queue_edges == autoware.queue_edges
     assert multi.paths == autoware.paths
@@ -84,19 +68,6 @@ def test_only_deadlines_differ(autoware: TaskSet, multi: TaskSet) -> None:
         for v, w in zip(one.vertices, other.vertices):
             assert (v.name, v.predecessors, v.callback.execution_time) == (
                 w.name, w.predecessors, w.callback.execution_time)
-
-
-def test_deadlines_can_be_met(multi: TaskSet) -> None:
-    """No new deadline is below the sum of the 95 % quantiles along its longest path."""
-    for name in UNEQUAL:
-        dag = multi.dag(name)
-        p95 = [
-            v.callback.execution_time.draw(0.95) for v in dag.vertices
-            if v.callback.execution_time is not None]
-        lengths = model.path_lengths(dag, p95)
-        for sink in dag.sinks:
-            deadline = dag.vertices[sink].deadline_ns
-            assert deadline is not None and lengths[sink] <= deadline
 
 
 def test_the_reference_system_as_described() -> None:

@@ -59,19 +59,6 @@ def test_periods_may_be_rounded() -> None:
     assert key(binder.bind(Entity('/a', 'timer', '', 9_999_999))) == '/a:t0'
 
 
-def test_the_nearest_period_is_meant() -> None:
-    tasks = graph("""
-        - node: /n
-          callbacks:
-            - {name: a, timer: 10ms, deadline: 1ms, dag: a}
-            - {name: b, timer: 10.005ms, deadline: 1ms, dag: b}
-    """)
-    binder = Binder(tasks)
-    assert key(binder.bind(Entity('/n', 'timer', '', 10_005_001))) == '/n:b'
-    assert key(binder.bind(Entity('/n', 'timer', '', 10_005_001))) == '/n:a'
-    assert binder.bind(Entity('/n', 'timer', '', 10_005_001)) is None
-
-
 def test_every_callback_can_be_bound_once() -> None:
     binder = Binder(TASKS)
     assert binder.unbound() == list(TASKS.callbacks)
@@ -129,24 +116,6 @@ def test_a_namespace_more_or_another_period_is_probably_meant(
         callback: str, seen: Entity, question: str | None) -> None:
     assert meant(TASKS.callback(callback), [Entity('/other', seen.kind, '/z', 1000), seen]) \
         == question
-
-
-def test_of_several_that_are_started_alike_only_a_similar_name_is_probably_meant() -> None:
-    callback = TASKS.callback('/b:t')
-    others = [Entity(node, 'timer', '', 33_333_333) for node in ('/xyz', '/uvw')]
-    assert meant(callback, others) is None
-    assert meant(callback, [*others, Entity('/bb', 'timer', '', 33_333_333)]) == \
-        "did you mean the node '/bb'?"
-
-
-def test_a_namespace_less_is_probably_meant() -> None:
-    tasks = graph("""
-- node: /robot/b
-  callbacks:
-    - {name: s, subscription: /robot/x, period: 1s, deadline: 1ms}
-""")
-    assert meant(tasks.callback('/robot/b:s'), [Entity('/b', 'subscription', '/x')]) == \
-        "did you mean the node '/b'?"
 
 
 @pytest.mark.parametrize(('symbol', 'name'), [

@@ -107,11 +107,3 @@ def test_what_may_run_in_another_process() -> None:
     assert kinds(drift(loads(text), seen)) == [('never ran', '/b:e')]
     seen.nodes = {'/a', '/b'}
     assert kinds(drift(loads(text), seen)) == [('never ran', '/b:e'), ('never ran', '/b:w')]
-
-
-def test_results() -> None:
-    seen = observed()
-    seen.got['/b:m'] = 0
-    assert drift(TASKS, seen)[0].result() == {
-        'kind': 'rate', 'callback': '/b:m', 'topic': None, 'declared': 50, 'observed': 0,
-        'text': '/b:m got 0 messages, and by the declaration 50 were due'}

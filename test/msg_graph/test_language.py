@@ -109,39 +109,23 @@ def test_quantiles_without_shares_are_evenly_spaced(count: int) -> None:
     assert (time.mean_ns, time.draw(0.99)) == (50_000, 99_000)
 
 
-def test_a_period_that_agrees_with_the_timer_is_allowed() -> None:
-    tasks = graph("""
-        - node: /a
-          callbacks:
-            - {name: t, timer: 100ms, period: 0.1s, deadline: 1s, release_from: arrival}
-    """)
-    assert tasks.dags[0].period_ns == 100_000_000
-
-
 HEAD = 'nodes:\n- node: /a\n  callbacks:\n  - {name: t, timer: 1ms, deadline: 1ms}\n'
 
 
 @pytest.mark.parametrize('text, says', [
     (HEAD + '', "'mddag' is missing: add 'mddag:'"),
     (f'mddag: 2 {MARK}\n' + HEAD, "'2' is no known version"),
-    (f'mddag: [1] {MARK}\n' + HEAD, "'mddag': is a list"),
     (f'mddag: {MARK}\n' + HEAD, "'mddag' has no value"),
     ('mddag: 1\n', "'nodes' is missing"),
     (f'mddag: 1\nnodes: {MARK}\n', "'nodes' has no value"),
     (f'mddag: 1\nnodes: [] {MARK}\n', "'nodes' is empty"),
-    (f'mddag: 1\nnodes: {{}} {MARK}\n', "'nodes' is a mapping"),
     (f'mddag: 1\nnodes:\n- /a {MARK}\n', "node 1 is the text '/a'"),
-    (f'mddag: 1\nnodes:\n- {MARK}\n', 'node 1 is empty'),
     (f'mddag: 1\nnode: [] {MARK}\n', "unknown key 'node': did you mean 'nodes'?"),
     (f'mddag: 1\nxyz: [] {MARK}\n',
      "unknown key 'xyz': use mddag, workers, nodes, processes, paths"),
     (f'mddag: 1\nworkers: 0 {MARK}\n' + HEAD, 'from 1 to 4096'),
-    (f'mddag: 1\nworkers: -7 {MARK}\n' + HEAD, 'from 1 to 4096'),
     (f'mddag: 1\nworkers: 4097 {MARK}\n' + HEAD, 'from 1 to 4096'),
     (f'mddag: 1\nworkers: seven {MARK}\n' + HEAD, 'whole number'),
-    (f'mddag: 1\nworkers: 7.0 {MARK}\n' + HEAD, 'whole number'),
-    (f'mddag: 1\nworkers: "7" {MARK}\n' + HEAD, 'whole number'),
-    (f'mddag: 1\nworkers: [7] {MARK}\n' + HEAD, 'a list'),
     (f'mddag: 1\nworkers: {"9" * 5000} {MARK}\n' + HEAD, 'whole number'),
 ])
 def test_head(text: str, says: str) -> None:
@@ -153,10 +137,7 @@ def test_head(text: str, says: str) -> None:
 
 @pytest.mark.parametrize('entry, says', [
     (f'node: a {MARK}', ["'a' is not an absolute node name: write it in full, as '/a'"]),
-    (f'node: ~/a {MARK}', ["as '/a'"]),
     (f'node: /a//b {MARK}', ["'/a//b' is not a valid node name"]),
-    (f'node: /a/ {MARK}', ['not a valid node name']),
-    (f'node: /1a {MARK}', ['start with no digit']),
     (f'node: /a-b {MARK}', ['not a valid node name']),
     (f'node: "/a\\nb" {MARK}', ["'/a\\nb' is not a valid"]),
     (f'node: /{"a" * 300} {MARK}', ['too long']),
@@ -169,18 +150,10 @@ def test_node_names(entry: str, says: list[str]) -> None:
         f'- {entry}\n  callbacks:\n  - {{name: t, timer: 1ms, deadline: 1ms}}\n', *says)
 
 
-def test_node_without_callbacks() -> None:
-    nodes_error(f'- node: /a {MARK}\n', "node '/a': 'callbacks' is missing")
-    nodes_error(f'- node: /a\n  callbacks: [] {MARK}\n', "'callbacks' is empty")
-    nodes_error(f'- callbacks: [] {MARK}\n', "node 1: 'node' is missing")
-
-
 @pytest.mark.parametrize('entries, says', [
     # names
     ([f'timer: 1ms {MARK}'], ["callback 1 of node '/a': 'name' is missing"]),
     ([f'name: "a b" {MARK}'], ["'a b' is no name for a callback"]),
-    ([f'name: a:b {MARK}'], ['no name for a callback']),
-    ([f'name: a@b {MARK}'], ['no name for a callback']),
     ([f'name: {"n" * 300} {MARK}'], ['too long']),
     # unknown keys
     (['name: t', f'subscribtion: /x {MARK}'],
@@ -202,39 +175,25 @@ def test_node_without_callbacks() -> None:
     (['name: t', f'sync: [/x] {MARK}'], ["here is 1: give at least 2, or write 'subscription:'"]),
     (['name: t', f'sync: [/x, /x] {MARK}'], ["'/x' is listed twice"]),
     (['name: t', 'sync:', '- /x', f'- [/y] {MARK}'], ["'sync': is a list"]),
-    (['name: t', 'sync:', '- /x', f'- {MARK}'], ["'sync': has an empty entry"]),
     (['name: t', f'service: /x/ {MARK}'], ['not a valid service name']),
     # times
     (['name: t', f'timer: 100 {MARK}'],
      ["callback '/a:t': 'timer': '100' has no unit: add one, as '100ms'"]),
-    (['name: t', f'timer: -1ms {MARK}'], ['negative']),
-    (['name: t', f'timer: 0s {MARK}'], ['too short']),
-    (['name: t', f'timer: 10ns {MARK}'], ['at least 1us']),
-    (['name: t', f'timer: 25000min {MARK}'], ['at most 86400s']),
-    (['name: t', f'timer: .nan {MARK}'], ['not a time']),
     (['name: t', f'timer: often {MARK}'], ['not a time']),
     (['name: t', f'timer: [1ms] {MARK}'], ["'timer' is a list"]),
     (['name: t', f'timer: {MARK}'], ["'timer' has no value"]),
     (['name: t', 'timer: 1ms', f'period: 2ms {MARK}'],
      ['period of 2ms is not that of its timer, 1ms']),
-    (['name: t', 'subscription: /x', f'period: 0ms {MARK}'], ["'period': '0ms' is too short"]),
-    (['name: t', 'timer: 1ms', f'deadline: -1ms {MARK}'], ["'deadline': '-1ms' is negative"]),
-    (['name: t', 'timer: 1ms', f'deadline: 2000min {MARK}'], ["'deadline': '2000min' is too"]),
     (['name: t', 'timer: 1ms', f'deadline: {{}} {MARK}'], ["'deadline' is a mapping"]),
     # execution times
-    (['name: t', 'timer: 1ms', f'execution_time: 0ms {MARK}'], ['too short']),
-    (['name: t', 'timer: 1ms', f'execution_time: 3 {MARK}'], ['no unit']),
     (['name: t', 'timer: 1ms', f'execution_time: [3ms] {MARK}'],
      ["execution time of callback '/a:t' is a list: write a mapping"]),
     (['name: t', 'timer: 1ms', f'execution_time: {{}} {MARK}'], ["'quantiles_us' is missing"]),
     (['name: t', 'timer: 1ms', f'execution_time: {{quantiles: [1]}} {MARK}'],
      ["did you mean 'quantiles_us'?"]),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: 1}} {MARK}'], ['the text']),
     (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: []}} {MARK}'], ['is empty']),
     (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, x]}} {MARK}'],
      ["'x' is not a number"]),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, [2]]}} {MARK}'],
-     ['a list is not a number']),
     (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, .nan]}} {MARK}'],
      ["'.nan' is not a number"]),
     (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 1e999]}} {MARK}'],
@@ -243,16 +202,12 @@ def test_node_without_callbacks() -> None:
      ['rising order']),
     (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [-1, 1]}} {MARK}'],
      ['negative']),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [0, 0]}} {MARK}'],
-     ['makes no sense']),
     (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 1e12]}} {MARK}'],
      ['makes no sense']),
     (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 2], percent: [1]}} {MARK}'],
      ['the number of shares is 1, that of quantiles 2']),
     (['name: t', 'timer: 1ms',
       f'execution_time: {{quantiles_us: [1, 2], percent: [5, 5]}} {MARK}'], ['do not rise']),
-    (['name: t', 'timer: 1ms',
-      f'execution_time: {{quantiles_us: [1, 2], percent: [-1, 5]}} {MARK}'], ['0 and 100']),
     (['name: t', 'timer: 1ms',
       f'execution_time: {{quantiles_us: [1, 2], percent: [1, 101]}} {MARK}'], ['0 and 100']),
     (['name: t', 'timer: 1ms', 'execution_time:', '  quantiles_us: [1,', f'    x] {MARK}'],
@@ -301,23 +256,6 @@ def test_overload_keys() -> None:
     assert (source.keep, source.importance, source.tolerate) == ('newest', 'normal', None)
     assert (sink.keep, sink.importance, sink.tolerate) == ('newest', 'high', WeaklyHard(2, 50))
     assert (str(sink.tolerate), tasks.dags[0].on_late) == ('2 of 50', 'demote')
-
-
-def test_duplicate_callback_names() -> None:
-    text = f"""
-        - node: /a
-          callbacks:
-            - {{name: t, timer: 1ms, deadline: 1ms}}
-        - node: /b
-          callbacks:
-            - {{name: t, timer: 1ms, deadline: 1ms}}
-        - node: /a
-          callbacks:
-            - timer: 2ms
-              name: t {MARK}
-              deadline: 1ms
-    """
-    nodes_error(text, "callback '/a:t': this name is taken in line 6")
 
 
 PATHS = """\

@@ -1,16 +1,23 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Execution times, look-ups, and that nothing can be changed."""
+"""Execution times, durations, longest paths and load; look-ups by name."""
 
 from __future__ import annotations
 
-import copy
-from dataclasses import fields, FrozenInstanceError
-import pickle
+from itertools import permutations
 
 from hypothesis import given
 from hypothesis import strategies as st
-from msg_graph import ExecutionTime, GraphError, TaskSet
+from msg_graph import (
+    Dag,
+    DurationError,
+    ExecutionTime,
+    format_duration,
+    loads,
+    model,
+    parse_duration,
+)
+from msg_graph.duration import DAY, exact_duration, whole_us
 import pytest
 
 from .helpers import graph
@@ -36,12 +43,6 @@ def test_draws_between_the_quantiles() -> None:
     time = distribution([100, 200, 400], [0.0, 50.0, 100.0])
     assert [time.draw(u) for u in (0.0, 0.25, 0.5, 0.75, 1.0)] == [100, 150, 200, 300, 400]
     assert time.mean_ns == 225
-
-
-def test_is_flat_beyond_the_outer_quantiles() -> None:
-    time = distribution([100, 200], [25.0, 75.0])
-    assert [time.draw(u) for u in (0.0, 0.25, 0.5, 0.75, 1.0)] == [100, 100, 150, 200, 200]
-    assert time.mean_ns == 150
 
 
 @pytest.mark.parametrize('u', [-0.1, 1.1, float('nan'), float('inf')])
@@ -79,29 +80,143 @@ def test_looks_up_by_name() -> None:
             lookup('/c:t')
 
 
-def test_nothing_can_be_changed() -> None:
-    tasks = graph(TWO)
-    for thing in (
-        tasks, tasks.dags[0], tasks.vertices[0], tasks.callbacks[0],
-        distribution([1], [50.0]),
-    ):
-        for field in fields(thing):
-            with pytest.raises(FrozenInstanceError):
-                setattr(thing, field.name, None)
-        hash(thing)
+def test_unknown_where_an_execution_time_is_missing() -> None:
+    dag = graph("""
+        - node: /n
+          callbacks:
+            - {name: t, timer: 10ms, publishes: [/a], execution_time: 1ms}
+            - {name: s, subscription: /a, deadline: 1ms}
+    """).dags[0]
+    assert model.mean_execution_times(dag) is None
+    assert model.load_of(dag) is None
 
 
-@pytest.mark.parametrize('clone', [copy.copy, copy.deepcopy, lambda x: pickle.loads(
-    pickle.dumps(x))])
-def test_copies_are_equal_and_work(clone) -> None:  # type: ignore[no-untyped-def]
-    tasks = graph(TWO)
-    other: TaskSet = clone(tasks)
-    assert other == tasks
-    assert other.vertex('/a:t') == tasks.vertex('/a:t')
+@st.composite
+def weighted(draw: st.DrawFn) -> tuple[Dag, list[int]]:
+    """Draw a DAG of up to seven vertices, in a random file order, with weights."""
+    count = draw(st.integers(1, 7))
+    order = draw(st.permutations(range(count)))
+    before = {i: draw(st.sets(st.integers(0, i - 1), min_size=1)) for i in range(1, count)}
+    lines = ['mddag: 1', 'nodes:', '- node: /n', '  callbacks:']
+    for i in order:
+        start = 'timer: 10ms'
+        if i:
+            topics = [f'/t{b}' for b in sorted(before[i])]
+            start = (f'sync: [{", ".join(topics)}]' if len(topics) > 1
+                     else f'subscription: {topics[0]}')
+        sink = not any(i in each for each in before.values())
+        lines.append(
+            f'  - {{name: c{i}, {start}, publishes: [/t{i}]{", deadline: 1ms" * sink}}}')
+    weights = draw(st.lists(st.integers(0, 9), min_size=count, max_size=count))
+    return loads('\n'.join(lines)).dags[0], weights
 
 
-def test_error_survives_pickling() -> None:
-    error = GraphError('f.yaml', 3, 'what', 'do')
-    other = pickle.loads(pickle.dumps(error))
-    assert str(other) == 'f.yaml:3: what: do'
-    assert (other.file, other.line, other.problem, other.remedy) == ('f.yaml', 3, 'what', 'do')
+@given(weighted())
+def test_path_lengths_are_those_of_all_paths(case: tuple[Dag, list[int]]) -> None:
+    dag, weights = case
+    best = 0
+    for length in range(len(dag.vertices)):
+        for rest in permutations(range(len(dag.vertices)), length + 1):
+            if all(step in dag.edges for step in zip(rest, rest[1:])):
+                best = max(best, sum(weights[i] for i in rest))
+    assert max(model.path_lengths(dag, weights)) == best
+
+
+@pytest.mark.parametrize('text, ns', [
+    ('100ms', 100_000_000),
+    ('20 us', 20_000),
+    ('1.5s', 1_500_000_000),
+    ('1500ns', 1_500),
+    ('2min', 120_000_000_000),
+    ('20µs', 20_000),
+    ('20μs', 20_000),
+    ('.5ms', 500_000),
+    ('5.ms', 5_000_000),
+    ('+1ms', 1_000_000),
+    (' 1ms\t', 1_000_000),
+    ('33.333333333ms', 33_333_333),
+    ('1us', 1_000),
+    ('86400s', 86_400_000_000_000),
+    ('0.1s', 100_000_000),
+])
+def test_reads_times(text: str, ns: int) -> None:
+    assert parse_duration(text) == ns
+
+
+@pytest.mark.parametrize('text, says', [
+    ('100', 'has no unit'),
+    ('1.5', "'1.5ms'"),
+    ('5 sec', "unknown unit 'sec'"),
+    ('100 MS', "unknown unit 'MS'"),
+    ('1h', "unknown unit 'h'"),
+    ('-5ms', 'is negative'),
+    ('-0ms', 'is negative'),
+    ('0ms', 'too short'),
+    ('999ns', 'at least 1us'),
+    ('1ns', 'at least 1us'),
+    ('86401s', 'at most 86400s'),
+    ('999999999999999999min', 'at most 86400s'),
+    ('nan', 'is not a time'),
+    ('inf', 'is not a time'),
+    ('nanms', 'is not a time'),
+    ('1e9s', 'is not a time'),
+    ('1_000ms', 'is not a time'),
+    ('1,5s', 'is not a time'),
+    ('soon', 'is not a time'),
+    ('', 'is not a time'),
+    ('ms', 'is not a time'),
+    ('.ms', 'is not a time'),
+    ('١ms', 'is not a time'),
+    ('1ms 2us', 'is not a time'),
+    ('1\nms', 'is not a time'),
+    ('9' * 100 + 's', 'is not a time'),
+])
+def test_refuses_the_rest(text: str, says: str) -> None:
+    with pytest.raises(DurationError) as caught:
+        parse_duration(text)
+    assert says in str(caught.value)
+    assert caught.value.problem and caught.value.remedy
+    assert isinstance(caught.value, ValueError)
+    assert str(caught.value).isprintable()
+
+
+@given(st.text())
+def test_text_is_a_time_or_a_duration_error(text: str) -> None:
+    try:
+        assert 1_000 <= parse_duration(text) <= 86_400 * 10 ** 9
+    except DurationError as error:
+        assert str(error).isprintable()
+
+
+@pytest.mark.parametrize('ns, text', [
+    (0, '0ns'), (999, '999ns'), (1_000, '1us'), (1_500, '1.5us'), (100_000_000, '100ms'),
+    (1_234_567, '1.235ms'), (60_000_000_000, '60s'), (-1_500_000, '-1.5ms'),
+])
+def test_formats_times(ns: int, text: str) -> None:
+    assert format_duration(ns) == text
+
+
+@given(st.integers(1, 86_400_000))
+def test_format_reads_back(us: int) -> None:
+    exact = parse_duration(f'{us}us')
+    assert abs(parse_duration(format_duration(exact)) - exact) <= exact * 0.0005
+
+
+@pytest.mark.parametrize('ns', [-1, -2**63, DAY + 1, 2**63 - 1])
+def test_what_no_declaration_can_say_has_an_exact_text_too(ns: int) -> None:
+    """Traces say such things; the reader of the text then says what is wrong."""
+    assert exact_duration(ns) == f'{ns}ns'
+
+
+@pytest.mark.parametrize(('ns', 'text'), [
+    (1, '1ns'), (999, '999ns'), (1_000, '1us'), (1_001, '1.001us'), (1_234_567, '1234.567us'),
+    (1_234_000, '1.234ms'), (1_500_000_000, '1.5s'), (DAY, '86400s')])
+def test_exact_ones_are_short(ns: int, text: str) -> None:
+    assert exact_duration(ns) == text
+    assert parse_duration(text, minimum_ns=1) == ns
+
+
+def test_deadlines_are_whole_us() -> None:
+    assert [whole_us(ns) for ns in (0, 1, 1_000, 1_000.5, 1_001)] == [
+        1_000, 1_000, 1_000, 2_000, 2_000]
+    assert whole_us(float('inf')) == whole_us(DAY + 1) == DAY
