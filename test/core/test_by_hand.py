@@ -85,92 +85,10 @@ def test_equal_deadlines_go_by_vertex_then_by_dag(policy: str) -> None:
         'a.0', 'b.0', 'a2.0']
 
 
-def test_rm_goes_by_period_and_wc_by_job_index_whatever_the_period() -> None:
-    callbacks = [single('short', 5), source('long', 20), after('long', 'end', 20)]
-    ticks = {'short': 4, 'long': 4, 'end': 4}
-    # 4: long, as short.1 comes at 5. 8: short.1 (ready at 5) or end.0 (ready at 8).
-    assert starts(case(callbacks, ticks, policy='rm'), 20) == [
-        'short.0', 'long.0', 'short.1', 'short.2', 'short.3']
-    assert starts(case(callbacks, ticks, policy='wc'), 20) == [
-        'short.0', 'long.0', 'end.0', 'short.1', 'short.2']
-
-
-@pytest.mark.parametrize('policy', ['wc', 'fifo'])
-def test_at_one_instant_successors_come_before_releases(policy: str) -> None:
-    # At 10 s.1 ends and makes s2.1 ready; long.1 (job 1 as well) and s.2 are released. Under rm,
-    # where period and job index come first, there is no such tie.
-    callbacks = [single('long', 10), source('s', 5), after('s', 's2', 90)]
-    ticks = {'long': 1, 's': 4, 's2': 1}
-    assert starts(case(callbacks, ticks, policy=policy), 12) == [
-        'long.0', 's.0', 's2.0', 's.1', 's2.1', 'long.1']
-
-
-@pytest.mark.parametrize('policy', ['fifo', 'wc', 'rm'])
-def test_completions_at_one_instant_go_by_worker_then_the_last_listed_first(policy: str) -> None:
-    # a publishes x and y, in this order; a3 takes x, so the edges of a are listed a3, a2, a4.
-    callbacks = [source('a', 50), after('y', 'a2', 50), after('x', 'a3', 50), after('y', 'a4', 50),
-                 source('b', 50), after('b', 'b2', 50)]
-    callbacks[0]['publishes'] = ['/x', '/y']
-    ticks = {'a': 2, 'a2': 1, 'a3': 1, 'a4': 1, 'b': 2, 'b2': 1}
-    assert log(case(callbacks, ticks, workers=2, policy=policy), 50) == [
-        (0, 'start', 0, 'a.0'), (0, 'start', 1, 'b.0'),
-        (2, 'end', 0, 'a.0'), (2, 'end', 1, 'b.0'),
-        (2, 'start', 0, 'a4.0'), (2, 'start', 1, 'a2.0'),
-        (3, 'end', 0, 'a4.0'), (3, 'end', 1, 'a2.0'),
-        (3, 'start', 0, 'a3.0'), (3, 'start', 1, 'b2.0'),
-        (4, 'end', 0, 'a3.0'), (4, 'end', 1, 'b2.0')]
-
-
 # --- workers and preemption ----------------------------------------------------------------------
 
 
-def test_of_equal_keys_the_worker_with_the_highest_number_is_preempted() -> None:
-    # 0: h on 0, a on 1, b on 2; 1: c on 0; 7: all three run with the period 50.
-    callbacks = [single('h', 7), single('a', 50), single('b', 50), single('c', 50)]
-    found = log(case(callbacks, {'h': 1, 'a': 20, 'b': 20, 'c': 20}, workers=3, policy='rm',
-                     preemptive=True), 8)
-    assert found[-3:] == [(7, 'preempt', 2, 'b.0'), (7, 'start', 2, 'h.1'), (8, 'end', 2, 'h.1')]
-
-
-def test_an_equal_priority_does_not_preempt() -> None:
-    # At 10 b.1 has the RAD 20, as has a.0 since 0; b would win the tie by its DAG's index.
-    callbacks = [single('b', 10, 10), single('a', 100, 20)]
-    plain = case(callbacks, {'b': 1, 'a': 15}, preemptive=True)
-    assert log(plain, 18) == [
-        (0, 'start', 0, 'b.0'), (1, 'end', 0, 'b.0'), (1, 'start', 0, 'a.0'),
-        (16, 'end', 0, 'a.0'), (16, 'start', 0, 'b.1'), (17, 'end', 0, 'b.1')]
-    callbacks = [single('b', 10, 9), single('a', 100, 20)]
-    strictly = case(callbacks, {'b': 1, 'a': 15}, preemptive=True)
-    assert (10, 'preempt', 0, 'a.0') in log(strictly, 18)
-    assert starts(case(callbacks, {'b': 1, 'a': 15}), 18) == ['b.0', 'a.0', 'b.1']
-
-
-def test_what_is_preempted_goes_behind_what_gets_ready_at_that_instant() -> None:
-    # rm. 1: v on worker 0, w on worker 1; 4: w ends and makes w2 ready, h and g come again:
-    # h takes worker 1, g takes worker 0 from v. 5: of v and w2 (both period 20, job 0) w2 goes
-    # first, as v was put back after w2 got ready.
-    callbacks = [single('h', 4), single('g', 4), single('v', 20), source('w', 20),
-                 after('w', 'w2', 20)]
-    ticks = {'h': 1, 'g': 1, 'v': 10, 'w': 3, 'w2': 10}
-    found = log(case(callbacks, ticks, workers=2, policy='rm', preemptive=True), 7)
-    assert [each for each in found if each[0] >= 4] == [
-        (4, 'end', 1, 'w.0'), (4, 'start', 1, 'h.1'), (4, 'preempt', 0, 'v.0'),
-        (4, 'start', 0, 'g.1'), (5, 'end', 0, 'g.1'), (5, 'end', 1, 'h.1'),
-        (5, 'start', 0, 'w2.0'), (5, 'start', 1, 'v.0')]
-
-
 # --- edges and groups ----------------------------------------------------------------------------
-
-
-def test_a_preempted_callback_keeps_its_group() -> None:
-    # At 6 a takes the worker from b, which keeps the group g: c.1 of g does not get in between.
-    callbacks = [single('a', 6, 2), single('c', 6, 3, group='g'), single('b', 40, 40, group='g')]
-    found = log(case(callbacks, {'a': 1, 'c': 1, 'b': 6}, preemptive=True), 12)
-    assert found == [
-        (0, 'start', 0, 'a.0'), (1, 'end', 0, 'a.0'), (1, 'start', 0, 'c.0'),
-        (2, 'end', 0, 'c.0'), (2, 'start', 0, 'b.0'), (6, 'preempt', 0, 'b.0'),
-        (6, 'start', 0, 'a.1'), (7, 'end', 0, 'a.1'), (7, 'start', 0, 'b.0'),
-        (9, 'end', 0, 'b.0'), (9, 'start', 0, 'c.1'), (10, 'end', 0, 'c.1')]
 
 
 # --- verdicts ------------------------------------------------------------------------------------

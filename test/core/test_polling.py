@@ -45,13 +45,6 @@ def test_what_becomes_ready_during_a_round_waits_for_the_next() -> None:
         'due.0', 'a.0', 'b.0', 'due.1']
 
 
-def test_a_callback_runs_once_in_a_round() -> None:
-    """Two runs of u wait when the executor polls at 6; b goes between them."""
-    callbacks = [single('u', 3), source('s', 100), after('s', 'b', 100)]
-    of = ros2(callbacks, {'u': 1, 's': 5, 'b': 1})
-    assert starts(of, 10) == ['u.0', 's.0', 'u.1', 'b.0', 'u.2', 'u.3']
-
-
 def test_workers_share_a_round() -> None:
     """Two workers take what one of them polled; the round goes on until it is empty."""
     callbacks = [single('x', 10), *(single(f'r{i}', 50) for i in range(3))]
@@ -88,32 +81,6 @@ def scheduler(workers: int = 1) -> Scheduler:
         {'node': '/n', 'name': 'tick', 'timer': '10us', 'deadline': '10us', 'dag': 't'}]),
         legs=True)
     return Scheduler(tables, workers, 'ros2', propagate=False)
-
-
-def test_legs_are_entities_of_their_own() -> None:
-    core = scheduler(workers=3)
-    slot = core.release(0, 0, 0, 0)
-    first, second = core.execution(slot, 1, 0), core.execution(slot, 1, 1)
-    core.ready(second, 1)
-    core.ready(first, 2)
-    other = core.execution(core.release(0, 1, 0, 2), 1, 1)
-    core.ready(other, 2)
-    assert core.queue_length == 3
-    assert [core.take(0, 3), core.take(1, 3)] == [second, first]  # one round, by arrival
-    assert core.take(2, 3) == other  # of the next one: its entity had one in this round
-
-
-def test_each_undeclared_callback_is_an_entity() -> None:
-    core = scheduler(workers=4)
-    others = [undeclared(core, i, -1, 0) for i in range(3)]
-    slot = core.release(1, 0, 0, 0)
-    core.ready(core.source(slot), 0)
-    assert core.take(0, 1) == core.source(slot)
-    late = core.source(core.release(1, 1, 1, 1))
-    core.ready(late, 1)
-    assert [core.take(worker, 1) for worker in (1, 2, 3)] == others  # before the timer
-    core.complete(others[0], 2)
-    assert core.take(1, 2) == late
 
 
 def test_dropped_ones_leave_the_queues() -> None:

@@ -1,17 +1,17 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What must hold of every schedule, read from its log alone."""
+"""What holds of every schedule and of its tables; the core against its twin by brute force."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.core import policy, rad_offsets, Tables
+from mddag_executor.core import POLICIES, policy, rad_offsets, Tables
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
@@ -33,10 +33,11 @@ from mddag_executor.simulate import END, LogEntry, PREEMPT, Settings
 from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import run_load
 from mddag_executor.simulate.machine import Machine
-from msg_graph import Dag
+from msg_graph import Dag, TaskSet
+import pytest
 
-from .dag_paths import laxity, reachable_sinks
-from .task_sets import Case, cases, examples, task_sets, TICK
+from .brute_force import BruteForce
+from .task_sets import Case, cases, declaration, examples, task_sets, TICK
 
 Id = tuple[int, int, int]
 """DAG, vertex in its DAG, job."""
@@ -62,139 +63,6 @@ def rad_offset(dag: Dag, index: int) -> int:
 def depth(dag: Dag, index: int) -> int:
     """Return how many vertices lie before one on the longest path to it."""
     return max((1 + depth(dag, p) for p in dag.vertices[index].predecessors), default=0)
-
-
-@dataclass
-class Moment:
-    """All that is ready and runs after what happened at one tick."""
-
-    now: int
-    started: list[Id]
-    preempted: list[tuple[Id, Id]]
-    running: dict[int, Id]
-    waiting: list[Id]
-    blocked: set[Id]
-
-
-class Schedule:
-    """A log of a run without bounds and aborts, taken apart tick by tick."""
-
-    def __init__(self, case: Case, horizon: int) -> None:
-        self.case = case
-        self.horizon = horizon
-        self.dags = case.task_set.dags
-        self.log = case.events(case.run(horizon))
-        self.end: dict[Id, int] = {}
-        for now, kind, _, dag, vertex, job in self.log:
-            if kind == 'end':
-                assert (dag, vertex, job) not in self.end, 'ended twice'
-                self.end[dag, vertex, job] = now
-        self.ready = self._ready_times()
-
-    def _ready_times(self) -> dict[Id, int]:
-        """Return when each execution became ready that did so before the horizon."""
-        ready = {}
-        for dag in self.dags:
-            for job in range(-(-self.horizon * TICK // dag.period_ns)):
-                for vertex in dag.vertices:
-                    ends = [self.end.get((dag.index, before, job), self.horizon)
-                            for before in vertex.predecessors]
-                    when = max(ends, default=job * dag.period_ns // TICK)
-                    if when < self.horizon:
-                        ready[dag.index, vertex.index, job] = when
-        assert {(d, v, job) for _, _, _, d, v, job in self.log} <= set(ready)
-        return ready
-
-    def group(self, each: Id) -> tuple[str, str] | None:
-        callback = self.dags[each[0]].vertices[each[1]].callback
-        return None if callback.group is None else (callback.node, callback.group)
-
-    def key(self, each: Id) -> tuple[int, ...]:
-        """Return the part of the documented key that does not depend on the order of events."""
-        d, v, job = each
-        dag = self.dags[d]
-        release = job * dag.period_ns
-        return {
-            'rad': (release + rad_offset(dag, v), v, d),
-            'gedf': (release + max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks), v, d),
-            'llf': (release + min(
-                laxity(dag, v, sink) for sink in reachable_sinks(dag, v)), v, d),
-            'dm': (rad_offset(dag, v), job),
-            'rm': (dag.period_ns, job), 'wc': (job,), 'fifo': (self.ready[each],),
-            'ros2': (0,),  # what waits for the next poll is not to be compared: see test_polling
-            'picas': self.chain(d, v),
-        }[self.case.policy]
-
-    def chain(self, d: int, v: int) -> tuple[int, ...]:
-        """Return the least (deadline, period, DAG, -depth, vertex) of a callback's vertices."""
-        callback = self.dags[d].vertices[v].callback
-        return min(
-            (rad_offset(dag, vertex.index), dag.period_ns, dag.index, -depth(dag, vertex.index),
-             vertex.index)
-            for dag in self.dags for vertex in dag.vertices if vertex.callback is callback)
-
-    def priority(self, each: Id) -> tuple[int, ...]:
-        """Return the part of the key that decides about preemption."""
-        return self.key(each) if self.case.policy == 'picas' else self.key(each)[:1]
-
-    def moments(self) -> Iterator[Moment]:
-        """Yield what is the case after each tick before the horizon at which something was."""
-        running: dict[int, Id] = {}
-        begun: set[Id] = set()
-        i = 0
-        while i < len(self.log) and self.log[i][0] < self.horizon:
-            now = self.log[i][0]
-            started: list[Id] = []
-            preempted: list[tuple[Id, Id]] = []
-            while i < len(self.log) and self.log[i][0] == now:
-                _, kind, worker, *rest = self.log[i]
-                each: Id = (rest[0], rest[1], rest[2])
-                if kind == 'start':
-                    assert worker not in running, 'two at once on a worker'
-                    assert each not in running.values(), 'one on two workers'
-                    if preempted and preempted[-1][1] == (-1, worker, -1):
-                        preempted[-1] = (preempted[-1][0], each)
-                    running[worker] = each
-                    begun.add(each)
-                    started.append(each)
-                else:
-                    assert running.pop(worker) == each
-                    if kind == 'preempt':
-                        preempted.append((each, (-1, worker, -1)))
-                i += 1
-            alive = [e for e, ready in self.ready.items()
-                     if ready <= now and self.end.get(e, now + 1) > now]
-            waiting = [e for e in alive if e not in running.values()]
-            held = {self.group(e): e for e in alive if e in begun and self.group(e) is not None}
-            blocked = {e for e in waiting if held.get(self.group(e), e) != e}
-            yield Moment(now, started, preempted, dict(running), waiting, blocked)
-
-
-plain_cases = cases(bounds=False)
-
-
-@examples(150)
-@given(plain_cases, st.integers(5, 50))
-def test_every_moment(case: Case, horizon: int) -> None:
-    """Order, work conservation, workers, groups and preemption, at every instant of a run."""
-    schedule = Schedule(case, horizon)
-    for moment in schedule.moments():
-        assert len(moment.running) <= case.workers
-        able = [e for e in moment.waiting if e not in moment.blocked]
-        if len(moment.running) < case.workers:
-            assert able == [], 'a worker idles while something may run'
-        for started in moment.started:
-            assert all(schedule.key(e) >= schedule.key(started) for e in able
-                       if e not in [victim for victim, _ in moment.preempted]), (
-                'a smaller key waits while a larger one starts')
-        for victim, preemptor in moment.preempted:
-            assert case.preemptive
-            assert schedule.priority(preemptor) < schedule.priority(victim), 'not smaller'
-        if case.preemptive and case.policy != 'fifo':  # a preemption makes fifo's keys anew
-            assert all(schedule.priority(e) >= schedule.priority(r) for e in able
-                       for r in moment.running.values()), 'a preemption was forgotten'
-        groups = Counter(schedule.group(e) for e in moment.running.values())
-        assert all(count == 1 for group, count in groups.items() if group is not None)
 
 
 @examples(100)
@@ -261,3 +129,113 @@ def test_rad_is_the_least_deadline_of_the_sinks_it_leads_to(task_set: Any) -> No
         assert rad_offsets(dag) == brute
         first = tables.first_vertex[dag.index]
         assert tables.rad_offset[first:first + len(dag.vertices)] == brute
+
+
+def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False,
+            last_release: int | None = None) -> BruteForce:
+    """Run a case both ways; every event and every verdict must be the same."""
+    run = case.run(horizon, judge, stop, last_release)
+    brute = BruteForce(
+        case.task_set, case.ticks, tick=TICK, horizon=horizon, workers=case.workers,
+        policy=case.policy, preemptive=case.preemptive, judge=judge, stop_at_first_miss=stop,
+        dispatch_overhead=case.dispatch_overhead, switch_overhead=case.switch_overhead,
+        last_release=last_release)
+    assert case.events(run) == brute.events
+    result = run.result()
+    for dag in result['dags'].values():
+        for sink in dag['sinks'].values():
+            sink.pop('demoted', None)  # counted when it is noticed
+    assert result['dags'] == brute.result()
+    assert result['first_miss'] == brute.first_miss()
+    assert result['deadline_missed'] == bool(brute.misses)
+    assert run.ended_ns == brute.now * TICK
+    return brute
+
+
+@pytest.mark.parametrize('policy', POLICIES)
+@examples(100)
+@given(st.data(), st.integers(5, 50), st.sampled_from(['horizon', 'completions']), st.booleans())
+def test_everything_at_once(
+    policy: str, data: st.DataObject, horizon: int, judge: str, stop: bool
+) -> None:
+    """Groups, bounds, aborts and overheads, or none of them, as in the paper."""
+    with_groups, with_bounds, overheads = (data.draw(st.booleans()) for _ in range(3))
+    compare(data.draw(cases((policy,), groups=with_groups, bounds=with_bounds,
+                            newest=with_bounds, overheads=overheads)), horizon, judge, stop)
+
+
+@examples(150)
+@given(cases(newest=True), st.integers(5, 30))
+def test_until_all_is_done(case: Case, last_release: int) -> None:
+    """Releases end and the run goes on until nothing is left: every job ends, and only once."""
+    work = sum(map(sum, case.ticks))
+    brute = compare(case, last_release * (1 + work), last_release=last_release)
+    assert all(job.outcome for job in brute.jobs)
+    assert not brute.waiting
+
+
+US = 1_000
+
+
+def two_dags() -> TaskSet:
+    return declaration([
+        {'node': '/a', 'name': 's', 'timer': '10us', 'publishes': ['/s', '/all'], 'dag': 'first',
+         'max_active_jobs': 4, 'on_late': 'abort', 'group': 'g'},
+        {'node': '/a', 'name': 'late', 'subscription': '/s', 'deadline': '30us', 'group': 'g'},
+        {'node': '/b', 'name': 't', 'timer': '20us', 'publishes': ['/t', '/all'],
+         'dag': 'second', 'group': 'g'},
+        {'node': '/a', 'name': 'mid', 'subscription': '/s', 'publishes': ['/mid']},
+        {'node': '/a', 'name': 'both', 'sync': ['/mid', '/s'], 'deadline': '25us'},
+        {'node': '/b', 'name': 'shared', 'subscription': '/all', 'deadline': '40us',
+         'group': 'g'},
+    ])
+
+
+def test_a_sync_has_a_leg_for_each_topic() -> None:
+    plain, legs = Tables.build(two_dags()), Tables.build(two_dags(), legs=True)
+    assert plain.n_legs == [1] * 8
+    assert plain.n_region == [5, 2, 1]
+    assert legs.n_legs == [1, 1, 1, 2, 1, 1, 1, 1]
+    assert legs.n_region == [6, 2, 1]
+    assert legs.region_offset == [0, 1, 2, 3, 5, 0, 1, 0]
+
+
+def test_a_sync_has_a_leg_for_each_publisher_of_a_topic() -> None:
+    tables = Tables.build(declaration([
+        {'node': '/n', 'name': 's', 'timer': '10us', 'publishes': ['/s', '/x'], 'dag': 'd'},
+        {'node': '/n', 'name': 'x', 'subscription': '/s', 'publishes': ['/x', '/y']},
+        {'node': '/n', 'name': 'join', 'sync': ['/x', '/y'], 'deadline': '9us'}]), legs=True)
+    assert tables.n_legs[:3] == [1, 1, 3]
+    assert tables.n_predecessors[:3] == [0, 1, 3]
+    assert tables.leg_topic[tables.first_leg[2]:tables.first_leg[3]] == [0, 0, 1]
+
+
+def test_rad_of_a_long_chain_is_found_without_recursion() -> None:
+    n = 3_000
+    chain = [{'node': '/n', 'name': 'c0', 'timer': '1ms', 'publishes': ['/t0'], 'dag': 'd'}]
+    chain += [{'node': '/n', 'name': f'c{i}', 'subscription': f'/t{i - 1}',
+               'publishes': [f'/t{i}']} for i in range(1, n)]
+    chain[-1] = {**{k: v for k, v in chain[-1].items() if k != 'publishes'}, 'deadline': '5ms'}
+    assert rad_offsets(declaration(chain).dags[0]) == [5_000_000] * n
+
+
+def test_latest_start_by_hand() -> None:
+    """The sink with the earlier deadline is not the one that has to start first."""
+    tables = Tables.build(declaration([
+        {'node': '/n', 'name': 's', 'timer': '90us', 'publishes': ['/s'], 'dag': 'd',
+         'execution_time': '2us'},
+        {'node': '/n', 'name': 'quick', 'subscription': '/s', 'deadline': '40us'},
+        {'node': '/n', 'name': 'way', 'subscription': '/s', 'publishes': ['/w'],
+         'execution_time': {'quantiles_us': [10, 30]}},
+        {'node': '/n', 'name': 'long', 'subscription': '/w', 'deadline': '60us',
+         'execution_time': '15us'}]), default_deadline=7)
+    assert tables.rad_offset == [40 * US, 40 * US, 60 * US, 60 * US, 7]
+    assert tables.latest_start == [23 * US, 40 * US, 25 * US, 45 * US, 7]
+    assert policy('llf').key(tables, 2, 1_000, 6, 9) == (1_000 + 25 * US, 2, 0, 9)
+
+
+def test_chains_of_equal_deadlines_go_by_period_then_by_dag() -> None:
+    tables = Tables.build(declaration([
+        {'node': '/n', 'name': name, 'timer': f'{period}us', 'deadline': '90us', 'dag': name}
+        for name, period in (('a', 20), ('b', 10), ('c', 20))]))
+    assert tables.chain_rank[:3] == [1, 0, 2]

@@ -1,20 +1,130 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The rules as the live executor uses them: messages make the edges, threads take the work."""
+"""Jobs from their release to their end: legs, groups, bounds, expiry, aborts, deadlines."""
 
 from __future__ import annotations
 
-from mddag_executor.core import NEVER, PolicyError, Scheduler, Tables
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.core import PolicyError, rules, Scheduler, Tables
+from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.queues import SWEEP_AT
 from mddag_executor.core.state import (
-    COMPLETED,
+    DROP,
+    FAILED,
     FREE,
     JOB_END,
-    SINK_IN_TIME,
+    OPEN,
+    SINK_ABORTED,
+    SINK_FAILED,
+    SINK_MISSED,
+    SINK_OVERDUE,
+    WAITING,
 )
+from mddag_executor.core.tables import NEVER
+from msg_graph import TaskSet
 import pytest
 
-from .live_helpers import J, JOIN, live, run_one, start_job, undeclared, US, X, Y
+from .live_helpers import J, JOIN, live, run_one, start_job, undeclared, US, X
+from .task_sets import declaration
+
+
+def test_a_job_fails_with_what_fails_of_it() -> None:
+    """What has a message already runs, and is not judged; nothing is missed twice."""
+    scheduler = live()
+    slot = start_job(scheduler)
+    x, leg = scheduler.execution(slot, X), scheduler.execution(slot, J, 0)
+    scheduler.ready(x, 1)
+    scheduler.ready(leg, 1)
+    first = scheduler.take(0, 1)
+    assert first in (x, leg)
+    rules.fail(scheduler.tables, scheduler.state, scheduler.policy.key, first, 2)
+    assert scheduler.decisions() == [
+        (SINK_FAILED, 0, J, 0, 50 * US, -1), (JOB_END, 0, -1, 0, FAILED, 2)]
+    second = scheduler.take(0, 3)
+    assert {first, second} == {x, leg}
+    rules.fail(scheduler.tables, scheduler.state, scheduler.policy.key, second, 4)
+    assert scheduler.decisions() == []
+    assert scheduler.state.job_state[slot] == FREE
+
+
+def test_a_stuck_job_does_not_keep_younger_ones_from_expiring() -> None:
+    scheduler = live(expire_after=10 * US)
+    stuck = scheduler.release(0, 0, 0, 0)
+    scheduler.ready(scheduler.source(stuck), 0)
+    assert scheduler.take(0, 0) == scheduler.source(stuck)
+    scheduler.suspend(scheduler.source(stuck))     # it waits for what never comes
+    lost = [start_job(scheduler, job, job) for job in (1, 2)]
+    scheduler.expire_idle(60 * US + 2)
+    assert [decision[3] for decision in scheduler.decisions() if decision[0] == JOB_END] == [1]
+    scheduler.expire_idle(60 * US + 3)
+    assert [decision[3] for decision in scheduler.decisions() if decision[0] == JOB_END] == [2]
+    states = [scheduler.state.job_state[slot] for slot in (stuck, *lost)]
+    assert states == [OPEN, FREE, FREE]
+
+
+def aborting() -> TaskSet:
+    return declaration([
+        {'node': '/n', 'name': 's', 'timer': '100us', 'publishes': ['/s'], 'dag': 'd',
+         'on_late': 'abort'},
+        {'node': '/n', 'name': 'x', 'subscription': '/s', 'deadline': '5us'},
+        {'node': '/n', 'name': 'y', 'subscription': '/s', 'deadline': '50us'},
+        {'node': '/n', 'name': 'z', 'subscription': '/s', 'deadline': '60us'}])
+
+
+def test_what_comes_too_late_aborts_its_job_at_its_turn() -> None:
+    scheduler = live(aborting(), workers=1)
+    slot = start_job(scheduler)
+    y = scheduler.execution(slot, 2)
+    scheduler.ready(y, 1)
+    assert scheduler.take(0, 5 * US + 1) == -1, 'x has missed its deadline: the job is over'
+    kinds = [decision[0] for decision in scheduler.decisions()]
+    assert kinds == [SINK_ABORTED, SINK_ABORTED, SINK_ABORTED, JOB_END, DROP]
+    assert scheduler.state.job_state[slot] == FREE
+
+
+def test_a_blocked_callback_does_not_abort_its_job() -> None:
+    """Only what would go next shows that a job is late; what waits for its group does not."""
+    scheduler = live(aborting(), workers=2)
+    group = scheduler.new_group()
+    busy = undeclared(scheduler, 0, group, 0)
+    scheduler.take(0, 0)
+    slot = start_job(scheduler)
+    y = scheduler.execution(slot, 2)
+    scheduler.state.x_group[y] = group
+    scheduler.ready(y, 1)
+    assert scheduler.take(1, 10 * US) == -1
+    assert scheduler.state.job_state[slot] == OPEN
+    scheduler.complete(busy, 11 * US)
+    assert scheduler.take(1, 11 * US) == -1
+    assert scheduler.decisions()[-1][0] == DROP
+
+
+def test_the_end_of_the_run_judges_what_is_open() -> None:
+    scheduler = live()
+    start_job(scheduler, 0, 0)
+    start_job(scheduler, 1, 10 * US)
+    start_job(scheduler, 2, 20 * US)
+    scheduler.finish(60 * US)
+    assert scheduler.decisions() == [
+        (SINK_MISSED, 0, J, 0, 50 * US, -1), (SINK_MISSED, 0, J, 1, 60 * US, -1)]
+    assert scheduler.state.n_open[0] == 3
+
+
+def test_a_recorded_execution_goes_past_queue_workers_and_groups() -> None:
+    scheduler = live(workers=1)
+    group = scheduler.new_group()
+    busy = undeclared(scheduler, 0, group, 0)
+    assert scheduler.take(0, 0) == busy
+    slot = scheduler.release(0, 0, 0, 0)
+    source = scheduler.source(slot)
+    scheduler.state.x_group[source] = group
+    assert rules.record(
+        scheduler.tables, scheduler.state, scheduler.policy.key, source, 2)
+    assert scheduler.idle_workers == 0
+    assert scheduler.state.group_owner[group] == busy
+    assert scheduler.state.job_active[slot] == 0
+    assert scheduler.state.x_state[source] != WAITING
 
 
 def test_an_unknown_policy_is_refused_with_the_list() -> None:
@@ -23,22 +133,6 @@ def test_an_unknown_policy_is_refused_with_the_list() -> None:
 
 
 # --- legs of a sync ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize('order', [(0, 1), (1, 0)])
-def test_a_sync_completes_with_the_leg_that_makes_it_whole(order: tuple[int, int]) -> None:
-    scheduler = live()
-    slot = start_job(scheduler)
-    for vertex in (X, Y):
-        assert run_one(scheduler, scheduler.execution(slot, vertex), 10)
-    first, last = (scheduler.execution(slot, J, leg) for leg in order)
-    assert first != last
-    assert run_one(scheduler, first, 20) is False
-    assert scheduler.decisions() == []
-    assert run_one(scheduler, last, 30) is True
-    assert scheduler.decisions() == [
-        (SINK_IN_TIME, 0, J, 0, 50 * US, 30), (JOB_END, 0, -1, 0, COMPLETED, 30)]
-    assert scheduler.state.job_state[slot] == FREE
 
 
 # --- workers -------------------------------------------------------------------------------------
@@ -55,16 +149,6 @@ def test_undeclared_callbacks_have_the_default_deadline() -> None:
             scheduler.take(0, 12 * US), scheduler.complete(scheduler.source(slot), 12 * US),
             scheduler.take(0, 12 * US)] == [early, True, scheduler.source(slot), True, later]
     assert scheduler.decisions() == [], 'nobody judges what nobody declared'
-
-
-def test_without_declaration_everything_is_undeclared() -> None:
-    scheduler = live(None)
-    x = undeclared(scheduler, 0, -1, 5)
-    assert scheduler.take(0, 5) == x
-    assert scheduler.complete(x, 6)
-    scheduler.expire_idle(NEVER)
-    scheduler.finish(NEVER)
-    assert scheduler.decisions() == []
 
 
 def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits() -> None:
@@ -116,3 +200,63 @@ def test_queues_stay_bounded_when_what_waits_longest_is_dropped_for_ever(grouped
         scheduler.complete(order[-1], 4_000)
     assert order == waiting
     assert scheduler.take(0, 4_000) == -1
+
+
+SINKS = declaration([
+    {'node': '/n', 'name': 's', 'timer': '100us', 'publishes': ['/s'], 'dag': 'd'},
+    {'node': '/n', 'name': 'x', 'subscription': '/s', 'deadline': '30us'},
+    {'node': '/n', 'name': 'y', 'subscription': '/s', 'deadline': '70us'},
+    {'node': '/n', 'name': 'z', 'subscription': '/s', 'deadline': '70us'},
+    {'node': '/n', 'name': 'o', 'timer': '100us', 'deadline': '10us', 'dag': 'other'},
+])
+steps = st.lists(st.one_of(
+    st.tuples(st.just('release'), st.integers(0, 1), st.integers(0, 40)),
+    st.tuples(st.just('complete'), st.integers(0, 30), st.integers(1, 3)),
+    st.tuples(st.just('expire'), st.integers(0, 30), st.just(0)),
+    st.tuples(st.just('judge'), st.just(0), st.just(0)),
+), max_size=60)
+
+
+@given(steps, st.lists(st.integers(0, 25), min_size=60, max_size=60))
+def test_each_overdue_sink_is_found_once_and_in_time(steps, gaps) -> None:
+    scheduler = live(SINKS)
+    tables, state = scheduler.tables, scheduler.state
+    deadlines = Deadlines(tables, state)
+    jobs: list[tuple[int, int, int]] = []
+    open_sinks: dict[tuple[int, int, int], int] = {}  # DAG, job, vertex -> deadline
+    overdue: list[tuple[int, int, int]] = []
+    now = 0
+    for (what, which, more), gap in zip(steps, gaps):
+        now += gap * US
+        if what == 'release':
+            # some releases are known late, and out of order
+            index, release = len(jobs), now - more * US
+            slot = scheduler.release(which, index, release, now)
+            deadlines.watch(slot)
+            jobs.append((which, index, slot))
+            first, last = tables.first_sink[which:which + 2]
+            for vertex in tables.sinks[first:last]:
+                open_sinks[which, index, vertex] = release + tables.sink_deadline[vertex]
+        elif what in ('complete', 'expire') and jobs:
+            dag, index, slot = jobs[which % len(jobs)]
+            vertex = tables.first_vertex[dag] + (more if dag == 0 else 0)
+            if state.job_state[slot] != OPEN or state.job_index[slot] != index:
+                continue
+            if what == 'expire':
+                scheduler.expire(slot, now)
+                open_sinks = {key: d for key, d in open_sinks.items() if key[:2] != (dag, index)}
+            elif (dag, index, vertex) in open_sinks:
+                run_one(scheduler, scheduler.execution(slot, vertex), now)
+                del open_sinks[dag, index, vertex]
+        else:
+            expected = sorted(key for key, d in open_sinks.items()
+                              if d < now and key not in overdue)
+            assert (deadlines.next < now) >= bool(expected)
+            scheduler.decisions()
+            deadlines.judge(now)
+            found = scheduler.decisions()
+            assert {decision[0] for decision in found} <= {SINK_OVERDUE}
+            assert sorted((dag, job, vertex) for _, dag, vertex, job, _, _ in found) == expected
+            overdue += expected
+            later = [d for d in open_sinks.values() if d >= now]
+            assert now <= deadlines.next <= min(later, default=NEVER)
