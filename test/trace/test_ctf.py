@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 import pickle
 import struct
@@ -201,21 +200,3 @@ def test_events_of_a_real_recording_equal_what_caret_made_of_them(tmp_path: Path
         expected = Plain(file).load()
     assert len(expected) == 2880
     assert list(read_events(path)) == expected
-
-
-@bt2
-@pytest.mark.skipif(not CARET.is_dir(), reason='the sample recording is not here')
-def test_callback_times_of_a_real_recording_equal_those_of_caret(tmp_path: Path) -> None:
-    path = imported(CARET / 'end_to_end_sample', tmp_path)
-    with open(CARET / 'cb_filter_node_callback_0.csv', newline='') as file:
-        expected = [tuple(map(int, row)) for row in list(csv.reader(file))[1:]]
-    runs: dict[int, list[tuple[int, int]]] = {}
-    started: dict[int, int] = {}
-    for event in read_events(path, {'ros2:callback_start', 'ros2:callback_end'}):
-        if event['_name'] == 'ros2:callback_start':
-            started[event['callback']] = event['_timestamp']
-        else:
-            runs.setdefault(event['callback'], []).append(
-                (started.pop(event['callback']), event['_timestamp']))
-    assert len(expected) == 49
-    assert expected in runs.values()

@@ -13,8 +13,6 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mddag_executor.trace import (
     EVENTS,
     read_events,
-    reading,
-    TraceError,
     TraceReader,
     TraceWarning,
 )
@@ -209,20 +207,6 @@ def test_any_disorder_is_put_into_order(tmp_path: Path, seed: int, finish: bool)
     in_time_order, warnings = read(path, in_time_order=True)
     assert in_time_order == sorted(read_back(recorded), key=lambda event: event[1])
     assert len(warnings) == (not finish)
-
-
-def test_too_much_disorder_for_the_memory(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, '_PENDING_LIMIT', 150)
-    monkeypatch.setattr(reading, '_BATCH_BYTES', 1)
-    path = tmp_path / 'a.mcap'
-    recorded = mixture(400)
-    write_chunks(path, [recorded[:100], recorded[100:200], recorded[200:300], recorded[300:]])
-    assert read(path, in_time_order=True) == (read_back(recorded), [])
-    write_chunks(path, [recorded[number::4] for number in range(4)])
-    assert len(read(path)[0]) == 400
-    with pytest.raises(TraceError, match='too much in disorder'):
-        read(path, in_time_order=True)
 
 
 BIG = """

