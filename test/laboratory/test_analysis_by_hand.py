@@ -8,11 +8,7 @@ from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS, NOTHING, Ve
 from mddag_executor.laboratory.necessary import largest_demand
 from mddag_executor.laboratory.sufficient import (
     graham,
-    own_jobs,
-    own_urgent,
     rad,
-    urgent,
-    workload,
 )
 from mddag_executor.laboratory.tasks import AnalysisError, tasks_of
 from msg_graph import loads
@@ -58,21 +54,6 @@ def verdicts(text: str, workers: int, budget: str = 'max') -> dict[str, Verdict]
     return {verdict.name: verdict for verdict in found}
 
 
-def test_tasks() -> None:
-    task, = tasks_of(loads(FORK))
-    assert (task.volume, task.length, task.deadline) == (43 * MS, 41 * MS, 50 * MS)
-    assert task.rad == (3 * MS, 3 * MS, 50 * MS)
-    assert task.latest == (1 * MS, 3 * MS, 50 * MS)
-    assert task.sinks == ((1, 3 * MS, 3 * MS), (2, 50 * MS, 41 * MS))
-
-
-@pytest.mark.parametrize(('budget', 'cost'), [('max', 100), ('p99', 99), ('mean', 50)])
-def test_budgets(budget: str, cost: int) -> None:
-    text = timers('1ms 1ms 1us').replace('1us', '{quantiles_us: [0, 100]}')
-    task, = tasks_of(loads(text), budget)
-    assert task.costs == (cost * 1000,)
-
-
 def test_what_is_not_declared() -> None:
     text = FORK.replace(', execution_time: 2ms', '')
     with pytest.raises(AnalysisError, match='g.yaml:6: /n:x declares no execution_time: add one'):
@@ -113,13 +94,6 @@ def test_graham() -> None:
     assert verdicts(timers('10ms 10ms 1ms'), 1)["Graham's bound"].verdict == HOLDS
     two = verdicts(timers('10ms 10ms 1ms', '10ms 10ms 1ms'), 1)["Graham's bound"]
     assert (two.verdict, two.figure) == (NOTHING, '2 of 2 DAGs in time, each alone')
-
-
-def test_workload() -> None:
-    task, = tasks_of(loads(timers('10ms 10ms 4ms')))
-    # One job ends as late as it may and one follows: y = 6 + 10 - 4 / 2 = 14, so 4 + min(4, 8).
-    assert workload(task, 6 * MS, 2) == 8 * MS
-    assert workload(task, 1 * MS, 1) == 1 * MS
 
 
 def test_only_rad_puts_the_urgent_first() -> None:
@@ -167,11 +141,6 @@ def test_a_bound_on_open_jobs_that_could_end_one() -> None:
     assert verdicts(text, 2)['response time, any policy'].verdict == HOLDS
 
 
-def test_deadlines_of_very_many_periods_take_no_time() -> None:
-    found = verdicts(timers('1ms 1000s 0.2ms', '1s 1000s 1ms'), 2)
-    assert found['utilisation'].verdict == HOLDS
-
-
 def test_a_long_callback_that_has_begun_is_part_of_the_bound() -> None:
     # 2 ms of its own, 4 ms of a job of the other with an earlier RAD, 4 ms of one with a later.
     tasks = tasks_of(loads(timers('100ms 50ms 2ms', '1s 1s 4ms')))
@@ -191,22 +160,3 @@ def test_without_preemption_less_is_proven() -> None:
     assert missed(loads(text), times, 'rad', False, 1, late)
     assert verdicts(text, 1)['response time, RAD without preemption'].verdict == NOTHING
     assert not missed(loads(text), times, 'rad', True, 1, late)
-
-
-def test_jobs_before_and_after() -> None:
-    task, = tasks_of(loads(timers('10ms 25ms 4ms')))
-    # Earlier: 15 and 5 ms into the window, later: 2 ms of it are left, for 2 workers.
-    assert own_jobs(task, 12 * MS, 2) == (4 + 4 + 4) * MS
-    assert own_jobs(task, 11 * MS, 2) == (4 + 4 + 2) * MS
-    assert own_jobs(task, 10 * MS, 2) == (4 + 4) * MS
-
-
-def test_urgent_work() -> None:
-    task, = tasks_of(loads(timers('10ms 25ms 4ms')))
-    assert urgent(task, 25 * MS) == 12 * MS
-    assert urgent(task, 22 * MS) == (4 + 4 + 2) * MS
-    assert urgent(task, 3 * MS) == 3 * MS
-    # RADs 25, 15, 5 ms of this job and of those before; 35 ms of the next one.
-    assert own_urgent(task, 25 * MS) == 12 * MS
-    assert own_urgent(task, 35 * MS) == 16 * MS
-    assert own_urgent(task, 24 * MS) == 8 * MS

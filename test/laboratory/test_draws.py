@@ -1,16 +1,18 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Execution times for many runs: tables and measured values, one draw for each vertex and run."""
+"""Random execution times, shares of a load, and acceptance ratios."""
 
 from __future__ import annotations
 
 import io
 from pathlib import Path
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.errors import InputError
+from mddag_executor.laboratory.acceptance import Acceptance, BINS, bins_of, WIDE_BINS, wilson
 from mddag_executor.laboratory.draws import Draws, feasible, read_samples, utilisations
+from mddag_executor.laboratory.shares import Dice, dirichlet_rescale
 from msg_graph import ExecutionTime, loads, TaskSet
 import numpy as np
 import pytest
@@ -72,13 +74,6 @@ def test_a_run_is_the_same_in_any_chunk(task_set: TaskSet) -> None:
     assert (Draws(task_set, 8).times(0, 20) != whole).any()
 
 
-def test_vertices_of_one_callback_are_drawn_apart(task_set: TaskSet) -> None:
-    names = [vertex.name for vertex in task_set.vertices]
-    first, second = (names.index(f'/n:c@{dag.name}') for dag in task_set.dags)
-    drawn = Draws(task_set, 0).times(0, 50)
-    assert (drawn[:, first] != drawn[:, second]).any()
-
-
 def test_measured_values_are_rounded_up_to_us(task_set: TaskSet, tmp_path: Path) -> None:
     path = tmp_path / 'samples.npz'
     np.savez(path, **{'/n:a': [0, 1, 1000, 1001], '/n:b': [2_000_000.5], '/n:c': [5, 7]})
@@ -131,15 +126,6 @@ def test_bad_samples(
     assert '\n' not in str(caught.value)
 
 
-def test_damaged_values(task_set: TaskSet, tmp_path: Path) -> None:
-    content = bytearray(npz(**{key: np.arange(1000) for key in GOOD}))
-    content[4000] ^= 0xFF
-    path = tmp_path / 'samples.npz'
-    path.write_bytes(content)
-    with pytest.raises(InputError, match='are damaged or no numbers'):
-        read_samples(task_set, path, 'samples.npz')
-
-
 def test_utilisation_and_bound(task_set: TaskSet) -> None:
     """By hand: periods 10 and 20 ms, both sinks with a deadline of 4 ms."""
     ms = 1_000_000
@@ -159,3 +145,95 @@ def test_bound_by_demand() -> None:
     # 7 * 7 + 4 * 7 = 77, 7 * 11 + 4 * 7 = 105 of 100 ms; the last has a path of 53 ms
     assert feasible(task_set, times, 1, 100 * ms).tolist() == [True, False, False]
     assert feasible(task_set, times, 2, 100 * ms).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize(('utilisation', 'centre'), [
+    (0.0, 0.5), (0.5, 0.5), (0.52499, 0.5), (0.5251, 0.55), (0.5749, 0.55), (0.5751, 0.6),
+    (0.7, 0.7), (0.92501, 0.95), (0.97499, 0.95), (0.97501, 1.0), (1.0, 1.0), (3.0, 1.0)])
+def test_bins(utilisation: float, centre: float) -> None:
+    assert BINS[bins_of(np.array([utilisation]))[0]] == centre
+
+
+@pytest.mark.parametrize(('utilisation', 'centre'), [
+    (0.0, 0.05), (0.0749, 0.05), (0.0751, 0.1), (0.5, 0.5), (0.97499, 0.95), (0.97501, 1.0),
+    (3.0, 1.0)])
+def test_wide_bins(utilisation: float, centre: float) -> None:
+    assert WIDE_BINS[bins_of(np.array([utilisation]), WIDE_BINS)[0]] == centre
+
+
+@pytest.mark.parametrize(('accepted', 'runs', 'low', 'high'), [
+    # Figures of R's binom.confint(method = 'wilson').
+    (0, 10, 0.0, 0.2775328), (5, 10, 0.2365931, 0.7634069), (10, 10, 0.7224672, 1.0),
+    (88, 100, 0.8019, 0.9300)])
+def test_wilson(accepted: int, runs: int, low: float, high: float) -> None:
+    assert wilson(accepted, runs) == pytest.approx((low, high), abs=1e-4)
+
+
+def test_wilson_covers_the_truth() -> None:
+    """Of many samples about 95 % have the true ratio in their interval."""
+    drawn = np.random.Generator(np.random.Philox(1)).binomial(60, 0.9, 4000)
+    covered = [low <= 0.9 <= high for low, high in (wilson(int(k), 60) for k in drawn)]
+    assert 0.92 < np.mean(covered) < 0.98
+
+
+def test_acceptance() -> None:
+    bins = np.array([0, 0, 2, 2, 2, 10])
+    accepted = np.array([True, True, True, False, False, False])
+    found = Acceptance(bins, accepted)
+    assert found.ratio[:4] == [1.0, None, pytest.approx(1 / 3), None]
+    assert found.ratio[10] == 0.0
+    assert found.interval[1] is None and found.interval[2] == wilson(1, 3)
+    assert found.total == 0.5
+
+
+LIMITS = st.lists(st.floats(0.01, 2.0), min_size=1, max_size=30)
+
+
+@given(limits=LIMITS, part=st.floats(0.0, 1.0), seed=st.integers(0, 10 ** 6))
+@example(limits=[0.375, 0.390625, 0.5, 0.5, 0.5, 0.015625], part=0.5, seed=42)
+def test_dirichlet_rescale_keeps_sum_and_bounds(
+    limits: list[float], part: float, seed: int
+) -> None:
+    total = sum(limits) * part
+    shares = dirichlet_rescale(Dice(str(seed)), total, limits)
+    assert sum(shares) == pytest.approx(total, abs=1e-8)
+    for share, limit in zip(shares, limits):
+        assert 0.0 <= share <= limit * (1 + 1e-9)
+
+
+@pytest.mark.parametrize('total', [0.7, 1.2, 1.5, 1.9, 2.6])
+def test_dirichlet_rescale_is_as_uniform_as_throwing_away(total: float) -> None:
+    """Quantiles of the largest of three shares are those of UUniFast-Discard."""
+    dice = Dice('uniform')
+    count, limits = 4000, [1.0, 1.0, 1.0]
+    stretched = sorted(max(dirichlet_rescale(dice, total, limits)) for _ in range(count))
+    discarded: list[float] = []
+    while len(discarded) < count:
+        first = total * (1 - dice.number() ** 0.5)      # UUniFast
+        second = (total - first) * dice.number()
+        shares = (first, second, total - first - second)
+        if max(shares) <= 1.0:
+            discarded.append(max(shares))
+    discarded.sort()
+    # The two-sided Kolmogorov-Smirnov statistic; 0.043 is exceeded by chance once in a thousand.
+    ours = theirs = gap = 0
+    while ours < count and theirs < count:
+        if stretched[ours] <= discarded[theirs]:
+            ours += 1
+        else:
+            theirs += 1
+        gap = max(gap, abs(ours - theirs))
+    assert gap / count < 0.043
+
+
+FIRST = [5, 5, 4, 4, 2, 5, 4, 2, 4, 3]
+
+
+@pytest.mark.parametrize('limits', [[1.0, 0.0, 1.0], [1.0, 1e-12, 1.0], [0.0, 0.5], [1.0, 1e-5]])
+@pytest.mark.parametrize('part', [0.1, 0.49, 0.9, 1.0])
+def test_dirichlet_rescale_with_no_room_for_one(limits: list[float], part: float) -> None:
+    total = part * sum(limits)
+    for seed in range(10):
+        shares = dirichlet_rescale(Dice(str(seed)), total, limits)
+        assert sum(shares) == pytest.approx(total)
+        assert all(0 <= share <= limit for share, limit in zip(shares, limits))

@@ -10,11 +10,15 @@ execution times drawn from the measured values.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+import logging
 import math
+import os
 from pathlib import Path
+import signal
+from typing import Any
 
-from mddag_executor.core import POLICIES
 from mddag_executor.laboratory.acceptance import Evaluation, WIDE_BINS
 from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.evaluate import evaluate
@@ -22,7 +26,6 @@ from mddag_executor.laboratory.experiment import Experiment
 from mddag_executor.laboratory.generate import generate
 from mddag_executor.laboratory.generate_options import Options
 from mddag_executor.simulate import (
-    compiled,
     compiling,
     periodic_load,
     Settings,
@@ -111,41 +114,6 @@ def test_verdicts_are_those_of_simulate(autoware: TaskSet) -> None:
     assert 0 < outcome.accepted.mean() < 1
 
 
-STARVES = """\
-mddag: 1
-workers: 1
-nodes:
-  - {node: /a, callbacks: [{name: a, timer: 10ms, deadline: 10ms, execution_time: 10ms}]}
-  - {node: /b, callbacks: [{name: b, timer: 20ms, deadline: 30ms, execution_time: 10ms}]}
-"""
-ENDS_TOO_LATE = """\
-mddag: 1
-workers: 1
-nodes:
-  - {node: /n, callbacks: [{name: a, timer: 5s, deadline: 1s, execution_time: 4s}]}
-"""
-
-
-@pytest.mark.parametrize('text', [STARVES, ENDS_TOO_LATE])
-def test_the_bound_is_that_of_the_judge(text: str) -> None:
-    task_set = loads(text)
-    accepted = {}
-    for judge in ('completions', 'horizon'):
-        outcome = evaluate(
-            Experiment(task_set, ('rad', 'rm'), workers=1, judge=judge), 1, compiled=False)
-        assert outcome.accepted.max() <= outcome.possible[0]
-        accepted[judge] = bool(outcome.accepted.any())
-    assert accepted == {'completions': True, 'horizon': False}
-
-
-def test_a_late_completion_that_no_scheduler_avoids_bounds_completions() -> None:
-    text = ENDS_TOO_LATE.replace('timer: 5s', 'timer: 500ms').replace('1s', '20ms')
-    for time, possible in (('19ms', True), ('21ms', False)):
-        outcome = evaluate(Experiment(
-            loads(text.replace('4s', time)), ('rad',), workers=1), 1, compiled=False)
-        assert (outcome.possible[0], outcome.accepted[0, 0]) == (possible, possible)
-
-
 @pytest.mark.parametrize('judge', ['completions', 'horizon'])
 @pytest.mark.parametrize('change', [
     {}, {'group': 'g'}, {'holds_interpreter': True}, {'on_late': 'abort'}])
@@ -186,18 +154,6 @@ def test_by_hand(small: TaskSet) -> None:
         (0.25 + lengths / 20_000_000).tolist())
 
 
-def test_modes_and_overhead(small: TaskSet) -> None:
-    """Non-preemptive, a fast job waits for a slow one; an overhead makes the light runs late."""
-    base = Experiment(small, ('rad', 'fifo'), workers=1, duration_ns=10 ** 9)
-    assert [base.settings(name).preemptive for name in base.policies] == [True, False]
-    preempting = evaluate(base, 20).accepted
-    assert preempting[0].any() and not preempting[1].all()
-    rigid = evaluate(replace(base, preemptive=False), 20)
-    assert rigid.result()['policies']['rad']['preemptive'] is False
-    assert not rigid.accepted[0][Draws(small, 0).times(0, 20)[:, 1] > 10_000_000].any()
-    assert not evaluate(replace(base, overhead_ns=3_000_000), 20).accepted.any()
-
-
 def same(first: Evaluation, second: Evaluation) -> bool:
     return all((getattr(first, name) == getattr(second, name)).all()
                for name in ('done', 'accepted', 'possible', 'utilisation'))
@@ -232,19 +188,6 @@ def test_several_task_sets(small: TaskSet) -> None:
     assert sum(each['accepted']['rad'] for each in graphs) == outcome.accepted[0].sum()
 
 
-@NEEDS_NUMBA
-@pytest.mark.timeout(400)
-def test_the_compiled_core_changes_nothing(autoware: TaskSet) -> None:
-    experiment = Experiment(
-        autoware, tuple(POLICIES), duration_ns=400_000_000, seed=5, workers=5)
-    plain = evaluate(experiment, 20, compiled=False)
-    for jobs in (1, 4):
-        fast = evaluate(experiment, 20, jobs=jobs, compiled=True)
-        assert same(plain, fast) and fast.compiled and not plain.compiled
-    other = replace(experiment, preemptive=False, overhead_ns=77_000, judge='horizon')
-    assert same(evaluate(other, 20, compiled=False), evaluate(other, 20, compiled=True))
-
-
 def test_interrupted(small: TaskSet) -> None:
     """What is done is kept, and is what a whole evaluation would have had there."""
     def stop(done: int) -> None:
@@ -276,13 +219,6 @@ def test_bad_input(
     assert str(caught.value).startswith(problem)
 
 
-def test_without_numba(small: TaskSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled, 'available', lambda: False)
-    assert not evaluate(Experiment(small), 2).compiled
-    with pytest.raises(SimulationError, match='numba, which compiles the core, is not installed'):
-        evaluate(Experiment(small), 2, compiled=True)
-
-
 def test_ranges_of_runs_make_up_the_whole(small: TaskSet) -> None:
     experiments = [Experiment(small, ('rad', 'fifo'), workers=1, duration_ns=200_000_000, seed=s)
                    for s in (1, 2)]
@@ -301,3 +237,46 @@ def test_ranges_of_runs_make_up_the_whole(small: TaskSet) -> None:
         assert graph['accepted'] == {name: sum(
             part['graphs'][number]['accepted'][name] for part in parts)
             for name in ('rad', 'fifo')}
+
+
+distributed = pytest.importorskip('distributed', reason='the extra dask is not installed')
+EXPERIMENT = Experiment(
+    load(Path(__file__).parents[2] / 'config' / 'autoware.yaml'), ('rad', 'fifo'),
+    duration_ns=200_000_000)
+
+
+@pytest.fixture(scope='module')
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Give a cluster of two worker processes."""
+    import dask
+    folder = str(tmp_path_factory.mktemp('dask'))
+    with dask.config.set({'temporary-directory': folder}), distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address='127.0.0.1:0',
+            silence_logs=logging.CRITICAL) as cluster:
+        yield cluster
+
+
+@pytest.mark.timeout(120)
+def test_the_outcome_is_that_of_this_machine(cluster: Any) -> None:
+    """Also if a worker is killed: its runs are made again."""
+    victim = next(iter(cluster.workers.values())).process.pid
+    killed = []
+
+    def kill(done: int) -> None:
+        if not killed and done > 20:
+            killed.append(victim)
+            os.kill(victim, signal.SIGKILL)
+
+    found = evaluate(
+        EXPERIMENT, 300, first_run=7, compiled=False, dask=cluster.scheduler_address,
+        progress=kill)
+    assert killed and same(found, evaluate(
+        EXPERIMENT, 300, first_run=7, compiled=False, jobs=2))
+
+
+def test_an_address_without_a_scheduler() -> None:
+    for address in ('tcp://127.0.0.1:1', 'nonsense'):
+        with pytest.raises(SimulationError) as caught:
+            evaluate(EXPERIMENT, 2, dask=address)
+        assert str(caught.value).startswith(f'--dask {address}: ')
+        assert ': check the address, and that the scheduler and workers with ' in str(caught.value)

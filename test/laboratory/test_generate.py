@@ -94,22 +94,6 @@ def test_shapes(count: int, part: float, edges: float, ors: float, seed: int) ->
     assert max(shape.copies) <= MOST_COPIES
 
 
-def test_edge_probability() -> None:
-    """Without edges the graph is a tree, with all of them it is complete."""
-    tree = loads(generate(Options(edge_probability=0.0, vertices=(10, 10), sinks=(3, 3))))
-    assert all(len(dag.edges) <= 9 + 6 for dag in tree.dags)
-    full = loads(generate(Options(edge_probability=1.0, vertices=(10, 10), sinks=(3, 3))))
-    assert all(len(dag.edges) == 7 * 6 / 2 + 7 * 3 for dag in full.dags)
-
-
-def test_joins() -> None:
-    base = Options(edge_probability=0.5, vertices=(8, 8), dags=(6, 6))
-    joined = loads(generate(base))
-    assert {callback.kind for callback in joined.callbacks} == {'timer', 'subscription', 'sync'}
-    apart = loads(generate(replace(base, or_share=1.0)))
-    assert sum(len(dag.vertices) for dag in apart.dags) > len(apart.callbacks)
-
-
 @pytest.mark.parametrize(('change', 'problem'), [
     ({'sinks': (9, 9), 'vertices': (9, 9)}, '--sinks 9: a DAG of 9 vertices has at most 8: '),
     ({'sinks': (2, 2), 'vertices': (1, 9)}, '--sinks 2: a DAG of 1 vertex has at most 1: '),

@@ -1,13 +1,23 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Which node runs in which process."""
+"""Which node runs in which process, and what a placement is predicted to do."""
 
 from __future__ import annotations
 
 from itertools import product
 
+from mddag_executor.core.tally import total
 from mddag_executor.laboratory.placement import Placing
-from msg_graph import loads, TaskSet
+from mddag_executor.laboratory.prediction import (
+    CALLBACK_NS,
+    cost_of,
+    improve,
+    Predictor,
+    PUBLISH_NS,
+)
+from mddag_executor.simulate.intakes import Costs
+from mddag_executor.simulate.machine import SWITCH_NS
+from msg_graph import loads, Process, TaskSet
 
 MS = 1_000_000
 
@@ -50,17 +60,6 @@ nodes:
     assert [p.nodes for p in placing.processes(placing.place())] == [('/a', '/c'), ('/b', '/d')]
 
 
-def test_what_does_not_hold_the_interpreter_weighs_nothing() -> None:
-    times = (90, 30, 25)
-    tasks = workload(*times, holds=', holds_interpreter: false')
-    assert {'/n1'} in placed(tasks, 2, *times) or {'/n2'} in placed(tasks, 2, *times)
-
-
-def test_no_process_is_without_a_node_where_nothing_is_declared_to_take_time() -> None:
-    times = (0, 0, 0, 0)
-    assert sorted(len(nodes) for nodes in placed(workload(*times), 3, *times)) == [1, 1, 2]
-
-
 def test_nodes_that_publish_one_topic_stay_together() -> None:
     tasks = loads("""
 mddag: 1
@@ -71,3 +70,98 @@ nodes:
 """)
     placing = Placing(tasks, 2, [[4 * MS, MS], [4 * MS, MS]])
     assert [p.nodes for p in placing.processes(placing.place())] == [('/a', '/b'), ('/c',)]
+
+
+TWO = """
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 100ms, deadline: 40ms}]}
+  - {node: /b, callbacks: [{name: t, timer: 100ms, deadline: 40ms}]}
+"""
+CHAIN = """
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 100ms, publishes: [/x]}]}
+  - {node: /b, callbacks: [{name: t, subscription: /x, deadline: 100ms}]}
+"""
+ALL = (Process('all', ('/a', '/b')),)
+EACH = (Process('p1', ('/a',)), Process('p2', ('/b',)))
+
+
+def missed(text: str, processes: tuple[Process, ...], cpus: int | None, *ms: int) -> int:
+    predictor = Predictor(loads(text), 7, cpus, 'rad', 1000 * MS)
+    tally = predictor.predict(processes, [[each * MS] for each in ms])
+    return total(tally.result()['dags']).missed
+
+
+def test_one_process_computes_in_one_callback_at_a_time() -> None:
+    assert missed(TWO, ALL, 2, 30, 30) == 10
+    assert missed(TWO, EACH, 2, 30, 30) == 0
+    assert missed(TWO, EACH, 1, 30, 30) > 0  # they share the CPU
+    assert missed(TWO, EACH, None, 30, 30) == 0
+
+
+def test_what_leaves_its_process_takes_longer() -> None:
+    def response(processes: tuple[Process, ...]) -> int:
+        tally = Predictor(loads(CHAIN), 7, 2, 'rad', 1000 * MS).predict(
+            processes, [[2 * MS, 3 * MS]])
+        found: int = tally.result()['dags']['/a']['sinks']['/b:t']['response_ns']['max']
+        return found
+
+    costs = Costs()
+    assert response(ALL) == 5 * MS + 2 * CALLBACK_NS + PUBLISH_NS + costs.timer_ns
+    assert response(EACH) == response(ALL) + costs.send_ns + costs.message_ns
+
+
+def test_a_timer_is_noticed_a_switch_interval_later_where_a_callback_computes() -> None:
+    urgent = """
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 100ms, deadline: 100ms}]}
+  - {node: /b, callbacks: [{name: t, timer: 10ms, deadline: 10ms, holds_interpreter: false}]}
+"""
+
+    def responses(processes: tuple[Process, ...]) -> tuple[int, int]:
+        dags = Predictor(loads(urgent), 7, 3, 'rad', 1000 * MS).predict(
+            processes, [[50 * MS], [MS]]).result()['dags']
+        long, short = (dags[name]['sinks'][f'{name}:t']['response_ns']['max']
+                       for name in ('/a', '/b'))
+        return long, short
+
+    alone, together = responses(EACH), responses(ALL)
+    costs = Costs()
+    assert alone == (50 * MS + CALLBACK_NS + costs.timer_ns,
+                     MS + CALLBACK_NS + costs.timer_ready_ns)
+    assert together[1] == alone[1] + SWITCH_NS
+    # it stands still while others are noticed
+    assert together[0] >= alone[0] + 4 * costs.timer_ns
+
+
+def several(*times: int) -> tuple[TaskSet, list[list[int]]]:
+    """Return nodes that compute so many ms of each 100 ms; the first are urgent."""
+    lines = [f'  - {{node: /n{i}, callbacks: [{{name: t, timer: 100ms, '
+             f'deadline: {40 if i < 2 else 100}ms}}]}}' for i, _ in enumerate(times)]
+    return loads('mddag: 1\nnodes:\n' + '\n'.join(lines)), [[ms * MS] for ms in times]
+
+
+def test_simulation_finds_what_loads_do_not_show() -> None:
+    # by load alone the two urgent ones may well share a process
+    task_set, times = several(30, 30, 30, 30)
+    placing = Placing(task_set, 2, times)
+    predictor = Predictor(task_set, 7, 2, 'rad', 1000 * MS)
+    bad = {0: 0, 1: 0, 2: 1, 3: 1}
+    assert predictor.predict(placing.processes(bad), times).missed
+    calls: list[int] = []
+    place, tried = improve(
+        placing, bad, lambda processes: cost_of(predictor.predict(processes, times)), calls.append)
+    assert not predictor.predict(placing.processes(place), times).missed
+    assert place[0] != place[1] and calls and tried >= max(calls)
+
+
+def test_a_few_tries_are_enough_to_stop() -> None:
+    task_set, times = several(90, 90, 90, 90)
+    placing = Placing(task_set, 2, times)
+    predictor = Predictor(task_set, 7, 2, 'rad', 300 * MS)
+    _, tried = improve(
+        placing, placing.place(), lambda p: cost_of(predictor.predict(p, times)), most=5)
+    assert tried == 5

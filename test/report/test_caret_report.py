@@ -7,9 +7,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
-import re
 from typing import Any
-from xml.etree import ElementTree
 
 from mddag_executor.cli import main as program
 from mddag_executor.trace import import_ctf
@@ -17,7 +15,6 @@ import pytest
 
 from ..replay.cases_by_hand import slow_cases
 from ..replay.test_caret_sample import GRAPH, rows, SESSION
-from ..report import test_html_browser as pages
 
 pytest.importorskip('bokeh', reason='Bokeh is not installed')
 pytestmark = [
@@ -59,20 +56,6 @@ def test_the_result_says_what_caret_says(folder: Path) -> None:
             len(times), times[0], times[-1], round(sum(times) / len(times))), case
 
 
-def test_junit(folder: Path) -> None:
-    suites = ElementTree.parse(folder / 'junit.xml').getroot()
-    result = json.loads((folder / 'result.json').read_text())
-    sinks = {name: sink for dag in result['dags'].values() for name, sink in dag['sinks'].items()}
-    tests = {test.get('name'): test for test in suites.iter('testcase')}
-    assert set(tests) == set(sinks)
-    for name, sink in sinks.items():
-        missed = sink['late'] + sink['expired']
-        failure = tests[name].find('failure')
-        assert (failure is not None) == (missed > 0)
-        if failure is not None:
-            assert (failure.get('message') or '').startswith(f'{missed} of ')
-
-
 def test_exports_have_carets_callback_times(folder: Path) -> None:
     with (folder / 'executions.csv').open(newline='') as stream:
         table = [(int(row['start_ns']), int(row['end_ns'])) for row in csv.DictReader(stream)
@@ -101,22 +84,3 @@ def test_perfetto_has_carets_callback_times(folder: Path) -> None:
         if packet.HasField('track_event') and packet.track_event.track_uuid in tracks:
             times[packet.track_event.type].append(packet.timestamp)
     assert list(zip(sorted(times[1]), sorted(times[2]))) == filter_times()
-
-
-@pytest.mark.needs('chromium')
-def test_the_report_opens_and_shows_it(browser: Any, folder: Path) -> None:
-    pages.opened(browser, folder / 'report.html')
-    assert pages.complaints(browser) == []
-    text = browser.execute_script('return document.body.innerText')
-    assert 'imported 12 threads ran callbacks' in ' '.join(text.split())
-    assert re.search(r'target\s+47 of 56\s+all\s+46', text)
-    assert re.search(r'\bfilter_node:callback_0\s+49\s', text)
-    names = pages.bars(browser, 'a')
-    assert len(names) == 480 and names.count(FILTER) == 49
-    starts = [left for left, name in zip(pages.bars(browser, 'left'), names) if name == FILTER]
-    expected = [start for start, _ in filter_times()]
-    for left, start in zip(sorted(starts), expected):   # the page counts in 100 ns
-        assert abs((left - min(starts)) * 1e9 - (start - expected[0])) <= 101
-    assert browser.execute_script(
-        'return document.documentElement.scrollWidth <= window.innerWidth')
-    assert pages.complaints(browser) == []

@@ -51,15 +51,6 @@ def test_what_is_worse(
     assert compare(result, changed(result, **sink), tolerance)['worse'] is worse
 
 
-def test_the_tables(result: dict[str, Any]) -> None:
-    after = changed(result, late=2, response_ns={
-        'min': 5 * MS, 'median': 9 * MS, 'p99': 20 * MS, 'max': 20 * MS})
-    difference = compare(result, after)
-    line = sinks_table(difference).splitlines()[1].split()
-    assert line == ['filter:run', '3', '3', '66.67', '%', '33.33', '%', '6', 'ms', '9', 'ms',
-                    '10', 'ms', '20', 'ms', '+100.0', '%', 'worse']
-
-
 def test_what_only_one_run_has(result: dict[str, Any], tmp_path: Path) -> None:
     graph = runs.GRAPH.replace('deadline: 8ms', 'deadline: 5ms').replace('name: whole', 'name: w')
     other = replay(runs.by_hand(tmp_path / 'other.mcap'), msg_graph.loads(graph)).result()

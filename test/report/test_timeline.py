@@ -17,7 +17,7 @@ from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.deadlines import Judged
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.report import html
-from mddag_executor.report.timeline import MOST_UNDECLARED, OTHERS, Timeline
+from mddag_executor.report.timeline import Timeline
 from mddag_executor.simulate import periodic_load, Settings, simulate
 import msg_graph
 import numpy as np
@@ -134,15 +134,6 @@ def test_a_bag_has_the_verdicts_of_its_report(tmp_path: Path) -> None:
     assert data.breakdown[1]['worst']['release_lag_ns'] == 5 * runs.MS
 
 
-def test_what_is_aborted_and_stopped_is_told() -> None:
-    task_set = runs.autoware()
-    load, run = runs.simulated(task_set, utilisation=1.5, stop_at_first_miss=True)
-    assert run.ended_ns < 300 * runs.MS
-    data = html.of_run(task_set, load, run)
-    assert data.timeline.n_missed >= 1
-    assert data.timeline.shown().executions['end'].max() <= run.ended_ns
-
-
 ONE = """\
 mddag: 1
 nodes: [{node: /n, callbacks: [{name: a, timer: 100us, deadline: 60us}]}]
@@ -188,19 +179,3 @@ def test_detail_is_bounded_and_keeps_the_misses() -> None:
     assert len(timeline.gaps()) >= 3
     assert sum(timeline.busy_over_time.result()['busy_ns']) == (998 * 50 + 2 * 70) * us
     assert sum(timeline.missed_over_time.result()['busy_ns']) == 2
-
-
-def test_undeclared_callbacks_have_names_and_a_bound() -> None:
-    timeline = ran(*((callback, -1, 4, i, i + 1) for i, callback in enumerate(
-        (7, 8, *range(1000, 1000 + MOST_UNDECLARED + 5)))))
-    names = timeline.undeclared_names()
-    assert names[:2] == ['spin_some', 'a callback whose start is not recorded']
-    assert len(names) == MOST_UNDECLARED + 1 and names[-1] == OTHERS
-    assert int(timeline.shown().row.min()) == -len(names)
-
-
-def test_never_completed_counts_at_its_deadline() -> None:
-    timeline = ran((1, 0, 0, 0, -1))
-    assert timeline.n_missed == 1
-    verdicts = timeline.shown().verdicts
-    assert verdicts[['sink', 'job', 'deadline', 'completed']].tolist() == [(0, 0, 60_000, -1)]

@@ -21,12 +21,11 @@ from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
 from mddag_executor.rerun import rerun, RerunError, Result
 import pytest
-from rcl_interfaces.srv import GetParameters
 import rclpy
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
@@ -126,22 +125,6 @@ def test_a_synchronous_call_lends_its_worker(bag: str, graph: Path) -> None:
     assert not result.warnings
 
 
-def test_a_service_that_nobody_offers(bag: str, graph: Path) -> None:
-    def take(node: Filter, number: int) -> None:
-        client = node.create_client(Trigger, '/nobody')
-        if number == 3:
-            node.note(client.wait_for_service(timeout_sec=0.25))
-            node.note(client.call(Trigger.Request(), timeout_sec=0.5))
-        elif number == 8:
-            client.call(Trigger.Request())
-
-    seen, result = run_filter(bag, graph, take)
-    assert seen == [(550.0, False), (1050.0, None)]
-    assert result.warnings == [
-        '/nobody: it is called, and no node of the run offers this service',
-        '/filter:take: it still waits (for service /nobody)']
-
-
 def test_ros_arguments(bag: str, graph: Path) -> None:
     seen: list[Any] = []
 
@@ -157,23 +140,6 @@ def test_ros_arguments(bag: str, graph: Path) -> None:
         '-r', '__node:=filter', '-r', '/cloud:=/points', '-p', 'gain:=3'])
     assert seen[0] == ('filter', 3)
     assert len(seen) == 21
-
-
-def test_parameters_of_another_node(bag: str, graph: Path) -> None:
-    def take(node: Filter, number: int) -> None:
-        if number == 1:
-            client = node.create_client(GetParameters, '/server/get_parameters')
-            answer = client.call(GetParameters.Request(names=['use_sim_time', 'speed']))
-            node.note([value.type for value in answer.values])
-
-    def other() -> Node:
-        node = rclpy.create_node('server')
-        node.declare_parameter('speed', 3)
-        return node
-
-    seen, result = run_filter(bag, graph, take, other)
-    assert seen == [(100.0, [Parameter.Type.BOOL.value, Parameter.Type.INTEGER.value])]
-    assert result.counts['/parameter_events'] == 5
 
 
 def test_coroutines(bag: str, graph: Path) -> None:
@@ -228,33 +194,6 @@ def test_threads_of_nodes_are_in_virtual_time_too(bag: str, graph: Path) -> None
     assert not result.warnings
 
 
-def test_guard_conditions(bag: str, graph: Path) -> None:
-    def fill(node: Filter) -> None:
-        node.guard = node.create_guard_condition(  # type: ignore[attr-defined]
-            lambda: node.note('triggered'))
-
-    def take(node: Filter, number: int) -> None:
-        if number == 2:
-            node.guard.trigger()  # type: ignore[attr-defined]
-
-    seen, _ = run_filter(bag, graph, take, fill=fill)
-    assert seen == [(200.0, 'triggered')]
-
-
-def test_joining_a_thread(bag: str, graph: Path) -> None:
-    def take(node: Filter, number: int) -> None:
-        if number == 1:
-            event = threading.Event()
-            thread = threading.Thread(
-                target=lambda: node.note(event.wait(0.02)), daemon=True)
-            thread.start()
-            thread.join()
-            node.note('joined')
-
-    seen, _ = run_filter(bag, graph, take)
-    assert seen == [(120.0, False), (120.0, 'joined')]
-
-
 # --- actions -------------------------------------------------------------------------------------
 
 def fibonacci() -> Node:
@@ -301,24 +240,6 @@ def test_an_action(bag: str, graph: Path) -> None:
         assert not result.warnings
 
 
-def test_cancelling_a_goal(bag: str, graph: Path) -> None:
-    async def take(node: Filter, number: int) -> None:
-        if number == 3:
-            node.goal = await node.client.send_goal_async(  # type: ignore[attr-defined]
-                Fibonacci.Goal(order=40))
-        elif number == 5:
-            answer = await node.goal.cancel_goal_async()  # type: ignore[attr-defined]
-            node.note(len(answer.goals_canceling))
-            result = await node.goal.get_result_async()  # type: ignore[attr-defined]
-            node.note(result.status)
-
-    def fill(node: Filter) -> None:
-        node.client = ActionClient(node, Fibonacci, 'fibonacci')  # type: ignore[attr-defined]
-
-    seen, _ = run_filter(bag, graph, take, fibonacci, fill=fill)
-    assert seen == [(510.0, 1), (520.0, GoalStatus.STATUS_CANCELED)]
-
-
 # --- programs ------------------------------------------------------------------------------------
 
 def test_a_program_with_a_loop_of_its_own(bag: str, graph: Path) -> None:
@@ -345,32 +266,6 @@ def test_a_program_with_a_loop_of_its_own(bag: str, graph: Path) -> None:
         (1500.0, 15)]
 
 
-def test_spin_until_future_complete_with_a_timeout(bag: str, graph: Path) -> None:
-    seen: Seen = []
-
-    def main() -> None:
-        rclpy.init()
-        node = Filter(lambda node, number: done.set_result(number) if number == 7 else None)
-        done, never = rclpy.Future(), rclpy.Future()
-        rclpy.spin_until_future_complete(node, never, timeout_sec=0.25)
-        node.note('timeout')
-        rclpy.spin_until_future_complete(node, done)
-        node.note(done.result())
-        for _ in range(3):
-            rclpy.spin_once(node, timeout_sec=0.1)
-        node.note('three steps')
-        executor = MultiThreadedExecutor()
-        executor.add_node(node)
-        executor.spin_until_future_complete(never, timeout_sec=0.1)
-        node.note('executor')
-        seen.extend(node.seen)
-        node.destroy_node()
-        rclpy.shutdown()
-
-    rerun(bag, graph, [main])
-    assert seen == [(250.0, 'timeout'), (700.0, 7), (910.0, 'three steps'), (1010.0, 'executor')]
-
-
 def test_a_program_waits_for_a_service_of_the_next_one(bag: str, graph: Path) -> None:
     seen: Seen = []
 
@@ -387,28 +282,6 @@ def test_a_program_waits_for_a_service_of_the_next_one(bag: str, graph: Path) ->
 
     rerun(bag, graph, [main, lambda: server(30)])
     assert seen == [(30.0, 'hello')]
-
-
-def test_shutdown_from_a_callback_ends_the_run(bag: str, graph: Path) -> None:
-    def take(node: Filter, number: int) -> None:
-        node.note(number)
-        if number == 3:
-            rclpy.shutdown()
-
-    seen, result = run_filter(bag, graph, take)
-    assert [number for _, number in seen] == [0, 1, 2, 3]
-    assert result.virtual_ns == 300 * MS
-
-
-def test_what_a_program_raises(bag: str, graph: Path) -> None:
-    def main() -> None:
-        rclpy.init()
-        node = Filter(lambda node, number: None)
-        rclpy.spin_once(node, timeout_sec=0.5)
-        raise RuntimeError('no more')
-
-    with pytest.raises(RerunError, match='--node main: it raised RuntimeError: no more'):
-        rerun(bag, graph, [main])
 
 
 # --- clocks --------------------------------------------------------------------------------------
@@ -443,20 +316,6 @@ def test_who_waits_by_looking_at_the_time_all_the_time(bag: str, graph: Path) ->
     assert seen == [(220.0, 'time'), (230.0, 'clock')]
 
 
-def test_a_program_that_polls(bag: str, graph: Path) -> None:
-    seen: Seen = []
-
-    def main() -> None:
-        rclpy.init()
-        node = Filter(lambda node, number: node.note(number))
-        while len(node.seen) < 3:
-            rclpy.spin_once(node, timeout_sec=0)
-        seen.extend(node.seen)
-
-    rerun(bag, graph, [main])
-    assert seen == [(0.0, 0), (100.0, 1), (200.0, 2)]
-
-
 def test_functions_of_time_that_were_imported_by_name(
     bag: str, graph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -478,16 +337,6 @@ def test_what_is_not_the_same_each_time_is_warned_of(bag: str, graph: Path) -> N
         'time.time() is not the same in each run: give --all-clocks',
         'time.sleep() takes real time: give --all-clocks']
     assert all(warning.startswith(f'{__file__}:') for warning in result.warnings)
-
-
-def test_the_clock_is_told_where_somebody_subscribes_to_it(bag: str, graph: Path) -> None:
-    def fill(node: Filter) -> None:
-        node.create_subscription(
-            Clock, '/clock', lambda message: node.note(message.clock.nanosec // MS), 10)
-
-    seen, _ = run_filter(bag, graph, lambda node, number: None, fill=fill)
-    assert seen[:4] == [(0.0, 0), (10.0, 10), (20.0, 20), (30.0, 30)]
-    assert len(seen) == 190
 
 
 def test_simulated_time_is_that_of_the_recording(tmp_path: Path, graph: Path) -> None:

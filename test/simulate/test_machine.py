@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core import queues, Tables
 from mddag_executor.core.state import divide, new_state
-from mddag_executor.laboratory.experiment import Evaluator, Experiment
 from mddag_executor.simulate import (
     END,
     Load,
@@ -110,14 +109,6 @@ def test_one_that_is_more_urgent_overtakes_and_they_take_turns() -> None:
     assert in_ms(times(jobs, 2)) == [(0, 10), (10, 13)]
 
 
-def test_one_is_overtaken_once_it_takes_much_longer_than_usual() -> None:
-    """Others have the CPU meanwhile; nothing happens at 11 ms, three times as long and 5 ms."""
-    others = [Job(MS, 100 * MS, 30 * MS) for _ in range(4)]
-    urgent = Job(1_500_000, 20 * MS, MS, True)
-    found = times([Job(0, 50 * MS, 2 * MS, True), *others, urgent], 6, 1)
-    assert found[-1][0] == 11 * MS
-
-
 def test_each_process_has_its_interpreter() -> None:
     """The second of each waits for the first of its own; what goes first of all is held back."""
     jobs = of_ms(Job(0, 50, 4, True), Job(0, 60, 6, True, interpreter=2),
@@ -125,21 +116,6 @@ def test_each_process_has_its_interpreter() -> None:
     assert in_ms(times(jobs, 4)) == [(0, 4), (0, 6), (4, 7), (6, 8)]
     jobs[0].cost = 9 * MS
     assert in_ms(times(jobs, 4)) == [(0, 9), (0, 6), (9, 12), (6, 8)]
-
-
-def test_each_process_has_its_workers() -> None:
-    """The third waits for the only worker of its process; that of the other one is idle."""
-    jobs = of_ms(Job(0, 50, 4), Job(0, 60, 1, interpreter=2), Job(1, 70, 3))
-    assert in_ms(times(jobs, 1, divided=True)) == [(0, 4), (0, 1), (4, 7)]
-    assert in_ms(times(jobs, 2)) == [(0, 4), (0, 1), (1, 4)]
-
-
-def test_a_worker_that_goes_on_is_warm() -> None:
-    """The second goes on, the third does not; all three take what they take otherwise."""
-    jobs = of_ms(Job(0, 50, 4, True), Job(1, 60, 4, True), Job(20, 70, 4, True))
-    ms = [1 * MS, 1 * MS, -2 * MS]
-    assert in_ms(times(jobs, 1, warmth=ms)) == [(0, 4), (4, 7), (20, 26)]
-    assert in_ms(times(jobs, 3, warmth=ms)) == [(0, 4), (4, 7), (20, 26)]
 
 
 def test_a_worker_that_goes_on_keeps_the_lock() -> None:
@@ -156,11 +132,6 @@ def test_cpus_are_shared_by_slices() -> None:
     assert in_ms(times(jobs, 3, cpus=2)) == [(0, 6), (0, 9), (0, 9)]
     assert in_ms(times(jobs, 3)) == [(0, 6)] * 3
     assert in_ms(times(jobs, 3, cpus=1)) == [(0, 12), (0, 15), (0, 18)]
-
-
-def test_who_waits_needs_nothing() -> None:
-    jobs = of_ms(*(Job(0, 50, 6, cpu=2) for _ in range(2)))
-    assert in_ms(times(jobs, 2, cpus=1)) == [(0, 6), (0, 8)]
 
 
 def test_who_waits_gets_the_lock_back_after_a_switch_interval() -> None:
@@ -197,16 +168,6 @@ def test_declared_holders_in_the_simulator() -> None:
     assert worst == [[6, 6], [6, 12], [9, 12]]
     with pytest.raises(SimulationError, match='cpus: 0 is too few'):
         simulate(task_set, load, Settings(workers=2, duration_ns=40 * MS, cpus=0))
-
-
-def test_declared_holders_in_an_evaluation() -> None:
-    text = HOLDERS.replace('deadline: 20ms', 'deadline: 10ms')
-    accepted = []
-    for holds in ('false', 'true'):
-        experiment = Experiment(
-            loads(text.replace('H', holds), 'g.yaml'), ('rad',), 2, 40 * MS)
-        accepted.append(Evaluator([experiment], 1, 0, True)(0, 1).accepted.tolist())
-    assert accepted == [[[True]], [[False]]]
 
 
 # --- a model that goes by ticks ------------------------------------------------------------------

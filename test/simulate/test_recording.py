@@ -18,17 +18,14 @@ from mddag_executor.simulate import (
     draw_execution_times,
     END,
     periodic_load,
-    PREEMPT,
     Settings,
     simulate,
     SimulatedRun,
-    START,
 )
-from mddag_executor.trace import read_events
-from msg_graph import load, loads
+from msg_graph import loads
 import pytest
 
-from ..core.task_sets import Case, cases, declaration, examples
+from ..core.task_sets import Case, cases, examples
 
 AUTOWARE = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
 US = 1_000
@@ -98,72 +95,6 @@ def test_rescheduled_alike_it_runs_alike(trace: Path, case: Case, last_release: 
     for name, dag in run.result()['dags'].items():
         for sink, values in dag['sinks'].items():
             found = result['dags'][name]['sinks'][sink]
-            assert {key: found[key] for key in values} == values
-
-
-def test_the_events_of_a_run(tmp_path: Path) -> None:
-    """A preempted job that joins two topics, worked out by hand."""
-    task_set = declaration([
-        {'node': '/n', 'name': 's', 'timer': '10us', 'publishes': ['/x', '/y'], 'dag': 'd'},
-        {'node': '/n', 'name': 'j', 'sync': ['/x', '/y'], 'deadline': '8us'},
-        {'node': '/n', 'name': 'h', 'timer': '4us', 'deadline': '2us', 'dag': 'h'}])
-    load_of_run = periodic_load(task_set, [[1 * US, 4 * US], [1 * US]], 8 * US)
-    run = simulate(task_set, load_of_run, Settings(
-        policy='rm', workers=1, duration_ns=8 * US, preemptive=True), log=True)
-    path = tmp_path / 'run.mcap'
-    write_trace(path, task_set, load_of_run, run)
-    events = [{key: value for key, value in event.items() if key != '_vpid'}
-              for event in read_events(path)]
-    assert events[0]['_name'] == 'mddag:task_set'
-    assert events[0]['yaml'] == task_set.text
-    assert [event['symbol'] for event in events[1:4]] == ['/n:s', '/n:j', '/n:h']
-    short = [(event['_timestamp'] // US, event['_name'].split(':')[1],
-              event.get('dag', event.get('callback')), event.get('vertex'), event.get('job'))
-             for event in events[4:]]
-    assert short == [
-        (0, 'job_release', 0, None, 0), (0, 'job_release', 1, None, 0),
-        (0, 'dispatch', 1, 0, 0), (0, 'callback_start', 3, None, None),
-        (1, 'callback_end', 3, None, None), (1, 'complete', 1, 0, 0),
-        (1, 'dispatch', 0, 0, 0), (1, 'callback_start', 1, None, None),
-        (2, 'callback_end', 1, None, None), (2, 'complete', 0, 0, 0),
-        (2, 'dispatch', 0, 1, 0), (2, 'callback_start', 2, None, None),
-        (4, 'callback_end', 2, None, None),
-        (4, 'job_release', 1, None, 1),
-        (4, 'dispatch', 1, 0, 1), (4, 'callback_start', 3, None, None),
-        (5, 'callback_end', 3, None, None), (5, 'complete', 1, 0, 1),
-        (5, 'dispatch', 0, 1, 0), (5, 'callback_start', 2, None, None),
-        (7, 'callback_end', 2, None, None), (7, 'complete', 0, 1, 0), (7, 'complete', 0, 1, 0),
-        (8, 'shutdown', None, None, None)]
-    dispatches = [event for event in events if event['_name'] == 'mddag:dispatch']
-    assert [(d['ready'], d['reference_deadline'], d['worker']) for d in dispatches] == [
-        (0, 2 * US, 0), (0, 8 * US, 0), (2 * US, 8 * US, 0), (4 * US, 6 * US, 0),
-        (2 * US, 8 * US, 0)]
-    completes = [event for event in events if event['_name'] == 'mddag:complete']
-    assert [(c['leg'], c['last_leg'], c['completed']) for c in completes] == [
-        (0, True, 1 * US), (0, True, 2 * US), (0, True, 5 * US), (0, False, 7 * US),
-        (1, True, 7 * US)]
-
-
-@pytest.mark.parametrize('preemptive', [False, True])
-def test_autoware(tmp_path: Path, preemptive: bool) -> None:
-    task_set = load(AUTOWARE)
-    times = draw_execution_times(task_set, 4)
-    load_of_run = periodic_load(task_set, times, 1_000_000_000)
-    run = simulate(task_set, load_of_run, Settings(
-        policy='wc' if not preemptive else 'rm', duration_ns=1_000_000_000,
-        preemptive=preemptive), log=True)
-    path = tmp_path / 'autoware.mcap'
-    write_trace(path, task_set, load_of_run, run)
-    kinds = Counter(event['_name'] for event in read_events(path))
-    log = Counter(entry[1] for entry in run.log)
-    assert kinds['mddag:dispatch'] == kinds['ros2:callback_start'] == log[START]
-    assert kinds['ros2:callback_end'] == log[END] + log[PREEMPT]
-    assert kinds['mddag:job_release'] == sum(run.tally.jobs)
-    replayed = replay(path)
-    assert replayed.warnings == []
-    for name, dag in run.result()['dags'].items():
-        for sink, values in dag['sinks'].items():
-            found = replayed.result()['dags'][name]['sinks'][sink]
             assert {key: found[key] for key in values} == values
 
 

@@ -70,14 +70,6 @@ def test_a_source_may_get_ready_after_its_release() -> None:
         'completed_ns': 9 * US + 2}
 
 
-def test_a_vertex_without_time_makes_its_successors_ready_at_once() -> None:
-    run = simulate(two_dags(), periodic_load(two_dags(), [[0, 0], [0, 1]], 8 * US),
-                   Settings(workers=1, duration_ns=8 * US), log=True)
-    assert [entry[0] for entry in run.log if entry[3] == 0] == [0, 0, 0, 0]
-    assert run.result()['dags']['a']['sinks']['/n:x@a']['response_ns']['max'] == 0
-    assert run.result()['dags']['b']['ends']['completed'] == 2
-
-
 def test_a_bound_for_all_dags_and_one_of_its_own() -> None:
     task_set = two_dags(max_active_jobs=3)
     load = periodic_load(task_set, [[1, 900 * US], [900 * US, 1]], 100 * US)
@@ -151,7 +143,3 @@ def changed(change: Callable[[dict[str, Any]], Any]) -> str:
     data = json.loads(json.dumps(GOOD))
     change(data)
     return json.dumps(data)
-
-
-NO_TIMES: tuple[Any, ...] = (
-    0, -1, -0.5, 86_400_000_000, '3', True, [1], {}, float('nan'), float('inf'), 10 ** 400)
