@@ -20,16 +20,6 @@ from ..replay.recorded import MS, Recorded
 Mddag = Callable[..., subprocess.CompletedProcess[str]]
 
 BAG = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
-ARCHITECTURE = """\
-nodes:
-- node_name: /sensing/imu/imu_corrector
-  callbacks:
-  - {callback_name: /sensing/imu/imu_corrector/callback_0, callback_type: timer_callback,
-     period_ns: 33000000}
-- node_name: /nobody
-  callbacks:
-  - {callback_name: /nobody/callback_0, callback_type: timer_callback, period_ns: 5000000}
-"""
 
 ASKING = """\
 from mddag_executor import MultiDeadlineExecutor
@@ -202,19 +192,6 @@ def test_from_trace_accepts_the_proposals(call: Mddag, tmp_path: Path) -> None:
     assert {name: [(sink['completed'], sink['late']) for sink in dag['sinks'].values()]
             for name, dag in judged.items()} == {
         '/n/callback_0': [(10, 1)], '/n/callback_2': [(5, 0)], '/n/callback_5': [(5, 0)]}
-
-
-def test_from_trace_with_nothing_to_declare(call: Mddag, tmp_path: Path) -> None:
-    r = Recorded(tmp_path / 'r.mcap')
-    r.node(1, '/n')
-    r.subscription(12, 1, '/in')
-    r.write()
-    for options in ([], ['--accept']):
-        done = call('graph', 'from-trace', 'r.mcap', *options, '-o', 'g.yaml', cwd=tmp_path)
-        assert (done.returncode, done.stdout) == (2, '')
-        assert done.stderr == ('error: r.mcap: none of its callbacks has a known rate: record for '
-                               'a longer time\n')
-    assert not (tmp_path / 'g.yaml').exists()
 
 
 def test_from_trace_of_a_cycle_says_so(call: Mddag, tmp_path: Path) -> None:

@@ -17,8 +17,6 @@ from ..cli.helpers import caller
 from ..replay.recorded import four_jobs, MS
 from ..report.runs import by_hand, GRAPH, START
 
-DEMO = Path(__file__).parents[2] / 'bags' / 'demo_short.mcap'
-
 call = caller('replay')
 
 

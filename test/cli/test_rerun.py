@@ -63,15 +63,6 @@ def test_a_run_and_its_result(drive: Path) -> None:
     assert 'the same as out.mcap' in same.stdout
 
 
-def test_processes_run_as_one_and_that_is_said(drive: Path) -> None:
-    text = (drive / 'graph.yaml').read_text()
-    (drive / 'placed.yaml').write_text(
-        text + 'processes: {eyes: [/lidar, /tracker], brake: [/brake]}\n')
-    done = mddag(drive, 'rerun', 'drive.mcap', 'placed.yaml', *NODES, '--json', '-')
-    assert 'placed.yaml: processes: all nodes run in one here' in done.stderr
-    assert json.loads(done.stdout)['digest'] == digest(drive, 'graph.yaml', *NODES)
-
-
 @pytest.mark.slow
 def test_the_same_each_time_also_beside_busy_processes(drive: Path) -> None:
     """Also where seven workers are too few, and with other hashes of strings."""
@@ -198,18 +189,3 @@ def test_bad_input_is_one_line(drive: Path, args: tuple[str, ...], message: str)
     assert 'Traceback' not in done.stderr
     assert sorted(path.name for path in drive.iterdir() if path.name != '__pycache__') == [
         name for name in before if name != '__pycache__']
-
-
-def test_a_callback_that_raises_shows_its_traceback(drive: Path, tmp_path: Path) -> None:
-    for name in ('graph.yaml', 'drive.mcap'):
-        shutil.copy(drive / name, tmp_path)
-    text = (drive / 'robot.py').read_text()
-    (tmp_path / 'robot.py').write_text(text.replace(
-        '        if self.distance is None:', '        if message.data < 40:\n'
-        "            raise ValueError('too near')\n        if self.distance is None:"))
-    done = mddag(
-        tmp_path, 'rerun', 'drive.mcap', 'graph.yaml', *NODES, '-o', 'out.mcap', status=70)
-    assert "raise ValueError('too near')" in done.stderr
-    last = done.stderr.splitlines()[-1]
-    assert last.startswith('error: /tracker:track: it raised ValueError: too near at ')
-    assert not (tmp_path / 'out.mcap').exists()

@@ -148,21 +148,6 @@ def test_fail_on_miss_judges_by_what_the_declaration_tolerates(
     assert found['tolerate']['worst'] == counts(found).missed > 1
 
 
-def test_spinning_takes_cpu_which_is_not_overhead(graph: Path, mddag: Mddag) -> None:
-    process = mddag(
-        'run', graph, '--synthetic', 'spin', '--utilisation', '0.1', '--workers', '4',
-        '--duration', '2s', '--json', '-')
-    assert process.returncode == 0, process.stderr
-    measured = json.loads(process.stdout)['measured']
-    assert (measured['mode'], measured['seed']) == ('spin', 0)
-    # 0.4 of a core for 150 callbacks a second are 2.7 ms each: they must not be in the figure.
-    assert 0 < measured['cpu_us_per_callback'] < 0.4 / 150 * 1e6
-    # A busy machine runs fewer of them: the rate is that of the run itself.
-    assert measured['callbacks'] > 0
-    assert measured['callbacks_per_s'] == pytest.approx(
-        measured['callbacks'] * 1e9 / measured['window_ns'], rel=0.01)
-
-
 @contextmanager
 def started(graph: Path) -> Iterator[subprocess.Popen[str]]:
     """Give a synthetic run that goes on until it is told to end."""
@@ -285,20 +270,6 @@ nodes:
     mddag('run', 'graph.yaml', '--synthetic', 'sleep', '--workers', '1', '--duration', '1s',
           '--json', 'out.json')
     assert json.loads(Path('out.json').read_text())['stops']['total_ns'] < 500_000_000
-
-
-def test_the_names_of_synthetic_nodes_are_those_of_the_declaration(
-    graph: Path, mddag: Mddag
-) -> None:
-    process = mddag(
-        'run', graph, '--synthetic', 'sleep', '--duration', '0.5s', '--json', 'result.json',
-        '--ros-args', '-r', '__ns:=/robot', '-r', '/data:=/other')
-    assert process.returncode == 0, process.stderr
-    assert '--ros-args: remappings do not apply to synthetic nodes' in process.stderr
-    result = json.loads(Path('result.json').read_text())
-    assert (result['undeclared'], result['never_ran']) == (0, [])
-    # A busy machine skips releases.
-    assert {each['kind'] for each in result['drift']} <= {'rate'}
 
 
 # --- tables --------------------------------------------------------------------------------------

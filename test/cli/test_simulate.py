@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import errno
 import json
 import os
@@ -17,9 +16,6 @@ from typing import Any
 from mddag_executor.cli.main import main
 import pytest
 
-Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
-
-AUTOWARE = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
 GRAPH = """\
 mddag: 1
 workers: 2

@@ -60,11 +60,6 @@ def rad_offset(dag: Dag, index: int) -> int:
     return min(deadline for deadline in deadlines if deadline is not None)
 
 
-def depth(dag: Dag, index: int) -> int:
-    """Return how many vertices lie before one on the longest path to it."""
-    return max((1 + depth(dag, p) for p in dag.vertices[index].predecessors), default=0)
-
-
 @examples(100)
 @given(cases(), st.integers(5, 40))
 def test_every_job_ends_in_exactly_one_way(case: Case, last_release: int) -> None:

@@ -82,12 +82,6 @@ def set_state(engine: Engine, x: int, state: int) -> None:
     engine._state.x_state[x] = state
 
 
-def waiting(engine: Engine, group: int = -1) -> int:
-    state = engine._state
-    return next(x for x in range(len(state.x_state))
-                if state.x_state[x] == WAITING and state.x_group[x] == group)
-
-
 BREAKS: dict[str, tuple[str, Callable[[Engine], Any]]] = {
     'lost': ('in no queue', lambda e: e._state.held_back.pop()),
     'wrong group': ('waits for group', lambda e: e._state.x_group.__setitem__(

@@ -139,11 +139,3 @@ def test_generated_and_damaged(seed: int, place: int, how: str) -> None:
         lines[row] = lines[row].replace(':', ': "', 1)
     used = through_all_verbs(''.join(lines))
     assert used == len(VERBS) or how, 'what was generated is right'
-
-
-def test_some_are_right() -> None:
-    """The verbs have been given what they can use."""
-    text = yaml.safe_dump({'mddag': 1, 'nodes': [{'node': '/n', 'callbacks': [
-        {'name': 't', 'timer': '1us', 'publishes': ['/a'], 'execution_time': '1us'},
-        {'name': 'u', 'subscription': '/a', 'deadline': '86400s', 'execution_time': '1us'}]}]})
-    assert through_all_verbs(text) == len(VERBS)

@@ -226,9 +226,6 @@ def test_dirichlet_rescale_is_as_uniform_as_throwing_away(total: float) -> None:
     assert gap / count < 0.043
 
 
-FIRST = [5, 5, 4, 4, 2, 5, 4, 2, 4, 3]
-
-
 @pytest.mark.parametrize('limits', [[1.0, 0.0, 1.0], [1.0, 1e-12, 1.0], [0.0, 0.5], [1.0, 1e-5]])
 @pytest.mark.parametrize('part', [0.1, 0.49, 0.9, 1.0])
 def test_dirichlet_rescale_with_no_room_for_one(limits: list[float], part: float) -> None:

@@ -5,15 +5,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-import tempfile
 from typing import Any
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import open_recording, replay, reschedule
-from mddag_executor.trace import EVENTS, TraceFile
+from mddag_executor.trace import TraceFile
 import pytest
 
 from .helpers import MS, SMALL, small, START_TIME, VirtualRun
@@ -80,54 +77,6 @@ def test_a_trace_cut_anywhere(sound: bytes, whole: dict[str, Any], tmp_path: Pat
         assert reschedule(path, workers=1).tally.jobs
     assert jobs == sorted(jobs)
     assert jobs[0] < jobs[-1]
-
-
-NUMBERS = st.integers(-1, 4) | st.sampled_from([2**31 - 1, -2**31])
-TIMES = st.integers(0, 40).map(lambda ms: START_TIME + ms * MS) | st.sampled_from(
-    [0, -1, 2**63 - 1, -2**63])
-ANY = {'int32': NUMBERS, 'int64': NUMBERS | TIMES, 'uint64': st.integers(0, 4),
-       'bool': st.booleans(), 'string': st.sampled_from(['', 'qos_depth', '\x1b[2J', SMALL])}
-KINDS = [event for event in EVENTS.values() if event.provider == 'mddag'
-         or event.name.startswith(('callback_', 'add_callback', 'rclcpp_timer', 'rclcpp_subs'))]
-
-
-@st.composite
-def nonsense(draw: st.DrawFn) -> tuple[Any, ...]:
-    """Return an event with any values."""
-    event = draw(st.sampled_from(KINDS))
-    return (event.key, draw(st.integers(0, 40)), draw(st.integers(1, 2)),
-            *(draw(ANY[kind]) for _, kind in event.fields))
-
-
-def write_events(path: Path, events: list[tuple[Any, ...]], in_order: bool) -> None:
-    """Write events (name, ms, thread, fields…) behind a declaration, by their times or not."""
-    with TraceFile(path) as file:
-        file.add('task_set', START_TIME, 1, 1, SMALL, 'g.yaml', 'rad', 2, MS, 3, False)
-        for name, ms, thread, *fields in sorted(
-                events, key=lambda event: event[1] if in_order else 0):
-            file.add(name, START_TIME + ms * MS, 1, thread, *fields)
-
-
-@given(st.lists(nonsense(), max_size=60), st.booleans())
-@settings(max_examples=200)
-def test_events_with_any_values(events: list[tuple[Any, ...]], in_order: bool) -> None:
-    """Whoever wrote it, there are counts and warnings, or one line; never a traceback."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, 'a.mcap')
-        write_events(path, events, in_order)
-        outcome = replay(path)
-        jobs = sum(outcome.tally.jobs)
-        assert jobs <= sum(event[0] == 'mddag:job_release' for event in events)
-        for dag in outcome.result()['dags'].values():
-            assert sum(dag['ends'].values()) <= dag['jobs']
-            for sink in dag['sinks'].values():
-                assert sink['completed'] + sink['overdue'] + sink['expired'] + sink[
-                    'aborted'] <= dag['jobs']
-        try:
-            result = reschedule(path, small()).result()
-            assert sum(dag['jobs'] for dag in result['dags'].values()) <= jobs
-        except MddagError as error:
-            assert str(error).startswith(str(path))
 
 
 def test_an_event_at_the_end_of_all_times(tmp_path: Path) -> None:

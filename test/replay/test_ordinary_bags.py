@@ -11,8 +11,6 @@ import shutil
 import sqlite3
 from typing import Any
 
-from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
 from mddag_executor.cli import main as program
 from mddag_executor.replay import bags, Reschedule
 from mddag_executor.replay.bags import Bag, BagError, is_ordinary, UNKNOWN
@@ -282,28 +280,6 @@ def test_hostile_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'folder').mkdir()
     with pytest.raises(BagError, match='there is neither metadata.yaml nor a bag file'):
         Bag(tmp_path / 'folder', {'/points'})
-
-
-@pytest.mark.parametrize('compression', list(CompressionType))
-def test_mcap_of_another_writer(tmp_path: Path, compression: CompressionType) -> None:
-    """Without metadata, with publication times, chunks in any compression or none, disorder."""
-    path = tmp_path / 'a.mcap'
-    with path.open('wb') as stream:
-        writer = McapWriter(stream, compression=compression, chunk_size=200)
-        writer.start('ros2')
-        schema = writer.register_schema('std_msgs/msg/Header', 'ros2msg', b'\
-# a comment\nint32 CONSTANT=1\n\nbuiltin_interfaces/Time stamp\nstring frame_id\n')
-        channel = writer.register_channel('/points', 'cdr', schema)
-        for i in (0, 2, 1, 3):
-            stamp = BEGIN + i * 100 * MS
-            writer.add_message(channel, stamp + 5 * MS, header(stamp), stamp + 2 * MS)
-        writer.finish()
-    text = GRAPH.replace('period: 100ms', 'period: 100ms, release_from: source_timestamp')
-    outcome = reschedule_bag(path, loads(text, 'g.yaml'))
-    assert outcome.warnings == []
-    assert set(responses(outcome, '/lidar', '/detector:detect').values()) == {12 * MS}
-    assert set(Bag(path, {'/points'}).stamps['/points'].header) == {
-        BEGIN + i * 100 * MS for i in range(4)}
 
 
 def test_counts_that_differ_are_said(tmp_path: Path) -> None:

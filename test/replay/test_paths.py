@@ -271,8 +271,6 @@ def test_a_spread(times: list[int]) -> None:
     assert spread(np.array(times, dtype=np.int64)) == statistics(times)
 
 
-TOP = Path(__file__).resolve().parent.parent.parent
-DEMO = TOP / 'bags' / 'demo_short.mcap'
 MS = 1_000_000
 
 GRAPH_OWN = """\

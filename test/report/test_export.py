@@ -16,7 +16,6 @@ import pytest
 
 from . import runs
 
-MS = runs.MS
 DEMO = runs.CONFIG.parent / 'bags' / 'demo_short.mcap'
 
 

@@ -24,8 +24,6 @@ from mddag_executor.report.html_data import (
 from mddag_executor.report.html_tables import (
     html_table,
 )
-from mddag_executor.simulate import periodic_load, Settings, simulate
-import msg_graph
 import pytest
 
 from . import runs
@@ -82,20 +80,6 @@ def test_what_is_in_the_file_is_what_ran(tmp_path: Path) -> None:
     assert [miss[1:] for miss in prepared.meta['missed']] == [
         pytest.approx((0.020, 0.028, 0.030))]
     assert prepared.marks['x'] == pytest.approx([0.030])
-
-
-@pytest.fixture(scope='module')
-def many() -> html.ReportData:
-    """Return a run with 200 sinks."""
-    nodes = '\n'.join(
-        f'  - {{node: /n{i}, callbacks: [{{name: c, timer: 100ms, dag: d{i}, deadline: 50ms, '
-        f'execution_time: {1 + i * 7 % 60}ms}}]}}' for i in range(200))
-    task_set = msg_graph.loads(f'mddag: 1\nworkers: 200\nnodes:\n{nodes}\n')
-    load = periodic_load(
-        task_set, [[vertex.callback.execution_time.draw(0)] for dag in task_set.dags
-                   for vertex in dag.vertices], 200 * 10 ** 6)
-    run = simulate(task_set, load, Settings('rad', 200, 200 * 10 ** 6), log=True)
-    return html.of_run(task_set, load, run)
 
 
 def ms(text: str) -> float:

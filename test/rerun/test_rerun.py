@@ -147,14 +147,6 @@ def test_what_was_published_early_leaves_early(bag: str, graph: Path, cpus: int 
     assert [time for time, _ in published(result, '/out')][:2] == [16, 116]
 
 
-TWO = GRAPH.partition('  - node: /sink')[0].replace('10ms}', '10ms, deadline: 50ms}') + """\
-  - node: /other
-    callbacks:
-      - {name: take, subscription: /points, execution_time: 10ms, publishes: [/out],
-         deadline: 60ms}
-"""
-
-
 # --- timers, seeds, what is kept -----------------------------------------------------------------
 
 def node_with(function: Callable[[Node], None], name: str = 'filter') -> Callable[[], Node]:

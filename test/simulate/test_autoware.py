@@ -23,52 +23,10 @@ DURATION_NS = 3_000_000_000
 WORKERS = 7
 DRAWS = 40
 
-Id = tuple[int, int, int]
-"""DAG, vertex in its DAG, job."""
-
 
 @cache
 def autoware() -> TaskSet:
     return load(AUTOWARE)
-
-
-@cache
-def least_deadline(dag: int, index: int) -> int:
-    """Return RAD minus release by the definition: the least deadline among the sinks below."""
-    vertex = autoware().dags[dag].vertices[index]
-    if vertex.deadline_ns is not None:
-        return vertex.deadline_ns
-    return min(least_deadline(dag, after) for after in vertex.successors)
-
-
-@cache
-def latest_start(dag: int, index: int) -> int:
-    """Return the latest start minus release: every vertex takes its mean time and none waits."""
-    vertex = autoware().dags[dag].vertices[index]
-    assert vertex.callback.execution_time is not None
-    end = vertex.deadline_ns
-    if end is None:
-        end = min(latest_start(dag, after) for after in vertex.successors)
-    return end - vertex.callback.execution_time.mean_ns
-
-
-@cache
-def depth(dag: int, index: int) -> int:
-    """Return how many vertices lie before one on the longest path to it."""
-    before = autoware().dags[dag].vertices[index].predecessors
-    return max((1 + depth(dag, each) for each in before), default=0)
-
-
-@cache
-def urgencies() -> dict[str, int]:
-    """Return the place of each callback in the order of PiCAS."""
-    order = sorted(
-        (least_deadline(dag.index, v.index), dag.period_ns, dag.index, -depth(dag.index, v.index),
-         v.index, v.callback.key) for dag in autoware().dags for v in dag.vertices)
-    places: dict[str, int] = {}
-    for place, (*_, key) in enumerate(order):
-        places.setdefault(key, place)
-    return places
 
 
 def test_acceptance_over_some_draws() -> None:

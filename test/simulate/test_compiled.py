@@ -33,7 +33,6 @@ pytestmark = [
     pytest.mark.skipif(not compiling.available(), reason='numba is not there'),
     pytest.mark.timeout(400),  # a first run compiles
 ]
-CONFIG = Path(__file__).parents[2] / 'config'
 
 
 def settings_of(case: Case, horizon: int, judge: str, stop: bool) -> Settings:

@@ -27,8 +27,6 @@ import pytest
 
 from ..core.task_sets import Case, cases, examples
 
-AUTOWARE = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
-US = 1_000
 # The first one is late, which aborts the job, so the other comes too late.
 TWO_SINKS_AT_ONCE = Case(loads("""\
 mddag: 1

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 import json
 from typing import Any
@@ -137,9 +136,3 @@ GOOD = {'a': {'/n:s': 2, '/n:x@a': 3.5}, 'b': {'/n:t': 0.0001, '/n:x': 86_399_99
 def test_times_from_a_file_are_microseconds() -> None:
     times = read_execution_times(two_dags(), json.dumps(GOOD), FILE)
     assert times == [[2_000, 3_500], [86_399_999_999_000, 1]]  # x stands before t
-
-
-def changed(change: Callable[[dict[str, Any]], Any]) -> str:
-    data = json.loads(json.dumps(GOOD))
-    change(data)
-    return json.dumps(data)
