@@ -131,7 +131,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('graph place g.yaml --processes 4 -o out.yaml',
      '--processes 4: there are only 2 nodes to place, or groups of nodes: give fewer processes'),
     ('graph place g.yaml --processes 1 --trace run.mcap --utilisation 0.2 -o out.yaml',
-     '--utilisation: recorded execution times are not scaled: leave it out'),
+     '--utilisation: execution times are those of --trace: leave one of them out'),
     # recordings
     ('replay bad.mcap', 'bad.mcap: is no MCAP file: give a trace'),
     ('replay none.mcap', 'none.mcap: cannot be read (No such file or directory): check '),
