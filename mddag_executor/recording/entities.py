@@ -26,7 +26,7 @@ Theory of operation
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from mddag_executor.trace import EVENTS
@@ -141,6 +141,10 @@ class Addresses(Generic[_T]):
         place = bisect_right(times, time)
         times.insert(place, time)
         self._things.setdefault((pid, address), []).insert(place, thing)
+
+    def times(self, pid: int, address: int) -> Sequence[int]:
+        """Return when objects were registered under an address, ascending."""
+        return self._times.get((pid, address), ())
 
     def latest(self, pid: int, address: int, time: int) -> _T | None:
         """Return the object that an event at run time means."""

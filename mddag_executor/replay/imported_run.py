@@ -5,9 +5,8 @@ An imported recording: releases, executions, completions and ends of jobs as tab
 
 Theory of operation
 -------------------
-The first pass over the trace identifies nodes and callbacks (``entities``) and matches them with
-the declaration (``mapping``).  The second links executions and messages (``linker``) and assigns
-them to jobs.
+Nodes and callbacks are identified (``entities``) and matched with the declaration (``mapping``).
+Executions are linked with messages (``links``), and assigned to jobs in the order of time.
 
 1. *Releases.*  A timer is due at t_init + n * period.  rcl keeps this grid even if a timer is more
    than a period late: it skips the missed times.  The release of an execution is the last due time
@@ -32,10 +31,12 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable as Function
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, legs_of, NEVER
-from mddag_executor.recording.entities import Callback, Entities, Event, INIT_EVENTS
+from mddag_executor.memory import give_back
+from mddag_executor.recording.entities import Callback, Entities, INIT_EVENTS
 from mddag_executor.recording.head import Head, named_errors, no_run
 from mddag_executor.recording.mapping import Matching, Target
 from mddag_executor.recording.tables import (
@@ -47,108 +48,113 @@ from mddag_executor.recording.tables import (
     Recording,
     RELEASES,
     Rows,
+    rows,
+    sort_by,
+    Table,
     TAKES,
     UNKNOWN,
     VERTEX,
     WITHDRAWN,
 )
 from mddag_executor.replay.doubts import Doubts
-from mddag_executor.replay.linker import (
-    Execution,
-    Linker,
-    LinkObserver,
-    Losses,
-    Publication,
-)
+from mddag_executor.replay.links import KINDS, Links, Losses, Lost, read_events, START
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
+import numpy as np
 
 _SLACK_NS = 1_000_000
-_PROGRESS_STEP = 4096
 _KEEP_LEGS = 65_536
-_START = 'ros2:callback_start'
 _OWN = ('mddag:job_release', 'mddag:dispatch')
 
 
-class Ended(NamedTuple):
-    """
-    What ended with a run of a callback in a thread.
-
-    :ivar piece: number of earlier pieces of the execution; ``last``: whether it is the last.
-    :ivar start: start of the execution; ``busy``: how long it ran.
-    """
-
-    piece: int
-    last: bool
-    start: int
-    busy: int
-
-
-class ImportedRun(LinkObserver):
+class ImportedRun:
     """
     A run of another executor; ``read`` turns it into tables.
 
     :param reader: a trace without declaration.
     :param task_set: the declaration to judge by; None: none.
     :param head: head of a trace of this executor; None: another executor recorded it.
-    :param linker: links its events.
+    :param progress: called regularly with the number of events read.
     """
+
+    kinds = KINDS
+    others: Sequence[str] = (*INIT_EVENTS, *_OWN)
+    links_type = Links
 
     def __init__(
         self, reader: TraceReader, name: str, task_set: TaskSet | None, head: Head | None = None,
-        linker: type[Linker] = Linker,
+        progress: Function[[int], None] | None = None,
     ) -> None:
         self._reader = reader
         self.name = name
-        first: int | None = None if head is None else head.time
-        threads: set[tuple[int, int]] = set()
-        own = False
-        init: list[Event] = []
-        for event in reader.layout_events(INIT_EVENTS | {_START, *_OWN}):
-            name_of_event = event[0].name
-            if name_of_event == _START:
-                threads.add(event[2:4])
-                first = event[1] if first is None else first
-            elif name_of_event in _OWN:
-                own = True      # recorded by this executor, but its executions are lost
-            else:
-                init.append(event)
-        if first is None or own and head is None:
+        with named_errors(reader.path, name):
+            self._events = read_events(
+                reader, self.kinds, self.others, progress)
+        give_back()     # memory of the batches
+        table = self._events.table
+        starts = table[table['kind'] == START]
+        init = [event for event in self._events.others if event[0].name not in _OWN]
+        # this executor recorded it, but its executions are lost
+        own = len(init) < len(self._events.others)
+        if head is None and (own or not len(starts)):
             raise no_run(reader)
         #: The nodes and callbacks.
         self.who = Entities()
         self.who.read(init)
+        threads = {self._events.threads[each] for each in np.unique(starts['thread']).tolist()}
         # The policy of another executor is not recorded; its name replaces the pool.
         self.head = head or Head(
-            first, '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
+            int(starts['time'][0]), '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
         self._imported = head is None
         self._matching = Matching(name, self.who, threads, task_set)
         #: The declaration to judge by; none is recorded.
-        self.task_set = self.recorded_set = self._matching.task_set
-        self.targets = self._matching.target
+        self.task_set = self._matching.task_set
+        self._targets = self._matching.target
         #: The first release, or when the first execution became ready, ns.
-        self.start: int | None = None
+        self._start: int | None = None
         #: The last event's time, ns.
-        self.end = min(max(0, first), NEVER - 1)
+        self.end = max(min(max(0, self.head.time), NEVER - 1), int(table['time'].max(initial=0)))
         self.jobs = 0
         self._order = 0
         self._doubts = Doubts(self.task_set.dags)
-        self._linker = linker(self.who, self)
-        self._workers: dict[tuple[int, int], int] = {}
+        self.links = self.links_type(self._events, self.who)
         self._timers = _Timers()
         self._fallbacks: Counter[str] = Counter()
         self._releases = Rows(RELEASES, 'dag', 'job', 'release', 'noticed', 'order')
-        self._executions = Rows(
-            EXECUTIONS, 'callback', 'thread', 'ready', 'start', 'dag', 'vertex', 'job', 'leg',
-            'worker', 'end', 'completes', 'message', 'order', 'piece', 'began', 'busy')
-        self._sent = Rows(PUBLICATIONS, 'publisher', 'execution', 'vertex', 'time',
-                          'source_timestamp')
-        self._taken = Rows(TAKES, 'execution', 'message', 'time')
         self._ends = Rows(JOB_ENDS, 'dag', 'job', 'time', 'reason', 'order')
+        self._add_executions()
         self._graph()
+
+    def _add_executions(self) -> None:
+        """Make the columns of executions, and those that are found in the order of time."""
+        runs, events = self.links.runs, self._events
+        count = len(runs)
+        table = self._executions = rows(EXECUTIONS, count)
+        callbacks = self.links.callbacks
+        table['callback'] = np.array([each.number for each in callbacks], dtype=np.int64)[
+            runs['callback']]
+        table['thread'] = np.array([tid for _, tid in events.threads], dtype=np.int64)[
+            runs['thread']]
+        table['start'] = table['began'] = runs['start']
+        table['end'], table['message'] = runs['end'], runs['message']
+        table['busy'] = np.where(runs['end'] >= 0, runs['end'] - runs['start'], UNKNOWN)
+        table['cpu'] = table['order'] = table['worker'] = UNKNOWN
+        ended = np.flatnonzero(runs['end_at'] >= 0)
+        ended = ended[sort_by(runs['end_at'][ended])]
+        threads, first = np.unique(runs['thread'][ended], return_index=True)
+        worker = np.full(len(events.threads), UNKNOWN)
+        worker[threads[sort_by(first)]] = np.arange(len(threads))
+        table['worker'][ended] = worker[runs['thread'][ended]]
+        #: By execution: DAG, vertex and job; its leg; when it was ready; what it completed, when.
+        self._of: list[tuple[int, int, int] | None] = [None] * count
+        self._leg_of = [0] * count
+        self._completes: list[tuple[int, int, int]] = []
+        self._runs: list[tuple[int, ...]] = list(zip(*(runs[name].tolist() for name in (
+            'callback', 'start', 'ready', 'stamp', 'stated', 'taken', 'message'))))
+        self._ready_of: list[int] = runs['ready'].tolist()
 
     def _graph(self) -> None:
         """Index the graph: sources by callback, successors by vertex and callback."""
@@ -158,7 +164,7 @@ class ImportedRun(LinkObserver):
         self._sizes: dict[int, int] = {}
         vertices = {v.callback.key: number for number, v in enumerate(self.task_set.vertices)}
         self._vertex = {number: vertices[target.callback.key]
-                        for number, target in self.targets.items()}
+                        for number, target in self._targets.items()}
         # by the vertices before and after, and the index of the topic
         self._leg: dict[tuple[int, int, int], int] = {}
         first = 0
@@ -182,41 +188,75 @@ class ImportedRun(LinkObserver):
             for dag in self._dags]
         self._legs: dict[tuple[int, int], set[int]] = {}
 
-    @property
-    def lost(self) -> int:
-        """Return how many events the tracer discarded, as it reports."""
-        return self._linker.discarded
-
-    @property
-    def unjudged(self) -> dict[int, int]:
-        """Return by DAG the number of jobs whose fate is unknown."""
-        return self._doubts.withdrawn
-
-    def read(self, progress: Function[[int], None] | None = None) -> Recording:
-        """Return the recording; ``progress`` is called regularly with the number of events."""
-        count, take = 0, self._linker.take
-        with named_errors(self._reader.path, self.name):
-            for event in self._reader.layout_events(self._linker.events):
-                take(event)
-                count += 1
-                if event[1] > self.end:
-                    self.end = event[1]
-                if progress is not None and count % _PROGRESS_STEP == 0:
-                    progress(count)
-        self._linker.finish()
+    def read(self) -> Recording:
+        """Return the recording."""
+        links = self.links
+        messages, runs = links.messages, links.runs
+        ended = np.flatnonzero(runs['end_at'] >= 0)
+        parts: list[tuple[Function[[int], None], Any]] = [
+            (self._lost, [each.at for each in links.lost]), (self._began, runs['at']),
+            (self._sent, messages['at']), (self._over, runs['end_at'][ended])]
+        at = np.concatenate([np.array(each, dtype=np.int64) for _, each in parts])
+        kind = np.repeat(np.arange(len(parts)), [len(each) for _, each in parts])
+        number = np.concatenate([*(np.arange(len(each)) for _, each in parts[:3]), ended])
+        order = sort_by(at, kind)
+        reports = [report for report, _ in parts]
+        self._messages = list(zip(*(messages[name].tolist() for name in (
+            'run', 'stamp', 'within'))))
+        for which, each in zip(kind[order].tolist(), number[order].tolist()):
+            reports[which](each)
         for dag, jobs in enumerate(self._open):
             for release, job in jobs:
                 self._close(dag, job, release)
-        executions = self._executions.table()
-        executions['cpu'] = UNKNOWN
         return Recording(
-            self.name, self.head, self.task_set, self.recorded_set, self.who, declared=False,
+            self.name, self.head, self.task_set, self.task_set, self.who, declared=False,
             imported=self._imported, same=False, releases=self._releases.table(),
-            executions=executions, publications=self._sent.table(), job_ends=self._ends.table(),
-            takes=self._taken.table(), start=self.start, end=self.end,
-            judged_until=self._judged_until(), lost=self.lost,
-            workers_each=self.head.workers, links=True,
-            callback_vertex=self._vertex, unjudged=self.unjudged, warnings=self.warnings)
+            executions=self._all_executions(), publications=self._publications(),
+            job_ends=self._ends.table(), takes=self._takes(), start=self._start, end=self.end,
+            judged_until=self._judged_until(), lost=links.discarded,
+            workers_each=self.head.workers, links=True, callback_vertex=self._vertex,
+            unjudged=self._doubts.withdrawn, warnings=self.warnings)
+
+    def _all_executions(self) -> Table:
+        table = self._executions
+        table['ready'] = self._ready_of
+        none = UNKNOWN, UNKNOWN, UNKNOWN
+        for name, values in zip(('dag', 'vertex', 'job'), zip(*(of or none for of in self._of))):
+            table[name] = values
+        table['leg'] = self._leg_of
+        if self._completes:
+            at, what, order = np.array(self._completes).T
+            table['completes'][at], table['order'][at] = what, order
+        return table
+
+    def _publications(self) -> Table:
+        messages, publishers = self.links.messages, self.links.publishers
+        numbers = np.array([*(each.number for each in publishers), UNKNOWN], dtype=np.int64)
+        callback = np.where(messages['run'] >= 0,
+                            self.links.runs['callback'][messages['run']], UNKNOWN) \
+            if len(self.links.runs) else messages['run']
+        pairs, which = np.unique(np.stack((callback, messages['publisher'])), axis=1,
+                                 return_inverse=True)
+        vertices = [self._publisher_vertex(*pair) for pair in pairs.T.tolist()]
+        return rows(
+            PUBLICATIONS, len(messages), publisher=numbers[messages['publisher']],
+            execution=messages['run'], time=messages['time'], source_timestamp=messages['stamp'],
+            vertex=np.array(vertices, dtype=np.int64)[which.ravel()])
+
+    def _publisher_vertex(self, callback: int, publisher: int) -> int:
+        """Return a vertex of a declared callback that publishes with its node's publisher."""
+        if callback < 0 or publisher < 0:
+            return UNKNOWN
+        number, node = self.links.callbacks[callback].number, self.links.publishers[publisher].node
+        target = self._targets.get(number)
+        known = target is not None and node is not None and target.callback.node == node.name
+        return self._vertex[number] if known else UNKNOWN
+
+    def _takes(self) -> Table:
+        found = self.links.takes
+        run = np.array([run for _, run, _ in found], dtype=np.int64)
+        return rows(TAKES, len(found), execution=run, message=[each for _, _, each in found],
+                    time=self.links.runs['start'][run])
 
     def _judged_until(self) -> int:
         """Return the time at which open jobs are judged."""
@@ -228,93 +268,93 @@ class ImportedRun(LinkObserver):
 
     # --- executions ------------------------------------------------------------------------------
 
-    def began(self, run: Execution, message: Publication | None) -> None:
-        """Find the job of an execution that has begun, and report it."""
-        target = self.targets.get(run.callback.number)
-        run.ready = self._ready(run, message)
-        if target is not None:
-            self._assign(run, target, message)
-        if self.start is None or run.ready < self.start:
-            self.start = run.ready
-        dag, vertex, job = run.of or (-1, -1, -1)
-        number = UNKNOWN if message is None else message.number
-        run.number = self._executions.add(
-            run.callback.number, run.thread[1], run.ready, run.start, dag, vertex, job, run.leg,
-            UNKNOWN, UNKNOWN, 0, number, UNKNOWN, 0, run.start, UNKNOWN)
-        if run.of is not None:
-            self._active[(dag, job)] += 1
-
-    def _ready(self, run: Execution, message: Publication | None) -> int:
-        if run.callback.kind == 'timer':
-            return self._timers.release(run.callback, run.start)
-        stamp = run.stamp if credible(run.stamp, run.start) else 0
-        sent = stamp or (message.stamp or message.time if message is not None else 0)
-        return min(sent or run.taken or run.start, run.start)
-
-    def _assign(self, run: Execution, target: Target, message: Publication | None) -> None:
+    def _began(self, run: int) -> None:
         """Find the job of an execution."""
+        callback = self.links.callbacks[self._runs[run][0]]
+        ready = self._ready_of[run] = self._ready(run, callback)
+        target = self._targets.get(callback.number)
+        if target is not None:
+            self._assign(run, callback, target)
+            ready = self._ready_of[run]
+        if self._start is None or ready < self._start:
+            self._start = ready
+        of = self._of[run]
+        if of is not None:
+            self._active[of[0], of[2]] += 1
+
+    def _ready(self, run: int, callback: Callback) -> int:
+        _, start, _, stamp, _, taken, message = self._runs[run]
+        if callback.kind == 'timer':
+            return self._timers.release(callback, start)
+        sent = stamp if credible(stamp, start) else 0
+        if not sent and message >= 0:
+            _, sent, _ = self._messages[message]
+            sent = sent or int(self.links.messages['time'][message])
+        return min(sent or taken or start, start)
+
+    def _assign(self, run: int, callback: Callback, target: Target) -> None:
+        """Find the job of an execution."""
+        _, start, _, stamp, _, _, message = self._runs[run]
         key = target.callback.key
         if key in self._source:
             dag, vertex = self._source[key]
             job = self._newest[dag] = self._newest[dag] + 1
-            release = self._release(run, self._dags[dag], target)
-            if run.callback.kind != 'timer':
-                run.ready = max(run.ready, min(release, run.start))
-            run.of = dag, vertex, job
-            self._expire(run.start)
+            release = self._release(run, callback, self._dags[dag], target)
+            if callback.kind != 'timer':
+                self._ready_of[run] = max(self._ready_of[run], min(release, start))
+            self._of[run] = dag, vertex, job
+            self._expire(start)
             self.jobs += 1
             self._doubts.opened(dag, job)
             self._open[dag].append((release, job))
-            if self.start is None or release < self.start:
-                self.start = release
-            self._releases.add(dag, job, release, run.start, self._next_order())
-        elif message is None or message.run is None:
-            self._doubts.ran_for_unknown(key, run.start, message is not None or run.stamp != 0)
-        elif message.run.of is not None:
-            dag, before, job = message.run.of
+            if self._start is None or release < self._start:
+                self._start = release
+            self._releases.add(dag, job, release, start, self._next_order())
+            return
+        sender = UNKNOWN if message < 0 else self._messages[message][0]
+        if sender < 0:
+            self._doubts.ran_for_unknown(key, start, message >= 0 or stamp != 0)
+        elif (of := self._of[sender]) is not None:
+            dag, before, job = of
             after = self._next.get((before, key))
             if after is not None:
-                run.of = dag, after, job
-                run.leg = self._leg.get((before, after, target.leg), 0)
+                self._of[run] = dag, after, job
+                self._leg_of[run] = self._leg.get((before, after, target.leg), 0)
 
-    def _release(self, run: Execution, dag: Dag, target: Target) -> int:
+    def _release(self, run: int, callback: Callback, dag: Dag, target: Target) -> int:
         """Return the release of a source's execution."""
-        if run.callback.kind == 'timer':
-            return run.ready
+        _, start, _, stamp, stated, taken, _ = self._runs[run]
+        if callback.kind == 'timer':
+            return self._ready_of[run]
         wanted = dag.release_from
-        if wanted == 'header_stamp' and credible(run.stated, run.start):
-            return min(run.stated, run.start)
+        if wanted == 'header_stamp' and credible(stated, start):
+            return min(stated, start)
         if wanted != 'arrival':
-            known = credible(run.stamp, run.start)
+            known = credible(stamp, start)
             if not known or wanted == 'header_stamp':
                 self._fallbacks[f'{target.callback.key} ({wanted})'] += 1
             if known:
-                return min(run.stamp, run.start)
-        return min(run.taken or run.start, run.start)
+                return min(stamp, start)
+        return min(taken or start, start)
 
-    def over(self, run: Execution) -> None:
-        """Note the end of an execution, and what it completed."""
-        columns = self._executions.columns
-        columns['end'][run.number] = run.end
-        columns['worker'][run.number] = self._workers.setdefault(run.thread, len(self._workers))
-        ended = self._ended(run)
-        columns['piece'][run.number] = ended.piece
-        columns['began'][run.number], columns['busy'][run.number] = ended.start, ended.busy
-        if run.of is None:
+    def _over(self, run: int) -> None:
+        """Note what the end of an execution completed."""
+        last = self._ends_with(run)
+        of = self._of[run]
+        if of is None:
             return
-        dag, vertex, job = run.of
+        dag, vertex, job = of
         self._active[(dag, job)] -= 1
-        if not ended.last:
+        if not last:
             return
-        whole = self._is_whole(vertex, job, run.leg)
+        whole = self._is_whole(vertex, job, self._leg_of[run])
         if whole:
             self._doubts.done(dag, vertex, job)
-        columns['completes'][run.number] = VERTEX if whole else LEG
-        columns['order'][run.number] = self._next_order()
+        self._completes.append((run, VERTEX if whole else LEG, self._next_order()))
 
-    def _ended(self, run: Execution) -> Ended:
-        """Return the ended execution; here each has one piece."""
-        return Ended(0, True, run.start, run.end - run.start)
+    def _ends_with(self, run: int) -> bool:
+        """Return whether an execution ends with a run of its callback; here it always does."""
+        return True
 
     def _is_whole(self, vertex: int, job: int, leg: int) -> bool:
         """Return whether an execution completes its vertex: the last leg of a sync vertex does."""
@@ -349,37 +389,23 @@ class ImportedRun(LinkObserver):
             self._ends.add(dag, job, UNKNOWN, WITHDRAWN, self._next_order())
         return doubted
 
-    def lost_sight(self, callback: Callback | None, run: Execution | None, time: int) -> None:
+    def _lost(self, number: int) -> None:
         """Doubt jobs: those of a callback that ran for an unknown one, or all open ones."""
-        if callback is None:
-            self._doubts.discarded(time)
-        elif (target := self.targets.get(callback.number)) is not None:
-            self._doubts.ran_for_unknown(target.callback.key, time)
-        if run is not None and run.of is not None:
-            dag, _, job = run.of
-            self._active[(dag, job)] -= 1
+        lost: Lost = self.links.lost[number]
+        if lost.callback < 0:
+            self._doubts.discarded(lost.time)
+        elif (target := self._targets.get(self.links.callbacks[lost.callback].number)) is not None:
+            self._doubts.ran_for_unknown(target.callback.key, lost.time)
+        of = self._of[lost.run] if lost.run >= 0 else None
+        if of is not None:
+            self._active[(of[0], of[2])] -= 1
 
-    def sent(self, message: Publication) -> None:
-        """Store a publication, and note that its job has sent it."""
-        of = None if message.run is None else message.run.of
-        if of is not None and (message.stamp or message.within):
-            self._doubts.sent(of[0], of[2], message.topic)
-        publisher, run = message.publisher, message.run
-        vertex = number = UNKNOWN
-        if run is not None:
-            number = run.number
-            target = self.targets.get(run.callback.number)
-            if target is not None and publisher is not None and publisher.node is not None and (
-                    target.callback.node == publisher.node.name):
-                vertex = self._vertex[run.callback.number]
-        message.number = self._sent.add(
-            UNKNOWN if publisher is None else publisher.number, number, vertex, message.time,
-            message.stamp)
-
-    def took(self, run: Execution, message: Publication) -> None:
-        """Note that a callback took a message itself."""
-        if run.number >= 0:
-            self._taken.add(run.number, message.number, run.start)
+    def _sent(self, message: int) -> None:
+        """Note that a job has sent a message."""
+        run, stamp, within = self._messages[message]
+        of = self._of[run] if run >= 0 else None
+        if of is not None and (stamp or within):
+            self._doubts.sent(of[0], of[2], self.links.topic(message))
 
     # --- warnings --------------------------------------------------------------------------------
 
@@ -393,11 +419,13 @@ class ImportedRun(LinkObserver):
                 f'{name}: left out: {counted(self.who.incomplete, "event")} of the '
                 'initialisation without some of the fields')
         lines += self._matching.warnings
-        if self.lost:
+        if self._events.warning:
+            lines.append(f'{name}: {self._events.warning}')
+        if self.links.discarded:
             lines.append(
-                f'{name}: the tracer discarded {counted(self.lost, "event")} or more: executions '
-                'and messages may be missing')
-        lines += [f'{name}: {text}' for text in self._linker.losses.lines()]
+                f'{name}: the tracer discarded {counted(self.links.discarded, "event")} or more: '
+                'executions and messages may be missing')
+        lines += [f'{name}: {text}' for text in self.links.losses.lines()]
         if self._doubts.withdrawn:
             dags = [f'{self._dags[dag].name} ({n})' for dag, n in self._doubts.withdrawn.items()]
             lines.append(

@@ -69,9 +69,10 @@ def open_recording(
             return judged_by(read_own(reader, name or path, head, progress), task_set)
         if head is not None and task_set is not None:
             from mddag_executor.replay.undeclared_run import UndeclaredRun
-            return UndeclaredRun(reader, name or path, head, task_set).read(progress)
+            return UndeclaredRun(
+                reader, name or path, head, task_set, progress).read()
         from mddag_executor.replay.imported_run import ImportedRun
-        return ImportedRun(reader, name or path, task_set).read(progress)
+        return ImportedRun(reader, name or path, task_set, progress=progress).read()
 
 
 def check_declared(path: Given, name: str) -> None:

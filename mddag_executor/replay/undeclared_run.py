@@ -25,133 +25,104 @@ the causes of executions.  Differences:
 
 from __future__ import annotations
 
-from array import array
 from bisect import bisect_right
-from collections import Counter, deque
-from collections.abc import Callable
-from typing import Any
+from collections import Counter
+from collections.abc import Callable as Function
 
-from mddag_executor.recording.entities import Address
+from mddag_executor.recording.entities import Callback, INIT_EVENTS
 from mddag_executor.recording.head import Head, no_end
 from mddag_executor.recording.mapping import Target
 from mddag_executor.recording.tables import DROPS, Ints, Recording, rows, UNKNOWN
-from mddag_executor.replay.imported_run import Ended, ImportedRun
-from mddag_executor.replay.linker import (
-    Event,
-    Execution,
-    Linker,
-    Publication,
-    Thread,
+from mddag_executor.replay.imported_run import ImportedRun
+from mddag_executor.replay.links import (
+    END,
+    KINDS,
+    Links,
+    OWN_KINDS,
+    READY,
+    SHUTDOWN,
+    START,
+    TAKE,
 )
 from mddag_executor.trace import TraceReader
+from mddag_executor.trace.times import NEVER
 from msg_graph import Dag, TaskSet
 import numpy as np
 
-_DISPATCH, _DROP, _SHUTDOWN = 'mddag:dispatch', 'mddag:drop', 'mddag:shutdown'
-_OPEN = 2 ** 62
+_DROP = 'mddag:drop'
 _ROUNDING_NS = 1_000        # of the two clocks that stamp and publication are read from
-_WAITING = 1024             # messages of a subscription that are remembered
-_UNSENT = 256               # publications of a topic without a timestamp that are remembered
+_UNSENT = 256               # publications of a topic without a timestamp that are compared
 # A timer is noticed shortly after its release within both: a time, and a part of its period.
 _SOON_NS, _SOON_PART = 1_000_000, 10
 
 
-class _Window:
-    """A publication without a timestamp, and the time range in which it may have been sent."""
+class _OwnLinks(Links):
+    """The executions and messages of this executor (rules 1 and 2)."""
 
-    __slots__ = ('publication', 'end')
+    def _stamp_messages(self) -> None:
+        """Find the source timestamps of publications (rule 2)."""
+        #: Topics and timestamps of several possible publications.
+        self._ambiguous: set[tuple[str, int]] = set()
+        table, found = self.events, self.messages
+        kind = table['kind']
+        sent = np.zeros(len(table), dtype=np.bool_)
+        sent[found['at']] = True
+        # a publication is being sent until the next one, or until the callback ends
+        ends = np.full(len(found), NEVER)
+        stops = sent | (kind <= END)
+        before = self._last(stops, stops)
+        at = np.flatnonzero(stops)
+        mine = (before >= 0) & sent[before]
+        ends[self._row[before[mine]]] = table['time'][at[mine]]
+        topics: dict[str, list[int]] = {}
+        for row in range(len(found)):
+            topics.setdefault(self.topic(row), []).append(row)
+        times = {topic: found['time'][mine].tolist() for topic, mine in topics.items()}
+        takes = np.flatnonzero((kind == TAKE) & (self._subscription >= 0))
+        known: set[tuple[str, int]] = set()
+        for number, stamp in zip(self._subscription[takes].tolist(), table['b'][takes].tolist()):
+            topic = self.taken[number][0].start
+            if (topic, stamp) in known or topic not in topics:
+                continue
+            last = bisect_right(times[topic], stamp + _ROUNDING_NS)
+            fits = [row for row in topics[topic][max(0, last - _UNSENT):last]
+                    if not found['stamp'][row] and stamp <= ends[row] + _ROUNDING_NS]
+            if fits:
+                known.add((topic, stamp))
+            if len(fits) == 1:
+                found['stamp'][fits[0]] = stamp
+            elif fits:
+                self._ambiguous.add((topic, stamp))
 
-    def __init__(self, publication: Publication) -> None:
-        self.publication, self.end = publication, _OPEN
+    def _messages_by_stamp(self) -> dict[tuple[str, int], int]:
+        return {**super()._messages_by_stamp(), **dict.fromkeys(self._ambiguous, -1)}
 
-    def holds(self, stamp: int) -> bool:
-        """Return whether the timestamp may be that of the publication."""
-        return self.publication.time - _ROUNDING_NS <= stamp <= self.end + _ROUNDING_NS
+    def _takes(self) -> list[tuple[int, int, int]]:
+        return []       # the executor takes messages in the threads of callbacks
 
-
-class _OwnLinker(Linker):
-    """Links the events of this executor (rules 1 and 2)."""
-
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        #: Number of dropped messages by reason.
-        self.dropped: Counter[str] = Counter()
-        #: End of the run, and end of its judged part; None: not recorded.
-        self.ended: tuple[int, int] | None = None
-        # by callback its taken messages: times; and their timestamps with the ready time of the
-        # execution that each started, 0: none so far
-        self._taken: dict[int, tuple[list[int], list[tuple[int, int]]]] = {}
-        self._windows: dict[str, deque[_Window]] = {}
-        self._sending: dict[Thread, _Window] = {}
-        self._ready: dict[Thread, int] = {}
-        self._handlers.update({
-            'ros2:rmw_take': self._was_taken, _DISPATCH: self._dispatched, _DROP: self._drop,
-            _SHUTDOWN: self._shut_down})
-        self.events = frozenset(self._handlers)
-
-    def _was_taken(self, event: Event, thread: Thread, state: Any) -> None:
-        stamp = self._get(event, 'source_timestamp')
-        callbacks = self._entities.taken.latest(
-            thread[0], self._get(event, 'rmw_subscription_handle'), event[1])
-        for callback in callbacks or ():
-            times, messages = self._taken.setdefault(callback.number, ([], []))
-            times.append(event[1])
-            messages.append((stamp, 0))
-            del times[:-_WAITING], messages[:-_WAITING]
-            self._find_publication(callback.start, stamp)
-
-    def _find_publication(self, topic: str, stamp: int) -> None:
-        """Find the publication of a timestamp."""
-        windows = self._windows.get(topic)
-        if windows is None or stamp in self._by_stamp.get(topic, ()):
-            return
-        fits = [window for window in windows if window.holds(stamp)]
-        if len(fits) == 1:
-            fits[0].publication.stamp = stamp
-            windows.remove(fits[0])
-        if fits:
-            self._know(topic, stamp, fits[0].publication if len(fits) == 1 else None)
-
-    def _publication(self, event: Event, thread: Thread, state: Any) -> Publication:
-        message = super()._publication(event, thread, state)
-        self._sent(thread, event[1])
-        window = self._sending[thread] = _Window(message)
-        self._windows.setdefault(message.topic, deque(maxlen=_UNSENT)).append(window)
-        return message
-
-    def _sent(self, thread: Thread, now: int) -> None:
-        """End the sending of a thread's last publication."""
-        window = self._sending.pop(thread, None)
-        if window is not None:
-            window.end = now
-
-    def _dispatched(self, event: Event, thread: Thread, state: Any) -> None:
-        callback = self._entities.callback(thread[0], self._get(event, 'callback'), event[1])
-        ready = self._ready[thread] = self._get(event, 'ready')
-        times, messages = self._taken.get(callback.number, ([], []))
-        place = bisect_right(times, ready) - 1
-        state.take = None
-        if place >= 0 and messages[place][1] in (0, ready):
-            stamp = messages[place][0]
-            messages[place] = stamp, ready
-            state.take = callback, None, stamp, 0, None, times[place]
-
-    def _start(self, event: Event, thread: Thread, state: Any) -> None:
-        self._sent(thread, event[1])
-        super()._start(event, thread, state)
-        state.stack[-1].ready = self._ready.get(thread, event[1])
-
-    def _end(self, event: Event, thread: Thread, state: Any) -> None:
-        self._sent(thread, event[1])
-        super()._end(event, thread, state)
-
-    def _drop(self, event: Event, thread: Thread, state: Any) -> None:
-        place = self._fields.get('reason')
-        if place is not None:
-            self.dropped[str(event[place])] += 1
-
-    def _shut_down(self, event: Event, thread: Thread, state: Any) -> None:
-        self.ended = event[1], self._get(event, 'end')
+    def _arrivals(self) -> Ints:
+        """Find the taken message of each execution (rule 1)."""
+        table = self.events
+        kind, time = table['kind'], table['time']
+        takes, ready = kind == TAKE, kind == READY
+        #: By event of a dispatch the event of the taken message, or -1.
+        self._taken_at = np.full(len(table), -1)
+        for number, callback in enumerate(self.callbacks):
+            subscriptions = [i for i, each in enumerate(self.taken) if callback in each]
+            mine = np.flatnonzero(takes & np.isin(self._subscription, subscriptions))
+            these = np.flatnonzero(ready & (self._callback == number)) if len(mine) else mine
+            place = np.searchsorted(time[mine], table['b'][these], 'right') - 1
+            these, place = these[place >= 0], place[place >= 0]
+            # a message starts one execution; its pieces have the same ready time
+            _, first, which = np.unique(place, return_index=True, return_inverse=True)
+            same = table['b'][these] == table['b'][these[first[which]]]
+            self._taken_at[these[same]] = mine[place[same]]
+        starts = kind == START
+        last = self._last(ready, starts)
+        self.runs['ready'] = np.where(last >= 0, table['b'][last], self.runs['start'])
+        last = self._last(ready | starts, starts)
+        found: Ints = np.where((last >= 0) & ready[last], self._taken_at[last], -1)
+        return found
 
 
 class UndeclaredRun(ImportedRun):
@@ -162,32 +133,36 @@ class UndeclaredRun(ImportedRun):
     :param task_set: the declaration to judge by.
     """
 
-    def __init__(self, reader: TraceReader, name: str, head: Head, task_set: TaskSet) -> None:
-        ready: dict[Address, array[int]] = {}
-        for event in reader.events({_DISPATCH}, sorted=True):
-            if None in event:
-                continue
-            ready.setdefault((event[2], event[4]), array('q')).append(event[9])
-        super().__init__(reader, name, task_set, head, _OwnLinker)
-        # by address and ready time: number of remaining pieces; and their execution so far
-        self._to_come: dict[tuple[Address | None, int], int] = {}
-        self._pieces: dict[tuple[Address | None, int], _Pieces] = {}
-        for address, times in ready.items():
-            callback = self.who.callbacks.latest(*address, times[0])
-            if callback is not None and callback.kind == 'timer':
+    kinds = {**KINDS, **OWN_KINDS}
+    others = (*INIT_EVENTS, _DROP)
+    links_type = _OwnLinks
+
+    def __init__(
+        self, reader: TraceReader, name: str, head: Head, task_set: TaskSet,
+        progress: Function[[int], None] | None = None,
+    ) -> None:
+        super().__init__(reader, name, task_set, head, progress)
+        runs = self.links.runs
+        # by callback and ready time: number of remaining pieces; and their execution so far
+        self._to_come: dict[tuple[int, int], int] = {}
+        self._pieces: dict[tuple[int, int], _Pieces] = {}
+        for number, callback in enumerate(self.links.callbacks):
+            times = runs['ready'][runs['callback'] == number]
+            if callback.kind == 'timer' and len(times):
                 callback.grid = _grid(np.unique(times), callback.period)
             different, counts = np.unique(times, return_counts=True)
             for time, count in zip(different[counts > 1].tolist(), counts[counts > 1].tolist()):
-                self._to_come[address, time] = count
+                self._to_come[number, time] = count
 
-    def read(self, progress: Callable[[int], None] | None = None) -> Recording:
-        """Return the recording; ``progress`` is called regularly with the number of events."""
-        found = super().read(progress)
-        assert isinstance(self._linker, _OwnLinker)
-        found.shut_down = self._linker.ended is not None
+    def read(self) -> Recording:
+        """Return the recording."""
+        found = super().read()
+        found.shut_down = bool((self._events.table['kind'] == SHUTDOWN).any())
         if not found.shut_down:
             found.warnings.append(no_end(self.name))
-        reasons = self._linker.dropped
+        reasons = Counter(str(event[4 + event[0].fields.index('reason')])
+                          for event in self._events.others if event[0].name == _DROP
+                          and 'reason' in event[0].fields)
         found.drop_reasons = tuple(reasons)
         found.drops = rows(
             DROPS, reasons.total(), vertex=UNKNOWN, job=UNKNOWN, time=UNKNOWN,
@@ -195,44 +170,47 @@ class UndeclaredRun(ImportedRun):
         return found
 
     def _judged_until(self) -> int:
-        assert isinstance(self._linker, _OwnLinker)
-        return self.end if self._linker.ended is None else self._linker.ended[1]
+        table = self._events.table
+        ends = table['a'][table['kind'] == SHUTDOWN]
+        return int(ends[-1]) if len(ends) else self.end
 
-    def _ready(self, run: Execution, message: Publication | None) -> int:
-        return run.ready        # the executor records it
+    def _ready(self, run: int, callback: Callback) -> int:
+        return self._ready_of[run]      # the executor records it
 
-    def _release(self, run: Execution, dag: Dag, target: Target) -> int:
-        callback = run.callback
+    def _release(self, run: int, callback: Callback, dag: Dag, target: Target) -> int:
+        ready = self._ready_of[run]
         if callback.kind == 'service':
-            return run.ready        # the time at which a request was taken is not recorded
+            return ready        # the time at which a request was taken is not recorded
         if callback.kind != 'timer':
-            return super()._release(run, dag, target)
+            return super()._release(run, callback, dag, target)
         if callback.grid is None:
             self._timers.odd.count('off', callback.label)
-            return run.ready
-        return self._timers.release(callback, run.ready)
+            return ready
+        return self._timers.release(callback, ready)
 
-    def _assign(self, run: Execution, target: Target, message: Publication | None) -> None:
-        key = run.callback.address, run.ready
+    def _assign(self, run: int, callback: Callback, target: Target) -> None:
+        key = self._runs[run][0], self._ready_of[run]
         if key in self._pieces:
-            run.of, run.leg = self._pieces[key].of, self._pieces[key].leg
+            self._of[run], self._leg_of[run] = self._pieces[key].of, self._pieces[key].leg
             return
-        super()._assign(run, target, message)
+        super()._assign(run, callback, target)
         if key in self._to_come:
-            self._pieces[key] = _Pieces(run.of, run.leg, run.start)
+            self._pieces[key] = _Pieces(self._of[run], self._leg_of[run], self._runs[run][1])
 
-    def _ended(self, run: Execution) -> Ended:
-        key = run.callback.address, run.ready
+    def _ends_with(self, run: int) -> bool:
+        key = self._runs[run][0], self._ready_of[run]
         pieces = self._pieces.get(key)
         if pieces is None:
-            return super()._ended(run)
+            return True
         self._to_come[key] -= 1
-        piece = pieces.count
+        row = self._executions[run]
+        pieces.busy += int(row['busy'])
+        row['piece'], row['began'], row['busy'] = pieces.count, pieces.start, pieces.busy
         pieces.count += 1
-        pieces.busy += run.end - run.start
-        if not self._to_come[key]:
-            del self._to_come[key], self._pieces[key]
-        return Ended(piece, key not in self._to_come, pieces.start, pieces.busy)
+        if self._to_come[key]:
+            return False
+        del self._to_come[key], self._pieces[key]
+        return True
 
 
 class _Pieces:

@@ -133,12 +133,13 @@ def members(native: Any, cls: Any, prefix: str = '') -> list[Member]:
 
 def _plain_value(native: Any, kind: str) -> Callable[[Any], Any] | None:
     """Return the native getter of a number's or text's class; None: it needs its object."""
+    getter: Callable[[Any], Any] | None = None
     if 'String' in kind:
-        return native.field_string_get_value
-    if 'Integer' in kind or 'Enumeration' in kind:
-        return native.field_integer_unsigned_get_value if 'Unsigned' in kind \
+        getter = native.field_string_get_value
+    elif 'Integer' in kind or 'Enumeration' in kind:
+        getter = native.field_integer_unsigned_get_value if 'Unsigned' in kind \
             else native.field_integer_signed_get_value
-    return None
+    return getter
 
 
 def _within(native: Any, place: int, get: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:

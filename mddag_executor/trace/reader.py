@@ -144,9 +144,13 @@ class TraceReader:
             for batch in self._read(channels, Reading.by_file):
                 yield from batch
 
-    def batches(self, names: Iterable[str]) -> Iterator[Batch]:
-        """Yield the named events in the order of the file, in batches."""
-        return self._read(Channels(set(names), True), Reading.by_file)
+    def batches(self, names: Iterable[str], as_table: bool = True) -> Iterator[Batch]:
+        """
+        Yield the named events in the order of the file, in batches.
+
+        :param as_table: whether they have the fields of the table, not those of the file.
+        """
+        return self._read(Channels(set(names), as_table), Reading.by_file)
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the undecoded messages of some topics, in the order of the file."""

@@ -6,10 +6,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mddag_executor.recording.tables import Recording
 from mddag_executor.replay.drafting import System
-from mddag_executor.replay.linker import Execution, Linker, LinkObserver, Publication
 from mddag_executor.replay.run import open_recording
-from mddag_executor.trace import TraceReader
+import numpy as np
 import pytest
 
 from .recorded import BEGIN, MS, Recorded, STYLES, US
@@ -18,39 +18,29 @@ CAMERA, DETECT = 11, 12         # callbacks
 IMAGE = 100                     # publisher
 
 
-class Links(LinkObserver):
-    """Keeps what a linker says."""
+class Links:
+    """The executions of a recording, what they ran for, and its publications; ns since `BEGIN`."""
 
-    def __init__(self) -> None:
-        self.runs: list[tuple[str, int, int]] = []
-        self.links: list[tuple[str, int, int | None]] = []
-        self.published_at: list[tuple[str, int, int, int]] = []
-
-    def began(self, run: Execution, message: Publication | None) -> None:
-        """Keep what an execution ran for: the publication's time."""
-        self.links.append((run.callback.label, run.start - BEGIN,
-                           None if message is None else message.time - BEGIN))
-
-    def over(self, run: Execution) -> None:
-        """Keep an execution."""
-        self.runs.append((run.callback.label, run.start - BEGIN, run.end - BEGIN))
-
-    def sent(self, message: Publication) -> None:
-        """Keep a publication's times."""
-        rclcpp, rcl, dds = (
-            time - BEGIN if time else 0 for time in (message.rclcpp, message.rcl, message.dds))
-        self.published_at.append((message.topic, rclcpp, rcl, dds))
+    def __init__(self, found: Recording) -> None:
+        table, sent = found.executions, found.publications
+        names = [found.who.name(number) for number in table['callback'].tolist()]
+        start, end = ((table[name] - BEGIN).tolist() for name in ('start', 'end'))
+        ended = np.flatnonzero(table['end'] >= 0)
+        ended = ended[np.argsort(table['end'][ended], kind='stable')].tolist()
+        self.runs = [(names[i], start[i], end[i]) for i in ended]
+        self.links = [
+            (name, at, None if message < 0 else int(sent['time'][message]) - BEGIN)
+            for name, at, message in zip(names, start, table['message'].tolist())]
+        publishers = found.who.every_publisher
+        self.published_at = [
+            (publishers[number].topic if number in publishers else '', time - BEGIN)
+            for number, time in zip(sent['publisher'].tolist(), sent['time'].tolist())]
 
 
 def linked(path: Path) -> tuple[Links, list[str]]:
-    """Return what the linker says of a recording, and the warnings."""
-    got = Links()
+    """Return the links of a recording, and the warnings."""
     recording = open_recording(path)
-    linker = Linker(recording.who, got)
-    for event in TraceReader(path).layout_events(linker.events):
-        linker.take(event)
-    linker.finish()
-    return got, [line.removeprefix(f'{path}: ') for line in recording.warnings]
+    return Links(recording), [line.removeprefix(f'{path}: ') for line in recording.warnings]
 
 
 @pytest.fixture
@@ -83,8 +73,7 @@ def test_messages_between_threads(recorded: Recorded, publish: str, receive: str
         ('/camera timer 100ms', 100 * MS, 103 * MS),
         ('/detector subscription /image', 102 * MS, 109 * MS)]
     assert len(got.runs) == 6
-    if publish not in ('tracing', 'rclpy'):
-        assert got.published_at[0] == ('/image', 101 * MS, 101 * MS + 5 * US, 101 * MS + 8 * US)
+    assert got.published_at[0] == ('/image', 100 * MS + sent)
 
 
 def test_the_subscriber_may_be_faster_than_the_tracer(recorded: Recorded) -> None:
@@ -274,7 +263,7 @@ def test_what_else_the_thread_writes_is_not_the_publication(recorded: Recorded) 
     recorded.receive(DETECT, 2, 305 * MS, 306 * MS, 77)
     recorded.receive(DETECT, 2, 307 * MS, 308 * MS, 88)
     got, warnings = linked(recorded.write())
-    assert got.published_at == [('/image', 101 * MS, 101 * MS + 1, 0), ('/image', 201 * MS, 0, 0)]
+    assert got.published_at == [('/image', 101 * MS), ('/image', 201 * MS)]
     assert [link[2] for link in got.links if link[0].startswith('/detector')] == [None, None]
     assert warnings == [
         '2 executions for a message whose publication is not known (not all of its topic have a '

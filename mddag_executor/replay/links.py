@@ -1,0 +1,662 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Links the events of a CARET or ros2_tracing recording to executions and messages.
+
+Theory of operation
+-------------------
+All events are rows of one table (``Events``), in the order of time.  Executions are found by a
+stack for each thread; all other links are joins of columns: the last event of some kinds before
+another one in the same thread.
+
+1. *Executions* last from `callback_start` to the next `callback_end` of the same callback in the
+   same thread (CARET: the same address; this differs only if a callback runs in several threads at
+   once).  Callbacks may nest (one spins).  If the outer one ends first, an end was lost.
+2. *Publications*, within a thread: `rclcpp_publish`, then `rcl_publish` of the same publisher (the
+   only event of rclpy; from Iron on the only one with the publisher's handle), then the
+   middleware's write and the source timestamp.  `rclcpp_intra_publish` before `rclcpp_publish` of
+   the same publisher is the same publication, at its own time.  Sources of the source timestamp:
+
+   * CARET, Cyclone DDS: `dds_write`, then `dds_bind_addr_to_stamp` of the message's address,
+   * CARET, Fast DDS up to Galactic: `dds_write`, `dds_bind_addr_to_addr` from the message to
+     its serialised form, then `dds_bind_addr_to_stamp` of that form,
+   * CARET, Fast DDS from Humble on: `dds_bind_addr_to_stamp` of address 0, which means the
+     thread's last publication,
+   * CARET from Jazzy on: `dds_write`,
+   * ros2_tracing from Jazzy on: `rmw_publish`; before, with an instrumented Cyclone DDS:
+     `dds:write_pre` of the message's address, then `dds:write`.
+
+   Until September 2021 CARET's events were named `ros2_hook`, with other names of some fields.
+3. *Messages between processes*: `dispatch_subscription_callback` (Galactic, Humble) has the
+   callback and the source timestamp; later formats have `rmw_take` before the `callback_start` in
+   the same thread.  In August 2021 `dispatch` had the callback and the message's address, and
+   `take_type_erased`, before it in the same thread, the address and the source timestamp.  The
+   publication is the one on the same topic with the same source timestamp.
+4. *Messages within a process*: in Humble by the message's address, followed through copies
+   (`message_construct`) to `dispatch_intra_process_subscription_callback` (August 2021:
+   `dispatch_intra_process`); from Iron on by buffer and index of the ring buffer
+   (`rclcpp_ring_buffer_enqueue`, `_dequeue`).
+5. `rmw_take` inside an execution: the callback itself took the message (a queue edge).
+6. Events that don't match (ends without starts, starts without ends, messages without publication,
+   publishers without tracepoint) are counted by callback or topic.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable as Function
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from mddag_executor.recording.entities import Addresses, Callback, Entities
+from mddag_executor.recording.tables import Ints, Mask, sort_by, Table
+from mddag_executor.text import counted, listed
+from mddag_executor.trace import TraceReader
+from mddag_executor.trace.events import Event
+from mddag_executor.trace.times import NEVER
+import numpy as np
+
+_DEEPEST = 32
+_ADDRESSES = 2 ** 64
+
+(START, END, INTRA, RCLCPP, RCL, DDS_WRITE, BECAME, BIND, RMW_PUBLISH, WRITE_PRE, WRITTEN,
+ DISPATCH, TAKE_ERASED, DISPATCH_ERASED, TAKE, WITHIN, COPY, ENQUEUE, DEQUEUE, LOST, READY,
+ SHUTDOWN) = range(22)
+_PUBLISHES = (INTRA, RCLCPP, RCL)
+_STAMPS = (DDS_WRITE, BIND, RMW_PUBLISH, WRITTEN)
+_ARRIVALS = (DISPATCH, DISPATCH_ERASED, TAKE, WITHIN, DEQUEUE, READY)
+
+_CARET = {
+    'dds_write': (DDS_WRITE, 'message message_addr', 'timestamp_'),
+    'dds_bind_addr_to_addr': (BECAME, 'addr_from', 'addr_to'),
+    'dds_bind_addr_to_stamp': (BIND, 'addr addr_from', 'source_stamp stamp_to')}
+KINDS: dict[str, tuple[Any, ...]] = {
+    **{f'{provider}:{name}': kind for name, kind in _CARET.items()
+       for provider in ('ros2_caret', 'ros2_hook')},
+    'ros2:callback_start': (START, 'callback'),
+    'ros2:callback_end': (END, 'callback'),
+    'ros2:rclcpp_intra_publish': (INTRA, 'publisher_handle', 'message'),
+    'ros2:rclcpp_publish': (RCLCPP, 'publisher_handle', 'message'),
+    'ros2:rcl_publish': (RCL, 'publisher_handle', 'message'),
+    'ros2:rmw_publish': (RMW_PUBLISH, 'message', 'timestamp_ source_timestamp'),
+    'dds:write_pre': (WRITE_PRE, 'data'),
+    'dds:write': (WRITTEN, '', 'timestamp_'),
+    'ros2:dispatch_subscription_callback': (
+        DISPATCH, 'callback', 'source_stamp', 'message_timestamp'),
+    'ros2_hook:take_type_erased': (TAKE_ERASED, 'message', 'source_stamp'),
+    'ros2:dispatch': (DISPATCH_ERASED, 'callback', 'message'),
+    'ros2:rmw_take': (TAKE, 'rmw_subscription_handle', 'source_timestamp', 'taken'),
+    'ros2:dispatch_intra_process_subscription_callback': (WITHIN, 'callback', 'message'),
+    'ros2:dispatch_intra_process': (WITHIN, 'callback', 'message'),
+    'ros2:message_construct': (COPY, 'original_message', 'constructed_message'),
+    'ros2:rclcpp_ring_buffer_enqueue': (ENQUEUE, 'buffer', 'index', 'overwritten'),
+    'ros2:rclcpp_ring_buffer_dequeue': (DEQUEUE, 'buffer', 'index'),
+    'mddag:lost': (LOST, 'count'),
+}
+"""By full name of an event its kind, and the fields of its columns ``a``, ``b`` and ``c``."""
+OWN_KINDS: dict[str, tuple[Any, ...]] = {
+    'mddag:dispatch': (READY, 'callback', 'ready'), 'mddag:shutdown': (SHUTDOWN, 'end')}
+"""The same of this executor's own events, for a trace without declaration."""
+
+_EVENT = np.dtype([('time', 'i8'), ('place', 'i8'), ('thread', 'i8'), ('kind', 'i1'),
+                   ('a', 'i8'), ('b', 'i8'), ('c', 'i8')])
+
+
+class Events(NamedTuple):
+    """
+    The events of a recording.
+
+    :ivar table: events of ``KINDS`` in the order of time; ``thread`` is an index of ``threads``.
+    :ivar threads: process and thread id.
+    :ivar others: the other events, as tuples with a ``Layout``, in the order of time.
+    :ivar warning: events at impossible times, which were left out; empty: none.
+    """
+
+    table: Table
+    threads: list[tuple[int, int]]
+    others: list[Event]
+    warning: str
+
+
+def read_events(
+    reader: TraceReader, kinds: Mapping[str, tuple[Any, ...]], others: Sequence[str],
+    progress: Function[[int], None] | None = None,
+) -> Events:
+    """Return the events of a trace: those of ``kinds`` as a table, and ``others`` as tuples."""
+    parts: list[Table] = [np.zeros(0, _EVENT)]
+    tuples: list[tuple[int, Event]] = []
+    count = 0
+    for batch in reader.batches({*kinds, *others}, as_table=False):
+        for column in batch.columns:
+            head, rows, places = batch.table(column)
+            if head[0].name in kinds:
+                parts.append(_normal(rows, places, kinds[head[0].name]))
+            if head[0].name not in kinds or head[0].name in others:
+                tuples += zip(places.tolist(), (head + row for row in rows.tolist()))
+        for place, event in batch.others():
+            layout = event[0]
+            if layout.name in kinds:
+                names = ('timestamp', 'vpid', 'vtid', *layout.fields)
+                numbers = {name: value for name, value in zip(names, event[1:])
+                           if isinstance(value, int)}
+                row = np.zeros(1, [(name, 'i8') for name in numbers])
+                for name, value in numbers.items():
+                    row[name] = (value + _ADDRESSES // 2) % _ADDRESSES - _ADDRESSES // 2
+                parts.append(_normal(row, np.array([place]), kinds[layout.name]))
+            if layout.name not in kinds or layout.name in others:
+                tuples.append((place, event))
+        count += len(batch)
+        if progress is not None:
+            progress(count)
+    table = np.concatenate(parts)
+    table = table[sort_by(table['time'], table['place'])]
+    tuples.sort(key=lambda each: (each[1][1], each[0]))
+    possible = (table['time'] >= 0) & (table['time'] < NEVER)
+    kept = [event for _, event in tuples if 0 <= event[1] < NEVER]
+    impossible = table['time'][~possible].tolist() + [
+        event[1] for _, event in tuples if not 0 <= event[1] < NEVER]
+    threads, which = np.unique(table['thread'], return_inverse=True)
+    table['thread'] = which
+    warning = '' if not impossible else (
+        f'left out: {counted(len(impossible), "event")} at an impossible time, the first at '
+        f'{impossible[0]} ns')
+    return Events(
+        table[possible], [(each >> 32, (each & 0xFFFFFFFF) - (each & 0x80000000) * 2)
+                          for each in threads.tolist()], kept, warning)
+
+
+def _normal(rows: Table, places: Ints, kind: tuple[Any, ...]) -> Table:
+    """Return events of one kind as rows of the table; missing fields are 0."""
+    found = np.zeros(len(rows), _EVENT)
+    found['time'], found['place'], found['kind'] = rows['timestamp'], places, kind[0]
+    found['thread'] = (rows['vpid'].astype(np.int64) << 32) | (
+        rows['vtid'].astype(np.int64) & 0xFFFFFFFF)
+    for name, fields in zip('abc', kind[1:]):
+        for field in reversed(fields.split()):
+            if field in (rows.dtype.names or ()):
+                value = rows[field].astype(np.int64)
+                found[name] = np.where(value != 0, value, found[name])
+    return found
+
+
+_SAID = {
+    'ends': ('execution', 'without an end in it (the event was lost)'),
+    'starts': ('execution', 'without a start in it (the event was lost): left out'),
+    'messages': ('execution', 'for a message whose publication is not in it: of no job and no '
+                 'path'),
+    'unlinked': ('execution', 'for a message whose publication is not known (not all of its topic '
+                 'have a source timestamp in it): of no job and no path'),
+    'without_message': ('execution', 'of a subscription with no event in it that says which '
+                        'message was taken: of no job and no path'),
+    'partial': ('publication', 'without the tracepoint rclcpp_publish that others of the '
+                'publisher have: counted from rcl_publish on'),
+    'ambiguous': ('execution', 'for a message with the topic and source timestamp of another one: '
+                  'of no job and no path'),
+    'overwritten': ('message', 'overwritten in a ring buffer, never taken'),
+    'unknown': ('execution', 'of a callback whose initialisation is not in it')}
+
+
+class Losses:
+    """
+    Counts missing or odd events, by what they affect.
+
+    :param said: by kind a noun, and the text for a number of them.
+    :param most: how many of the affected callbacks or topics are named.
+    """
+
+    def __init__(self, said: Mapping[str, tuple[str, str]], most: int) -> None:
+        self._said, self._most = said, most
+        self._counts: dict[str, Counter[str]] = {kind: Counter() for kind in said}
+
+    def count(self, kind: str, affected: str, number: int = 1) -> None:
+        """Count events of a kind."""
+        self._counts[kind][affected] += number
+
+    def lines(self) -> list[str]:
+        """Return the counts as text."""
+        return [
+            f'{counted(sum(counts.values()), noun)} {text}: '
+            + listed([f'{name} ({n})' for name, n in counts.most_common()], self._most)
+            for counts, (noun, text) in zip(self._counts.values(), self._said.values()) if counts]
+
+
+class Lost(NamedTuple):
+    """
+    A sign that events are missing.
+
+    :ivar callback: index of the callback that ran for an unknown reason; -1: events were lost.
+    :ivar run: its execution if only the end is missing; -1: none.
+    """
+
+    at: int
+    callback: int
+    run: int
+    time: int
+
+
+_RUN = np.dtype([
+    ('callback', 'i8'), ('at', 'i8'), ('end_at', 'i8'), ('thread', 'i8'), ('start', 'i8'),
+    ('end', 'i8'), ('ready', 'i8'), ('stamp', 'i8'), ('stated', 'i8'), ('taken', 'i8'),
+    ('message', 'i8')])
+_MESSAGE = np.dtype([
+    ('at', 'i8'), ('publisher', 'i8'), ('run', 'i8'), ('time', 'i8'), ('stamp', 'i8'),
+    ('message', 'i8'), ('within', '?')])
+
+
+class Links:
+    """
+    The executions and messages of a recording.
+
+    Events are named by their row in the table.
+
+    :ivar runs: executions in the order of their starts: ``callback`` (index of ``callbacks``),
+        ``at`` and ``end_at`` (events; -1: no end), ``thread``, ``start``, ``end``, ``ready`` (-1:
+        not recorded), ``stamp`` and ``stated`` (source and header stamp of its message, 0:
+        unknown), ``taken`` (when the message was taken; 0: unknown), ``message`` (-1: unknown).
+    :ivar messages: publications: ``at`` (event), ``publisher`` (index of ``publishers``, -1:
+        unknown), ``run`` (-1: none), ``time``, ``stamp``, ``within`` (only within the process).
+    :ivar takes: executions with messages that they took themselves.
+    :ivar lost: signs of missing events, in the order of time.
+    """
+
+    def __init__(self, events: Events, who: Entities) -> None:
+        self.events, self.who, self.losses = events.table, who, Losses(_SAID, 3)
+        self._pid = np.array([pid for pid, _ in events.threads], dtype=np.int64)
+        kind = self.events['kind']
+        self.discarded = int(self.events['a'][kind == LOST].sum())
+        self.lost = [Lost(at, -1, -1, int(self.events['time'][at]))
+                     for at in np.flatnonzero(kind == LOST).tolist()]
+        # by thread, then by time
+        self._order = sort_by(self.events['thread'])
+        self.callbacks, self._callback = self._objects(
+            np.isin(kind, (START, END, DISPATCH, DISPATCH_ERASED, WITHIN, READY)),
+            who.callbacks, who.callback)
+        self.publishers, self._publisher = self._objects(
+            np.isin(kind, _PUBLISHES) & (self.events['a'] != 0), who.publishers)
+        self.taken, self._subscription = self._objects(kind == TAKE, who.taken)
+        self.runs = self._runs()
+        self.messages = self._publications()
+        self._stamp_messages()
+        arrived = self._arrivals()
+        self._by_stamp = self._messages_by_stamp()
+        self._started_by(arrived)
+        self._find_messages()
+        self.takes = self._takes()
+        self.lost.sort(key=lambda each: each.at)
+
+    def _objects(
+        self, events: Mask, known: Addresses[Any],
+        find: Function[[int, int, int], Any] | None = None,
+    ) -> tuple[list[Any], Ints]:
+        """Return the objects that column ``a`` of events means, and by event their index."""
+        find = find or known.latest
+        at = np.flatnonzero(events)
+        table = self.events
+        pid, address = self._pid[table['thread'][at]], table['a'][at]
+        processes, addresses = np.unique(pid), np.unique(address)
+        key = np.searchsorted(processes, pid) * max(1, len(addresses)) + np.searchsorted(
+            addresses, address)
+        order = sort_by(key)
+        begins = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0][:len(order)])
+        groups = sorted(np.split(order, begins[1:]), key=lambda each: each[:1].tolist())
+        objects: dict[int, int] = {}
+        found: list[Any] = []
+        index = np.full(len(table), -1)
+        for group in groups if len(order) else ():
+            where = int(pid[group[0]]), int(address[group[0]]) % _ADDRESSES
+            times = table['time'][at[group]]
+            since = np.array(known.times(*where), dtype=np.int64)
+            piece = np.maximum(0, np.searchsorted(since, times, 'right') - 1)
+            for number in np.unique(piece).tolist():
+                thing = find(*where, int(since[number]) if len(since) else int(times[0]))
+                if thing is None:
+                    continue
+                if id(thing) not in objects:
+                    objects[id(thing)] = len(found)
+                    found.append(thing)
+                index[at[group[piece == number]]] = objects[id(thing)]
+        return found, index
+
+    def _last(self, of: Mask, before: Mask) -> Ints:
+        """
+        Return for each event of ``before`` the last one of ``of`` before it in its thread; or -1.
+
+        The result is in the order of the events.
+        """
+        order, thread = self._order, self.events['thread'][self._order]
+        place = np.where(of[order], np.arange(len(order)), -1)
+        latest = np.r_[-1, np.maximum.accumulate(place)[:-1]] if len(place) else place
+        found = np.full(len(order), -1)
+        known = (latest >= 0) & (thread[np.maximum(latest, 0)] == thread)
+        found[order[known]] = order[latest[known]]
+        return found[before]
+
+    # --- executions ------------------------------------------------------------------------------
+
+    def _runs(self) -> Table:
+        """Return the executions (rule 1)."""
+        table = self.events
+        at = self._order[table['kind'][self._order] <= END]
+        alternates = self._alternates(at)
+        #: By event of a start or end the execution that runs after it in the thread, or -1.
+        self._top = np.full(len(table), -1)
+        stacked = self._stacked(np.sort(at[~alternates]))
+        starts = alternates & (table['kind'][at] == START)
+        begin = at[starts]
+        ended = np.append(starts[:-1] & alternates[1:] & (
+            table['thread'][at[1:]] == table['thread'][at[:-1]]), False)[starts]
+        end_at = np.where(ended, np.append(at[1:], -1)[starts], -1)
+        count = len(stacked)
+        self._top[begin] = count + np.arange(len(begin))
+        begin, end_at = (np.append([row[i] for row in stacked], each).astype(np.int64)
+                         for i, each in enumerate((begin, end_at)))
+        order = sort_by(begin)
+        number = np.empty(len(order), dtype=np.int64)
+        number[order] = np.arange(len(order))
+        self._top = np.where(self._top >= 0, number[self._top], -1) if len(order) else self._top
+        self.lost = [each._replace(run=int(number[each.run])) if each.run >= 0 else each
+                     for each in self.lost]
+        begin, end_at = begin[order], end_at[order]
+        runs = np.zeros(len(begin), _RUN)
+        runs['callback'], runs['at'], runs['end_at'] = self._callback[begin], begin, end_at
+        runs['thread'], runs['start'] = table['thread'][begin], table['time'][begin]
+        runs['end'] = np.where(end_at >= 0, table['time'][end_at], -1)
+        runs['ready'] = runs['message'] = -1
+        for callback, times in zip(self.callbacks, np.bincount(
+                runs['callback'], minlength=len(self.callbacks)).tolist()):
+            if times and callback.kind == 'unknown':
+                self.losses.count('unknown', callback.label, times)
+        return runs
+
+    def _alternates(self, at: Ints) -> Mask:
+        """
+        Return which starts and ends are of threads that ran one callback after the other.
+
+        :param at: the starts and ends, by thread.
+        """
+        thread, kind = self.events['thread'][at], self.events['kind'][at]
+        callback = self._callback[at]
+        first = np.append(True, thread[1:] != thread[:-1])[:len(at)]
+        wrong = first & (kind == END)
+        wrong[1:] |= ~first[1:] & np.where(
+            kind[1:] == END, (kind[:-1] == END) | (callback[1:] != callback[:-1]),
+            kind[:-1] == START)
+        return ~np.isin(thread, thread[wrong])
+
+    def _stacked(self, at: Ints) -> list[list[int]]:
+        """
+        Return the first and last event of executions that may be nested or incomplete.
+
+        :param at: the starts and ends of their threads, in the order of time.
+        """
+        table = self.events
+        stacks: dict[int, list[int]] = {}
+        found: list[list[int]] = []
+        callback: list[int] = []
+        inner: list[int] = []       # last start of a nested execution
+        for here, thread, kind, number, now in zip(
+                at.tolist(), table['thread'][at].tolist(), table['kind'][at].tolist(),
+                self._callback[at].tolist(), table['time'][at].tolist()):
+            fresh = thread not in stacks
+            stack = stacks.setdefault(thread, [])
+            known = any(callback[run] == number for run in stack)
+            if kind == START:
+                if known or len(stack) > _DEEPEST:
+                    while stack:
+                        run = stack.pop()
+                        self._without_end(here, callback[run], run, now)
+                        if callback[run] == number:
+                            break
+                if stack:
+                    inner[stack[-1]] = now
+                stack.append(len(found))
+                found.append([here, -1])
+                callback.append(number)
+                inner.append(-1)
+            elif known:
+                while callback[run := stack.pop()] != number:
+                    self._without_end(here, callback[run], run, now)
+                found[run][1] = here
+            elif not fresh or self.callbacks[number].made >= self.who.begin:
+                # otherwise it began before the recording
+                self.losses.count('starts', self.callbacks[number].label)
+                self.lost.append(Lost(here, number, -1, now))
+            if stack:
+                self._top[here] = stack[-1]
+        for stack in stacks.values():
+            for run in stack:
+                if inner[run] >= 0:
+                    self._without_end(len(table), callback[run], run, inner[run])
+        return found
+
+    def _without_end(self, at: int, callback: int, run: int, now: int) -> None:
+        self.losses.count('ends', self.callbacks[callback].label)
+        self.lost.append(Lost(at, callback, run, now))
+
+    def _running(self, events: Mask) -> Ints:
+        """Return the executions that run at events, or -1."""
+        last = self._last(self.events['kind'] <= END, events)
+        found: Ints = np.where(last >= 0, self._top[np.maximum(last, 0)], -1)
+        return found
+
+    # --- publications ----------------------------------------------------------------------------
+
+    def _publications(self) -> Table:
+        """Return the publications (rule 2), without their source timestamps."""
+        table = self.events
+        kind, handle, publisher = table['kind'], table['a'], self._publisher
+        publishes = np.isin(kind, _PUBLISHES)
+        previous = np.full(len(table), -1)
+        previous[publishes] = self._last(publishes | (kind <= END), publishes)
+        before = np.maximum(previous, 0)
+        after_intra = (kind == RCLCPP) & (previous >= 0) & (kind[before] == INTRA) & (
+            (handle == 0) | (publisher == publisher[before]))
+        # by event: the publisher so far
+        so_far = np.where(after_intra, publisher[before], publisher)
+        after_rclcpp = (kind == RCL) & (previous >= 0) & (kind[before] == RCLCPP) & (
+            (so_far[before] < 0) | (so_far[before] == publisher))
+        joins = after_intra | after_rclcpp
+        at = np.flatnonzero(publishes & ~joins)
+        #: By event of a publication: its row, or -1.
+        self._row = np.full(len(table), -1)
+        self._row[at] = np.arange(len(at))
+        for again in (after_intra, after_rclcpp):
+            self._row[again] = self._row[before[again]]
+        found = np.zeros(len(at), _MESSAGE)
+        found['at'], found['publisher'], found['time'] = at, so_far[at], table['time'][at]
+        found['message'], found['within'] = table['b'][at], kind[at] == INTRA
+        found['run'] = self._running(publishes)[~joins[publishes]]
+        found['within'][self._row[after_intra]] = False
+        for again in (after_intra, after_rclcpp):
+            found['message'][self._row[again]] = table['b'][again]
+        found['publisher'][self._row[after_rclcpp]] = publisher[after_rclcpp]
+        self._count_partial(found[kind[at] == RCL]['publisher'], publisher[after_rclcpp])
+        return found
+
+    def _count_partial(self, only_rcl: Ints, by_both: Ints) -> None:
+        for number in np.intersect1d(only_rcl, by_both[by_both >= 0]).tolist():
+            self.losses.count('partial', self.publishers[number].topic,
+                              int((only_rcl == number).sum()))
+
+    def _stamp_messages(self) -> None:
+        """Find the source timestamps of publications."""
+        table, found = self.events, self.messages
+        kind, a = table['kind'], table['a']
+        publishes = np.isin(kind, _PUBLISHES)
+        about = np.isin(kind, (*_STAMPS, BECAME, WRITE_PRE))
+        # by event: the last one of a publication, unless a callback began or ended after it
+        last = np.full(len(table), -1)
+        last[about] = self._last(publishes | (kind <= END), about)
+        last[about & (kind[np.maximum(last, 0)] <= END)] = -1
+        message = table['b'][np.maximum(last, 0)]
+        # the write of another publication: what follows is not of this one
+        other = (kind == WRITE_PRE) & (last >= 0) & (a != message)
+        wrote = np.full(len(table), -1)
+        wrote[about] = self._last(publishes | (kind <= END) | other, about)
+        last[about & (wrote >= 0) & other[np.maximum(wrote, 0)]] = -1
+        became = (kind == BECAME) & (last >= 0) & (a == message)
+        form = np.full(len(table), -1)
+        form[about] = self._last(publishes | (kind <= END) | became, about)
+        form = np.where((form >= 0) & became[np.maximum(form, 0)],
+                        table['b'][np.maximum(form, 0)], 0)
+        of = kind[np.maximum(last, 0)]
+        good = np.isin(kind, _STAMPS) & (last >= 0) & (of != INTRA) & (table['b'] != 0) & (
+            (of != RCL) | (a == 0) | (a == message) | (a == form))
+        at = np.flatnonzero(good)[::-1]     # the first one is assigned last
+        found['stamp'][self._row[last[at]]] = table['b'][at]
+
+    def topic(self, row: int) -> str:
+        """Return the topic of a publication; empty if unknown."""
+        publisher = self.messages['publisher'][row]
+        topic: str = self.publishers[publisher].topic if publisher >= 0 else ''
+        return topic
+
+    def _messages_by_stamp(self) -> dict[tuple[str, int], int]:
+        """Return publications by topic and source timestamp; -1: ambiguous."""
+        topics = [each.topic for each in self.publishers] + ['']
+        found: dict[tuple[str, int], int] = {}
+        stamped = np.flatnonzero(self.messages['stamp'] != 0)
+        for row, publisher, stamp in zip(
+                stamped.tolist(), self.messages['publisher'][stamped].tolist(),
+                self.messages['stamp'][stamped].tolist()):
+            key = topics[publisher], stamp
+            found[key] = -1 if key in found else row
+        unstamped = self.messages[(self.messages['stamp'] == 0) & ~self.messages['within']]
+        self._unstamped = {topics[each] for each in np.unique(unstamped['publisher']).tolist()}
+        return found
+
+    def _find(self, topic: str, stamp: int) -> int:
+        """Return the publication of a source timestamp, or -1."""
+        found = self._by_stamp.get((topic, stamp), -1)
+        return found if found >= 0 else self._by_stamp.get(('', stamp), -1)
+
+    # --- messages that arrive --------------------------------------------------------------------
+
+    def _arrivals(self) -> Ints:
+        """Return by execution the event that says which message it processes, or -1."""
+        kind = self.events['kind']
+        arrives = np.isin(kind, _ARRIVALS)
+        taken = (kind == TAKE) & (self.events['c'] != 0) & (self.events['b'] != 0)
+        arrives &= (kind != TAKE) | taken
+        erased = kind == DISPATCH_ERASED
+        if erased.any():
+            before = self._last(erased | (kind == TAKE_ERASED), erased)
+            good = (before >= 0) & (kind[before] == TAKE_ERASED) & (
+                self.events['a'][before] == self.events['b'][erased])
+            at = np.flatnonzero(erased)     # otherwise its `take_type_erased` was lost
+            arrives[at[~good]] = False
+            self.events['c'][at[good]] = before[good]
+        starts = kind == START
+        last = self._last(arrives | starts, starts)
+        found: Ints = np.where((last >= 0) & arrives[np.maximum(last, 0)], last, -1)
+        return found
+
+    def _takes(self) -> list[tuple[int, int, int]]:
+        """Return executions, and what they took themselves (rule 5): event, execution, message."""
+        table = self.events
+        takes = (table['kind'] == TAKE) & (table['c'] != 0) & (self._subscription >= 0)
+        runs = self._running(takes)
+        at, runs = np.flatnonzero(takes)[runs >= 0], runs[runs >= 0]
+        topics = [each[0].start for each in self.taken]
+        found = [self._find(topics[number], stamp) for number, stamp in zip(
+            self._subscription[at].tolist(), table['b'][at].tolist())]
+        return [each for each in zip(at.tolist(), runs.tolist(), found) if each[2] >= 0]
+
+    def _started_by(self, arrived: Ints) -> None:
+        """Find the message of each execution."""
+        within = self._within()
+        table, runs = self.events, self.runs
+        rows = np.flatnonzero(arrived >= 0)
+        at, number = arrived[rows], runs['callback'][rows]
+        kind = table['kind'][at]
+        plain = np.array([each.kind not in ('timer', 'service') for each in self.callbacks], bool)
+        # otherwise the message belongs to another execution
+        fits = plain[number] & np.where(
+            kind == TAKE, self._may_take(at, number),
+            (kind == DEQUEUE) | (self._callback[at] == number))
+        rows, at, kind = rows[fits], at[fits], kind[fits]
+        source = np.where(kind == DISPATCH_ERASED, table['c'][at], at)
+        runs['taken'][rows] = table['time'][source]
+        by_stamp = np.isin(kind, (DISPATCH, DISPATCH_ERASED, TAKE))
+        runs['stamp'][rows[by_stamp]] = table['b'][source[by_stamp]]
+        stated = kind == DISPATCH
+        runs['stated'][rows[stated]] = table['c'][at[stated]]
+        runs['message'][rows[~by_stamp]] = [within.get(e, -1) for e in at[~by_stamp].tolist()]
+
+    def _may_take(self, at: Ints, callback: Ints) -> Mask:
+        """Return whether callbacks are those of the subscriptions of `rmw_take` events."""
+        subscription = self._subscription[at]
+        pairs, which = np.unique(
+            subscription * len(self.callbacks) + callback, return_inverse=True)
+        fits = [number < 0 or self.callbacks[each] in self.taken[number] for number, each in (
+            divmod(pair, len(self.callbacks)) for pair in pairs.tolist())]
+        return np.array(fits, dtype=np.bool_)[which]
+
+    def _find_messages(self) -> None:
+        """Find messages by their source timestamps; count missing ones."""
+        runs = self.runs
+        rows = np.flatnonzero(runs['message'] < 0)
+        found = []
+        for number, stamp, taken, at, start in zip(*(runs[name][rows].tolist() for name in (
+                'callback', 'stamp', 'taken', 'at', 'start'))):
+            callback = self.callbacks[number]
+            message = -1
+            if stamp:
+                message = self._find(callback.start, stamp)
+                if message < 0:
+                    self._not_found(callback, number, stamp, at, start)
+            elif callback.kind == 'subscription' and not taken:
+                self.losses.count('without_message', callback.label)
+            found.append(message)
+        runs['message'][rows] = found
+
+    def _not_found(
+        self, callback: Callback, number: int, stamp: int, at: int, start: int
+    ) -> None:
+        topic = callback.start
+        if (topic, stamp) in self._by_stamp:
+            self.losses.count('ambiguous', callback.label)
+            self.lost.append(Lost(at, number, -1, start))
+        elif self._unstamped.isdisjoint((topic, '')):
+            self.losses.count('messages', callback.label)
+        else:
+            self.losses.count('unlinked', callback.label)
+
+    def _within(self) -> dict[int, int]:
+        """Return the message by event that dispatches or dequeues it in its process (rule 4)."""
+        table = self.events
+        kind = table['kind']
+        at = np.flatnonzero(np.isin(kind, (INTRA, COPY, WITHIN, ENQUEUE, DEQUEUE)))
+        found: dict[int, int] = {}
+        if not len(at):
+            return found
+        enqueues = kind == ENQUEUE
+        last = np.full(len(table), -1)
+        last[enqueues] = self._last(np.isin(kind, (*_PUBLISHES, START, END)), enqueues)
+        started = self._last(kind <= END, kind == DEQUEUE)
+        fresh = dict(zip(np.flatnonzero(kind == DEQUEUE).tolist(), (started < 0).tolist()))
+        by_address: dict[tuple[int, int], int] = {}
+        by_slot: dict[tuple[int, int, int], int] = {}
+        for here, thread in zip(at.tolist(), table['thread'][at].tolist()):
+            pid, (_, _, _, what, a, b, c) = self._pid[thread], table[here].item()
+            if what == INTRA:
+                by_address[pid, b] = int(self._row[here])
+            elif what == COPY:
+                if (pid, a) in by_address:
+                    by_address[pid, b] = by_address[pid, a]
+            elif what == WITHIN:
+                if (pid, b) in by_address:
+                    found[here] = by_address[pid, b]
+                else:
+                    self.losses.count('messages', self.callbacks[self._callback[here]].label)
+            elif what == ENQUEUE:
+                before = by_slot.pop((pid, a, b), -1)
+                if c and before >= 0 and last[here] >= 0 and kind[last[here]] > END:
+                    self.losses.count('overwritten', self.topic(before) or 'unknown topic')
+                if last[here] >= 0 and kind[last[here]] > END:
+                    by_slot[pid, a, b] = int(self._row[last[here]])
+            elif (pid, a, b) in by_slot:
+                found[here] = by_slot.pop((pid, a, b))
+            elif not fresh[here]:
+                self.losses.count('messages', 'a ring buffer')
+        return found
