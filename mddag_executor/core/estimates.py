@@ -10,6 +10,7 @@ executions cost one comparison.
 
 from __future__ import annotations
 
+from mddag_executor.core.overload import admit
 from mddag_executor.core.state import State
 from mddag_executor.core.tables import Tables
 
@@ -19,23 +20,26 @@ LEAST_CHANGE_NS = 100_000
 
 
 class MeanTimes:
-    """The measured mean execution times of a run, by global vertex."""
+    """The measured mean execution times of a run, by global vertex: ``State.mean``."""
 
     def __init__(self, t: Tables, s: State) -> None:
         self._t = t
         self._s = s
-        self._mean = t.mean_time[:]
+        self._mean = s.mean
+        admit(t, s)
 
-    def note(self, vertex: int, mean: int) -> None:
-        """Note the recent mean execution time of a vertex, ns."""
+    def note(self, vertex: int, mean: int, holds: bool) -> None:
+        """Note the recent mean execution time of a vertex, ns, and whether it holds the GIL."""
         known = self._mean[vertex]
         change = mean - known
-        if change * CHANGE > known + LEAST_CHANGE_NS or -change * CHANGE > known + LEAST_CHANGE_NS:
+        if (change * CHANGE > known + LEAST_CHANGE_NS or -change * CHANGE > known + LEAST_CHANGE_NS
+                or holds != self._s.holder[vertex]):
             self._mean[vertex] = mean
+            self._s.holder[vertex] = int(holds)
             self._update(self._t.dag_of[vertex])
 
     def _update(self, dag: int) -> None:
-        """Compute the latest starts of a DAG again."""
+        """Compute the latest starts of a DAG again, and what is refused."""
         t, s = self._t, self._s
         first, last = t.first_vertex[dag:dag + 2]
         starts: dict[tuple[int, int], int] = {}
@@ -47,4 +51,4 @@ class MeanTimes:
                 for each in after:
                     start = min(start, starts.get((each, sink), start))
                 s.reach_by[i] = starts[vertex, sink] = start - self._mean[vertex]
-            s.start_by[vertex] = min(s.reach_by[t.first_reach[vertex]:t.first_reach[vertex + 1]])
+        admit(t, s)

@@ -22,9 +22,9 @@ from mddag_executor.core.state import (
     LEADS_OUT,
     NOT_JUDGED,
     OPEN,
+    OTHER_KEYS,
     OUTDATED,
     SINK_ABORTED,
-    SINK_DEMOTED,
     SINK_DROPPED,
     SINK_EXPIRED,
     SINK_FAILED,
@@ -33,6 +33,7 @@ from mddag_executor.core.state import (
     SINK_OVERDUE,
     SKIP,
     State,
+    URGENCY,
 )
 from mddag_executor.core.tables import DEMOTE, NEVER, Tables
 
@@ -58,7 +59,11 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     s.job_state[slot] = OPEN
     s.job_sinks_left[slot] = t.first_sink[dag + 1] - t.first_sink[dag]
     s.job_late[slot] = 0
-    s.job_hope[slot] = release if t.on_late[dag] == DEMOTE else NEVER
+    s.job_hope[slot] = NEVER
+    if t.on_late[dag] == DEMOTE and s.scalars[URGENCY] != OTHER_KEYS:
+        s.job_hope[slot] = release
+        s.job_demoted[slot] = -1
+        s.job_refused[slot] = -1
     s.job_active[slot] = 0
     _link_newest(s, dag, slot)
     base = s.job_base[slot]
@@ -217,15 +222,6 @@ def outdate_sink(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
     s.job_sinks_left[slot] -= 1
     if s.job_sinks_left[slot] == 0:
         close_job(s, slot, OUTDATED, now)
-
-
-def announce_demoted(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
-    """Report once that a sink of an open job is demoted: it cannot be in time (rule 7)."""
-    head = s.job_base[slot] + t.region_offset[vertex]
-    job = s.job_index[slot]
-    if s.job_state[slot] == OPEN and s.x_demoted[head] != job and s.x_pending[head] >= 0:
-        s.x_demoted[head] = job
-        judge(s, slot, SINK_DEMOTED, vertex, s.job_release[slot] + t.sink_deadline[vertex], now)
 
 
 def _give_up_sinks(t: Tables, s: State, slot: int, kind: int) -> None:

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from mddag_executor.core.state import DEADLINE_KEYS, OTHER_KEYS, START_KEYS
+from mddag_executor.core.state import DAG_KEYS, DEADLINE_KEYS, OTHER_KEYS, START_KEYS
 from mddag_executor.core.tables import Tables
 from mddag_executor.errors import MddagError
 
@@ -92,8 +92,7 @@ class Policy(NamedTuple):
 
     ``preemptive``: whether the paper's experiment runs the policy with preemption; an executor of
     callbacks cannot preempt and ignores it.  ``polling``: whether it works in rounds (rule 9 of
-    ``rules``).  ``urgency``: what the keys are: deadlines of sinks, latest starts for them, or
-    neither (rule 7).
+    ``rules``).  ``urgency``: which time the keys are, if any (rule 7).
     """
 
     name: str
@@ -128,7 +127,7 @@ POLICIES: dict[str, Policy] = {p.name: p for p in (
     Policy('rm', key_rm, True, 'rate monotonic: the shortest period first'),
     Policy('wc', key_wc, False, 'work-conserving baseline of the paper: job index, order'),
     Policy('fifo', key_fifo, False, 'order of becoming ready'),
-    Policy('gedf', key_gedf, True, 'one deadline for each DAG: its latest'),
+    Policy('gedf', key_gedf, True, 'one deadline for each DAG: its latest', urgency=DAG_KEYS),
     Policy('dm', key_dm, True, 'deadline monotonic: the shortest relative deadline first'),
     Policy('llf', key_llf, True, 'least laxity first: deadline less the critical path to it',
            urgency=START_KEYS),

@@ -27,20 +27,15 @@ from __future__ import annotations
 
 from heapq import heapify, heappop, heappush
 
-from mddag_executor.core.jobs import announce_demoted
 from mddag_executor.core.state import (
     ABORTED,
-    BEHIND,
-    DEADLINE_KEYS,
     N_HOLDING,
     N_STALE,
     QueueEntry,
-    START_KEYS,
     State,
-    URGENCY,
     WAITING,
 )
-from mddag_executor.core.tables import NEVER, Tables
+from mddag_executor.core.tables import Tables
 
 TURN_NS = 1_000_000
 """No overtaking if the holder needs less time than this: Python switches threads no sooner."""
@@ -201,43 +196,6 @@ def overtaking_pays_from(t: Tables, s: State, process: int, usual: int) -> int:
     first = first_waiting(t, s, process)
     wait = 0 if first < 0 else -(-t.rad_offset[s.x_vertex[first]] // PATIENCE)
     return max(LONGER * usual + LONG_NS, TURN_NS, wait)
-
-
-def lower_key(t: Tables, s: State, x: int, now: int) -> bool:
-    """
-    Change the key of a waiting execution if its job is late (rule 7); return whether it changed.
-
-    The caller removes its entry from the queue.
-    """
-    slot = s.x_slot[x]
-    vertex = s.x_vertex[x]
-    hope = s.job_hope[slot]
-    if s.x_started[x] >= 0:  # it was preempted
-        now -= s.x_cost[x] - s.x_left[x]
-    if now <= hope + s.start_by[vertex]:
-        return False
-    deadline = NEVER
-    start = NEVER
-    for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
-        if now > hope + s.reach_by[i]:
-            announce_demoted(t, s, slot, t.reach_sink[i], now)
-        else:
-            deadline = min(deadline, t.reach_deadline[i])
-            start = min(start, t.reach_start[i])
-    behind = 0
-    if deadline == NEVER:
-        behind = BEHIND
-        deadline = t.rad_offset[vertex]
-        start = t.latest_start[vertex]
-    old = s.x_key[x]
-    priority = old[0]
-    if s.scalars[URGENCY] == DEADLINE_KEYS:
-        priority = s.job_release[slot] + deadline
-    elif s.scalars[URGENCY] == START_KEYS:
-        priority = s.job_release[slot] + start
-    priority += behind
-    s.x_key[x] = (priority, old[1], old[2], old[3], x)
-    return priority != old[0]
 
 
 def wait_for_poll(t: Tables, s: State, entry: QueueEntry) -> None:

@@ -43,12 +43,15 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     programs have started.
 7.  **Late jobs.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops its waiting executions
     once the miss is known: at a late completion, or when one of them comes first in the ready
-    queue after the deadline of an incomplete sink; started ones finish.  ``DEMOTE`` puts an
-    execution that comes first in a queue behind all that can be in time, if none of its sinks can
-    be: the time plus the mean execution times on the longest path to the sink is past its
-    deadline.  Demoted executions keep the order of their keys.  An execution with sinks of both
-    kinds has as RAD the earliest deadline of those that can be in time.  Running executions keep
-    their keys.
+    queue after the deadline of an incomplete sink; started ones finish.  ``DEMOTE`` lowers the
+    priority of an execution that comes first in a queue, if none of its sinks can be in time: the
+    time plus the mean execution times on the longest path to the sink is past its deadline.  From
+    then on its job counts as released ``PATIENCE`` relative deadlines later (one, if a sink has
+    used up the misses that it tolerates).  So demoted jobs age, and each callback gets some time.
+    Executions of one vertex keep their order: one that became ready later than a demoted one goes
+    behind it.  An execution with sinks of both kinds has as RAD the earliest deadline of those
+    that can be in time.  Running executions keep their keys.  Only policies whose keys are times
+    demote.
 8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
     when an execution of it fails (its callback raises): each incomplete sink is missed.
     Executions that have not started are dropped after an abort.  After an expiry or a failure they
@@ -78,6 +81,12 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
 13. **Only the newest.**  Of a source or sink with ``keep: newest`` at most one execution waits:
     one that has not started is dropped when that of a later job becomes ready.  A job without its
     source is ``OUTDATED``; a dropped sink is not in time.
+14. **Importance.**  A vertex has the highest importance of the sinks that it leads to.  If the
+    known execution times demand more than the workers or the interpreter of a process can give,
+    the least importance is refused, as many as necessary, but never the highest.  Less importance
+    than that of a sink that missed a deadline is refused for ``REFUSED_PATIENCE`` of its relative
+    deadlines, too.  Refused jobs (of DAGs that ``DEMOTE``) count as released that many relative
+    deadlines later.
 """
 
 from __future__ import annotations
@@ -94,12 +103,12 @@ from mddag_executor.core.jobs import (
     outdate_sink,
     overdue,
 )
+from mddag_executor.core.overload import demote, note_miss
 from mddag_executor.core.policies import Key, KeyFunction
 from mddag_executor.core.queues import (
     add_stale,
     idle_worker,
     is_stale,
-    lower_key,
     may_start,
     next_queue,
     poll,
@@ -108,7 +117,6 @@ from mddag_executor.core.queues import (
 from mddag_executor.core.state import (
     ABORTED,
     add_slot,
-    BEHIND,
     COMPLETED,
     DISPATCH_OVERHEAD,
     DONE,
@@ -250,20 +258,20 @@ def peek(t: Tables, s: State, now: int) -> int:
             x = entry[4]
             group = s.x_group[x]
             slot = s.x_slot[x]
-            if (now > s.job_hope[slot] + s.start_by[s.x_vertex[x]] and entry[0] < BEHIND // 2
-                    and lower_key(t, s, x, now)):
-                heappop(queue)
-                heappush(s.ready, s.x_key[x])
-                if group >= 0 and s.group_owner[group] == -1:
-                    _release_group(s, group)  # others of the group may go first
-                queue = next_queue(t, s, False)
-                continue
             if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
                 heappop(queue)
                 if s.scalars[POLLING] == 0:
                     heappush(s.group_heap[group], entry)
                 else:
                     wait_for_poll(t, s, entry)
+                queue = next_queue(t, s, False)
+                continue
+            if (now > s.job_hope[slot] + s.start_by[s.x_vertex[x]]
+                    and demote(t, s, x, now)):
+                heappop(queue)
+                heappush(s.ready, s.x_key[x])
+                if group >= 0 and s.group_owner[group] == -1:
+                    _release_group(s, group)  # others of the group may go first
                 queue = next_queue(t, s, False)
                 continue
             if ((s.pool or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
@@ -492,6 +500,7 @@ def _complete_vertex(
         s.job_sinks_left[slot] -= 1
         if late:
             s.job_late[slot] += 1
+            note_miss(t, s, slot, vertex, now)
         if s.job_sinks_left[slot] == 0:
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
         elif late and t.on_late[dag] == ABORT:

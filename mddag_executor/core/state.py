@@ -29,11 +29,9 @@ ELSEWHERE, HERE, LEADS_OUT = range(3)
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
  JUDGE_FROM, SKIP, N_HOLDING, URGENCY, N_SCALARS) = range(13)
 
-# What the keys of a policy are (``URGENCY``): neither of the two, deadlines, or latest starts.
-OTHER_KEYS, DEADLINE_KEYS, START_KEYS = range(3)
-
-BEHIND = NEVER
-"""Added to the priority of a demoted execution (rule 7): behind all that can be in time."""
+# Which times the keys of a policy are (``URGENCY``): none, deadlines of sinks, latest starts for
+# them, or deadlines of DAGs.
+OTHER_KEYS, DEADLINE_KEYS, START_KEYS, DAG_KEYS = range(4)
 
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  Each sink of a job is in time,
 # or late: it completed; or missed: it had not completed when the run ended past its deadline; or
@@ -73,6 +71,11 @@ class State(NamedTuple):
     overtaking: list[int]
     # the executions of undeclared callbacks that may be used again
     undeclared: list[int]
+    # by process, from 1: the least importance that is not refused
+    refused_below: list[int]
+    # the same because of late jobs, and until when
+    refused_late: list[int]
+    refused_until: list[int]
     # by DAG
     free_slot: list[int]
     oldest: list[int]
@@ -81,10 +84,18 @@ class State(NamedTuple):
     # whether some of its vertices are not expected here; by vertex: whether it is (see ``expect``)
     partial: list[int]
     expected: list[int]
-    # by vertex: the latest start (``Tables.latest_start``) with the known execution times, and,
-    # with ``keep: newest``, the execution that became ready last
+    # by vertex: from when on its executions are checked (see ``overload``); with ``keep: newest``,
+    # the execution that became ready last; the demoted execution whose key is the largest, or -1;
+    # the known mean execution time, and whether it holds the interpreter
     start_by: list[int]
     newest_ready: list[int]
+    last_demoted: list[int]
+    mean: list[int]
+    holder: list[int]
+    # of a sink that tolerates misses: its last ones, from ``Tables.first_miss`` on, as a ring, and
+    # the place of the oldest
+    missed_jobs: list[int]
+    next_miss: list[int]
     # ``Tables.reach_start`` with the known execution times
     reach_by: list[int]
     # by slot
@@ -97,6 +108,9 @@ class State(NamedTuple):
     job_late: list[int]
     # base of its latest starts: its release; NEVER: it continues when it is late
     job_hope: list[int]
+    # the release that counts for its order since it was late, and since it was refused, or -1
+    job_demoted: list[int]
+    job_refused: list[int]
     job_active: list[int]
     job_next: list[int]
     job_previous: list[int]
@@ -160,7 +174,7 @@ def new_state(
     :param dispatch_overhead: added to an execution each time it is dispatched, ns.
     :param switch_overhead: added to an execution each time it is preempted, ns.
     :param polling: ready executions wait for a poll (see ``queues``); never with preemption.
-    :param urgency: the kind of the policy's keys: ``DEADLINE_KEYS``, ``START_KEYS`` or neither.
+    :param urgency: the kind of the policy's keys, ``DEADLINE_KEYS``, …
     """
     state = empty(State)
     fill_state(
@@ -187,10 +201,16 @@ def fill_state(
     for v in range(t.n_vertices + 1):
         s.start_by.append(t.latest_start[v])
         s.newest_ready.append(-1)
+        s.last_demoted.append(-1)
+        s.mean.append(t.mean_time[v])
+        s.holder.append(0)
+        s.next_miss.append(0)
+        for _ in range(t.tolerated[v]):
+            s.missed_jobs.append(-NEVER)
     for i in range(len(t.reach_start)):
         s.reach_by.append(t.reach_start[i])
     for _ in range(2):
-        s.overtaking.append(1)
+        add_process(s)
     if polling != 0:
         for _ in range(t.n_entities + 1):
             add_queue(s.entity_queue)
@@ -224,6 +244,8 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
     s.job_sinks_left.append(0)
     s.job_late.append(0)
     s.job_hope.append(NEVER)
+    s.job_demoted.append(-1)
+    s.job_refused.append(-1)
     s.job_active.append(0)
     s.job_next.append(-1)
     s.job_previous.append(-1)
@@ -256,7 +278,15 @@ def divide(s: State, workers: list[int]) -> None:
         for _ in range(workers[process]):
             s.pool.append(process + 1)
         if process > 0:
-            s.overtaking.append(1)
+            add_process(s)
+
+
+def add_process(s: State) -> None:
+    """Add the columns of a process."""
+    s.overtaking.append(1)
+    s.refused_below.append(0)
+    s.refused_late.append(0)
+    s.refused_until.append(-NEVER)
 
 
 def add_group(s: State) -> int:

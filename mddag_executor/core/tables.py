@@ -28,6 +28,9 @@ least difference of these sinks' deadlines and the longest paths to them (least 
 * ``reach_deadline``, ``reach_start``: the same two of each sink that the vertex leads to
 (``reach_sink``), from ``first_reach`` of the vertex on.  ``mean_time`` is the declared mean
 execution time, ``height`` the number of vertices on the longest path to a sink.
+* ``importance``: the highest of the sinks that it leads to.  ``tolerated``, ``tolerated_of``: of a
+sink with ``tolerate: m of k``, else 0; ``first_miss``: the number of misses that the sinks before
+it tolerate.
 
 ``process`` is the number of the declared process that a callback runs in, from 1.
 
@@ -62,6 +65,9 @@ EXPIRE_AFTER_NS = 1_000_000_000
 """An idle job expires this long after its latest deadline, ns."""
 
 CONTINUE, DEMOTE, ABORT = range(3)
+IMPORTANCE = {'low': 0, 'normal': 1, 'high': 2}
+IMPORTANT = 2
+"""The highest importance."""
 ON_LATE = {'continue': CONTINUE, 'demote': DEMOTE, 'abort': ABORT}
 """The treatments of late jobs, by their names in declarations and options."""
 
@@ -101,6 +107,10 @@ class Tables(NamedTuple):
     keep_newest: list[int]
     mean_time: list[int]
     height: list[int]
+    importance: list[int]
+    tolerated: list[int]
+    tolerated_of: list[int]
+    first_miss: list[int]
     sink_deadline: list[int]
     entity: list[int]
     chain_rank: list[int]
@@ -208,6 +218,12 @@ class _Columns:
             lists['first_reach'].append(len(lists['reach_sink']))
             lists['mean_time'].append(mean_time(vertex))
             lists['height'].append(heights[vertex.index])
+            lists['importance'].append(max(
+                IMPORTANCE[dag.vertices[sink].callback.importance] for sink, _, _ in sinks))
+            tolerate = vertex.callback.tolerate
+            lists['tolerated'].append(0 if tolerate is None else tolerate.misses)
+            lists['tolerated_of'].append(0 if tolerate is None else tolerate.of)
+            lists['first_miss'].append(sum(lists['tolerated'][:-1]))
             lists['keep_newest'].append(int(vertex.callback.keep == 'newest'))
             lists['sink_deadline'].append(-1 if vertex.deadline_ns is None else vertex.deadline_ns)
             lists['entity'].append(self._entities[vertex.callback.key])
@@ -244,7 +260,9 @@ class _Columns:
         undeclared = {
             'dag_of': n_dags, 'index_in_dag': 0, 'rad_offset': default_deadline,
             'latest_start': default_deadline, 'first_reach': len(lists['reach_sink']),
-            'keep_newest': 0, 'mean_time': 0, 'height': 0, 'sink_deadline': -1,
+            'keep_newest': 0, 'mean_time': 0, 'height': 0,
+            'importance': IMPORTANT, 'tolerated': 0, 'tolerated_of': 0, 'first_miss': 0,
+            'sink_deadline': -1,
             'entity': self._n_entities, 'region_offset': 0,
             'n_legs': 1, 'first_leg': len(lists['leg_topic']), 'leg_topic': 0,
             'n_predecessors': 0, 'first_successor': len(lists['successors']),

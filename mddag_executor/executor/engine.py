@@ -514,7 +514,7 @@ class Engine:
             return
         entity.failed += failed
         if origin is not None:
-            self.mean_times.note(origin.vertex, entity.habit.mean_ns)
+            self.mean_times.note(origin.vertex, entity.habit.mean_ns, entity.habit.holds)
         if self.verdicts.tally.overdue and work.origin is not None:
             deadline = self.verdicts.tally.overdue.get((work.origin.vertex, work.origin.job), -1)
             if end <= deadline:  # it was reported overdue before this was known

@@ -27,10 +27,11 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
-from mddag_executor.core import jobs, policies, queues, rules, state, tables
+from mddag_executor.core import jobs, overload, policies, queues, rules, state, tables
 from mddag_executor.simulate import deliveries, engine, load, machine
 
-_MODULES = (tables, state, queues, jobs, policies, rules, load, machine, deliveries, engine)
+_MODULES = (
+    tables, state, queues, jobs, overload, policies, rules, load, machine, deliveries, engine)
 _NOT_COMPILED = frozenset({
     # for plain lists
     'empty', 'as_object', 'new_state', 'add_queue', 'rad_offsets', 'reached_sinks', 'mean_time',
@@ -59,7 +60,7 @@ def entry_points() -> dict[str, Callable[..., Any]]:
             assert space[name] is function or name in _REPLACED, f'there are two of {name}'
             space[name] = njit(error_model='numpy')(_bound(function, space))
             setattr(inner, name, space[name])
-        if module in (jobs, rules):
+        if module in (jobs, overload, rules):
             space[module.__name__.rsplit('.', 1)[1]] = inner
     structures.bind_policies(space)
     sources = _hash_of(*_MODULES, kernel, structures, vectors)

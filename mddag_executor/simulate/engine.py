@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from mddag_executor.core import jobs, rules
+from mddag_executor.core import jobs, overload, rules
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import add_slot, divide, fill_state, JUDGE_FROM, State
 from mddag_executor.core.tables import NEVER, Tables
@@ -136,6 +136,10 @@ def run(
     which the first miss is known: a late completion, an expiry or an abort.  ``progress`` receives
     the virtual time at each event.  The busy time of each worker is added to ``busy``.
     """
+    if len(load.holds) > 0:
+        for v in range(t.n_vertices):
+            s.holder[v] = load.holds[load.cost_base[t.dag_of[v]] + t.region_offset[v]]
+    overload.admit(t, s)
     n_workers = len(s.worker_x)
     finish_at = [NEVER] * n_workers
     running = [-1] * n_workers

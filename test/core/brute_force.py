@@ -17,9 +17,11 @@ Its reading of the documents:
   What it has ready or running goes on, without consequences.
 * ``abort`` takes effect at a late completion, and when what is next to be handed out belongs to a
   job that has an unfinished sink past its deadline. What has never run of the job vanishes.
-* ``demote``: what waits and cannot make any deadline that it leads to any more, if every vertex
-  on the longest way takes its mean time, goes after all that can. Among these, and as long as only
-  some deadlines are out of reach, ``rad`` and ``llf`` go by the deadlines within reach.
+* ``demote`` (``rad``, ``gedf``, ``llf``): an execution that would start next, and cannot make any
+  deadline that it leads to any more, if every vertex on the longest way takes its mean time, goes
+  from then on as if its job were released ten relative deadlines later. As long as only some
+  deadlines are out of reach, ``rad`` and ``llf`` go by those within reach. One that became ready
+  later at the same vertex does not go before it.
 * ``keep: newest`` at a source or sink: one of an earlier job that waits there and has never run
   vanishes when the next one is ready.
 * ``ros2`` goes by rounds. When a worker is free and the round has nothing left that it could take,
@@ -58,6 +60,7 @@ class Job:
     done: set[int] = field(default_factory=set)
     outcome: str | None = None
     late: bool = False
+    demoted: int | None = None  # the release that counts from then on, ns
 
 
 @dataclass(eq=False)
@@ -69,7 +72,7 @@ class Execution:
     left: int
     arrival: int
     has_run: bool = False
-    dispatched: tuple[bool, int] | None = None  # the priority that it was dispatched with
+    lowered: int | None = None  # its priority since it was demoted
 
 
 class Miss(NamedTuple):
@@ -102,6 +105,7 @@ class BruteForce:
         self.switch_overhead = switch_overhead
         self.running: list[Execution | None] = [None] * workers
         self.waiting: list[Execution] = []
+        self.last_demoted: dict[tuple[int, int], Execution] = {}
         self.round: list[Execution] = []
         self.jobs: list[Job] = []
         self.events: list[Event] = []
@@ -150,26 +154,49 @@ class BruteForce:
         assert relative is not None
         return job.release + relative // self.tick
 
-    def priority(self, execution: Execution) -> tuple[bool, int]:
+    def priority(self, execution: Execution) -> int:
         """Return what decides about preemption."""
-        if execution.dispatched is not None:
-            return execution.dispatched
-        all_sinks = {*self.laxity[execution.job.dag.index, execution.vertex.index]}
-        sinks = self._within_reach(execution, all_sinks)
-        return not sinks, self._priority(execution, sinks or all_sinks)
+        if execution.lowered is not None:
+            return execution.lowered
+        return self._priority(
+            execution, {*self.laxity[execution.job.dag.index, execution.vertex.index]})
 
-    def _within_reach(self, execution: Execution, sinks: set[int]) -> set[int]:
-        """Return the sinks that what waits is not too late for."""
-        job = execution.job
-        if (job.dag.on_late or self.on_late) != 'demote':
-            return sinks
-        starts = {sink: job.release * self.tick + start for sink, start in self.laxity[
-            job.dag.index, execution.vertex.index].items()}
-        done = self.ticks[job.dag.index][execution.vertex.index] - execution.left
-        if self.now * self.tick <= min(starts.values()):
-            return sinks
-        now = (self.now - done) * self.tick
-        return {sink for sink, start in starts.items() if now <= start}
+    def _demote(self, execution: Execution) -> bool:
+        """Lower the priority of an execution if it is late; return whether it is another."""
+        job, vertex = execution.job, execution.vertex
+        if ((job.dag.on_late or self.on_late) != 'demote'
+                or self.policy not in ('rad', 'gedf', 'llf')):
+            return False
+        last = self.last_demoted.get((job.dag.index, vertex.index))
+        if last not in self.waiting or last is execution:
+            last = None
+        if last is not None and last.arrival < execution.arrival and not execution.has_run:
+            lowest = self.priority(last)
+        else:
+            lowest = self._demoted_priority(execution)
+        if lowest <= self.priority(execution):
+            return False
+        execution.lowered = lowest
+        if last is None or lowest >= self.priority(last):
+            self.last_demoted[job.dag.index, vertex.index] = execution
+        return True
+
+    def _demoted_priority(self, execution: Execution) -> int:
+        """Return the priority by the deadlines within reach, or later if there is none."""
+        job, vertex = execution.job, execution.vertex
+        unit = 1 if self.policy == 'llf' else self.tick
+        done = (self.ticks[job.dag.index][vertex.index] - execution.left) * self.tick
+        starts = self.laxity[job.dag.index, vertex.index]
+        now = (self.now - job.release) * self.tick
+        within = {sink for sink, start in starts.items()
+                  if now - (done if execution.has_run else 0) <= start}
+        lowest = self._priority(execution, within or {*starts})
+        if not within:
+            if job.demoted is None:
+                deadline = max(job.dag.vertices[s].deadline_ns or 0 for s in job.dag.sinks)
+                job.demoted = self.now * self.tick + 10 * deadline
+            lowest += (job.demoted - job.release * self.tick) // unit
+        return lowest
 
     def _priority(self, execution: Execution, sinks: set[int]) -> int:
         job = execution.job
@@ -357,6 +384,8 @@ class BruteForce:
             best = min(able, key=self.key) if able else None
         if best is None:
             return False
+        if self._demote(best):
+            return True
         job = best.job
         if job.outcome is None and job.dag.on_late == 'abort' and any(
                 self._deadline(job, sink) < self.now for sink in self._open_sinks(job)):
@@ -377,7 +406,7 @@ class BruteForce:
         self._start(best, worker)
         victim.left += self.switch_overhead
         victim.arrival = self._arrival()
-        victim.dispatched = None
+        victim.lowered = None
         self.waiting.append(victim)
         return True
 
@@ -400,7 +429,6 @@ class BruteForce:
 
     def _start(self, execution: Execution, worker: int) -> None:
         self.waiting.remove(execution)
-        execution.dispatched = self.priority(execution)
         execution.has_run = True
         execution.left += self.dispatch_overhead
         self.running[worker] = execution

@@ -129,7 +129,7 @@ def _triggers(draw: st.DrawFn, callbacks: list[dict[str, Any]]) -> dict[str, Any
 @st.composite
 def task_sets(
     draw: st.DrawFn, /, max_dags: int = 3, max_callbacks: int = 5, groups: bool = True,
-    bounds: bool = True, newest: bool = False,
+    bounds: bool = True, newest: bool = False, importance: bool = False,
 ) -> TaskSet:
     """
     Draw a task set: one to some DAGs with AND, OR, unequal deadlines, shared callbacks.
@@ -137,6 +137,7 @@ def task_sets(
     :param groups: some callbacks are in mutually exclusive groups, also across DAGs.
     :param bounds: some DAGs abort or demote late jobs or bound their open jobs.
     :param newest: some sources and sinks keep only the newest.
+    :param importance: sinks have an importance, and some tolerate misses.
     """
     every: list[dict[str, Any]] = []
     n_dags = draw(st.integers(1, max_dags))
@@ -177,6 +178,10 @@ def task_sets(
             callback['deadline'] = _ticks(draw, 1, 40)
         if newest and ('timer' in callback or 'deadline' in callback):
             callback['keep'] = draw(st.sampled_from(['all', 'all', 'newest']))
+        if importance and 'deadline' in callback:
+            callback['importance'] = draw(st.sampled_from(['high', 'normal', 'low']))
+            if draw(st.booleans()):
+                callback['tolerate'] = f'{draw(st.integers(1, 2))} of {draw(st.integers(3, 5))}'
         callback['publishes'] = sorted(callback['publishes'])
         del callback['topic']
         if not callback['publishes']:

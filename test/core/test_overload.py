@@ -27,14 +27,32 @@ def with_times(case: Case, on_late: Any = None) -> Case:
 
 
 @examples(300)
-@given(cases(bounds=False), st.integers(5, 60))
+@given(cases(bounds=False, importance=True), st.integers(5, 60))
 def test_demote_without_an_overload_changes_nothing(case: Case, horizon: int) -> None:
     case = with_times(case)
     run = case.run(horizon)
-    assume(not run.tally.missed)
+    assume(not run.tally.missed and demand(case) <= case.workers)
     latest = max(v.deadline_ns or 0 for v in case.task_set.vertices) // TICK
     demoted = with_times(case, on_late='demote').run(horizon)
     assert _until(case, run, horizon - latest) == _until(case, demoted, horizon - latest)
+
+
+def demand(case: Case) -> float:
+    """Return how many workers the executions need."""
+    return sum(sum(row) * TICK / dag.period_ns
+               for dag, row in zip(case.task_set.dags, case.ticks))
+
+
+@examples(300)
+@given(cases(('rad', 'gedf', 'llf'), groups=False, bounds=False, importance=True),
+       st.integers(5, 60))
+def test_messages_of_a_callback_keep_their_order(case: Case, horizon: int) -> None:
+    case = replace(with_times(case, on_late='demote'), workers=1, preemptive=False)
+    latest: dict[tuple[int, int], int] = {}
+    for _, kind, _, dag, vertex, job in case.events(case.run(horizon)):
+        if kind == 'start':
+            assert job == latest.get((dag, vertex), -1) + 1
+            latest[dag, vertex] = job
 
 
 def _until(case: Case, run: Any, end: int) -> list[Any]:
@@ -47,9 +65,10 @@ def single(name: str, period: int, deadline: int, **more: Any) -> dict[str, Any]
             'dag': name, **more}
 
 
-def results(callbacks: list[dict[str, Any]], ticks: Sequence[int], horizon: int) -> Any:
+def results(callbacks: list[dict[str, Any]], ticks: Sequence[int], horizon: int,
+            preemptive: bool = False) -> Any:
     """Return of each sink what came of it, on one worker."""
-    case = Case(declaration(callbacks), tuple((each,) for each in ticks), 1, 'rad', False)
+    case = Case(declaration(callbacks), tuple((each,) for each in ticks), 1, 'rad', preemptive)
     dags = case.run(horizon).result()['dags']
     return {name: next(iter(dag['sinks'].values())) for name, dag in dags.items()}
 
@@ -80,6 +99,60 @@ def test_a_sink_that_can_be_in_time_keeps_its_deadline() -> None:
     assert sinks['/n:near']['demoted'] == sinks['/n:near']['late'] == 1
     assert sinks['/n:far']['response_ns']['max'] == 12 * TICK  # other went after it
     assert sinks['/n:near']['response_ns']['max'] == 23 * TICK  # and before this
+
+
+def test_demoted_callbacks_do_not_starve() -> None:
+    # The sensor is always late, because the others block it for longer than its deadline.
+    callbacks = [single('sensor', 10, 2, execution_time='1us', on_late='demote'),
+                 *(single(f'heavy{i}', 40, 80, execution_time='20us', on_late='demote')
+                   for i in range(2))]
+    sinks = results(callbacks, [1, 20, 20], 4000)
+    assert counts(sinks['sensor']).in_time < 200
+    assert sinks['sensor']['completed'] >= 4000 // (11 * 2 + 20)  # one in 11 deadlines
+
+
+def test_less_important_sinks_are_demoted_first() -> None:
+    for preemptive in (True, False):
+        in_time = {}
+        for importance in ('normal', 'high'):
+            callbacks = [
+                single('low', 20, 20, execution_time='8us', importance='low', on_late='demote'),
+                single('main', 30, 40, execution_time='24us', importance=importance,
+                       on_late='demote')]
+            sinks = results(callbacks, [8, 24], 6000, preemptive)
+            in_time[importance] = {name: counts(sink).in_time for name, sink in sinks.items()}
+        assert in_time['high']['main'] >= 199 == 6000 // 30 - 1
+        assert in_time['high'] == in_time['normal']  # normal is more than low
+
+
+def test_the_highest_importance_is_never_refused() -> None:
+    def run(**more: Any) -> Any:
+        return results([single(name, 10, 10, execution_time='8us', on_late='demote', **more)
+                        for name in 'ab'], [8, 8], 2000)
+    assert run(importance='low') == run(importance='high') == run()
+
+
+def test_late_jobs_of_an_important_sink_refuse_others() -> None:
+    # There is room for both, but the first has the earlier deadline.
+    in_time = {}
+    for importance in ('low', 'high'):
+        sinks = results([
+            single('first', 40, 10, execution_time='10us', importance='low', on_late='demote'),
+            single('second', 40, 20, execution_time='15us', importance=importance,
+                   on_late='demote')], [10, 15], 8000)
+        in_time[importance] = counts(sinks['second']).in_time
+    assert in_time['low'] == 0 and in_time['high'] >= 0.97 * 200
+
+
+def test_a_sink_that_tolerates_no_further_miss_goes_first() -> None:
+    def run(**more: Any) -> list[int]:
+        sinks = results([
+            single('plain', 20, 20, execution_time='12us', on_late='demote'),
+            single('other', 20, 20, execution_time='12us', on_late='demote', **more)],
+            [12, 12], 4000)
+        return [sinks[name]['completed'] for name in ('plain', 'other')]
+    (plain, other), (plain_then, other_then) = run(), run(tolerate='1 of 10')
+    assert other_then > other and plain_then < plain
 
 
 def test_only_the_newest_is_kept() -> None:

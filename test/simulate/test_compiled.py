@@ -33,6 +33,7 @@ pytestmark = [
     pytest.mark.skipif(not compiling.available(), reason='numba is not there'),
     pytest.mark.timeout(400),  # a first run compiles
 ]
+EVERY_RULE = cases(overheads=True, importance=True)
 
 
 def settings_of(case: Case, horizon: int, judge: str, stop: bool) -> Settings:
@@ -64,7 +65,7 @@ def test_the_paper_s_model(policy: str, data: st.DataObject, horizon: int) -> No
 
 
 @examples(1000)
-@given(cases(overheads=True), st.integers(5, 60), st.sampled_from(['horizon', 'completions']),
+@given(EVERY_RULE, st.integers(5, 60), st.sampled_from(['horizon', 'completions']),
        st.booleans())
 def test_everything_at_once(case: Case, horizon: int, judge: str, stop: bool) -> None:
     """Groups, bounds, aborts and overheads too."""
@@ -119,7 +120,7 @@ def with_everything(load_: Load, tables: Tables, chances: random.Random) -> Load
 
 
 @examples(800)
-@given(cases(overheads=True), st.integers(5, 60), st.booleans(), st.integers(0, 2 ** 32))
+@given(EVERY_RULE, st.integers(5, 60), st.booleans(), st.integers(0, 2 ** 32))
 def test_machine_messages_and_processes(
     case: Case, horizon: int, stop: bool, seed: int
 ) -> None:
@@ -138,14 +139,14 @@ def test_machine_messages_and_processes(
 
 
 @examples(15)
-@given(cases(overheads=True, max_callbacks=12))
+@given(cases(overheads=True, importance=True, max_callbacks=12))
 def test_long_runs(case: Case) -> None:
     """Overload for long: slots, queues and stale entries grow and are swept."""
     compare(case, 1500)
 
 
 @examples(150)
-@given(st.lists(cases(overheads=True), min_size=1, max_size=1), st.integers(5, 60),
+@given(st.lists(EVERY_RULE, min_size=1, max_size=1), st.integers(5, 60),
        st.sampled_from(['horizon', 'completions']), st.data())
 def test_runs_do_not_disturb_one_another(
     one: list[Case], horizon: int, judge: str, data: st.DataObject

@@ -1,0 +1,211 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Demoted jobs: rules 7 and 14 of the scheduling rules, which ``rules`` lists.
+
+An execution is checked (``demote``) when it comes first in a queue after ``State.start_by`` of its
+vertex.  That is the latest start with which all its sinks are in time; or the past if every
+execution of the vertex must be checked, because an older one is demoted or the vertex is refused.
+So work that is in time costs one comparison.  Like ``rules`` this module contains only integer
+arithmetic and list indexing.
+"""
+
+from __future__ import annotations
+
+from mddag_executor.core.jobs import judge
+from mddag_executor.core.state import (
+    DEADLINE_KEYS,
+    ELSEWHERE,
+    OPEN,
+    SINK_DEMOTED,
+    START_KEYS,
+    State,
+    URGENCY,
+    WAITING,
+)
+from mddag_executor.core.tables import IMPORTANT, NEVER, Tables
+
+PATIENCE = 10
+"""A late job is ordered as if it were released this many relative deadlines after it was demoted:
+so demoted callbacks run, however long the overload lasts, with about a tenth of what they need."""
+USED_UP_PATIENCE = 1
+"""The same for a sink that tolerates no further miss."""
+REFUSED_PATIENCE = 100
+"""The same for a refused job."""
+PPM = 1_000_000
+
+
+def demote(t: Tables, s: State, x: int, now: int) -> bool:
+    """
+    Demote a waiting execution if rule 7 or 14 demands it; return whether its key changed.
+
+    The caller removes its entry from the queue.
+    """
+    old = s.x_key[x]
+    vertex = s.x_vertex[x]
+    last = s.last_demoted[vertex]
+    if last >= 0 and s.x_state[last] != WAITING:
+        last = -1
+        s.last_demoted[vertex] = -1
+        set_start(t, s, vertex)
+    if last >= 0 and s.x_key[last][3] < old[3] and s.x_started[x] < 0:  # it became ready before
+        priority = s.x_key[last][0]
+    else:
+        priority = _demoted_priority(t, s, x, now)
+    if priority <= old[0]:
+        return False
+    s.x_key[x] = (priority, old[1], old[2], old[3], x)
+    if last < 0 or priority >= s.x_key[last][0]:
+        s.last_demoted[vertex] = x
+        s.start_by[vertex] = -NEVER
+    return True
+
+
+def _demoted_priority(t: Tables, s: State, x: int, now: int) -> int:
+    """Return the priority of an execution by the sinks that can be in time, if any."""
+    slot = s.x_slot[x]
+    vertex = s.x_vertex[x]
+    dag = s.job_dag[slot]
+    begin = now
+    if s.x_started[x] >= 0:  # it was preempted
+        begin = now - (s.x_cost[x] - s.x_left[x])
+    refused = is_refused(t, s, vertex)
+    process = _process(t, s, vertex)
+    if refused and now > s.refused_until[process] and s.refused_late[process] > 0:
+        s.refused_late[process] = 0
+        admit(t, s)
+        refused = is_refused(t, s, vertex)
+    patience = PATIENCE
+    deadline = NEVER
+    start = NEVER
+    for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
+        sink = t.reach_sink[i]
+        if refused or begin > s.job_hope[slot] + s.reach_by[i]:
+            if _is_used_up(t, s, sink, s.job_index[slot]):
+                patience = USED_UP_PATIENCE
+            _announce_demoted(t, s, slot, sink, now)
+        else:
+            deadline = min(deadline, t.reach_deadline[i])
+            start = min(start, t.reach_start[i])
+    release = s.job_release[slot]
+    if deadline == NEVER:
+        if refused:
+            if s.job_refused[slot] < 0:
+                s.job_refused[slot] = now + REFUSED_PATIENCE * t.dag_deadline[dag]
+            release = s.job_refused[slot]
+        else:
+            if s.job_demoted[slot] < 0:
+                s.job_demoted[slot] = now + patience * t.dag_deadline[dag]
+            release = s.job_demoted[slot]
+        deadline = t.rad_offset[vertex]
+        start = t.latest_start[vertex]
+    if s.scalars[URGENCY] == DEADLINE_KEYS:
+        return release + deadline
+    if s.scalars[URGENCY] == START_KEYS:
+        return release + start
+    return release + t.dag_deadline[dag]
+
+
+def set_start(t: Tables, s: State, vertex: int) -> None:
+    """Set from when on an execution of a vertex that comes first is checked."""
+    if s.last_demoted[vertex] >= 0 or is_refused(t, s, vertex):
+        s.start_by[vertex] = -NEVER
+        return
+    s.start_by[vertex] = NEVER
+    for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
+        s.start_by[vertex] = min(s.start_by[vertex], s.reach_by[i])
+
+
+# --- importance ----------------------------------------------------------------------------------
+
+def admit(t: Tables, s: State) -> None:
+    """
+    Set which importance is refused in each process (rule 14), by the known execution times.
+
+    A driver calls this at the begin and when the execution times have changed.
+    """
+    for process in range(1, len(s.overtaking)):
+        workers = len(s.worker_x)
+        if len(s.pool) > 0:
+            workers = 0
+            for worker in range(len(s.pool)):
+                workers += int(s.pool[worker] == process)
+        s.refused_below[process] = s.refused_late[process]
+        for importance in range(IMPORTANT + 1):
+            demand, held = _demand(t, s, process, importance)
+            if demand > 0 and importance > s.refused_below[process]:
+                s.refused_below[process] = importance
+            if demand <= workers * PPM and held <= PPM:
+                break
+    for vertex in range(t.n_vertices):
+        set_start(t, s, vertex)
+
+
+def _demand(t: Tables, s: State, process: int, importance: int) -> tuple[int, int]:
+    """Return the utilisation by vertices of at least some importance, and by those that hold."""
+    demand = 0
+    held = 0
+    for v in range(t.n_vertices):
+        if (t.importance[v] >= importance and s.expected[v] != ELSEWHERE
+                and (len(s.pool) == 0 or t.process[v] == process)):
+            share = s.mean[v] * PPM // t.period[t.dag_of[v]]
+            demand += share
+            if s.holder[v] != 0:
+                held += share
+    return demand, held
+
+
+def is_refused(t: Tables, s: State, vertex: int) -> bool:
+    """Return whether jobs are refused at a vertex in its process, for more important ones."""
+    return t.importance[vertex] < s.refused_below[_process(t, s, vertex)]
+
+
+def _process(t: Tables, s: State, vertex: int) -> int:
+    return 1 if len(s.pool) == 0 else t.process[vertex]
+
+
+def _refuse_for(t: Tables, s: State, sink: int, now: int) -> None:
+    """Refuse what is less important than a sink that missed a deadline, for a while."""
+    process = _process(t, s, sink)
+    if t.importance[sink] >= s.refused_late[process]:
+        s.refused_until[process] = now + REFUSED_PATIENCE * t.sink_deadline[sink]
+    if t.importance[sink] > s.refused_late[process]:
+        s.refused_late[process] = t.importance[sink]
+        admit(t, s)
+
+
+# --- tolerated misses ----------------------------------------------------------------------------
+
+def _is_used_up(t: Tables, s: State, sink: int, job: int) -> bool:
+    """Return whether a sink tolerates no miss of this job: it has missed as many before."""
+    if t.tolerated[sink] == 0:
+        return False
+    oldest = s.missed_jobs[t.first_miss[sink] + s.next_miss[sink]]
+    return oldest > job - t.tolerated_of[sink]
+
+
+def note_miss(t: Tables, s: State, slot: int, sink: int, now: int) -> None:
+    """Note a job that misses the deadline of a sink; a job may be noted more than once."""
+    if s.job_hope[slot] == NEVER:
+        return  # late jobs of the DAG are not demoted
+    if not is_refused(t, s, sink):
+        _refuse_for(t, s, sink, now)
+    misses = t.tolerated[sink]
+    if misses == 0:
+        return
+    job = s.job_index[slot]
+    first = t.first_miss[sink]
+    place = s.next_miss[sink]
+    if s.missed_jobs[first + (place + misses - 1) % misses] < job:
+        s.missed_jobs[first + place] = job
+        s.next_miss[sink] = (place + 1) % misses
+
+
+def _announce_demoted(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
+    """Report once that a sink of an open job is demoted."""
+    head = s.job_base[slot] + t.region_offset[vertex]
+    job = s.job_index[slot]
+    if s.job_state[slot] == OPEN and s.x_demoted[head] != job and s.x_pending[head] >= 0:
+        s.x_demoted[head] = job
+        note_miss(t, s, slot, vertex, now)
+        judge(s, slot, SINK_DEMOTED, vertex, s.job_release[slot] + t.sink_deadline[vertex], now)
