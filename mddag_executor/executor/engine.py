@@ -77,7 +77,7 @@ class Engine:
 
     def __init__(
         self, task_set: TaskSet | None, n_workers: int, policy: str, *, default_deadline: int,
-        max_active_jobs: int, expire_after: int, on_late: str = 'continue',
+        max_active_jobs: int, expire_after: int, on_late: str = 'demote',
         record: Record | None = None, on_miss: Callable[[DeadlineMiss], None] | None = None,
         process: str | None = None,
     ) -> None:

@@ -144,7 +144,7 @@ class MultiDeadlineExecutor(BareExecutor):
         num_workers: int | None = None,
         *,
         policy: str = 'rad',
-        on_late: str = 'continue',
+        on_late: str = 'demote',
         context: Context | None = None,
         trace: str | os.PathLike[str] | None = None,
         on_deadline_miss: Callable[[DeadlineMiss], None] | None = None,

@@ -41,8 +41,8 @@ class Driver:
     def __init__(self, case: Case) -> None:
         self.case = case
         self.engine = Engine(
-            case.task_set, case.workers, case.policy, default_deadline=1, max_active_jobs=NEVER,
-            expire_after=NEVER)
+            case.task_set, case.workers, case.policy, default_deadline=1,
+            on_late='continue', max_active_jobs=NEVER, expire_after=NEVER)
         self.tables = self.engine.tables
         self.entities = {
             self.tables.first_vertex[dag.index] + vertex.index:
