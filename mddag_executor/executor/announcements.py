@@ -59,8 +59,8 @@ from std_msgs.msg import UInt8MultiArray
 if TYPE_CHECKING:
     from mddag_executor.executor.workers import WorkerPool
 
-WAIT_NS, CHECK_NS = 100_000_000, 50_000_000
-"""How long a message waits for its announcement, and how often that is checked."""
+WAIT_NS = 100_000_000
+"""How long a message waits for its announcement; this is checked twice in that time."""
 _QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1000)
 # sender, publisher, sequence, begin, end; home, number and release of the job; DAG, vertex, topic
@@ -204,7 +204,7 @@ class Announcements:
 
     def _check_later(self) -> None:
         self._pool.due.call_at(
-            time.monotonic_ns() + CHECK_NS, lambda: self._pool.report(self._check))
+            time.monotonic_ns() + WAIT_NS // 2, lambda: self._pool.report(self._check))
 
     def _check(self, now: int) -> None:
         """Pass on messages that have waited for too long (rule 3)."""

@@ -32,9 +32,9 @@ How often unannounced changes are checked.
 These are a callback group that has refused an execution, and the end of a context.
 """
 
-YIELD_STEP_NS, MOST_YIELD_NS = 1_000, 2_000_000
+MOST_YIELD_NS = 2_000_000
 """
-A coroutine that yields continues in the next turn: each time in a row this much later, up to 2 ms.
+A coroutine that yields continues in the next turn: each time in a row 1 us later, up to this.
 
 So a coroutine that yields a few times loses nothing, and one that polls does not compute all the
 time.
@@ -49,7 +49,7 @@ The bound of numbers that are usually less than ten.
 
 These are the messages taken from one entity before the next entity, the messages of a keep-all
 profile that wait in Python, the publications of a topic, and the callbacks that wait in
-``Client.call``.
+``Client.call``, and the ready executions that are checked for one that may start.
 """
 
 REMEMBERED = 4096

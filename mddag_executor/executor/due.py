@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER
 from mddag_executor.executor.bounds import AGAIN_NS, BRIEF_NS, STOP_NS
-from mddag_executor.executor.gil import FIRST_CHECK_NS, GilCheck, LAST_CHECK_NS
+from mddag_executor.executor.gil import CHECK_NS, GilCheck, LAST_CHECK_NS
 from mddag_executor.executor.listeners import TimerFd
 from mddag_executor.executor.work import Work
 
@@ -95,7 +95,7 @@ class DueTimes:
         return bool(
             self._may_expire_early
             or engine.holders and engine.has_waiting and (self._timer.at or NEVER)
-            > now + self._check_after(engine.holders[0]) + FIRST_CHECK_NS)
+            > now + self._check_after(engine.holders[0]) + CHECK_NS)
 
     def arm(self, now: int) -> None:
         """Set the timerfd to the next due time."""
@@ -143,7 +143,7 @@ class DueTimes:
         """Return the time until the first check of an execution that holds the GIL, ns."""
         if holder.entity.wall_ns <= BRIEF_NS:
             return LAST_CHECK_NS
-        return max(FIRST_CHECK_NS, 2 * holder.entity.habit.mean_ns)
+        return max(CHECK_NS, 2 * holder.entity.habit.mean_ns)
 
     def _check_gil(self, now: int) -> None:
         """Take the GIL from an execution that waits for anything else."""

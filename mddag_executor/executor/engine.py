@@ -35,7 +35,7 @@ from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.estimates import MeanTimes
 from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import is_judged, judge_from
-from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE
+from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE, TURN_NS
 from mddag_executor.core.state import (
     IDLE,
     JUDGE_FROM,
@@ -44,6 +44,7 @@ from mddag_executor.core.state import (
     SUSPENDED,
     WAITING,
 )
+from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.entity import Entity, SUBSCRIPTION, TIMER
 from mddag_executor.executor.jobs import Announced, Jobs, NO_ORIGIN, Origin
@@ -57,10 +58,6 @@ if TYPE_CHECKING:
 
 MOST_MISSED = 1000
 """After a long stop (a suspended machine) at most this many releases are judged one by one."""
-MOST_LOOKED_AT = 32
-"""With more ready executions than this, it is not checked whether all of them hold the GIL."""
-LONG_NS = 1_000_000
-"""While a callback holds the GIL for longer than this, callbacks that cannot start are muted."""
 
 
 class Engine:
@@ -405,7 +402,7 @@ class Engine:
         if not state.scalars[N_IDLE] or not (ready or held_back or state.unpolled):
             return False
         is_held = bool(self.holders)
-        if state.unpolled or len(ready) > MOST_LOOKED_AT or held_back and not is_held:
+        if state.unpolled or len(ready) > MOST or held_back and not is_held:
             return True
         x_holds, x_group, owners = state.x_holds, state.x_group, state.group_owner
         first = held_back[0] if held_back else None
@@ -445,7 +442,7 @@ class Engine:
         work = self.holders[0]
         mean = work.entity.habit.mean_ns
         left = mean - (now - self._holds_since)
-        if left < LONG_NS:
+        if left < TURN_NS:
             return 0, 0
         bound = PATIENCE * left
         if self._keys_are_deadlines:

@@ -75,16 +75,8 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from typing_extensions import Self
 
-MOST_SELECTED = 1024
-"""``select`` supports descriptors below this."""
-SETTLE_S, SETTLE_CHECK_S = 0.1, 0.00005
-"""How long, and how often, to check whether the callback that completed a future has ended."""
-QUIET_TURNS, MOST_TURNS = 3, 20
-"""
-A spin that has handled actions ends after this many idle milliseconds.
-
-It ends after ``MOST_TURNS`` milliseconds in any case.
-"""
+SETTLE_S = 0.1
+"""How long to check whether the callback that completed a future has ended."""
 
 
 def deadline_of(timeout_sec: float | None) -> float | None:
@@ -466,7 +458,8 @@ class MultiDeadlineExecutor(BareExecutor):
         Wait briefly for callbacks that a single thread would have ended before the future is done.
 
         These are the callback that has completed the future, and the feedback of an action: it was
-        published before the result, but may arrive later.
+        published before the result, but may arrive later.  If actions were handled, it waits for 3
+        idle milliseconds, and for 20 at most.
 
         :param completed_by: holds the pool's thread in which the future was completed, with its
             execution, or None for another thread; possibly only some time after the future is
@@ -477,13 +470,13 @@ class MultiDeadlineExecutor(BareExecutor):
         while time.monotonic() < end and (
                 not completed_by
                 or any(each is not None and each[0].work is each[1] for each in completed_by)):
-            time.sleep(SETTLE_CHECK_S)
+            time.sleep(0.00005)
         if self._upkeep.handled_waitables() == handled:
             return
         quiet = 0
-        for _ in range(MOST_TURNS):
+        for _ in range(20):
             quiet = quiet + 1 if self._pool.is_idle() else 0
-            if quiet >= QUIET_TURNS:
+            if quiet == 3:
                 return
             time.sleep(0.001)
 
@@ -627,7 +620,7 @@ class MultiDeadlineExecutor(BareExecutor):
         """Wait for an arrival or a due time; at most ``left`` seconds, None: for ever."""
         assert self._stepping is not None
         fd = self._stepping.fileno()
-        if left is None or fd >= MOST_SELECTED:
+        if left is None or fd >= 1024:  # which ``select`` does not support
             self._stepping.poll(-1 if left is None else left)
         else:
             select.select([fd], [], [], left)  # resolution 1 us; that of an epoll is 1 ms

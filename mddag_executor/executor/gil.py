@@ -17,17 +17,17 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
     inconclusive.
 2.  *Unknown.*  After inconclusive first executions, the next ones are treated as if they held the
     GIL: then no other callback computes, and the measurement is conclusive.  Later, one execution
-    is treated so (a trial) after every ``UNCLEAR_RUNS`` inconclusive ones.
+    is treated so (a trial) after every ``LATELY`` inconclusive ones.
 3.  *A callback that computes with the GIL released* (numpy, hashlib) is measured as if it held it.
     Declare ``holds_interpreter: false`` to run several such callbacks in parallel.
 4.  *A callback that waits though it usually computes* would keep others from the GIL.
-    ``GilCheck`` checks its thread while others wait for the GIL, first after ``FIRST_CHECK_NS``
+    ``GilCheck`` checks its thread while others wait for the GIL, first after ``CHECK_NS``
     and then at growing intervals.  If the thread waits, the execution gives the GIL up.
 5.  *Waiting, not starving.*  A thread that has not computed since the last check may have waited
     for an event, for the GIL, or for a CPU.  It waited for an event if it got no CPU and is
     asleep, because a thread that waits for the GIL wakes up every ``SWITCH_INTERVAL_S``.  It also
     did if, for half of the time, it was not ready to run and no other thread computed.  Anything
-    else is unclear, and counts only after ``UNCLEAR_CHECKS`` checks, so that the GIL is not
+    else is unclear, and counts only after ``LATELY`` checks, so that the GIL is not
     withheld from others for ever.
 """
 
@@ -50,19 +50,18 @@ WAITS = 0.5
 SHORT_NS = 2_000
 """A callback that usually computes for less than half of this is not worth ordering."""
 LATELY = 8
-"""Averages cover about this many executions."""
+"""
+Averages cover about this many executions.
+
+After as many inconclusive executions in a row, one runs as if it held the GIL; after as many
+unclear checks in a row, about 100 ms, a thread is treated as waiting.
+"""
 SELDOM = 32
 """One in this many short executions is measured (8 us) if the callback's GIL habit is known."""
-UNCLEAR_RUNS = 8
-"""After this many inconclusive executions, one runs as if it held the GIL."""
 
-FIRST_CHECK_NS = 2_000_000
-LAST_CHECK_NS = 20_000_000
+CHECK_NS = 2_000_000
+LAST_CHECK_NS = 10 * CHECK_NS
 """The interval between checks grows from the first to the last; short callbacks use the last."""
-IDLE_SHARE = 0.05
-"""A thread that computed for this fraction of the time since the last check computes."""
-UNCLEAR_CHECKS = 8
-"""After this many unclear checks in a row, about 100 ms, a thread is treated as waiting."""
 
 SWITCH_INTERVAL_S = 0.001
 """
@@ -125,7 +124,7 @@ class GilHabit:
                 self._unclear += 1
                 if self.share is None:
                     self.holds = 1
-                elif self._unclear >= UNCLEAR_RUNS:
+                elif self._unclear >= LATELY:
                     self._unclear = 0
                     self._is_trial = not usual
                     self.holds = 1
@@ -251,7 +250,7 @@ class GilCheck:
             self._last = None
             self._unclear = 0
             # on a grid, so that several short callbacks do not each set the timer again
-            self.at = (now + self._step) // FIRST_CHECK_NS * FIRST_CHECK_NS + FIRST_CHECK_NS
+            self.at = (now + self._step) // CHECK_NS * CHECK_NS + CHECK_NS
 
     def end(self) -> None:
         """Stop checking."""
@@ -267,12 +266,12 @@ class GilCheck:
         """
         last = self._last
         new = self._last = _Reading(now, cpu_ns(ident), process_time_ns(), schedule_of(tid))
-        self._step = FIRST_CHECK_NS if last is None else min(2 * self._step, LAST_CHECK_NS)
+        self._step = CHECK_NS if last is None else min(2 * self._step, LAST_CHECK_NS)
         self.at = now + self._step
         if last is None:
             return False
         passed, own = now - last.at, new.own - last.own
-        if own >= IDLE_SHARE * passed:
+        if 20 * own >= passed:  # it computes for at least 5 % of the time
             self._unclear = 0
             return False
         if new.schedule.is_asleep:
@@ -283,7 +282,7 @@ class GilCheck:
             if passed - others - delayed >= WAITS * passed:
                 return True
         self._unclear += 1
-        return self._unclear >= UNCLEAR_CHECKS
+        return self._unclear >= LATELY
 
 
 def times_preempted() -> int:

@@ -23,7 +23,6 @@ from mddag_executor.executor.compat import on_end
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 
-LAST_LOOK_NS = 500_000_000
 _now = time.monotonic_ns
 
 
@@ -151,7 +150,7 @@ class ContextChecks:
         if self.at is None or _now() < self.at:
             return False
         self._step *= 4
-        self.at = _now() + self._step if self._step <= LAST_LOOK_NS else None
+        self.at = _now() + self._step if self._step <= 500_000_000 else None
         return True
 
     def seconds(self) -> float:

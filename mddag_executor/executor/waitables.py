@@ -39,10 +39,8 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
 from rclpy.waitable import Waitable
 
-SENDER_CHECKS, SENDER_CHECK_NS = 500, 1_000_000
-"""How often and at what interval to post a response whose request is not noted yet (7.1.5)."""
-POLL_CHECKS, POLL_CHECK_S = 5, 0.1
-"""How often and how long ``WaitSetThread.poll`` waits if an entity is being destroyed."""
+SENDER_CHECKS = 500
+"""For how many ms to wait with a response until its request is noted (7.1.5)."""
 
 Post = Callable[[list[Work]], None]
 """Makes executions ready; must be called without the engine's lock."""
@@ -169,7 +167,7 @@ class WaitableSource:
         if len(early) < len(found):
             self._post([work for work in found if work not in early])
         if early:
-            self._at(time.monotonic_ns() + SENDER_CHECK_NS,
+            self._at(time.monotonic_ns() + 1_000_000,
                      partial(self._post_noted, early, checks + 1))
 
 
@@ -258,10 +256,10 @@ class WaitSetThread:
             self._has_answered.clear()
             self._asked += 1
             self.wake()
-            for _ in range(POLL_CHECKS):
+            for _ in range(5):  # an entity may be being destroyed
                 if self._answered == self._asked or not thread.is_alive():
                     break
-                self._has_answered.wait(POLL_CHECK_S)
+                self._has_answered.wait(0.1)
                 self._has_answered.clear()
 
     def wake(self) -> None:

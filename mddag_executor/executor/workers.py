@@ -41,6 +41,7 @@ from time import monotonic_ns
 from typing import Any
 
 from mddag_executor.clocks import TraceClock
+from mddag_executor.core.queues import TURN_NS
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
     BRIEF_NS,
@@ -48,12 +49,11 @@ from mddag_executor.executor.bounds import (
     GUARD_NS,
     MOST,
     MOST_YIELD_NS,
-    YIELD_STEP_NS,
 )
 from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.debugging import engine_lock
 from mddag_executor.executor.due import DueTimes, Guard
-from mddag_executor.executor.engine import Engine, LONG_NS
+from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.groups import Refused
@@ -548,7 +548,7 @@ class WorkerPool:
         me.work = work
         holders = engine.holders
         if holders:
-            if holders[0].entity.habit.mean_ns >= LONG_NS or self.muting.until:
+            if holders[0].entity.habit.mean_ns >= TURN_NS or self.muting.until:
                 self.muting.update(now, self.running)
             if engine.has_waiting and self.due.is_early(now - self._offset):
                 self.due.arm(now - self._offset)
@@ -715,7 +715,7 @@ class WorkerPool:
                 self._of_next_step.append(work)
                 return
             work.yields += 1
-            rest = min(work.yields * YIELD_STEP_NS, MOST_YIELD_NS)
+            rest = min(work.yields * 1_000, MOST_YIELD_NS)
             self.call_at(monotonic_ns() + rest, partial(self.resume, work))
         else:
             work.yields = 0

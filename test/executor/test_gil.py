@@ -338,7 +338,7 @@ def test_without_figures_of_the_kernel_the_cpu_time_decides(monkeypatch):
 
 def test_what_stays_unclear_gives_the_interpreter_back_in_the_end(monkeypatch):
     unclear, computes = (0.0, 20.0, 0.0, 5, True), (5.0, 0.0, 0.0, 1, True)
-    most = gil.UNCLEAR_CHECKS
+    most = gil.LATELY
     assert waits(monkeypatch, *[unclear] * most) == [False] * (most - 1) + [True]
     assert waits(monkeypatch, *[unclear] * (most - 1), computes, unclear) == [False] * (most + 1)
 

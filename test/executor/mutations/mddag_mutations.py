@@ -20,7 +20,7 @@ from typing import Any
 
 from mddag_executor.core import policies, tally
 from mddag_executor.core.state import COMPLETED, IDLE, JOB_END, LATE, OPEN
-from mddag_executor.executor import compat, executor, workers
+from mddag_executor.executor import compat, executor
 from mddag_executor.executor.compat import BareTask
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, TASK
@@ -34,6 +34,7 @@ from mddag_executor.executor.waitables import WaitableSource, WaitSetThread
 from mddag_executor.executor.work import TaskWork, Work
 from mddag_executor.executor.workers import WorkerPool
 import pytest
+from rclpy.task import Future
 
 MUTATIONS: dict[str, Callable[[], None]] = {}
 MEANING: dict[str, str] = {}
@@ -89,12 +90,12 @@ def every_twentieth_lost() -> None:
     seen: Counter[str] = Counter()
 
     def make(step: Any) -> Any:
-        def broken(self: Work) -> Any:
+        def broken(self: Work, *args: Any) -> Any:
             if self.coroutine is None:
                 seen[self.entity.kind] += 1
                 if seen[self.entity.kind] % 20 == 0:
                     return None
-            return step(self)
+            return step(self, *args)
         return broken
     replace(Work, 'step', make)
     replace(TaskWork, 'step', make)
@@ -174,8 +175,14 @@ def coroutines_not_resumed() -> None:
 
 @mutation("A coroutine never goes on that yields without awaiting one of rclpy's futures.")
 def unknown_waits_not_resumed() -> None:
-    workers.YIELD_STEP_NS = workers.MOST_YIELD_NS = 10 ** 18
-    replace(WorkerPool, '_resume_of_last_step', lambda resume: lambda self: None)
+    def mutant(settle: Any) -> Any:
+        def settle_end(self: WorkerPool, work: Any, outcome: Any) -> None:
+            if isinstance(outcome, (type(None), BaseException, Future)):
+                settle(self, work, outcome)
+
+        return settle_end
+
+    replace(WorkerPool, '_settle_end', mutant)
 
 
 @mutation('A task of rclpy 7.1.9 goes on by itself as well, so it does so twice.')
