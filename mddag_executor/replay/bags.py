@@ -13,8 +13,7 @@ Theory of operation
   the stamp at the beginning of its content, if its type begins with a `std_msgs/Header` or a time.
   The rest is not decoded.
 * A topic with a relative name (`AAA`) is the same as in the root namespace (`/AAA`).
-* Messages at impossible times (``trace.times``) are dropped.  Impossible stamps are dropped, too,
-  but their messages stay.
+* Messages at impossible times (``trace.times``) are dropped and counted.
 * Damage loses the rest of its file, and is reported.
 """
 
@@ -24,7 +23,6 @@ from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
 import io
-from itertools import compress
 import os
 from pathlib import Path
 import re
@@ -39,7 +37,7 @@ from mddag_executor.text import counted
 from mddag_executor.trace import TraceError, TraceReader
 from mddag_executor.trace.channels import Topic
 from mddag_executor.trace.errors import renamed
-from mddag_executor.trace.times import joined, NEVER, stretches, Times
+from mddag_executor.trace.times import joined, NEVER, stretches
 import zstandard
 
 _METADATA_LIMIT = 4 * 1024 * 1024
@@ -71,12 +69,6 @@ class Stamps:
         self.header = array('q')
         self.type = ''
 
-    def leave_out(self, never: Collection[int]) -> None:
-        """Drop the messages that arrived at these times."""
-        kept = [time not in never for time in self.arrival]
-        for name in ('arrival', 'published', 'header'):
-            setattr(self, name, array('q', compress(getattr(self, name), kept)))
-
 
 class Bag:
     """
@@ -101,14 +93,17 @@ class Bag:
         self.topics: set[str] = set()
         self.stamps: dict[str, Stamps] = {}
         self.stretches: list[tuple[int, int]] = []
-        self._times = Times()
+        self._impossible = 0
         self.warnings: list[str] = []
         self._stamped: dict[tuple[str, str], bool] = {}
         self._stated: int | None = None     # number of messages according to metadata.yaml
         files = self._files()
         for file in files:
             self._read(file, topics, len(files) == 1)
-        self._finish()
+        if self._impossible:
+            self.warnings.append(
+                f'{self.name}: left out: {counted(self._impossible, "message")} at an impossible '
+                'time')
         if self._stated is not None and self._stated != self.count and not self.warnings:
             self.warnings.append(
                 f'{self.name}: metadata.yaml counts {counted(self._stated, "message")}, but '
@@ -200,28 +195,10 @@ class Bag:
         return self.name if str(file) == self.path else str(file)
 
     def _look_through(self, times: Sequence[int]) -> None:
-        """Store the arrivals of a file's messages; drop those at impossible times."""
-        wrong = self._times.impossible(times)
-        if wrong:
-            never = {times[place] for place in wrong}
-            for stamps in self.stamps.values():
-                stamps.leave_out(never)
-            times = [time for time in times if time not in never]
-        self.stretches = joined([*self.stretches, *stretches(times)])
-
-    def _finish(self) -> None:
-        """Report odd times, and drop impossible stamps."""
-        self.warnings += [f'{self.name}: {text}' for text in self._times.lines('message')]
-        for topic, stamps in self.stamps.items():
-            for column, noun in ((stamps.header, 'header stamp'),
-                                 (stamps.published, 'publication time')):
-                wrong = _stray_stamps(stamps.arrival, column)
-                for place in wrong:
-                    column[place] = UNKNOWN
-                if wrong:
-                    self.warnings.append(
-                        f'{self.name}: {topic}: left out: {counted(len(wrong), noun)} far from '
-                        'the others, beside the arrival')
+        """Store the arrivals of a file's messages."""
+        possible = [time for time in times if 0 <= time < NEVER]
+        self._impossible += len(times) - len(possible)
+        self.stretches = joined([*self.stretches, *stretches(possible)])
 
     @property
     def start(self) -> int | None:
@@ -267,18 +244,6 @@ class Bag:
         if seconds < 0 or nanoseconds >= 1_000_000_000:
             return UNKNOWN
         return int(seconds * 1_000_000_000 + nanoseconds)
-
-
-def _stray_stamps(arrivals: Sequence[int], stamps: Sequence[int]) -> list[int]:
-    """Return the positions of stamps that are much earlier or later than others before arrival."""
-    known = [place for place, stamp in enumerate(stamps) if stamp > 0]
-    if not known:
-        return []
-    lags = [stamps[place] - arrivals[place] for place in known]
-    usual = sorted(lags)[len(lags) // 2]
-    # a usual lag at both ends, so that odd ones there are between others, too
-    around = [NEVER // 2 + lag - usual for lag in (usual, *lags, usual)]
-    return [known[odd - 1] for odd in Times().impossible(around) if 0 < odd <= len(known)]
 
 
 def is_ordinary(path: str) -> bool:

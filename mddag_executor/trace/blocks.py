@@ -81,7 +81,6 @@ class Block:
 
     :ivar offset: position of its first byte in the file; ``end``: position after its records.
     :ivar after: position after its message indexes.
-    :ivar start_time: the earliest log_time of its messages, according to its head, ns.
     :ivar data_offset: position of its (compressed) records in the file.
     :ivar size: size of its records, uncompressed; ``crc``: CRC of these, 0: none.
     """
@@ -89,7 +88,6 @@ class Block:
     offset: int
     end: int
     after: int
-    start_time: int
     chunk: bool
     compression: str
     data_offset: int
@@ -182,23 +180,22 @@ def _chunk(file: int, position: int, end: int) -> Block:
     start = position + records.RECORD.size
     content = Content(os.pread(file, min(end - start, _CHUNK_HEAD), start))
     try:
-        start_time, _, size, crc = records.CHUNK_HEAD.unpack(content.read(records.CHUNK_HEAD.size))
+        _, _, size, crc = records.CHUNK_HEAD.unpack(content.read(records.CHUNK_HEAD.size))
         compression, length = content.read_prefixed_string(), content.read8()
     except ValueError:
         raise Damage('the head of a chunk is damaged', position) from None
     data_offset = start + content.count
     if data_offset + length != end or size > MAX_CHUNK or length > MAX_CHUNK + _CHUNK_HEAD:
         raise Damage('the lengths in the head of a chunk are wrong', position)
-    return Block(position, end, end, start_time, True, compression, data_offset, size, crc)
+    return Block(position, end, end, True, compression, data_offset, size, crc)
 
 
 def _plain(file: int, position: int, size: int, messages: bool) -> Block:
     """Return the run of plain records from a position on, at least one."""
     allowed = [Opcode.SCHEMA, Opcode.CHANNEL] + [Opcode.MESSAGE] * messages
-    start_time = 2 ** 64 - 1
     end = position
     while True:
-        head = os.pread(file, records.RECORD.size + records.MESSAGE_HEAD.size, end)
+        head = os.pread(file, records.RECORD.size, end)
         if len(head) < records.RECORD.size:
             break       # ``scan`` reports the damage
         opcode, length = records.RECORD.unpack_from(head)
@@ -209,11 +206,8 @@ def _plain(file: int, position: int, size: int, messages: bool) -> Block:
             break
         if after - position > MAX_CHUNK:
             raise Damage('a record is too large', position)
-        if opcode == Opcode.MESSAGE and length >= records.MESSAGE_HEAD.size:
-            start_time = min(
-                start_time, records.MESSAGE_HEAD.unpack_from(head, records.RECORD.size)[2])
         end = after
-    return Block(position, end, end, start_time, False, '', position, end - position, 0)
+    return Block(position, end, end, False, '', position, end - position, 0)
 
 
 def load(stream: BinaryIO, block: Block, room: memoryview) -> bytes:

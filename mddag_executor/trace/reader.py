@@ -122,7 +122,7 @@ class TraceReader:
 
         :param names: full names (`ros2:callback_start`) of the wanted events, None for all
         :param sorted: whether to yield in the order of time instead of that of the file
-        :raises TraceError: if the file can no longer be read, or is too unordered to be sorted
+        :raises TraceError: if the file can no longer be read
         """
         return self._events(names, True, sorted)
 

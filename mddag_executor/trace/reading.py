@@ -11,9 +11,8 @@ Theory of operation
    one after the other.
 2. In the order of the file the events of one thread are ordered.  Those of different threads are
    not: a thread appends an event after it has read its clock.
-3. In the order of time an event is yielded as soon as no later block can have an earlier one; the
-   heads of the blocks have their earliest times.  Only overlapping blocks need memory, which is
-   limited.  Events of equal time are in the order of the file.
+3. In the order of time all events are in memory.  Events of equal time are in the order of the
+   file.
 4. A block is used only if everything before it in the file is valid.  So the beginning of a
    damaged recording is used.  ``damage`` has the damage; it is not raised.
 5. An undecodable message in a valid block is skipped and counted.  In the order of time, events
@@ -23,7 +22,7 @@ Theory of operation
 from __future__ import annotations
 
 from array import array
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from operator import itemgetter
@@ -36,14 +35,11 @@ from mddag_executor.trace import records
 from mddag_executor.trace.blocks import Block, Damage, load
 from mddag_executor.trace.cdr import ENCAPSULATION
 from mddag_executor.trace.channels import Channels, Topic
-from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.events import Batch, Column, Event, FIELDS, Ints, rows_at
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
 _BATCH_BYTES = 1 << 21
-_PENDING_LIMIT = 2_000_000
-"""Maximum number of events in memory while they are sorted."""
 _HEAD = np.dtype({
     'names': ['opcode', 'length', 'channel', 'log_time', 'publish_time', 'encapsulation'],
     'formats': ['u1', '<u8', '<u2', '<u8', '<u8', '<u2'], 'offsets': [0, 1, 9, 15, 23, 31],
@@ -123,32 +119,11 @@ class Reading:
 
     def by_time(self, stream: BinaryIO) -> Iterator[Event]:
         """Yield the events in the order of time."""
-        starts = [block.start_time for block in self._blocks]
-        for number in range(len(starts) - 1, 0, -1):
-            starts[number - 1] = min(starts[number - 1], starts[number])
-        pending: list[Event] = []
-        time = itemgetter(1)
-        first = 0
-        for batch in self.by_file(stream):
-            new = [event for event in batch if 0 <= event[1] < NEVER]
-            if len(new) < len(batch):
-                self._left_out += [event[1] for event in batch if not 0 <= event[1] < NEVER]
-            if new and min(map(time, new)) < starts[first]:
-                self.damage = Damage('a chunk holds an event from before the time in its head',
-                                     self._blocks[first].offset)
-                break
-            pending += new
-            pending.sort(key=time)
-            first = self._used
-            if first < len(starts):
-                count = bisect_left(pending, starts[first], key=time)
-                yield from pending[:count]
-                del pending[:count]
-            if len(pending) > _PENDING_LIMIT:
-                raise TraceError(
-                    self._path, 'holds too much in disorder to put it into order of time',
-                    'sort it first, as with `mcap sort`')
-        yield from pending
+        found = [event for batch in self.by_file(stream) for event in batch]
+        possible = [event for event in found if 0 <= event[1] < NEVER]
+        if len(possible) < len(found):
+            self._left_out = [event[1] for event in found if not 0 <= event[1] < NEVER]
+        yield from sorted(possible, key=itemgetter(1))
 
     def messages_of(
         self, stream: BinaryIO, topics: Collection[str], times: array[int]

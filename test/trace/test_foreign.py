@@ -207,28 +207,3 @@ def test_any_disorder_is_put_into_order(tmp_path: Path, seed: int, finish: bool)
     in_time_order, warnings = read(path, in_time_order=True)
     assert in_time_order == sorted(read_back(recorded), key=lambda event: event[1])
     assert len(warnings) == (not finish)
-
-
-BIG = """
-import resource, sys
-from mddag_executor.trace import TraceFile, TraceReader, read_events
-path, count = sys.argv[1], int(sys.argv[2])
-with TraceFile(path) as file:
-    for first in range(0, count, 1000):
-        file.extend([('callback_start', number * 1000 ^ 8192, 5, number, True)
-                     for number in range(first, first + 1000)], 1)
-reader = TraceReader(path)
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-assert sum(1 for _ in reader.events()) == count
-last = -1
-for event in reader.events(sorted=True):
-    assert event[1] > last
-    last = event[1]
-assert not reader.warnings
-print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
-"""
-
-
-def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
-    megabytes = int(run_child(BIG, tmp_path / 'a.mcap', 500_000))
-    assert megabytes < 20       # all events at once would take more than 100
