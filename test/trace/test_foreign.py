@@ -23,7 +23,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
-from .helpers import mixture, read, read_back, run_child, VPID, write_chunks
+from .helpers import mixture, read, read_back, VPID, write_chunks
 
 
 def message(entry: tuple[Any, ...]) -> bytes:
