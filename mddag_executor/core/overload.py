@@ -50,6 +50,8 @@ def demote(t: Tables, s: State, x: int, now: int) -> bool:
         set_start(t, s, vertex)
     if last >= 0 and s.x_key[last][3] < old[3] and s.x_started[x] < 0:  # it became ready before
         priority = s.x_key[last][0]
+        for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
+            _announce_demoted(t, s, s.x_slot[x], t.reach_sink[i], now)
     else:
         priority = _demoted_priority(t, s, x, now)
     if priority <= old[0]:
@@ -83,6 +85,7 @@ def _demoted_priority(t: Tables, s: State, x: int, now: int) -> int:
         if refused or begin > s.job_hope[slot] + s.reach_by[i]:
             if _is_used_up(t, s, sink, s.job_index[slot]):
                 patience = USED_UP_PATIENCE
+            note_miss(t, s, slot, sink, now)
             _announce_demoted(t, s, slot, sink, now)
         else:
             deadline = min(deadline, t.reach_deadline[i])
@@ -207,5 +210,4 @@ def _announce_demoted(t: Tables, s: State, slot: int, vertex: int, now: int) -> 
     job = s.job_index[slot]
     if s.job_state[slot] == OPEN and s.x_demoted[head] != job and s.x_pending[head] >= 0:
         s.x_demoted[head] = job
-        note_miss(t, s, slot, vertex, now)
         judge(s, slot, SINK_DEMOTED, vertex, s.job_release[slot] + t.sink_deadline[vertex], now)

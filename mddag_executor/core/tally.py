@@ -63,7 +63,11 @@ def quantiles_us(values: list[int]) -> dict[str, float] | None:
 
 
 class Counts(NamedTuple):
-    """Verdicts about the jobs of one or several sinks; ``late`` includes the overdue."""
+    """
+    Verdicts about the jobs of one or several sinks; ``late`` includes the overdue.
+
+    Demoted jobs have another verdict, too.
+    """
 
     due: int
     in_time: int
@@ -72,6 +76,7 @@ class Counts(NamedTuple):
     aborted: int
     failed: int
     dropped: int
+    demoted: int
 
     @property
     def missed(self) -> int:
@@ -85,7 +90,7 @@ class Counts(NamedTuple):
     @classmethod
     def total(cls, several: Iterable[Counts]) -> Counts:
         """Return the sums of several."""
-        return cls(*(sum(column) for column in zip(cls(0, 0, 0, 0, 0, 0, 0), *several)))
+        return cls(*(sum(column) for column in zip(cls(*[0] * len(cls._fields)), *several)))
 
 
 def counts(sink: Mapping[str, Any]) -> Counts:
@@ -94,7 +99,8 @@ def counts(sink: Mapping[str, Any]) -> Counts:
     aborted, failed, dropped = (sink.get(key, 0) for key in ('aborted', 'failed', 'dropped'))
     in_time = sink['completed'] - (sink['late'] - overdue)
     due = sink['completed'] + overdue + sink['expired'] + aborted + failed + dropped
-    return Counts(due, in_time, sink['late'], sink['expired'], aborted, failed, dropped)
+    return Counts(due, in_time, sink['late'], sink['expired'], aborted, failed, dropped,
+                  sink.get('demoted') or 0)
 
 
 def is_kept(sink: Mapping[str, Any]) -> bool:
@@ -367,6 +373,10 @@ class Tally:
     def _vertex(self, vertex: int) -> Vertex:
         dag = self._dags[self._tables.dag_of[vertex]]
         return dag.vertices[self._tables.index_in_dag[vertex]]
+
+    def tolerated(self, vertex: int) -> int:
+        """Return how many misses a sink with a window tolerates in it."""
+        return self._tables.tolerated[vertex]
 
     def _tolerate(self, vertex: int) -> WeaklyHard | None:
         return self._vertex(vertex).callback.tolerate if self._dags else None

@@ -115,10 +115,22 @@ class DagWatch:
             'results': str(results.due), 'missed': str(results.missed),
             'late': str(results.late), 'expired': str(results.expired),
             'aborted': str(results.aborted), 'failed': str(results.failed),
+            'dropped': str(results.dropped), 'demoted': str(results.demoted),
+            **self._tolerated(),
             'window_results': str(window.due), 'window_missed': str(window.missed),
             'window_missed_ratio': f'{ratio:.4f}', 'window_in_stops': str(in_stops),
             **self._response_times(last, seen)}
         return Status(f'{self._thresholds.name}: {self._dag.name}', level, message, values)
+
+    def _tolerated(self) -> dict[str, str]:
+        """Return the worst window of the sink that is nearest to its tolerance, if any has one."""
+        sinks = [(vertex, window) for vertex, window in self._tally.windows.items()
+                 if vertex in self._tally.sinks_of(self._dag)]
+        if not sinks:
+            return {}
+        tolerated = {v: self._tally.tolerated(v) for v, _ in sinks}
+        vertex, window = max(sinks, key=lambda item: item[1].worst / tolerated[item[0]])
+        return {'worst_window': f'{window.worst} of {window.of}, {tolerated[vertex]} tolerated'}
 
     def _level(
         self, step: Counts, window: Counts, now: int, in_stops: int

@@ -99,7 +99,11 @@ class Verdicts:
                 self._ended(dag, job, deadline, now)
             elif kind == SINK_OVERDUE:
                 self._report(kind, dag, vertex, job, deadline, None)
-            elif kind not in (SINK_IN_TIME, SINK_DEMOTED):
+            elif kind == SINK_DEMOTED:
+                if self.record is not None:
+                    self.record('demote', now, threading.get_native_id(), dag,
+                                self._tables.index_in_dag[vertex], job)
+            elif kind != SINK_IN_TIME:
                 self._missed(kind, dag, vertex, job, deadline, time, now)
         self.tally.add(decisions)  # last: it knows which sinks were overdue before
         return dropped

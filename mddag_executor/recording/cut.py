@@ -81,12 +81,13 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
         table['message'] = messages.new(table['message'])
     takes['execution'] = executions.new(takes['execution'])
     takes['message'] = messages.new(takes['message'])
-    stops, drops = recording.stops, recording.drops
+    stops, drops, demotions = recording.stops, recording.drops, recording.demotions
     return replace(
         recording, releases=pick(released, seen[jobs.of(released)]), executions=table,
         publications=sent, takes=takes, job_ends=pick(ends, seen[jobs.of(ends)]),
         stops=pick(stops, (stops['start'] < last) & (stops['end'] > begin)),
         drops=pick(drops, (drops['time'] >= begin) & (drops['time'] < last)),
+        demotions=pick(demotions, (demotions['time'] >= begin) & (demotions['time'] < last)),
         misses=pick(recording.misses, judged[jobs.of(recording.misses)]),
         start=begin, end=until, judged_releases=(begin, end),
         unjudged=None if recording.unjudged is None else _withdrawn(recording, jobs, judged))

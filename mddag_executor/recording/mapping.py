@@ -154,7 +154,8 @@ def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
     return replace(
         recording, task_set=mapping.task_set, same=False, warnings=warnings, hosted=hosted,
         executions=moved(recording.executions), publications=moved(recording.publications),
-        drops=moved(recording.drops), misses=moved(recording.misses),
+        drops=moved(recording.drops), demotions=moved(recording.demotions),
+        misses=moved(recording.misses),
         releases=of_dags(recording.releases), job_ends=of_dags(recording.job_ends))
 
 

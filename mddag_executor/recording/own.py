@@ -34,6 +34,7 @@ from mddag_executor.recording.head import declared, Head, named_errors, no_end, 
 from mddag_executor.recording.tables import (
     ABORTED,
     ALL_LEGS,
+    DEMOTIONS,
     DROPS,
     EXECUTIONS,
     EXPIRED,
@@ -68,13 +69,13 @@ import numpy as np
 _DISPATCH, _START, _END, _COMPLETE = (
     'mddag:dispatch', 'ros2:callback_start', 'ros2:callback_end', 'mddag:complete')
 _PUBLISH, _RELEASE = 'ros2:rclcpp_publish', 'mddag:job_release'
-(_DEADLINE, _FAIL, _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN,
+(_DEADLINE, _DEMOTE, _FAIL, _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN,
  _JUDGE_FROM) = (
     f'mddag:{name}' for name in (
-        'deadline', 'fail', 'expire', 'abort', 'outdate', 'lost', 'stop', 'drop', 'hosted',
-        'shutdown', 'judge_from'))
-_NUMBERS = (_DISPATCH, _START, _END, _COMPLETE, _PUBLISH, _RELEASE, _DEADLINE, _FAIL, _EXPIRE,
-            _ABORT, _OUTDATE, _LOST, _STOP, _JUDGE_FROM, _SHUTDOWN)
+        'deadline', 'demote', 'fail', 'expire', 'abort', 'outdate', 'lost', 'stop', 'drop',
+        'hosted', 'shutdown', 'judge_from'))
+_NUMBERS = (_DISPATCH, _START, _END, _COMPLETE, _PUBLISH, _RELEASE, _DEADLINE, _DEMOTE, _FAIL,
+            _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _JUDGE_FROM, _SHUTDOWN)
 _JOB_ENDS = {_EXPIRE: EXPIRED, _ABORT: ABORTED, _FAIL: FAILED, _OUTDATE: OUTDATED}
 _CORE = (_RELEASE, _COMPLETE, _DEADLINE, *_JOB_ENDS)
 """Events that the executor's core processed: the run lasts at least until the last of them."""
@@ -324,6 +325,7 @@ class _Source:
         found.releases, released_at = self._releases(released, released_at)
         found.job_ends, ends_at = self._job_ends()
         found.misses = self._misses()
+        found.demotions = self._demotions()
         stops, _ = self._kind(_STOP).joined()
         if stops is not None:
             found.stops = rows(
@@ -523,6 +525,14 @@ class _Source:
         dag, vertex = self._numbering.of(found['dag'], found['vertex'])
         return rows(MISSES, len(found), dag=dag, vertex=vertex, job=found['job'],
                     deadline=found['deadline'], completed=found['completed'])
+
+    def _demotions(self) -> Table:
+        found, _ = self._kind(_DEMOTE).joined()
+        if found is None:
+            return rows(DEMOTIONS)
+        dag, vertex = self._numbering.of(found['dag'], found['vertex'])
+        return rows(DEMOTIONS, len(found), dag=dag, vertex=vertex, job=found['job'],
+                    time=found['timestamp'])
 
     def _set_end(self, found: Recording) -> None:
         """Find the end of the run, and process events that are not in tables."""

@@ -69,12 +69,14 @@ TAKES = _table(execution='i8', message='i8', time='i8')
 JOB_ENDS = _table(
     process='i2', dag='i4', vertex='i4', job='i8', time='i8', reason='i1', order='i8')
 DROPS = _table(process='i2', vertex='i4', job='i8', time='i8', reason='i2')
+DEMOTIONS = _table(process='i2', dag='i4', vertex='i4', job='i8', time='i8')
 MISSES = _table(dag='i4', vertex='i4', job='i8', deadline='i8', completed='i8')
 STOPS = _table(process='i2', start='i8', end='i8')
 
 TABLES = {
     'releases': RELEASES, 'executions': EXECUTIONS, 'publications': PUBLICATIONS,
-    'job_ends': JOB_ENDS, 'stops': STOPS, 'takes': TAKES, 'drops': DROPS, 'misses': MISSES}
+    'job_ends': JOB_ENDS, 'stops': STOPS, 'takes': TAKES, 'drops': DROPS,
+    'demotions': DEMOTIONS, 'misses': MISSES}
 """The tables of a recording with the types of their columns."""
 
 
@@ -193,6 +195,7 @@ class Recording:
     stops: Table = field(default_factory=lambda: rows(STOPS))
     takes: Table = field(default_factory=lambda: rows(TAKES))
     drops: Table = field(default_factory=lambda: rows(DROPS))
+    demotions: Table = field(default_factory=lambda: rows(DEMOTIONS))
     misses: Table = field(default_factory=lambda: rows(MISSES))
     start: int | None = None
     end: int = 0

@@ -14,6 +14,7 @@ along its critical chain (see ``chains``):
 * ready callback: *group* while another callback of its group ran; else *waited* while all workers
   were busy; else, with an idle worker, *interpreter* while any callback ran, *machine* while none
   ran;
+* what a job *waited*, or waited for the *interpreter*, after it was demoted is *overload*;
 * running callback: *ran* up to the usual time (its median or, if less, the declared maximum) and
   *ran long* beyond.  If its CPU time is recorded, shows computing and is not unusual, the excess
   is *interpreter* while other callbacks held the GIL, else *machine*: it got no CPU;
@@ -43,9 +44,9 @@ from mddag_executor.replay.spans import Spans
 import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
-          'lost', 'failed')
-(WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, LOST, FAILED,
- RAN_USUALLY, UNKNOWN) = range(11)
+          'lost', 'failed', 'overload')
+(WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, LOST, FAILED, OVERLOAD,
+ RAN_USUALLY, UNKNOWN) = range(12)
 #: Kinds of time of a job; the last two are not causes.
 PARTS = (*CAUSES, 'ran', 'unknown')
 #: By cause what to do about it.
@@ -60,16 +61,18 @@ REMEDIES = {
                'stand still',
     'lost': 'if a process ended early (see the warnings), its end; else a longer queue (QoS '
             'depth), reliable QoS, or a publisher that always publishes',
-    'failed': 'mend what the callback raises'}
+    'failed': 'mend what the callback raises',
+    'overload': 'less work, or a lower importance or longer deadline of what ran instead'}
 _NOTHING_NS = 1_000_000
 _ABOUT_BITS = 4     # up to a 16th above the usual time is usual
-_WAITS = (WAITED, INTERPRETER, GROUP)
+_WAITS = (WAITED, INTERPRETER, GROUP, OVERLOAD)
 
 MISSED = np.dtype([
     ('kind', 'i8'), ('sink', 'i8'), ('job', 'i8'), ('release', 'i8'), ('until', 'i8'),
-    ('at', 'i8'), ('length', 'i8')])
+    ('at', 'i8'), ('length', 'i8'), ('demoted', 'i8')])
 """
-Columns of a miss: ``at`` is the vertex that the job reached, ``length`` the length of its chain.
+Columns of a miss: ``at`` is the vertex that the job reached, ``length`` the length of its chain,
+``demoted`` when it was demoted.
 """
 PARTS_OF = np.dtype([
     ('miss', 'i8'), ('vertex', 'i8'), ('cause', 'i8'), ('begin', 'i8'), ('end', 'i8'),
@@ -190,6 +193,12 @@ def find(
     waits = kinds == _WAIT
     if waits.any():
         times[waits] += _waits(spans[waits], left[waits], pool)
+        demoted = np.maximum(0, spans['end'] - np.maximum(spans['begin'], rows['demoted'][of]))
+        for part in (WAITED, INTERPRETER):
+            moved = np.where(waits, np.minimum(times[:, part], demoted), 0)
+            times[:, part] -= moved
+            times[:, OVERLOAD] += moved
+            demoted -= moved
     total = np.zeros((len(rows), len(PARTS)), dtype=np.int64)
     np.add.at(total, of, times)
     sinks = rows['sink']
@@ -331,7 +340,7 @@ def _causes(
     for stall in pool.stalls:
         credit[delayed_by(rows, stall)] += stall[1] - stall[0]
     after_stall = credit > 0
-    for cause in (WAITED, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT):
+    for cause in (WAITED, INTERPRETER, GROUP, OVERLOAD, RELEASED_LATE, TRANSPORT):
         moved = np.minimum(credit, amounts[:, cause])
         amounts[:, cause] -= moved
         amounts[:, MACHINE] += moved
@@ -390,7 +399,7 @@ def behind(
     names = list(runs)
     begins, ends = parts['begin'][chosen], parts['end'][chosen]
     times = np.array([each.within(begins, ends) for each in runs.values()])
-    waited = parts['cause'][chosen] == WAITED
+    waited = np.isin(parts['cause'][chosen], (WAITED, OVERLOAD))
     times[:, waited] = [
         each.within(begins[waited], ends[waited]) for each in on_workers.values()]
     grouped = np.flatnonzero(parts['cause'][chosen] == GROUP)

@@ -338,6 +338,7 @@ class Judged:
     def _tally(self) -> MissTally:
         tally = MissTally(self.task_set, self.tables)
         judging = self._judging
+        demoted = Counter(self._recording.demotions['vertex'].tolist())
         for dag, outcome, released, over in self._outcomes:
             tally.jobs[dag] = int(judging.is_judged(released, self.jobs[dag].release).sum())
             for end, n in Counter(outcome[over].tolist()).items():
@@ -346,7 +347,7 @@ class Judged:
             sink = tally.sinks[v]
             kinds = np.bincount(mine['kind'], minlength=SINK_DROPPED + 1).tolist()
             sink.completed = kinds[SINK_IN_TIME] + kinds[SINK_LATE]
-            sink.demoted = None
+            sink.demoted = demoted.get(v)
             sink.late, sink.overdue = kinds[SINK_LATE] + kinds[SINK_MISSED], kinds[SINK_MISSED]
             sink.expired, sink.failed, sink.aborted, sink.dropped = (
                 kinds[kind] for kind in (SINK_EXPIRED, SINK_FAILED, SINK_ABORTED, SINK_DROPPED))

@@ -86,6 +86,10 @@ class Explanation:
         missed = np.zeros(len(verdicts), dtype=MISSED)
         for name in ('kind', 'sink', 'job', 'release', 'until'):
             missed[name] = verdicts[name]
+        demoted = {(vertex, job): time for vertex, job, time in zip(*(
+            self._recording.demotions[name].tolist() for name in ('vertex', 'job', 'time')))}
+        missed['demoted'] = [demoted.get(key, _NO_END) for key in zip(
+            missed['sink'].tolist(), missed['job'].tolist())]
         links: list[Table] = []
         for dag in np.unique(verdicts['dag']).tolist():
             mine = np.flatnonzero(verdicts['dag'] == dag)

@@ -77,10 +77,11 @@ _NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
 _TIMES = {
     'releases': ('release', 'noticed'), 'executions': ('ready', 'began', 'start', 'end'),
     'publications': ('time', 'source_timestamp'), 'job_ends': ('time',), 'drops': ('time',),
+    'demotions': ('time',),
     'misses': ('deadline', 'completed'), 'stops': ('start', 'end')}
 _HAPPENED = {
     'releases': 'noticed', 'executions': 'end', 'publications': 'time', 'job_ends': 'time',
-    'drops': 'time', 'stops': 'end'}
+    'drops': 'time', 'demotions': 'time', 'stops': 'end'}
 
 Event = tuple[Any, ...]
 Progress = Callable[[int], None]
@@ -212,7 +213,7 @@ class _Part:
         self._note_ran(pick(table, (row >= 0) & (table['vertex'] >= 0) & (table['start'] >= 0)))
         known = row >= 0
         table['job'][known] = self.number[row[known]]
-        for name in ('job_ends', 'misses'):
+        for name in ('job_ends', 'misses', 'demotions'):
             table = getattr(found, name)
             row = rows[jobs.of(table)]
             table['job'] = self.number[row] if len(self.number) else UNKNOWN

@@ -22,7 +22,7 @@ import os
 from typing import Any
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, rad_offsets, Tables
-from mddag_executor.core.state import ABORTED, DROP, JOB_END
+from mddag_executor.core.state import ABORTED, DROP, JOB_END, SINK_DEMOTED
 from mddag_executor.recording import tables
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.deadlines import Judged
@@ -88,6 +88,8 @@ def _events(run: ComputedRun, knows_cpu: bool) -> Iterator[_Entry]:
             yield (now, NEVER - 2, 0), 'drop', now, 0, (
                 address[vertex], dag, local[vertex], job,
                 'aborted' if (dag, job) in aborted else 'newer')
+        elif kind == SINK_DEMOTED:
+            yield (now, NEVER - 2, 0), 'demote', now, 0, (dag, local[vertex], job)
 
 
 def _executions(

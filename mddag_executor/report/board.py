@@ -39,7 +39,8 @@ _DAG_COLUMNS = (
     Column('missed', 'window_missed'), Column('p99', 'response_p99_ms', 'ms'),
     Column('of deadline', 'deadline_used_max', '%'), Column('p50', 'response_p50_ms', 'ms'),
     Column('max', 'response_max_ms', 'ms'), Column('jobs', 'jobs'),
-    Column('period', 'period_ms', 'ms'), Column('least margin', 'margin_min_ms', 'ms'))
+    Column('period', 'period_ms', 'ms'), Column('least margin', 'margin_min_ms', 'ms'),
+    Column('demoted', 'demoted'), Column('worst window', 'worst_window'))
 _POOL_COLUMNS = (
     Column('workers of', 'name'), Column('state', 'level'), Column('busy', 'busy_ratio', '%'),
     Column('CPU', 'cpu_ratio', '%'), Column('idle', 'idle_workers'), Column('queue', 'queue'),

@@ -76,7 +76,8 @@ def _side(sink: Mapping[str, Any] | None) -> dict[str, Any] | None:
     if sink is None:
         return None
     return {'relative_deadline_ns': sink['relative_deadline_ns'], **counts(sink)._asdict(),
-            'response_ns': sink['response_ns']}
+            'response_ns': sink['response_ns'],
+            **({'tolerate': sink['tolerate']} if 'tolerate' in sink else {})}
 
 
 def _sink(
@@ -145,6 +146,11 @@ def _remark(sink: Mapping[str, Any]) -> str:
         remarks.append('never due' + ('' if not any(due) else ' in B' if due[0] else ' in A'))
     if sink['a']['relative_deadline_ns'] != sink['b']['relative_deadline_ns']:
         remarks.append(f'deadline in B {format_ns(sink["b"]["relative_deadline_ns"])}')
+    for side in 'ab':
+        tolerate = sink[side].get('tolerate')
+        if tolerate is not None and tolerate['worst'] > tolerate['misses']:
+            remarks.append(f'{tolerate["worst"]} of {tolerate["of"]} missed in {side.upper()}, '
+                           f'{tolerate["misses"]} tolerated')
     return ', '.join(remarks)
 
 

@@ -28,6 +28,8 @@ from mddag_executor.report.tables import (
     RESPONSES,
     short_names,
     Sink,
+    tolerate_cells,
+    tolerate_columns,
 )
 from mddag_executor.report.text import Cell, format_ns, printable
 from mddag_executor.text import counted
@@ -130,10 +132,13 @@ def sinks_html(data: ReportData) -> str:
     The rows after the first ``MOST_ROWS`` are data for the page's script, which adds them on
     demand.
     """
-    rare = rare_ends(total(data.tally.result()['dags']))
-    header = ['DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', *rare, *RESPONSES]
+    dags = data.tally.result()['dags']
+    rare, tolerate = rare_ends(total(dags)), tolerate_columns(dags)
+    header = ['DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', *rare, *RESPONSES,
+              *tolerate]
     ranked = RankedSink.every(data)
-    full = [(*_sink_cells(each.sink, rare), _reached(each.reached)) for each in ranked]
+    full = [(*_sink_cells(each.sink, rare), *(tolerate and tolerate_cells(each.sink.result)),
+             _reached(each.reached)) for each in ranked]
     bad = range(header.index('late'), header.index('median'))
     shown = html_table([*header, 'max of deadline'], full[:MOST_ROWS], 2, bad,
                        attributes=(f'data-reached="{each.reached:.4f}"' for each in ranked))

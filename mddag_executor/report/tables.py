@@ -76,9 +76,8 @@ def sink_table(dags: Mapping[str, Any]) -> str:
     misses that are not tolerated are red on a terminal.
     """
     every = total(dags)
-    weakly_hard = [column for column in ('tolerates', 'worst') if any(
-        'tolerate' in sink for dag in dags.values() for sink in dag['sinks'].values())]
-    rare = [name for name in ('expired', 'failed', 'aborted') if getattr(every, name)]
+    weakly_hard = tolerate_columns(dags)
+    rare = ['expired'] * bool(every.expired) + rare_ends(every)
     found = [(sink, counts(sink.result)) for sink in worst_first(dags)]
     rows: list[list[Cell]] = []
     above = None
@@ -89,14 +88,21 @@ def sink_table(dags: Mapping[str, Any]) -> str:
             *(getattr(verdicts, name) for name in rare),
             *response_cells(sink.result['response_ns'], 3),
             format_ns(sink.result['relative_deadline_ns']),
-            *(weakly_hard and _tolerate_cells(sink.result))])
+            *(weakly_hard and tolerate_cells(sink.result))])
         above = sink.dag
     return table(
         ('DAG', 'sink', 'due', 'in time', 'late', *rare, *RESPONSES, *weakly_hard), rows,
         marked=[not is_kept(sink.result) for sink, _ in found])
 
 
-def _tolerate_cells(sink: Mapping[str, Any]) -> list[Cell]:
+def tolerate_columns(dags: Mapping[str, Any]) -> list[str]:
+    """Return the columns of tolerated misses, if any sink tolerates some."""
+    return ['tolerates', 'worst'] * any(
+        'tolerate' in sink for dag in dags.values() for sink in dag['sinks'].values())
+
+
+def tolerate_cells(sink: Mapping[str, Any]) -> list[Cell]:
+    """Return what a sink tolerates, and its misses in the worst window."""
     tolerate = sink.get('tolerate')
     if tolerate is None:
         return ['', '']
@@ -115,7 +121,7 @@ def missed_share(verdicts: Counts) -> float:
 
 def rare_ends(every: Counts) -> list[str]:
     """Return the counts that are only shown if they are not 0."""
-    return [name for name in ('failed', 'aborted') if getattr(every, name)]
+    return [name for name in ('failed', 'aborted', 'dropped', 'demoted') if getattr(every, name)]
 
 
 def response_cells(response: Mapping[str, int] | None, digits: int = 4) -> list[Cell]:

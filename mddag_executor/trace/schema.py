@@ -145,6 +145,7 @@ _ALL = (
     _event('mddag', 'deadline',
            dag=_I32, vertex=_I32, job=_I64, deadline=_I64, completed=_I64),
     _event('mddag', 'drop', callback=_U64, dag=_I32, vertex=_I32, job=_I64, reason=_STR),
+    _event('mddag', 'demote', dag=_I32, vertex=_I32, job=_I64),
     _event('mddag', 'fail', dag=_I32, vertex=_I32, job=_I64),
     _event('mddag', 'expire', dag=_I32, job=_I64),
     _event('mddag', 'abort', dag=_I32, job=_I64),

@@ -408,3 +408,28 @@ def test_a_timer_that_no_worker_could_notice_has_waited(
         end_trace(file, START_TIME + 21_000 * MS)
     result = explain(capsys, str(path))
     assert result['causes'][cause] == result['missed'] == 10
+
+
+def test_what_an_overload_takes_from_less_important_sinks(tmp_path: Path) -> None:
+    graph, trace, found = (tmp_path / name for name in ('g.yaml', 'run.mcap', 'found.json'))
+    graph.write_text("""\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: main, timer: 30ms, deadline: 30ms, execution_time: 20ms, importance: high, dag: a}
+      - {name: rest, dag: b, timer: 20ms, deadline: 20ms, execution_time: 10ms}
+""")
+    for command in (
+            f'simulate {graph} --workers 1 --preemptive --duration 3s --on-late demote '
+            f'--trace {trace}', f'explain {trace} --json {found}'):
+        assert program.main(command.split()) == 0
+    run = replay(trace)
+    sinks = {name: next(iter(dag['sinks'].values()))
+             for name, dag in run.result()['dags'].items()}
+    assert 'demoted' not in sinks['a'] and sinks['b']['demoted'] > 70
+    explained = json.loads(found.read_text())
+    assert explained['missed'] == explained['causes']['overload'] > 70
+    behind = {each['callback'] for job in explained['jobs'] for part in job['parts']
+              for each in part['behind']}
+    assert '/n:main' in behind
