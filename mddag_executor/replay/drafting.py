@@ -5,11 +5,10 @@ Drafts systems from traces: nodes, callbacks, published topics, rates, execution
 
 Theory of operation
 -------------------
-1. A first pass reads the initialisation into ``Entities``.  Entities of every node (parameter
-   services and the like) are ignored, and nodes without others, too.
-2. A second pass reads executions and publications.  Both addresses that rclcpp gives the callback
-   of a subscription are one callback.  A coroutine is one execution, however often it was resumed:
-   its pieces have the same ``ready`` time in their ``mddag:dispatch`` events.
+1. The tables of the recording have the executions and publications.  Entities of every node
+   (parameter services and the like) are ignored, and nodes without others, too.
+2. A coroutine is one execution, however often it was resumed: its pieces have the same ``ready``
+   time.
 3. A callback in the recorded declaration keeps its name and the declared properties that a trace
    does not show: deadline, queue edges, period, sync, group, name of the DAG.  Other callbacks are
    named by their recorded function, otherwise ``callback_0``, ``callback_1``, … by node, in the
@@ -24,39 +23,27 @@ Theory of operation
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 import os
-from typing import Any
 
 from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
-from mddag_executor.recording.entities import (
-    Callback,
-    Entities,
-    Event,
-    INIT_EVENTS,
-    KINDS,
-    Publisher,
-)
+from mddag_executor.recording.entities import Callback, KINDS
+from mddag_executor.recording.head import is_declared, named_errors, read_head
+from mddag_executor.recording.own import read_own
+from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by, VERTEX
+from mddag_executor.replay.imported_run import ImportedRun
+from mddag_executor.replay.undeclared_run import UndeclaredRun
 from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
-from msg_graph import ExecutionTime, GraphError, loads, TaskSet
+from msg_graph import ExecutionTime, NO_GRAPH, TaskSet
 from msg_graph.binding import function_of, is_background
 from msg_graph.draft import Draft, DraftCallback, DraftNode, leave_out_sources
 from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
+import numpy as np
 
 PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
-_STEP = 4096
-_KEEP_TIMES = 100_000
-_KEEP_PIECES = 1_024
-
-Fields = dict[str, Any]
-Thread = tuple[int, int]
-"""Process and thread."""
-Piece = tuple[int, ...]
-"""Identity of an execution with pieces: DAG, vertex, job and ready time."""
 
 
 @dataclass
@@ -64,44 +51,21 @@ class Runs:
     """
     The executions of a callback.
 
-    :ivar count: their number; ``first``, ``last``: starts of the first and the last, ns.
-    :ivar times: duration of each of the first ``_KEEP_TIMES``, all pieces together, ns; -1 if the
-        end is not recorded.
-    :ivar publishers: numbers of the publishers that they used.
+    :ivar starts: of each, ns; ``times``: how long each took, all pieces together.
+    :ivar whole: which of them completed a vertex.
+    :ivar topics: what they published on, in the order of time.
     """
 
-    count: int = 0
-    first: int = 0
-    last: int = 0
-    times: array[int] = field(default_factory=lambda: array('q'))
-    publishers: dict[int, Publisher] = field(default_factory=dict)
-    _recent: dict[Piece, int] = field(default_factory=dict)
+    starts: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    times: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    whole: Mask = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    topics: list[str] = field(default_factory=list)
 
     @property
     def interval_ns(self) -> int | None:
         """Return the mean time between two executions; None with fewer than two."""
-        return (self.last - self.first) // (self.count - 1) if self.count > 1 else None
-
-    def begin(self, now: int, piece: Piece | None) -> int:
-        """Note the begin or resumption of an execution; return its number."""
-        if piece is not None and piece in self._recent:
-            return self._recent[piece]
-        number = self.count
-        self.first = self.first if number else now
-        self.last = now
-        self.count += 1
-        if number < _KEEP_TIMES:
-            self.times.append(-1)
-        if piece is not None:
-            self._recent[piece] = number
-            if len(self._recent) > _KEEP_PIECES:
-                del self._recent[next(iter(self._recent))]
-        return number
-
-    def end(self, number: int, took: int) -> None:
-        """Note the duration of an execution, or of a piece of it."""
-        if number < len(self.times):
-            self.times[number] = max(0, self.times[number]) + took
+        count = len(self.starts)
+        return int(self.starts.max() - self.starts.min()) // (count - 1) if count > 1 else None
 
 
 class System:
@@ -117,124 +81,47 @@ class System:
         progress: Callable[[int], None] | None = None,
     ) -> None:
         self.name = name or os.fspath(path)
-        self.task_set: TaskSet | None = None
-        self.workers: int | None = None
-        # by callback's number
-        self._declared: dict[int, Declared] = {}
-        self._runs: dict[int, Runs] = {}
-        # by sync callback: durations of completing executions
-        self._whole: dict[str, array[int]] = {}
-        # by thread: next piece; running execution and its start; last ended execution
-        self._next: dict[Thread, tuple[int, Piece]] = {}
-        self._running: dict[Thread, list[tuple[int, int, int]]] = {}
-        self._ended: dict[Thread, tuple[int, int]] = {}
-        reader = TraceReader(path)
-        self._who = Entities()
-        self._who.read(reader.layout_events(INIT_EVENTS))
+        with named_errors(os.fspath(path), self.name):
+            reader = TraceReader(path)
+            recording = _read(reader, self.name, progress)
+        declared = recording.declared
+        self.task_set: TaskSet | None = recording.task_set if declared else None
+        self.workers: int | None = recording.head.workers if declared else None
+        self.warnings = list(reader.warnings)
+        self._who = recording.who
         self._entities = [entity for entity in sorted(
             self._who.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
         if not self._entities:
             raise InputError(
                 self.name, 'no timer, subscription or service of a node is recorded in it',
                 'record the start of the nodes, too')
-        self._read(reader, progress)
-        self.warnings = list(reader.warnings)
+        # by callback's number
+        numbers, index = recording.callbacks()
+        self._declared: dict[int, Declared] = {
+            number: recording.task_set.vertices[vertex].callback for number, vertex in zip(
+                numbers.tolist(), recording.vertices_of_callbacks().tolist()) if vertex >= 0}
+        self._runs = {number: _runs_of(recording, index == place)
+                      for place, number in enumerate(numbers.tolist())}
+        self._find_publishers(recording)
+
+    def _find_publishers(self, recording: Recording) -> None:
+        """Find the topics of callbacks and nodes."""
         #: By node its published topics, and whether a callback was seen to publish them.
         self._publishers: dict[str, dict[str, bool]] = {
             name: {} for name in self._who.names_of_nodes}
-        for publisher in self._who.every_publisher.values():
+        publishers = self._who.every_publisher
+        for publisher in publishers.values():
             if publisher.node is not None:
                 self._publishers[publisher.node.name][publisher.topic] = False
-        for runs in self._runs.values():
-            for publisher in runs.publishers.values():
-                if publisher.node is not None:
-                    self._publishers[publisher.node.name][publisher.topic] = True
-
-    def _read(self, reader: TraceReader, progress: Callable[[int], None] | None) -> None:
-        """Note executions and publications."""
-        handlers = {
-            'mddag:task_set': self._recorded,
-            'mddag:dispatch': self._dispatch,
-            'mddag:complete': self._complete,
-            'ros2:callback_start': self._start,
-            'ros2:callback_end': self._end,
-            'ros2:rclcpp_publish': self._publish,
-            'ros2:rclcpp_intra_publish': self._publish,
-            'ros2:rcl_publish': self._publish}
-        for count, event in enumerate(reader.layout_events(frozenset(handlers))):
-            fields = dict(zip(event[0].fields, event[4:]))
-            handlers[event[0].name](event, fields)
-            if progress is not None and count % _STEP == 0:
-                progress(count)
-
-    def _number(self, event: Event, fields: Fields) -> int:
-        return self._who.callback(event[2], fields['callback'], event[1]).number
-
-    def _start(self, event: Event, fields: Fields) -> None:
-        if not isinstance(fields.get('callback'), int):
-            return
-        thread, now, callback = event[2:4], event[1], self._number(event, fields)
-        expected, piece = self._next.pop(thread, (0, ()))
-        number = self._runs.setdefault(callback, Runs()).begin(
-            now, piece if expected == callback else None)
-        self._running.setdefault(thread, []).append((callback, number, now))
-
-    def _end(self, event: Event, fields: Fields) -> None:
-        if not isinstance(fields.get('callback'), int):
-            return
-        thread, callback = event[2:4], self._number(event, fields)
-        stack = self._running.get(thread, [])
-        if all(each[0] != callback for each in stack):
-            return      # it began before the recording
-        while True:     # ends of nested executions were lost
-            running, number, since = stack.pop()
-            if running == callback:
-                break
-        self._runs[callback].end(number, event[1] - since)
-        self._ended[thread] = callback, number
-
-    def _publish(self, event: Event, fields: Fields) -> None:
-        """Note a publisher; executions nest in a thread, because a callback may spin."""
-        stack, handle = self._running.get(event[2:4]), fields.get('publisher_handle')
-        if not stack or not handle:
-            return
-        publisher = self._who.publishers.latest(event[2], handle, event[1])
-        if publisher is not None:
-            self._runs[stack[-1][0]].publishers[publisher.number] = publisher
-
-    def _recorded(self, event: Event, fields: Fields) -> None:
-        text = fields.get('yaml')
-        if self.task_set is not None or not text or not text.strip():
-            return
-        try:
-            self.task_set = loads(text, fields.get('file') or self.name)
-        except GraphError:
-            return  # the declaration is unusable, the entities are not
-        self.workers = fields.get('workers')
-
-    def _dispatch(self, event: Event, fields: Fields) -> None:
-        piece = tuple(value for name in ('dag', 'vertex', 'job', 'ready')
-                      if isinstance(value := fields.get(name), int))
-        if len(piece) < 4 or fields.get('callback') is None:
-            return
-        callback = self._number(event, fields)
-        self._next[event[2:4]] = callback, piece
-        dag, vertex = piece[:2]
-        if (self.task_set is not None and 0 <= dag < len(self.task_set.dags)
-                and 0 <= vertex < len(self.task_set.dags[dag].vertices)):
-            self._declared[callback] = self.task_set.dags[dag].vertices[vertex].callback
-
-    def _complete(self, event: Event, fields: Fields) -> None:
-        if fields.get('callback') is None or not fields.get('last_leg'):
-            return
-        callback = self._number(event, fields)
-        declared = self._declared.get(callback)
-        ended, number = self._ended.get(event[2:4], (0, 0))
-        if declared is None or declared.kind != 'sync' or ended != callback:
-            return
-        times = self._runs[callback].times
-        if number < len(times):
-            self._whole.setdefault(declared.key, array('q')).append(times[number])
+        sent = recording.publications[recording.publications['execution'] >= 0]
+        pairs = np.stack((recording.executions['callback'][sent['execution']], sent['publisher']))
+        different, first = np.unique(pairs, axis=1, return_index=True)
+        for callback, number in different.T[np.argsort(first)].tolist():
+            known = publishers.get(number)
+            if known is not None:
+                self._runs[callback].topics.append(known.topic)
+                if known.node is not None:
+                    self._publishers[known.node.name][known.topic] = True
 
     def draft(self) -> Draft:
         """Return the whole system."""
@@ -307,16 +194,20 @@ class System:
     def _measure(self, callback: DraftCallback, entity: Callback) -> bool:
         """Fill in the measured values of a callback; return whether there are any."""
         runs = self._runs.get(entity.number) or Runs()
-        callback.runs = (callback.runs or 0) + runs.count
-        if not runs.count:
+        count = len(runs.starts)
+        callback.runs = (callback.runs or 0) + count
+        if not count:
             return False
         callback.publishes.extend(
-            t for t in dict.fromkeys(each.topic for each in runs.publishers.values())
+            t for t in dict.fromkeys(runs.topics)
             if t not in callback.publishes and not is_background(t, callback.node)
             and TOPIC.check(t) is None)
         callback.maybe = [t for t in callback.maybe if t not in callback.publishes]
         if callback.kind == 'sync':
-            callback.times = execution_time(self._whole.get(callback.key, ()))
+            legs = [self._runs[number] for number, declared in self._declared.items()
+                    if declared.key == callback.key]
+            callback.times = execution_time(np.concatenate(
+                [leg.times[leg.whole] for leg in legs or [runs]]))
         else:
             callback.interval_ns = runs.interval_ns
             callback.times = execution_time(runs.times)
@@ -342,9 +233,41 @@ class System:
         return count
 
 
-def execution_time(took: Iterable[int]) -> tuple[ExecutionTime, int] | None:
+def _read(
+    reader: TraceReader, name: str, progress: Callable[[int], None] | None
+) -> Recording:
+    head = read_head(reader)
+    if head is None:
+        return ImportedRun(reader, name, None, progress=progress).read()
+    if is_declared(head):
+        return read_own(reader, name, head, progress)
+    return UndeclaredRun(reader, name, head, NO_GRAPH, progress).read()
+
+
+def _runs_of(recording: Recording, which: Mask) -> Runs:
+    """Return the executions of a callback: the chosen rows; pieces are taken together."""
+    table = recording.executions[which]
+    table = table[table['start'] >= 0]
+    if recording.imported:      # without pieces
+        first = last = np.arange(len(table))
+        pieces = np.where(table['end'] >= 0, table['end'] - table['start'], -1)
+    else:
+        keys = [table[name] for name in ('vertex', 'job', 'ready', 'start')]
+        table = table[sort_by(*keys)]
+        again = np.ones(len(table), dtype=np.bool_)
+        again[1:] = np.any([table[name][1:] != table[name][:-1]
+                            for name in ('vertex', 'job', 'ready')], axis=0)
+        first = np.flatnonzero(again)
+        last = np.append(first[1:], len(table)) - 1 if len(table) else first
+        took = np.where(table['end'] >= 0, table['end'] - table['start'], 0)
+        pieces = np.add.reduceat(took, first) if len(first) else took
+        pieces[table['end'][first] < 0] = -1
+    return Runs(table['start'][first], pieces, table['completes'][last] == VERTEX)
+
+
+def execution_time(took: Ints) -> tuple[ExecutionTime, int] | None:
     """Return the execution time of a callback and the number of executions; None without any."""
-    times = sorted(max(1, time) for time in took if time >= 0)
+    times = np.sort(np.maximum(1, took[took >= 0])).tolist()
     if not times:
         return None
     quantiles = tuple(quantile(times, share / 100) for share in PERCENT)
