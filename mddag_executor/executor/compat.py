@@ -6,7 +6,7 @@ All uses of rclpy beyond its documented interface.
 No other module uses a private name of rclpy, or what is behind a handle; ``test/test_layers.py``
 checks that. Each entry lists the versions in which it was seen. *7.1* is Jazzy: 7.1.5, the version
 in the package index, to 7.1.11. *9.1* is Kilted: 9.1.2. Entries without a version are in both, and
-the executor needs them. ``test/executor/test_compat.py`` tries each on the installed rclpy.
+the executor needs them.
 
 Two adapters are separate modules: ``listeners`` (``handle.pointer``) and ``waitsets``.
 """

@@ -13,7 +13,6 @@ from contextlib import ExitStack
 from typing import Any
 
 from mddag_executor.executor import current_job
-from mddag_executor.executor.announcements import Announcements
 from msg_graph import loads
 import pytest
 from std_msgs.msg import Int64, UInt8MultiArray
@@ -127,15 +126,6 @@ def test_every_job_is_found_by_its_number(
     assert sum(sink['completed'] for sink in last['sinks'].values()) == 2 * JOBS
 
 
-def test_without_a_name_nobody_announces(make_executor: Any, make_node: Any) -> None:
-    text = GRAPH + 'processes: {p1: [/one], p2: [/two, /three, /four, /five]}'
-    executor = make_executor(loads(text))
-    assert executor.unmatched() == [] and executor._announcements is None
-    # of one that is not divided, neither
-    whole = make_executor(loads(GRAPH + 'processes: {p1: [/one]}'), process='p1')
-    assert whole._announcements is None
-
-
 def test_what_nobody_announces_waits_for_a_while_and_is_counted(
         make_executor: Any, make_node: Any) -> None:
     text = GRAPH + 'processes: {p1: [/one], p2: [/two, /three, /four, /five]}'
@@ -174,34 +164,3 @@ def test_what_several_processes_publish_on_one_topic_is_a_doubt(
         assert wait_for(lambda: len(nodes.ran.get('four /join_left', ())) == 1)
     assert nodes.ran['four /join_left'] == [(1, None)]
     assert executor.statistics()['unattributed'] == {'unknown': 0, 'doubtful': 1}
-
-
-def test_a_message_that_comes_first_waits_for_its_announcement(
-        make_executor: Any, make_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    held: list[Any] = []
-    announce = Announcements._announce
-    monkeypatch.setattr('mddag_executor.executor.announcements.WAIT_NS', 60 * 10 ** 9)
-    monkeypatch.setattr(
-        Announcements, '_announce',
-        lambda self, send, topic, several: announce(
-            self, lambda *message: held.append((send, message)), topic, several))
-    text = GRAPH + 'processes: {p1: [/one], p2: [/two, /three, /four, /five]}'
-    nodes = Nodes(make_node)
-    up, down = (make_executor(loads(text), process=name) for name in ('p1', 'p2'))
-    up.add_node(nodes.nodes['one'])
-    for name in ('two', 'three', 'four', 'five'):
-        down.add_node(nodes.nodes[name])
-    with Spinning(up), Spinning(down):
-        assert wait_for(nodes.connected)
-        assert wait_for(lambda: not up.unmatched() and not down.unmatched())
-        nodes.timer.reset()
-        up.wake()
-        assert wait_for(lambda: len(held) >= 2 * JOBS)
-        assert wait_for(lambda: len(down._announcements._waiting) == 2 * JOBS)
-        assert set(nodes.ran) == {'one'}
-        for send, message in held:
-            send(*message)
-        assert wait_for(lambda: len(nodes.ran.get('five /end', ())) == 2 * JOBS)
-        nodes.timer.cancel()
-    assert sorted(number for number, _ in nodes.ran['two /left']) == list(range(1, JOBS + 1))
-    assert all(job is not None for _, job in nodes.ran['five /end'])

@@ -13,7 +13,6 @@ import signal
 import threading
 import time
 
-from mddag_executor import MultiDeadlineExecutor
 import pytest
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -92,21 +91,6 @@ def test_rclpy_spin_until_future_complete_as_the_global_executor(as_global, make
     answer = asked.call_async(Trigger.Request())
     rclpy.spin_until_future_complete(node, answer, timeout_sec=5.0)
     assert answer.done()
-
-
-def test_a_with_statement_shuts_it_down(make_executor, make_node):
-    node = make_node()
-    calls = counting(node)
-    with make_executor() as executor:
-        assert isinstance(executor, MultiDeadlineExecutor)
-        executor.add_node(node)
-        executor.spin_once(5.0)
-    assert len(calls) == 1
-    executor.spin()  # which ends at once
-    executor.spin_once(5.0)
-    assert len(calls) == 1
-    with pytest.raises(RuntimeError, match='shut down'):
-        executor.add_node(make_node('late'))
 
 
 # --- several at once -----------------------------------------------------------------------------

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 import threading
 import time
 from typing import Any
@@ -16,14 +15,12 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
-from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import LivelinessPolicy, QoSProfile
-from rclpy.subscription import Subscription
 from rclpy.task import Future
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
@@ -210,87 +207,6 @@ def test_entities_that_a_callback_makes_run(make_executor, make_node):
         made.destroy()
 
 
-def test_what_is_made_while_the_executor_looks_is_not_lost(make_executor, make_node):
-    """A guard condition that is triggered before the executor knows of it."""
-    made: list[GuardCondition] = []
-    calls: list[int] = []
-
-    class Listed(Node):
-
-        def make(self) -> None:
-            made.append(self.create_guard_condition(lambda: calls.append(1)))
-            made[-1].trigger()
-
-        @property
-        def waitables(self) -> Any:
-            if len(made) == 1:  # as another thread would do it
-                self.make()
-            return super().waitables
-
-    node = Listed('listed', context=make_node().context, enable_rosout=False)
-    executor = make_executor(nodes=[node])
-    with Spinning(executor):
-        executor.create_task(node.make)
-        assert wait_for(lambda: len(calls) == 2), (made, calls)
-    node.destroy_node()
-
-
-class LateSender:
-    """An action client's handle; a request is sent long before its number is returned."""
-
-    def __init__(self, handle: Any) -> None:
-        self._handle = handle
-        self._answered = threading.Event()
-
-    def __getattr__(self, name: str) -> Any:
-        function = getattr(self._handle, name)
-        if name.startswith('send_'):
-            return partial(self._send, function)
-        if name.startswith('take_') and name.endswith('_response'):
-            return partial(self._take, function)
-        return function
-
-    def _send(self, function: Any, *args: Any) -> Any:
-        self._answered.clear()
-        number = function(*args)
-        self._answered.wait(5.0)
-        time.sleep(0.02)
-        return number
-
-    def _take(self, function: Any, *args: Any) -> Any:
-        taken = function(*args)
-        self._answered.set()
-        return taken
-
-
-def test_an_action_that_answers_before_the_request_is_noted(make_executor, make_node):
-    node, group = make_node(), ReentrantCallbackGroup()
-    executor = make_executor(nodes=[node])
-
-    def execute(goal: Any) -> Any:
-        goal.succeed()
-        return Fibonacci.Result(sequence=[3])
-
-    server = ActionServer(node, Fibonacci, '/late', execute, callback_group=group)
-    client = ActionClient(node, Fibonacci, '/late', callback_group=group)
-    if hasattr(client, '_lock'):
-        pytest.skip('this rclpy takes no response before the request is noted')
-
-    async def ask() -> Any:
-        goal = await client.send_goal_async(Fibonacci.Goal())
-        return await goal.get_result_async()
-
-    with Spinning(executor) as spinning:
-        assert client.wait_for_server(5.0)
-        client._client_handle = LateSender(client._client_handle)
-        task = executor.create_task(ask)
-        assert wait_for(task.done)
-    assert spinning.error is None
-    assert list(task.result().result.sequence) == [3]
-    server.destroy()
-    client.destroy()
-
-
 def test_a_cancelled_goal_request_does_not_block_its_callback_group(
         make_executor, make_node, monkeypatch):
     monkeypatch.setattr(waitables, 'SENDER_CHECKS', 10 ** 9)  # the response is unknown for ever
@@ -319,62 +235,6 @@ def test_a_cancelled_goal_request_does_not_block_its_callback_group(
     assert spinning.error is None
     server.destroy()
     client.destroy()
-
-
-@pytest.mark.skipif(
-    not hasattr(Subscription, 'set_content_filter'), reason='this rclpy cannot set filters')
-def test_a_content_filter_may_be_set_while_it_spins(make_executor, make_node):
-    node, got = make_node(), []
-    subscription = node.create_subscription(String, '/filtered', lambda msg: got.append(msg.data),
-                                            10)
-    publisher = node.create_publisher(String, '/filtered', 10)
-    executor = make_executor(nodes=[node])
-
-    def publish_until(found: str) -> bool:
-        got.clear()
-
-        def published() -> bool:
-            publisher.publish(String(data='other'))
-            publisher.publish(String(data=found))
-            return found in got
-
-        return wait_for(published)
-
-    with Spinning(executor):
-        for found in 'a', 'b':
-            subscription.set_content_filter('data = %0', [f"'{found}'"])
-            assert publish_until(found)
-            got.clear()
-            assert publish_until(found) and 'other' not in got
-        subscription.set_content_filter('', [])
-        assert publish_until('other')
-    node.destroy_node()
-
-
-@pytest.mark.parametrize('stepwise', [False, True])
-def test_a_timer_that_its_callback_cancels_runs_once(make_executor, make_node, stepwise):
-    """Even where the next period begins before it gets to that."""
-    node, calls = make_node(), []
-    executor = make_executor(nodes=[node])
-
-    def once() -> None:
-        calls.append(1)
-        time.sleep(0.03)
-        timer.cancel()
-
-    timer = node.create_timer(0.005, once)
-    if stepwise:
-        for _ in range(5):
-            executor.spin_once(0.05)
-    else:
-        with Spinning(executor):
-            assert wait_for(lambda: calls)
-            time.sleep(0.1)
-            assert calls == [1]
-            timer.reset()
-            assert wait_for(lambda: len(calls) == 2)
-            time.sleep(0.05)
-    assert len(calls) == (1 if stepwise else 2)
 
 
 def test_a_callback_may_destroy_what_it_belongs_to(make_executor, make_node):

@@ -333,38 +333,6 @@ def tick_as_timer(executor: Any, timer: Any, tick: Any) -> None:
         lambda now: executor._engine.timer_due(Work(entity, timer.callback), now, now))
 
 
-SAME_INSTANT = """
-mddag: 1
-nodes:
-  - node: /calm
-    callbacks: [{name: tick, timer: 20ms, deadline: 1s}]
-  - node: /urgent
-    callbacks: [{name: tick, timer: 20ms, deadline: 5ms}]
-"""
-
-
-def test_of_timers_due_at_one_instant_the_most_urgent_starts_first(make_executor, make_node):
-    """Timers are handed over one by one; no worker may start the first before the last is in."""
-    ran: list[str] = []
-    timers = {}
-    executor = make_executor(loads(SAME_INSTANT), num_workers=1)
-    for name in ('calm', 'urgent'):
-        node = make_node(name)
-        timers[name] = node.create_timer(
-            0.02, lambda n=name: (ran.append(n), time.sleep(0.002)), ReentrantCallbackGroup(),
-            autostart=False)
-        executor.add_node(node)
-    with Spinning(executor):
-        assert wait_for(lambda: not executor._upkeep.changed)
-        for timer in timers.values():
-            timer.reset()
-        executor.wake()
-        assert wait_for(lambda: len(ran) >= 40)
-    pairs = [tuple(ran[i:i + 2]) for i in range(0, 40, 2)]
-    # All of them, but where a busy machine makes the intake late for one of the two.
-    assert pairs.count(('urgent', 'calm')) > 10, pairs
-
-
 def with_source(more: str) -> TaskSet:
     return loads(CHAIN.replace('dag: chain', f'dag: chain, {more}'))
 
@@ -423,37 +391,6 @@ def test_a_lost_message_expires_its_job(make_executor, make_node):
     assert found['completed'] == 0
     # Three are open, or less behind releases that a busy machine skipped.
     assert dag['jobs'] - 3 <= dag['ends']['expired'] == found['expired']
-
-
-def test_nodes_that_are_made_anew_at_once_stay_declared(make_executor, make_node):
-    """Also when the executor sees the old ones go and the new ones come with one look."""
-    executor = make_executor(loads(CHAIN))
-    chain = Chain(make_node)
-    for node in chain.nodes.values():
-        executor.add_node(node)
-    executor.spin_once(0.0)
-    for node in chain.nodes.values():
-        executor.remove_node(node)
-        node.destroy_node()
-    chain = Chain(make_node)
-    chain.start(executor)
-    with Spinning(executor):
-        assert wait_for(lambda: len(chain.jobs['last']) >= 10)
-    assert sinks(executor)['/sink:last']['completed'] >= 9  # the last may be about to end
-    assert executor.statistics()['undeclared'] == 0
-
-
-def test_current_job_is_none_elsewhere(make_executor):
-    assert current_job() is None
-    executor = make_executor()
-    seen: list[Any] = []
-    executor.create_task(lambda: seen.append(current_job()))
-    executor.spin_once(1.0)
-    assert seen == [None]
-    thread = threading.Thread(target=lambda: seen.append(current_job()))
-    thread.start()
-    thread.join()
-    assert seen == [None, None]
 
 
 def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, ros_context):
@@ -567,31 +504,3 @@ def test_a_leg_that_two_publishers_feed_waits_for_both(make_executor, make_node,
     executor.shutdown()
     replayed = replay(str(tmp_path / 'run.mcap')).result()
     assert replayed['dags']['joined']['ends'] == statistics['dags']['joined']['ends']
-
-
-def test_a_leg_that_two_publishers_elsewhere_feed_waits_for_both(make_executor, make_node):
-    """Only the sync is here; the stamps say which job a message belongs to."""
-    group = ReentrantCallbackGroup()
-    sink, elsewhere = make_node('sink'), make_node('elsewhere')
-    publishers = {topic: elsewhere.create_publisher(Header, topic, 10) for topic in ('/x', '/y')}
-    for topic in publishers:
-        sink.create_subscription(Header, topic, lambda _: None, 10, callback_group=group)
-    executor = make_executor(loads(TWO_PUBLISHERS.replace(
-        'dag: joined', 'dag: joined, release_from: header_stamp')))
-
-    def counted() -> tuple[int, int]:
-        statistics = executor.statistics()
-        return (statistics['callbacks']['/sink:join']['ran'],
-                statistics['dags']['joined']['sinks']['/sink:join']['completed'])
-
-    with Spinning(executor):
-        executor.add_node(sink)
-        assert wait_for(lambda: all(
-            publisher.get_subscription_count() == 1 for publisher in publishers.values()))
-        assert wait_for(
-            lambda: '/sink:join' in executor.statistics()['dags']['joined']['sinks'])
-        message = Header(stamp=sink.get_clock().now().to_msg())
-        for topic, expected in (('/x', (1, 0)), ('/y', (2, 0)), ('/x', (3, 1))):
-            publishers[topic].publish(message)
-            assert wait_for(lambda e=expected: counted() == e), (topic, counted())
-    assert executor.statistics()['undeclared'] == 0

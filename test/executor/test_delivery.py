@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import threading
@@ -12,24 +11,12 @@ import time
 from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.executor import publishing
-from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from .conftest import Spinning, wait_for
-
-CHAIN = """
-mddag: 1
-nodes:
-  - node: /node
-    callbacks:
-      - {name: tick, timer: 20ms, publishes: [/one]}
-      - {name: step, subscription: /one, publishes: [/two]}
-      - {name: sink, subscription: /two, deadline: 20ms}
-"""
 
 
 def in_a_thread(function: Any, *args: Any) -> None:
@@ -160,45 +147,6 @@ def test_several_threads_publish_and_each_ones_order_is_kept(make_executor, make
         assert mine == list(range(200))
 
 
-ASYNCHRONOUS = """
-import threading, time, rclpy
-from std_msgs.msg import Header
-from mddag_executor import MultiDeadlineExecutor
-rclpy.init()
-node = rclpy.create_node('slow')
-got = []
-node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 100)
-publisher = node.create_publisher(Header, '/a', 100)
-executor = MultiDeadlineExecutor()
-executor.add_node(node)
-thread = threading.Thread(target=executor.spin)
-thread.start()
-while not publisher.get_subscription_count():
-    time.sleep(0.01)
-def publish():
-    for number in range(50):
-        publisher.publish(Header(frame_id=str(number)))
-        time.sleep(0.001)
-publishing = threading.Thread(target=publish)
-publishing.start()
-publishing.join()
-end = time.monotonic() + 10
-while len(got) < 50 and time.monotonic() < end:
-    time.sleep(0.01)
-print(len(got), got == [str(n) for n in range(50)])
-executor.shutdown()
-thread.join()
-rclpy.shutdown()
-"""
-
-
-def test_a_middleware_that_delivers_later_loses_nothing():
-    done = subprocess.run(
-        [sys.executable, '-c', ASYNCHRONOUS], capture_output=True, text=True, timeout=60,
-        env={**os.environ, 'RMW_FASTRTPS_PUBLICATION_MODE': 'ASYNCHRONOUS'}, check=False)
-    assert done.stdout == '50 True\n', done
-
-
 def test_a_message_from_before_the_subscription_comes_first(make_executor, make_node):
     node, got = make_node(), []
     late = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -210,28 +158,6 @@ def test_a_message_from_before_the_subscription_comes_first(make_executor, make_
         assert wait_for(lambda: got == ['early'])
         publisher.publish(Header(frame_id='now'))
         assert wait_for(lambda: got == ['early', 'now'])
-
-
-def test_a_destroyed_subscription_is_no_harm(make_executor, make_node):
-    node, got = make_node(), []
-    first = node.create_subscription(Header, '/a', lambda m: got.append('first'), 10)
-    node.create_subscription(Header, '/a', lambda m: got.append('second'), 10)
-    publisher = node.create_publisher(Header, '/a', 10)
-    executor = make_executor(nodes=[node])
-    with Spinning(executor) as spinning:
-        publisher.publish(Header())
-        assert wait_for(lambda: len(got) == 2)
-        first.destroy()
-        publisher.publish(Header())
-        assert wait_for(lambda: got.count('second') == 2)
-        node.destroy_subscription(first)
-        publisher.publish(Header())
-        assert wait_for(lambda: got.count('second') == 3)
-        node.destroy_node()
-        executor.wake()
-        assert wait_for(lambda: not publishing._deliveries.get('/a'))
-    assert spinning.error is None
-    assert got.count('first') == 1
 
 
 @pytest.mark.parametrize('waits', ['always', 'seldom'])
@@ -257,26 +183,6 @@ def test_work_does_not_wait_for_a_callback_that_goes_on_after_publishing(
     assert all(waited)
 
 
-@pytest.mark.parametrize('takes_first', [True, False])
-def test_counts_are_the_same_with_and_without(make_executor, make_node, monkeypatch, takes_first):
-    """Also where the workers take all: one declaration, one result."""
-    if not takes_first:
-        monkeypatch.setattr(publishing, 'replace_delivery', lambda *args: None)
-    node, got = make_node(), []
-    one = node.create_publisher(Header, '/one', 10)
-    two = node.create_publisher(Header, '/two', 10)
-    node.create_timer(0.02, lambda: one.publish(Header()))
-    node.create_subscription(Header, '/one', lambda m: two.publish(Header()), 10)
-    node.create_subscription(Header, '/two', lambda m: got.append(1), 10)
-    executor = make_executor(loads(CHAIN, 'chain.yaml'), nodes=[node])
-    with Spinning(executor):
-        assert wait_for(lambda: len(got) >= 20)
-    statistics = executor.statistics()
-    assert statistics['undeclared'] == 0
-    assert statistics['unattributed'] == {'unknown': 0, 'doubtful': 0}
-    assert statistics['callbacks']['/node:sink']['ran'] == len(got)
-
-
 def two_executors(
     ros_context: Any, make_node: Any
 ) -> tuple[list[MultiDeadlineExecutor], list[Any], list[list[str]]]:
@@ -288,18 +194,6 @@ def two_executors(
             Header, '/a', lambda m, heard=heard: heard.append(m.frame_id), 100)
         executor.add_node(node)
     return executors, nodes, got
-
-
-def test_two_executors_subscribe_and_each_gets_its_own(ros_context, make_node):
-    (first, second), nodes, got = two_executors(ros_context, make_node)
-    publisher = nodes[0].create_publisher(Header, '/a', 100)
-    with Spinning(first), Spinning(second):
-        assert sees_all(publisher, 2)
-        for number in range(50):
-            publisher.publish(Header(frame_id=str(number)))
-        assert wait_for(lambda: all(len(ids) >= 50 for ids in got)), list(map(len, got))
-    assert got[0] == got[1] == [str(number) for number in range(50)]
-    assert not publishing._deliveries.get('/a')
 
 
 def test_a_publishing_callback_wakes_the_workers_of_another_executor(ros_context, make_node):
@@ -318,17 +212,3 @@ def test_a_publishing_callback_wakes_the_workers_of_another_executor(ros_context
         nodes[0].create_timer(0.001, publish)
         assert wait_for(lambda: len(waited) >= 5, 60.0)
     assert all(waited)
-
-
-def test_a_message_of_a_publisher_that_was_there_for_a_moment_does_not_wait(
-    make_executor, make_node,
-):
-    node, other, got = make_node('here'), make_node('elsewhere'), []
-    node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 10)
-    executor = make_executor(nodes=[node])
-    with Spinning(executor):
-        foreign = other.create_publisher(Header, '/a', 10)
-        assert sees_all(foreign)
-        foreign.publish(Header(frame_id='brief'))
-        other.destroy_publisher(foreign)
-        assert wait_for(lambda: got == ['brief'])

@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
-import threading
+import os
+from pathlib import Path
 import time
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints, is_typeddict, Union
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.core import Tables, Tally
 from mddag_executor.core.state import SINK_EXPIRED, SINK_IN_TIME, SINK_LATE
 from mddag_executor.errors import UsageError
 from mddag_executor.executor.diagnostics import DagWatch, ERROR, OK, STALE, WARN
-from mddag_executor.executor.settings import diagnostics_period_ns, Thresholds
+from mddag_executor.executor.settings import Thresholds
+from mddag_executor.executor.statistics_types import Statistics
 from msg_graph import loads
 import pytest
 
@@ -26,7 +30,7 @@ SECOND = 1_000_000_000
 
 
 class Watched:
-    """A DAG of one sink whose results are made up; each ``after`` is one period."""
+    """Diagnostics of a live run, and the types of its statistics."""
 
     def __init__(self, **thresholds: Any) -> None:
         task_set = loads(CHAIN)
@@ -80,30 +84,12 @@ def test_a_source_that_stops_is_stale_until_it_goes_on():
     assert watched.after(in_time=50).level == OK
 
 
-def test_response_times_are_those_of_the_last_period():
-    watched = Watched()
-    values = watched.after(in_time=98, late=2).values
-    assert values['response_p50_ms'] == '20.000'
-    assert values['response_max_ms'] == values['response_p99_ms'] == '60.000'
-    assert values['deadline_used_max'] == '1.20'
-    assert watched.after(in_time=10).values['response_max_ms'] == '20.000'
-    assert 'response_max_ms' not in watched.after().values
-
-
 @pytest.mark.parametrize('wrong', [
     {'warn_ratio': 0.0}, {'warn_ratio': 1.5}, {'error_ratio': -1.0}, {'error_ratio': float('nan')},
     {'warn_burst': 0}, {'window': 0}, {'stale_periods': 0}])
 def test_thresholds_that_make_no_sense(wrong: dict[str, Any]):
     with pytest.raises(UsageError, match=next(iter(wrong))):
         Thresholds(**wrong)
-
-
-def test_the_period():
-    assert diagnostics_period_ns(None) is diagnostics_period_ns(0) is None
-    assert diagnostics_period_ns('1s') == diagnostics_period_ns(SECOND) == SECOND
-    for short in (1, '1ms'):
-        with pytest.raises(UsageError, match='too short'):
-            diagnostics_period_ns(short)
 
 
 # --- published -----------------------------------------------------------------------------------
@@ -175,24 +161,6 @@ def test_only_dags_that_have_a_callback_here_have_a_status(make_executor, make_n
     assert names == ['mddag: chain', 'mddag: workers']
 
 
-def test_drops_are_a_warning_of_the_pool(make_executor, make_node):
-    from std_msgs.msg import Header
-    node = make_node()
-    publisher = node.create_publisher(Header, '/a', 100)
-    node.create_subscription(Header, '/a', lambda message: time.sleep(0.02), 1)
-    executor = make_executor(num_workers=1, diagnostics_period='1000s', nodes=[node])
-    with Spinning(executor):
-        assert wait_for(lambda: publisher.get_subscription_count() == 1)
-        assert executor._diagnostics.statuses()[-1].level == OK
-        for _ in range(20):
-            publisher.publish(Header())
-            time.sleep(0.003)
-        status = executor._diagnostics.statuses()[-1]
-        assert (status.name, status.level) == ('mddag: workers', WARN)
-        assert f'{status.values["dropped"]} dropped' in status.message
-        assert wait_for(lambda: executor._diagnostics.statuses()[-1].level == OK)
-
-
 def test_a_shutdown_of_the_context_ends_it_quietly(make_executor, make_node, ros_context, capfd):
     executor = make_executor(diagnostics_period='20ms')
     executor.add_node(make_node())
@@ -206,16 +174,53 @@ def test_a_shutdown_of_the_context_ends_it_quietly(make_executor, make_node, ros
     assert 'diagnostics' not in capfd.readouterr().err
 
 
-def test_a_shutdown_while_its_thread_is_started(make_executor, monkeypatch):
-    start, begun = threading.Thread.start, threading.Event()
+GRAPH = """\
+mddag: 1
+nodes:
+  - {node: /n, callbacks: [{name: t, timer: 20ms, deadline: 1us}]}
+"""
 
-    def late(thread: threading.Thread) -> None:
-        if thread.name == 'mddag-diagnostics':
-            begun.set()
-            time.sleep(0.2)
-        start(thread)
 
-    monkeypatch.setattr(threading.Thread, 'start', late)
-    with Spinning(make_executor(loads(CHAIN), diagnostics_period='20ms')) as spinning:
-        assert begun.wait(5.0)
-    assert spinning.error is None
+def check(value: Any, hint: Any, place: str) -> None:
+    """Find out whether a value has the type that is declared, no key missing or more."""
+    if is_typeddict(hint):
+        hints = get_type_hints(hint)
+        assert isinstance(value, dict), place
+        assert hint.__required_keys__ <= set(value) <= set(hints), place
+        for key, inner in value.items():
+            check(inner, hints[key], f'{place}.{key}')
+    elif get_origin(hint) in (Union, UnionType):
+        kinds = [each for each in get_args(hint) if each is not NoneType]
+        if value is not None:
+            check(value, kinds[0], place)
+    elif get_origin(hint) is dict:
+        for key, inner in value.items():
+            assert isinstance(key, str), place
+            check(inner, get_args(hint)[1], f'{place}[{key}]')
+    elif get_origin(hint) is list:
+        for inner in value:
+            check(inner, get_args(hint)[0], place)
+    else:
+        assert isinstance(value, hint), f'{place}: {value!r}'
+
+
+def test_statistics_have_the_declared_types(
+    ros_context: Any, make_node: Any, tmp_path: Path
+) -> None:
+    trace = tmp_path / 'run.mcap'
+    with MultiDeadlineExecutor(
+            loads(GRAPH), context=ros_context, trace=trace,
+            worker_cpus=list(os.sched_getaffinity(0))) as executor:
+        assert isinstance(executor, MultiDeadlineExecutor)
+        check(executor.statistics(), Statistics, 'statistics')
+        node = make_node('n')
+        node.create_timer(0.02, lambda: time.sleep(0.001))
+        node.create_timer(0.01, lambda: None)
+        executor.add_node(node)
+        with Spinning(executor):
+            assert wait_for(lambda: executor.statistics()['first_miss'] is not None)
+        found = executor.statistics()
+    check(found, Statistics, 'statistics')
+    assert found['trace'] == {'path': str(trace), 'lost': 0, 'error': None}
+    assert found['dags']['/n']['sinks']['/n:t']['response_ns'] is not None
+    assert {'/n:t'} < set(found['callbacks'])

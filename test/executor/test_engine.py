@@ -1,24 +1,27 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The engine by itself: a list of events, without threads, clocks and rclpy."""
+"""The engine by itself, without threads and clocks; its invariants, each broken once."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from collections.abc import Callable
+from typing import Any
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER, POLICIES
+from mddag_executor.core.state import N_HOLDING, N_IDLE, N_STALE, WAITING
+from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.entity import Entity, SUBSCRIPTION
 from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.jobs import Origin
-from mddag_executor.executor.verdicts import DeadlineMiss
 from mddag_executor.executor.work import Work
 from msg_graph import loads, TaskSet
+import pytest
 
 from ..core.task_sets import Case, cases, Event, examples, TICK
+from .conftest import Spinning, wait_for
 
 HORIZON = 60
 PLAIN = tuple(name for name, policy in POLICIES.items() if not policy.polling)
@@ -103,37 +106,6 @@ def test_the_same_events_give_the_same_answers_as_the_simulator(case: Case) -> N
     assert verdicts['dags'] == run.result()['dags']
 
 
-def test_what_was_reported_as_overdue_is_late() -> None:
-    """Also when the thread in which it completed in time gets the lock only after that."""
-    task_set = loads("""
-mddag: 1
-nodes:
-  - node: /n
-    callbacks: [{name: tick, timer: 100us, deadline: 100us}]
-""")
-    reported: list[DeadlineMiss] = []
-    recorded: list[tuple[object, ...]] = []
-    engine = Engine(
-        task_set, 2, 'rad', default_deadline=1, max_active_jobs=NEVER, expire_after=NEVER,
-        on_miss=reported.append, record=lambda *event: recorded.append(event))
-    entity = entity_of(engine, task_set, 0, 0)
-    for release in (0, 100_000):
-        engine.timer_due(Work(entity, print), release, release)
-    first, second = engine.dispatch(0, 100_000), engine.dispatch(1, 100_000)
-    assert first is not None and second is not None
-    engine.judge_overdue(150_000)
-    engine.finished(first, 0, 90_000, 151_000, 0, 0)
-    engine.finished(second, 100_000, 149_000, 152_000, 0, 1)
-    engine.finish(200_000)
-    assert [(miss.job, miss.kind) for miss in reported] == [(0, 'overdue')]
-    sink = engine.verdicts.tally.result()['dags']['/n']['sinks']['/n:tick']
-    assert (sink['completed'], sink['late'], sink['overdue']) == (2, 1, 0)
-    assert sink['response_ns']['max'] == 100_001
-    # what a trace has of it judges the same
-    assert [event[5:] for event in recorded if event[0] == 'deadline'] == [(0, 100_000, 100_001)]
-    assert entity.busy_ns == 10_001  # it would have ended that much later
-
-
 @examples(150)
 @given(st.lists(st.booleans() | st.integers(0, 2), max_size=120))
 def test_nothing_waits_that_may_run_beside_who_computes(steps: list[bool | int]) -> None:
@@ -162,47 +134,98 @@ def test_nothing_waits_that_may_run_beside_who_computes(steps: list[bool | int])
         assert sum(work.entity.habit.holds for work in running.values()) <= 1
 
 
-def test_it_needs_no_rclpy_and_no_thread() -> None:
-    program = (
-        'import sys; sys.modules["rclpy"] = None\n'
-        'import mddag_executor.executor.engine as engine\n'
-        'engine.Engine(None, 7, "rad", default_deadline=1, max_active_jobs=1, expire_after=1)\n')
-    assert subprocess.run([sys.executable, '-c', program], check=False).returncode == 0
+GRAPH = """
+mddag: 1
+nodes:
+  - node: /n
+    callbacks: [{name: tick, timer: 10ms, deadline: 10ms}]
+"""
 
 
-def without_job(group: int = -1, most_waiting: int = 0) -> Entity:
-    entity = Entity('waitable', None, '/n', None, group, 0, '/t')
-    entity.most_waiting = most_waiting
-    return entity
+def busy_engine() -> Engine:
+    """
+    Return an engine in which something of each kind is under way.
+
+    One of group 0 runs and two wait for it; one holds the GIL and two are held back; one is
+    suspended; a message and a job of a DAG are ready; and one entry is stale.
+    """
+    engine = Engine(
+        loads(GRAPH), 4, 'rad', default_deadline=10 ** 9, max_active_jobs=64, expire_after=NEVER)
+
+    def entity(group: int = -1, holds: bool = False, depth: int = 0) -> Entity:
+        found = Entity('waitable', None, '/n', None, group, depth, '/t')
+        found.kind = SUBSCRIPTION
+        found.habit = GilHabit(holds)
+        return found
+
+    def ready(which: Entity, count: int) -> None:
+        for _ in range(count):
+            engine.ready(Work(which, print), 0)
+
+    ready(entity(engine.scheduler.new_group()), 3)
+    ready(entity(holds=True), 3)
+    suspended = entity()
+    ready(suspended, 1)
+    running = []
+    while (work := engine.dispatch(0, 0)) is not None:
+        running.append(work)
+    work = next(each for each in running if each.entity is suspended)
+    engine.suspended(work, 0, 0, 0, work.worker)
+    ready(entity(depth=1), 1)
+    gone = entity()
+    ready(gone, 2)
+    engine.remove(gone, 0)
+    source = Entity('waitable', None, '/n', None, -1, 2, '')
+    source.source = 0
+    engine.timer_due(Work(source, print), 0, 0)
+    engine.validate()
+    return engine
 
 
-def new_engine(workers: int = 2, policy: str = 'rad') -> Engine:
-    return Engine(None, workers, policy, default_deadline=100, max_active_jobs=64,
-                  expire_after=NEVER)
+def count(engine: Engine, column: int) -> None:
+    engine._state.scalars[column] += 1
 
 
-def test_more_is_collected_when_one_that_waits_starts() -> None:
-    engine, collected = new_engine(), []
-    entity = without_job(most_waiting=1)
-    engine.ready(Work(entity, print), 0)
-    entity.collect_more = lambda: collected.append(1)
-    first = engine.dispatch(0, 0)
-    assert first is not None and collected == [1] and entity.collect_more is None
+def running(engine: Engine) -> int:
+    """Return an execution of the group that runs."""
+    return engine._state.group_owner[0]
 
 
-def test_who_holds_the_gil_is_given_back_when_it_ends_waits_or_lends() -> None:
-    engine = new_engine(4)
-    entities = [without_job() for _ in range(3)]
-    for entity in entities:
-        entity.habit = GilHabit(True)
-    for end in (
-        lambda work: engine.finished(work, 0, 1, 1, 0, work.worker),
-        lambda work: engine.suspended(work, 0, 1, 0, work.worker),
-        engine.lend, engine.stop_holding,
-        lambda work: engine.left_open(work, 0, 1, 0, work.worker, True),
-    ):
-        work = Work(entities[0], print)
-        engine.ready(work, 0)
-        assert engine.dispatch(0, 0) is work and engine.interpreter_holder() is work
-        end(work)
-        assert engine.holders == [] and engine.interpreter_holder() is None
+def set_state(engine: Engine, x: int, state: int) -> None:
+    engine._state.x_state[x] = state
+
+
+BREAKS: dict[str, tuple[str, Callable[[Engine], Any]]] = {
+    'lost': ('in no queue', lambda e: e._state.held_back.pop()),
+    'wrong group': ('waits for group', lambda e: e._state.x_group.__setitem__(
+        e._state.group_heap[0][0][4], -1)),
+    'stale': ('are stale', lambda e: count(e, N_STALE)),
+    'idle workers': ('are idle', lambda e: count(e, N_IDLE)),
+    'holders counted': ('hold the interpreter', lambda e: count(e, N_HOLDING)),
+    'worker': ('runs execution', lambda e: set_state(e, running(e), WAITING)),
+    'owner': ('nothing brings', lambda e: e._state.group_owner.__setitem__(0, -1)),
+    'active': ('counted are', lambda e: e._state.job_active.__setitem__(0, 9)),
+    'open jobs': ('jobs of DAG 0 are open', lambda e: e._state.n_open.__setitem__(0, 0)),
+    'deadline': ('next deadline', lambda e: setattr(e.deadlines, 'next', 5)),
+}
+
+
+@pytest.mark.parametrize('broken', BREAKS)
+def test_each_broken_invariant_is_found(broken):
+    engine = busy_engine()
+    text, break_it = BREAKS[broken]
+    break_it(engine)
+    with pytest.raises(InvariantError, match=text):
+        engine.validate()
+
+
+def test_a_broken_invariant_ends_the_spin(make_executor, make_node):
+    node, ticks = make_node(), []
+    node.create_timer(0.01, lambda: ticks.append(None))
+    executor = make_executor(nodes=[node])
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: ticks)
+        count(executor._engine, N_STALE)
+        spinning.join()
+        executor._engine._state.scalars[N_STALE] -= 1
+    assert isinstance(spinning.error, InvariantError)

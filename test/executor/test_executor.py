@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import gc
-import os
 import sys
 import threading
 import time
@@ -14,7 +12,6 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.errors import MddagError
-from mddag_executor.trace import TraceWriter
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.serialization import deserialize_message
@@ -22,7 +19,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import is_idle, Spinning, wait_for
+from .conftest import Spinning, wait_for
 
 
 def publish_when_matched(publisher: Any, message: Any, count: int = 1) -> None:
@@ -117,49 +114,6 @@ def test_synchronous_calls_from_all_workers_at_once(make_executor, make_node):
     assert executor.statistics()['lent'] == 7
 
 
-def test_two_synchronous_calls_in_one_callback_inside_spin_once(make_executor, make_node):
-    """The same one callback at a time (rclpy#1211)."""
-    node, answers = make_node(), []
-    node.create_service(Trigger, '/ask', lambda request, response: response)
-    client = node.create_client(Trigger, '/ask', callback_group=ReentrantCallbackGroup())
-
-    def ask_twice() -> None:
-        for _ in range(2):
-            answers.append(client.call(Trigger.Request(), timeout_sec=5.0))
-
-    executor = make_executor(nodes=[node])
-    assert client.wait_for_service(5.0)
-    executor.create_task(ask_twice)
-    executor.spin_once(1.0)
-    assert len(answers) == 2 and None not in answers
-
-
-def test_shutdown_does_not_wait_for_the_second_call_of_a_callback(make_executor, make_node):
-    """As it does not for the first: nobody would answer it any more."""
-    node, done = make_node(), threading.Event()
-    group = ReentrantCallbackGroup()
-    node.create_service(Trigger, '/ask', lambda request, response: response)
-    client = node.create_client(Trigger, '/ask', callback_group=group)
-    nobody = node.create_client(Trigger, '/nobody', callback_group=group)
-
-    def ask_twice() -> None:
-        client.call(Trigger.Request(), timeout_sec=5.0)
-        nobody.call(Trigger.Request())
-        done.set()
-
-    executor = make_executor(nodes=[node])
-    assert client.wait_for_service(5.0)
-    executor.create_task(ask_twice)
-    try:
-        with Spinning(executor):
-            assert wait_for(lambda: nobody._pending_requests)
-            assert executor.shutdown(2.0)
-    finally:
-        for future in list(nobody._pending_requests.values()):
-            future.set_result(None)
-    assert done.wait(5.0)
-
-
 def test_tasks_functions_coroutines_and_futures_across_them(make_executor):
     executor = make_executor()
     future = Future(executor=executor)
@@ -179,20 +133,6 @@ def test_tasks_functions_coroutines_and_futures_across_them(make_executor):
         future.set_result('value')
         assert wait_for(waiting.done)
     assert waiting.result() == 'value!' and order == ['waits', 'has it']
-
-
-def test_a_task_made_before_spin_runs_before_messages_that_wait(make_executor, make_node):
-    """As rclpy's executors have it."""
-    node, ran = make_node(), []
-    node.create_subscription(Header, '/topic', lambda _: ran.append('message'), 10)
-    publisher = node.create_publisher(Header, '/topic', 10)
-    executor = make_executor(num_workers=1, nodes=[node])
-    publish_when_matched(publisher, Header())
-    time.sleep(0.1)
-    executor.create_task(ran.append, 'task')
-    with Spinning(executor):
-        assert wait_for(lambda: len(ran) == 2)
-    assert ran == ['task', 'message']
 
 
 def test_create_task_wakes_an_idle_executor(make_executor):
@@ -333,52 +273,6 @@ def test_bad_arguments_say_what_to_do(ros_context, kwargs, says):
         MultiDeadlineExecutor(context=ros_context, **kwargs)
 
 
-def test_a_destroyed_subscription_does_not_run_what_it_has_queued(make_executor, make_node):
-    """Not even when it is just dispatched while the executor takes note; hence the rounds."""
-    node, got = make_node(), []
-    executor = make_executor(num_workers=1, nodes=[node])
-    publisher = node.create_publisher(Header, '/topic', 10)
-    begun, gate = threading.Semaphore(0), threading.Semaphore(0)
-
-    def hold() -> None:
-        begun.release()
-        gate.acquire(timeout=15.0)
-
-    with Spinning(executor):
-        for _ in range(50):
-            subscription = node.create_subscription(Header, '/topic', got.append, 10)
-            assert wait_for(lambda: publisher.get_subscription_count() == 1)
-            executor.create_task(hold)
-            assert begun.acquire(timeout=15.0)
-            assert wait_for(
-                lambda: publisher.publish(Header()) or executor.statistics()['queue'] > 0)
-            node.destroy_subscription(subscription)
-            gate.release()
-            assert wait_for(lambda: is_idle(executor) and not publisher.get_subscription_count())
-    assert got == []
-
-
-def test_executors_that_are_shut_down_leave_no_files(ros_context):
-    """Neither those that have spun nor those that were only stepped."""
-    def files() -> int:
-        return len(os.listdir('/proc/self/fd'))
-
-    def use(spin: bool) -> None:
-        executor = MultiDeadlineExecutor(num_workers=1, context=ros_context)
-        if spin:
-            executor.spin_until_future_complete(executor.create_task(lambda: None))
-        else:
-            executor.spin_once(0.0)
-        executor.shutdown()
-
-    use(True)  # what the process keeps
-    before = files()
-    for spin in (False, True) * 5:
-        use(spin)
-    gc.collect()
-    assert files() <= before
-
-
 def test_statistics_while_entities_come_and_go(make_executor, make_node):
     """No exception, and nothing that has been counted is lost."""
     node, errors, counts = make_node(), [], [0]
@@ -414,31 +308,3 @@ def test_statistics_while_entities_come_and_go(make_executor, make_node):
         sys.setswitchinterval(interval)
     assert errors == []
     assert counts == sorted(counts)
-
-
-def test_who_shuts_down_second_waits_until_the_trace_is_closed(
-        make_executor, make_node, monkeypatch, tmp_path):
-    closing, go_on, closed = threading.Event(), threading.Event(), []
-    close = TraceWriter.close
-
-    def late(writer: Any, *args: Any) -> None:
-        closing.set()
-        go_on.wait(30.0)
-        close(writer, *args)
-        closed.append(1)
-
-    monkeypatch.setattr(TraceWriter, 'close', late)
-    executor = make_executor(trace=tmp_path / 'run.mcap')
-    executor.add_node(make_node())
-    executor.spin_once(0.0)
-    seen: list[list[int]] = []
-    first, second = (threading.Thread(
-        target=lambda: (executor.shutdown(), seen.append([*closed]))) for _ in range(2))
-    first.start()
-    assert closing.wait(15.0)
-    second.start()
-    second.join(0.2)
-    go_on.set()
-    for thread in (first, second):
-        thread.join()
-    assert seen == [[1], [1]]

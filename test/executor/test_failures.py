@@ -11,7 +11,6 @@ from mddag_executor import DeadlineMiss
 from mddag_executor.executor import current_job
 from mddag_executor.replay import replay, reschedule
 from msg_graph import loads
-import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 
@@ -218,44 +217,3 @@ nodes:
     ends = executor.statistics()['dags']['chain']['ends']
     assert ends['failed'] == len(ran) >= len(caught) >= 2
     assert ends['completed'] == ends['late'] == 0
-
-
-class Awaitable:
-    """Something to wait for of a user's own, which takes no callbacks."""
-
-    def __await__(self) -> Any:
-        yield self
-
-    def add_done_callback(self, callback: Any) -> None:
-        raise Wrong('no callbacks')
-
-
-def test_an_exception_outside_of_callbacks_ends_spin_and_no_worker(
-        make_executor, make_node) -> None:
-    node = make_node('source')
-    ran: list[int] = []
-
-    async def tick() -> None:
-        ran.append(len(ran))
-        await Awaitable()
-
-    node.create_timer(0.01, tick, ReentrantCallbackGroup())
-    executor = make_executor(num_workers=1, nodes=[node])
-    for runs in (1, 2, 3):
-        with pytest.raises(Wrong):
-            executor.spin()
-        assert len(ran) >= runs
-
-
-def test_what_cannot_work_because_its_context_has_ended_has_not_failed(
-        make_executor, make_node, ros_context: Any) -> None:
-    """Such a callback is one that had not ended when the run ended."""
-    chain = Chain(make_node, {'tick': ros_context.shutdown})
-    executor = make_executor(loads(CHAIN.replace('50ms', '5s').replace('10ms', '5s')))
-    with Spinning(executor) as spinning:
-        chain.start(executor)
-        spinning.join()
-    assert spinning.error is None
-    ends = executor.statistics()['dags']['chain']['ends']
-    assert (ends['failed'], ends['completed'], ends['late']) == (0, 0, 0)
-    assert executor.statistics()['callbacks']['/source:tick']['failed'] == 0

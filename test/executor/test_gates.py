@@ -13,8 +13,7 @@ from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
-from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
-from rclpy.executors import MultiThreadedExecutor
+from rclpy.callback_groups import CallbackGroup
 from rclpy.task import Future
 from std_msgs.msg import Int32
 
@@ -90,32 +89,6 @@ def test_a_timer_runs_as_often_as_its_group_lets_it(make_executor, node):
     assert gated['ran'] == len(ran) and gated['dropped'] == 0 < gated['skipped']
 
 
-def test_it_is_asked_again_though_no_callback_ends(make_executor, node):
-    group, ran = Tokens(), []
-    node.create_timer(0.001, lambda: ran.append(1), callback_group=group)
-    executor = make_executor(nodes=[node])
-    with Spinning(executor):
-        assert wait_for(lambda: group.asked > 2)
-        assert not ran
-        group.give(5)
-        assert wait_for(lambda: len(ran) == 5)
-
-
-def test_a_group_that_always_refuses_stops_nobody_else(make_executor, node):
-    group, ran, refused = Tokens(), [], []
-    node.create_timer(0.001, lambda: refused.append(1), callback_group=group)
-    node.create_subscription(Int32, '/shut', refused.append, 5, callback_group=group)
-    node.create_timer(0.001, lambda: ran.append(1))
-    publisher = node.create_publisher(Int32, '/shut', 5)
-    executor = make_executor(num_workers=1, nodes=[node])
-    with Spinning(executor) as spinning:
-        assert wait_for(lambda: publisher.get_subscription_count() == 1)
-        for i in range(20):
-            publisher.publish(Int32(data=i))
-        assert wait_for(lambda: len(ran) > 50 and group.asked > 50)
-    assert spinning.error is None and not refused and group.ended == 0
-
-
 def test_messages_that_wait_are_as_many_as_the_qos_says_and_keep_their_order(make_executor, node):
     group, got = Tokens(), []
     node.create_subscription(
@@ -157,22 +130,6 @@ def test_callbacks_of_one_entity_run_at_once_where_the_group_lets_them(make_exec
     assert spinning.error is None and group.most == 2 and sorted(got) == list(range(10))
 
 
-def test_the_end_is_told_when_a_callback_raises(make_executor, node):
-    group = AtMost(1)
-
-    def callback() -> None:
-        raise ValueError('on purpose')
-
-    node.create_timer(0.001, callback, callback_group=group)
-    executor = make_executor(nodes=[node])
-    with pytest.raises(ValueError, match='on purpose'):
-        executor.spin()
-    assert wait_for(lambda: group.begun == group.ended >= 1)
-    with pytest.raises(ValueError, match='on purpose'):
-        executor.spin_once(5.0)
-    assert group.begun == group.ended >= 2
-
-
 @pytest.mark.parametrize('method', ['can_execute', 'beginning_execution', 'ending_execution'])
 def test_what_a_group_raises_comes_out_of_spin(make_executor, node, monkeypatch, method):
     group = AtMost(1)
@@ -210,22 +167,6 @@ def test_a_coroutine_ends_when_it_has_run_to_its_end(make_executor, node):
         assert wait_for(lambda: len(steps) == 4 and group.ended == 2)
     assert spinning.error is None
     assert steps == [('begins', 1), ('ends', 1), ('begins', 2), ('ends', 2)]
-
-
-def test_a_destroyed_entity_that_waits_for_its_group_is_forgotten(make_executor, node):
-    group, ran = Tokens(), []
-    timer = node.create_timer(0.001, lambda: ran.append(1), callback_group=group)
-    executor = make_executor(nodes=[node])
-    with Spinning(executor) as spinning:
-        assert wait_for(lambda: group.asked > 2)
-        node.destroy_timer(timer)
-        node.create_timer(0.001, lambda: ran.append(2))
-        assert wait_for(lambda: 2 in ran)
-        group.give(10)
-        assert wait_for(lambda: len(ran) > 20)
-    assert spinning.error is None and 1 not in ran
-    waiting = [c['waiting'] for c in executor.statistics()['callbacks'].values()]
-    assert sum(waiting) <= 1
 
 
 def test_a_declared_callback_completes_its_jobs_when_its_group_lets_it(
@@ -277,43 +218,3 @@ nodes:
         event['group_type_name'] for event in read_events(trace)
         if event['_name'] == 'ros2_caret:add_callback_group'
         and event['callback_group_addr'] == id(group)]
-
-
-class Noting(MutuallyExclusiveCallbackGroup):
-    """Is rclpy's own, and notes what has ended."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.ended: list[Any] = []
-
-    def ending_execution(self, entity: Any) -> None:
-        self.ended.append(entity)
-        super().ending_execution(entity)
-
-
-def test_a_group_that_changes_one_of_rclpys_is_asked_and_still_exclusive(make_executor, node):
-    group, running, most = Noting(), [], []
-
-    def callback() -> None:
-        running.append(1)
-        most.append(len(running))
-        running.pop()
-
-    timers = [node.create_timer(0.001, callback, callback_group=group) for _ in range(3)]
-    executor = make_executor(nodes=[node])
-    with Spinning(executor) as spinning:
-        assert wait_for(lambda: all(group.ended.count(timer) > 5 for timer in timers))
-    assert spinning.error is None and set(most) == {1} and len(group.ended) == len(most)
-
-
-def test_rclpys_own_executor_asks_the_same(ros_context, node):
-    """What the tests above take for granted."""
-    group, ran = Tokens(2), []
-    node.create_timer(0.001, lambda: ran.append(1), callback_group=group)
-    executor = MultiThreadedExecutor(2, context=ros_context)
-    executor.add_node(node)
-    assert wait_for(lambda: executor.spin_once(0.01) or group.ended == 2)
-    for _ in range(5):
-        executor.spin_once(0.01)
-    executor.shutdown()
-    assert len(ran) == 2

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import threading
 import time
@@ -14,10 +12,8 @@ from typing import Any
 from mddag_executor.executor import gil, publishing
 from mddag_executor.executor.gil import (
     GilCheck,
-    GilHabit,
     LAST_CHECK_NS,
     Schedule,
-    times_preempted,
 )
 import msg_graph
 import pytest
@@ -200,97 +196,6 @@ def test_the_switch_interval_is_given_back(make_executor, make_node):
     assert seen[0] == pytest.approx(0.001) and sys.getswitchinterval() == before
 
 
-def learnt(*executions: tuple[float, float, float], habit: GilHabit | None = None) -> int:
-    """
-    Return whether a callback holds the GIL after these executions.
-
-    Each is how long it took, and how long its thread and all others computed meanwhile, in ms.
-    """
-    habit = habit or GilHabit()
-    for execution in executions:
-        habit.ran(*(int(ms * MS) for ms in execution))
-    return habit.holds
-
-
-def test_the_share_of_cpu_in_the_duration_decides():
-    assert learnt() == 0
-    assert learnt((10, 9.5, 0)) == 1
-    assert learnt((10, 0.2, 0)) == 0
-    assert learnt(*[(10, 9.5, 0)] * 3, *[(10, 0.2, 0)] * 20) == 0
-    assert learnt(*[(10, 0.2, 0)] * 3, *[(10, 9.5, 0)] * 30) == 1
-    assert learnt(*[(0.001, 0.001, 0)] * 20) == 0  # too short to matter
-
-
-def test_two_that_fight_for_the_lock_are_both_found_out():
-    assert learnt((20, 10, 10)) == 1
-    assert learnt((70, 10, 60)) == 1
-    assert learnt((20, 0.2, 15)) == 0  # sleeps while others compute
-
-
-def test_who_starves_is_not_thought_to_wait():
-    habit = GilHabit()
-    assert learnt(*[(10, 9.5, 0)] * 20, habit=habit) == 1
-    for _ in range(50):
-        habit.ran(40 * MS, 10 * MS, 0, starved=True)
-        assert habit.holds and habit.share > 0.9
-    habit = GilHabit()
-    assert learnt(*[(10, 0.2, 0)] * 20, habit=habit) == 0
-    found = []
-    for _ in range(100):
-        habit.ran(40 * MS, 10 * MS, 0, starved=True)
-        found.append(habit.holds)
-    assert 0 < sum(found) < 20 and habit.share < 0.1
-
-
-def test_a_thread_knows_how_often_it_was_preempted():
-    """One that shares a CPU with another process."""
-    cpu, found = min(os.sched_getaffinity(0)), []
-
-    def share() -> None:
-        os.sched_setaffinity(0, {cpu})
-        before = times_preempted()
-        found.append(wait_for(lambda: compute(5) or times_preempted() > before))
-
-    program = f'import os\nos.sched_setaffinity(0, [{cpu}])\nwhile True: pass'
-    hog = subprocess.Popen([sys.executable, '-c', program])
-    try:
-        thread = threading.Thread(target=share)
-        thread.start()
-        thread.join()
-    finally:
-        hog.kill()
-        hog.wait()
-    assert found == [True]
-
-
-def test_what_is_declared_is_not_measured():
-    assert learnt(*[(10, 0.2, 0)] * 20, habit=GilHabit(True)) == 1
-    assert learnt(*[(10, 9.5, 0)] * 20, habit=GilHabit(False)) == 0
-
-
-def test_a_thread_that_is_asleep_waits():
-    check, go_on, subject = GilCheck(), threading.Event(), object()
-    thread = threading.Thread(target=go_on.wait)
-    thread.start()
-    assert thread.ident is not None and thread.native_id is not None
-    now = time.monotonic_ns()
-    check.begin(subject, now, 0)
-    assert now < check.at <= now + 5 * MS
-    assert not check.waits(thread.ident, thread.native_id, time.monotonic_ns())
-    before = gil.schedule_of(thread.native_id)
-    try:
-        assert wait_for(lambda: check.waits(  # it may not be asleep yet
-            thread.ident, thread.native_id, time.monotonic_ns()))
-        after = gil.schedule_of(thread.native_id)
-        assert after.is_asleep and after.slices >= before.slices > 0
-        assert after.delay_ns >= before.delay_ns >= 0
-    finally:
-        go_on.set()
-        thread.join()
-    check.end()
-    assert check.at == 0
-
-
 def waits(
     monkeypatch: pytest.MonkeyPatch, *steps: tuple[float, float, float, int, bool],
 ) -> list[bool]:
@@ -314,33 +219,6 @@ def waits(
         found.append(check.waits(1, 1, now))
         assert now < check.at <= now + LAST_CHECK_NS
     return found
-
-
-@pytest.mark.parametrize('step, expected', [
-    ((9.0, 0.0, 0.0, 3, True), False),  # computes
-    ((0.6, 0.0, 0.0, 3, True), False),  # a little
-    ((0.0, 0.0, 0.0, 0, True), True),  # is asleep
-    ((0.0, 20.0, 0.0, 0, True), True),  # while others compute
-    ((0.2, 0.0, 0.1, 9, True), True),  # polls
-    ((0.0, 0.0, 0.0, 0, False), False),  # has got no CPU yet
-    ((0.4, 0.0, 9.5, 1, True), False),  # has waited for one
-    ((0.3, 9.0, 0.1, 9, True), False),  # waits for the GIL, or polls
-])
-def test_a_thread_waits_if_it_neither_computes_nor_starves(monkeypatch, step, expected):
-    assert waits(monkeypatch, step) == [expected]
-
-
-def test_without_figures_of_the_kernel_the_cpu_time_decides(monkeypatch):
-    assert waits(monkeypatch, (0.0, 0.0, 0.0, -6, True)) == [True]
-    assert waits(monkeypatch, (0.0, 9.0, 0.0, -6, True)) == [False]
-    assert waits(monkeypatch, (1.0, 9.0, 0.0, -6, True)) == [False]
-
-
-def test_what_stays_unclear_gives_the_interpreter_back_in_the_end(monkeypatch):
-    unclear, computes = (0.0, 20.0, 0.0, 5, True), (5.0, 0.0, 0.0, 1, True)
-    most = gil.LATELY
-    assert waits(monkeypatch, *[unclear] * most) == [False] * (most - 1) + [True]
-    assert waits(monkeypatch, *[unclear] * (most - 1), computes, unclear) == [False] * (most + 1)
 
 
 # --- what arrives beside a callback that computes for long ---------------------------------------
@@ -467,18 +345,3 @@ def test_what_cannot_start_is_left_in_the_middleware(beside):
         if queued[-1] == 0:
             break
     assert queued[-1] == 0
-
-
-def test_a_callback_that_releases_the_gil_starts_beside_a_long_one(make_executor, make_node):
-    node = make_node()
-    executor = make_executor(msg_graph.loads(
-        BESIDE.replace('120s,\n         holds_interpreter: true', '120s,\n         '
-                       'holds_interpreter: false'), 'g.yaml'))
-    beside = Beside(executor, node)
-    with Spinning(executor):
-        for name in beside.publishers:
-            beside.publish(name)
-        assert wait_for(lambda: len(beside.ran) == 4), beside.ran
-        beside.meanwhile = lambda: 'patient' in beside.ran
-        for _ in range(3):
-            assert beside.order('patient') == ['begins', 'patient', 'ends']

@@ -5,12 +5,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-import time
 from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.jobs import (
     Announced,
     Jobs,
@@ -94,14 +92,6 @@ def test_messages_of_a_stranger_in_the_window_are_nobody_s():
     assert bench.jobs.unknown == 198
 
 
-def test_a_long_publication_is_found_behind_many_short_ones():
-    bench = Bench()
-    bench.published(0, 10 ** 12, 42, publisher=1)
-    for job in range(MOST - 1):
-        bench.published(1_000_000 * job + 1, 1_000_000 * job + 2, job)
-    assert bench.job(500) == 42
-
-
 @given(st.lists(st.tuples(st.integers(1, 50), st.integers(0, 40)), min_size=1, max_size=60),
        st.data())
 def test_it_never_guesses(steps, data):
@@ -133,14 +123,6 @@ def number(bench: Bench, stamp: int, sequence: int | None = None) -> int | None:
     return found.name[1] if isinstance(found, Announced) else None
 
 
-def test_the_sequence_number_decides_between_announced_publications():
-    bench, one, other = Bench(), PublisherNumbers(), PublisherNumbers()
-    announced(bench, 0, 10, 1, 1, one)
-    announced(bench, 5, 15, 2, 2, other)
-    assert (number(bench, 7, 1), number(bench, 7, 2)) == (1, 2)
-    assert number(bench, 7, 9) is None
-
-
 def test_a_publication_here_and_one_elsewhere_at_once_are_a_doubt_if_their_numbers_agree():
     bench, other = Bench(), PublisherNumbers()
     bench.published(0, 10, 5)
@@ -148,34 +130,6 @@ def test_a_publication_here_and_one_elsewhere_at_once_are_a_doubt_if_their_numbe
     assert bench.job(7, 1) == 5 and number(bench, 7, 9) == 1
     announced(bench, 5, 15, 1, 1, PublisherNumbers())
     assert bench.jobs.find(TOPIC, 7, 1) is None and bench.jobs.doubtful == 1
-
-
-def test_what_began_long_ago_and_is_noted_late_hides_nothing():
-    """Its thread has waited for the interpreter between the two; it is just being sent."""
-    bench = Bench()
-    bench.published(0, 10, 1, publisher=0)
-    bench.published(5_000_000, 5_000_010, 2, publisher=0)
-    bench.published(1_000_000, None, 3, publisher=1)
-    assert bench.job(5_000_005, 2) == 2
-    assert bench.job(5_000_005, 1) == 3, 'the publisher that was late'
-
-
-def test_a_publication_within_another_of_its_publisher_has_no_number():
-    """A signal's handler publishes while a publication is being sent."""
-    bench = Bench()
-    state = bench.publishers[0]
-
-    def publish(job: int, send: Callable[[], None]) -> None:
-        state.count += 1
-        bench.jobs.publish(
-            lambda *_: send(), None, None, state, bench.topic, Origin(0, 0, job, 0))
-
-    stamps = []
-    publish(1, lambda: publish(2, lambda: stamps.append(time.time_ns())))
-    for number in (1, 2):
-        assert bench.job(stamps[0], number) is None
-    publish(3, lambda: stamps.append(time.time_ns()))
-    assert bench.job(stamps[1], 3) == 3
 
 
 def test_publications_that_overlap_are_announced_together_when_all_have_returned():

@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator
 import threading
 import time
 
-from mddag_executor.executor.compat import TASKS_NEWEST_FIRST
 import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
@@ -27,13 +26,6 @@ def test_tasks_created_while_nobody_spins_run_in_rclpys_order(make_executor, ros
             executor.spin_once(timeout_sec=0)
         executor.shutdown()
     assert orders[0] == orders[1] and sorted(orders[0]) == ['a', 'b', 'c']
-
-
-def test_tasks_created_while_nobody_spins_run_in_a_spin_too(make_executor):
-    executor, order = make_executor(num_workers=1), []
-    tasks = [executor.create_task(order.append, name) for name in 'abc']
-    executor.spin_until_future_complete(tasks[0 if TASKS_NEWEST_FIRST else 2], 5.0)
-    assert order == (['c', 'b', 'a'] if TASKS_NEWEST_FIRST else ['a', 'b', 'c'])
 
 
 def test_a_coroutine_goes_on_in_the_step_after_its_future_is_done(make_executor):
@@ -113,13 +105,3 @@ def test_a_task_awaits_one_future_after_another(make_executor, mine, generates):
     assert spinning.error is None
     # where rclpy's own executors keep tasks that are to go on, which nobody would take out here
     assert not getattr(executor, '_ready_tasks', ())
-
-
-def test_a_step_does_not_wait_for_a_future_that_is_done_already(make_executor):
-    """Also when what woke it up has been polled away by then."""
-    executor = make_executor()
-    future: Future = Future(executor=executor)
-    future.set_result(True)
-    begin = time.monotonic()
-    executor.spin_once_until_future_complete(future, 10)
-    assert time.monotonic() - begin < 5.0

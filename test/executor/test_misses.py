@@ -156,19 +156,6 @@ def test_callbacks_run_while_the_handler_hangs_and_what_does_not_fit_is_counted(
         unreported), warned
 
 
-def test_the_handler_may_end_the_executor(ros_context, make_node) -> None:
-    ended: list[bool] = []
-    node = make_node('late')
-    node.create_timer(PERIODS_MS[0] / 1e3, lambda: None)
-    executor = MultiDeadlineExecutor(
-        loads(LATE), on_deadline_miss=lambda miss: ended.append(executor.shutdown()),
-        context=ros_context)
-    executor.add_node(node)
-    executor.spin()
-    assert wait_for(lambda: ended)
-    assert all(ended)
-
-
 # --- when a miss is known ------------------------------------------------------------------------
 
 #: Nothing but `/start` starts a job, so nothing else makes a miss known.

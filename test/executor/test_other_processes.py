@@ -7,17 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 import time
 from typing import Any
 
-from mddag_executor.core import rules, Scheduler, Tables
-from mddag_executor.core.state import (
-    COMPLETED,
-    EXPIRED,
-    JOB_END,
-    LATE,
-    SINK_EXPIRED,
-    SINK_IN_TIME,
-    SINK_LATE,
-    SINK_MISSED,
-)
 from mddag_executor.executor import current_job
 from mddag_executor.executor.jobs import header_stamp
 from msg_graph import loads
@@ -43,75 +32,6 @@ MS = 1_000_000
 
 
 # --- the core's rule 10 --------------------------------------------------------------------------
-
-FORK = """
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: source, timer: 20ms, publishes: [/a], dag: fork, release_from: header_stamp}
-      - {name: left, subscription: /a, publishes: [/b]}
-      - {name: right, subscription: /a, publishes: [/c]}
-      - {name: one, subscription: /b, deadline: 10ms}
-      - {name: two, subscription: /c, deadline: 20ms}
-"""
-SOURCE, LEFT, RIGHT, ONE, TWO = range(5)
-
-
-class Part:
-    """A core in one of several processes."""
-
-    def __init__(self, *here: int) -> None:
-        self.scheduler = Scheduler(
-            Tables.build(loads(FORK), legs=True, expire_after=100 * MS), 1, propagate=False)
-        self.scheduler.expect(0, [int(i in here) for i in range(5)])
-        self.slot = self.scheduler.release(0, 0, 0, 0)
-
-    def run(self, vertex: int, end: int) -> list[tuple[int, int]]:
-        """Run a vertex; return the kinds of decisions, and vertex or the job's end."""
-        x = self.scheduler.execution(self.slot, vertex)
-        scheduler = self.scheduler
-        rules.record(scheduler.tables, scheduler.state, scheduler.policy.key, x, end)
-        return self.decisions()
-
-    def decisions(self) -> list[tuple[int, int]]:
-        return [(d[0], d[4] if d[0] == JOB_END else d[2]) for d in self.scheduler.decisions()]
-
-
-def test_a_part_without_sinks_completes_when_all_that_lead_out_have():
-    part = Part(SOURCE, LEFT, RIGHT)
-    assert part.run(SOURCE, MS) == part.run(RIGHT, 2 * MS) == []
-    assert part.run(LEFT, 500 * MS) == [(JOB_END, COMPLETED)]  # nobody's deadline is here
-
-
-def test_what_publishes_to_another_process_keeps_its_job_open_while_it_runs():
-    part = Part(SOURCE, LEFT, ONE)  # the source goes on after it has started `left`
-    assert part.run(LEFT, MS) == []
-    assert part.run(ONE, 2 * MS) == [(SINK_IN_TIME, ONE)]
-    assert part.run(SOURCE, 3 * MS) == [(JOB_END, COMPLETED)]
-
-
-def test_sinks_are_judged_where_they_are_only():
-    part = Part(LEFT, ONE)
-    assert part.run(LEFT, MS) == []
-    assert part.run(ONE, 11 * MS) == [(SINK_LATE, ONE), (JOB_END, LATE)]
-    part = Part(TWO)
-    assert part.run(TWO, 11 * MS) == [(SINK_IN_TIME, TWO), (JOB_END, COMPLETED)]
-
-
-def test_a_part_that_is_left_and_entered_again_ends_with_its_sink():
-    part = Part(SOURCE, ONE)
-    assert part.run(SOURCE, MS) == []
-    assert part.run(ONE, 5 * MS) == [(SINK_IN_TIME, ONE), (JOB_END, COMPLETED)]
-
-
-def test_what_is_elsewhere_does_not_expire_here():
-    part = Part(SOURCE, LEFT, ONE)
-    part.scheduler.expire_idle(1000 * MS)
-    assert part.decisions() == [(SINK_EXPIRED, ONE), (JOB_END, EXPIRED)]
-    part = Part(SOURCE, RIGHT, TWO)
-    part.scheduler.finish(1000 * MS)
-    assert part.decisions() == [(SINK_MISSED, TWO)]
 
 
 # --- stamps --------------------------------------------------------------------------------------
@@ -280,15 +200,6 @@ def test_a_second_message_of_a_job_that_has_ended_is_undeclared(lone):
     assert nodes.jobs['second'][0][0] is not None
     assert nodes.jobs['second'][1][0] is None
     assert executor.statistics()['dags']['chain']['jobs'] == 1
-
-
-def test_a_stamp_says_how_late_a_job_is_already(lone):
-    executor, half, nodes = lone
-    half.publish(stamped(time.time_ns() - 300 * MS))
-    assert wait_for(lambda: len(nodes.jobs.get('last', ())) == 1)
-    assert wait_for(lambda: ends(executor)['late'] == 1)
-    sink = executor.statistics()['dags']['chain']['sinks']['/last:sink']
-    assert sink['response_ns']['min'] >= 300 * MS
 
 
 def test_a_stamp_of_the_future_is_no_release_before_now(lone):

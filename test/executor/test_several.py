@@ -5,16 +5,13 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import threading
 from typing import Any
 
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
-from rclpy.task import Future
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
 
 from .conftest import is_idle, Spinning, wait_for
 
@@ -70,65 +67,6 @@ def test_a_node_moves_between_executors_that_spin(make_executor, make_node):
             assert wait_for(lambda n=before: len(ticks) > n)
     assert first.error is second.error is None
     assert heard == expected
-
-
-def test_a_node_may_go_and_come_back_while_messages_come(make_executor, make_node):
-    node, source, heard = make_node(), make_node('source'), []
-    node.create_subscription(Header, '/a', lambda m: heard.append(m.stamp.sec), DEPTH)
-    publisher = source.create_publisher(Header, '/a', DEPTH)
-    executor = make_executor()
-    message, done = Header(), threading.Event()
-
-    def publish() -> None:
-        while not done.wait(0.0005):
-            message.stamp.sec += 1
-            publisher.publish(message)
-
-    assert wait_for(lambda: publisher.get_subscription_count() == 1)
-    with Spinning(executor) as spinning:
-        thread = threading.Thread(target=publish)
-        thread.start()
-        try:
-            for _ in range(30):
-                executor.add_node(node)
-                before = len(heard)
-                assert wait_for(lambda n=before: len(heard) > n)
-                executor.remove_node(node)
-        finally:
-            done.set()
-            thread.join()
-    assert spinning.error is None
-    assert heard == sorted(set(heard))  # what had been taken when it was removed is dropped
-
-
-def test_spinning_until_a_future_is_done_150_times(make_executor, make_node):
-    """Each time it is the right answer, and nothing grows."""
-    node, group = make_node(), ReentrantCallbackGroup()
-
-    def answer(request: Any, response: Any) -> Any:
-        answered.append(1)
-        response.message = str(len(answered))
-        return response
-
-    answered: list[int] = []
-    node.create_service(Trigger, '/ask', answer, callback_group=group)
-    client = node.create_client(Trigger, '/ask', callback_group=group)
-    executor = make_executor(num_workers=2, nodes=[node])
-    assert client.wait_for_service(15.0)
-    files = 0
-    for number in range(150):
-        future = client.call_async(Trigger.Request())
-        executor.spin_until_future_complete(future, 15.0)
-        assert future.done() and future.result().message == str(number + 1)
-        if number == 10:
-            files = len(os.listdir('/proc/self/fd'))
-            threads = threading.active_count()
-    assert len(os.listdir('/proc/self/fd')) <= files
-    assert threading.active_count() <= threads
-    done = Future()
-    done.set_result(None)
-    for _ in range(50):
-        executor.spin_until_future_complete(done, 15.0)
 
 
 # --- fork ----------------------------------------------------------------------------------------

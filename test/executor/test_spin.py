@@ -12,7 +12,6 @@ from typing import Any
 
 from mddag_executor.executor.loop import EventLoop
 import pytest
-import rclpy
 from rclpy.task import Future
 from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import Header
@@ -76,16 +75,6 @@ def test_what_fails_when_it_is_taken_comes_out_of_spin(make_executor, make_node)
         executor.spin_until_future_complete(Future(), 2.0)
 
 
-def test_it_spins_on_after_an_exception(make_executor):
-    executor = make_executor()
-    executor.create_task(lambda: 1 // 0)
-    with pytest.raises(ZeroDivisionError):
-        executor.spin()
-    task = executor.create_task(lambda: 'fine')
-    executor.spin_until_future_complete(task, 5.0)
-    assert task.result() == 'fine'
-
-
 def test_an_exception_that_somebody_awaits_does_not_end_spin(make_executor):
     """See also ``test_asked_for`` (rclpy#1215)."""
     executor = make_executor()
@@ -146,29 +135,6 @@ def test_spin_once_runs_one_callback_and_has_finished_it(make_executor, make_nod
         executor.spin_once(1.0)
         assert len(calls) == count
     assert set(calls) == {threading.get_ident()}
-
-
-def test_spin_once_times_out(make_executor):
-    executor = make_executor()
-    begin = time.monotonic()
-    executor.spin_once(0.05)
-    assert time.monotonic() - begin >= 0.05
-    executor.spin_once(0)
-
-
-def test_spin_once_until_future_complete_ends_when_it_is_done(make_executor):
-    executor = make_executor()
-    future = Future()
-    threading.Timer(0.05, lambda: future.set_result(1)).start()
-    executor.spin_once_until_future_complete(future, 5.0)
-    assert future.done()
-
-
-def test_spin_until_future_complete_times_out(make_executor):
-    executor = make_executor()
-    begin = time.monotonic()
-    executor.spin_until_future_complete(Future(), 0.1)
-    assert time.monotonic() - begin >= 0.1
 
 
 @pytest.mark.parametrize('what', ['task', 'node', 'entity'])
@@ -258,49 +224,6 @@ def test_a_wake_up_that_another_worker_hears_is_not_the_last_one(make_executor, 
         assert wait_for(task.done, 5.0)
 
 
-def test_a_callback_has_ended_when_the_future_that_it_completes_is_waited_for(
-        make_executor, make_node):
-    """As with one thread: rclpy's own tests count on it."""
-    node, executor = make_node(), make_executor()
-    executor.add_node(node)
-    begun, ended = [], []
-
-    def complete() -> None:
-        begun.append(1)
-        future.set_result(None)
-        ended.append(1)
-
-    future: Future = Future()
-    node.create_timer(0.001, lambda: None if future.done() else complete())
-    for count in range(1, 201):
-        executor.spin_until_future_complete(future, 15.0)
-        assert len(begun) == len(ended) == count
-        future = Future()
-
-
-def test_a_future_may_be_polled_without_waiting(make_executor, make_node):
-    node, executor = make_node(), make_executor()
-    executor.add_node(node)
-    future: Future = Future()
-    node.create_timer(0.01, lambda: future.done() or future.set_result(None))
-
-    def polled() -> bool:
-        executor.spin_until_future_complete(future, 0)
-        return future.done()
-
-    assert wait_for(polled)
-
-
-def test_what_is_triggered_runs_in_a_step_that_does_not_wait(make_executor, make_node):
-    node, executor, calls = make_node(), make_executor(), []
-    executor.add_node(node)
-    guard = node.create_guard_condition(lambda: calls.append(1))
-    for count in range(1, 51):
-        guard.trigger()
-        executor.spin_once(0)
-        assert len(calls) == count
-
-
 def test_spinning_twice_is_an_error(make_executor):
     executor = make_executor()
     assert not executor.is_spinning
@@ -370,37 +293,6 @@ def test_wait_for_message_from_a_callback(make_executor, make_node, ros_context)
     with Spinning(executor):
         found, message = wait_for_message(Header, node, '/topic', time_to_wait=5.0)
     assert found and message.frame_id == 'it'
-
-
-def test_what_was_taken_is_not_lost_between_two_spin_once_of_rclpy(make_executor, make_node):
-    """``rclpy.spin_once`` adds the node, and removes it when one callback has run."""
-    node, heard = make_node(), []
-    executor = make_executor()
-    node.create_subscription(Header, '/burst', lambda m: heard.append(m.frame_id), 10)
-    publisher = node.create_publisher(Header, '/burst', 10)
-    assert wait_for(lambda: publisher.get_subscription_count() == 1)
-    for number in range(5):
-        publisher.publish(Header(frame_id=str(number)))
-    assert wait_for(lambda: rclpy.spin_once(node, executor=executor, timeout_sec=0.1)
-                    or len(heard) == 5)
-    assert heard == list('01234')
-    assert executor.statistics()['dropped'] == {}
-
-
-def test_a_rate_ends_a_spin_once(make_executor, make_node):
-    node, slept = make_node(), threading.Event()
-    executor = make_executor(nodes=[node])
-    rate = node.create_rate(100.0)
-
-    def sleep() -> None:
-        rate.sleep()
-        slept.set()
-
-    thread = threading.Thread(target=sleep)
-    thread.start()
-    while not slept.is_set():
-        executor.spin_once()
-    thread.join()
 
 
 def test_a_coroutine_that_only_yields_goes_on_in_the_next_spin_once(make_executor, make_node):

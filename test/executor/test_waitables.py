@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Actions, QoS events, guard conditions and waitables of a user's own."""
+"""Actions, QoS events, guard conditions, waitables of a user's own, and timers that have info."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.executor import waitables
+from mddag_executor.executor import compat, waitables
 import pytest
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.guard_condition import GuardCondition
 from rclpy.qos import QoSProfile
 from rclpy.waitable import NumberOfEntities, Waitable
@@ -97,30 +96,6 @@ def test_many_goals_at_once(make_executor, make_node, apart):
     counting.destroy()
 
 
-def test_who_takes_as_much_as_may_be_at_once_looks_again(make_executor, make_node, monkeypatch):
-    monkeypatch.setattr(waitables, 'MOST', 1)
-    nodes = [make_node('server'), make_node('client')]
-    counting = Counting(*nodes)
-    server, client = make_executor(), make_executor()
-    server.add_node(nodes[0])
-    client.add_node(nodes[1])
-    server._upkeep.refresh()
-    source, = (each for each in server._upkeep._sources.values()
-               if isinstance(each, waitables.WaitableSource))
-    found: list[Any] = []
-    later: list[Any] = []
-    source._post, source._at = found.extend, lambda at, function: later.append(function)
-    with Spinning(client):
-        assert counting.client.wait_for_server(15.0)
-        for _ in range(3):
-            counting.client.send_goal_async(Fibonacci.Goal(order=1))
-        assert wait_for(lambda: source.collect() or found)
-        while later:
-            later.pop()()
-        assert len(found) == 3
-    counting.destroy()
-
-
 @pytest.mark.parametrize('stepwise', [False, True])
 def test_a_goal_expires_when_its_time_is_over(make_executor, make_node, stepwise):
     """The timer is within the server; nothing else happens meanwhile."""
@@ -164,20 +139,6 @@ class spun:
 
 
 # --- QoS events ----------------------------------------------------------------------------------
-
-
-def test_who_comes_and_goes_is_told(make_executor, make_node):
-    node, other, matched = make_node(), make_node('other'), []
-    node.create_subscription(
-        Header, '/a', lambda message: None, 10, event_callbacks=SubscriptionEventCallbacks(
-            matched=lambda event: matched.append(event.current_count)))
-    executor = make_executor(nodes=[node])
-    with Spinning(executor):
-        for number in range(1, 4):
-            publisher = other.create_publisher(Header, '/a', 10)
-            assert wait_for(lambda n=number: matched == [1, 0] * (n - 1) + [1])
-            other.destroy_publisher(publisher)
-            assert wait_for(lambda n=number: matched == [1, 0] * n)
 
 
 class Pair(Waitable):
@@ -243,18 +204,6 @@ def test_something_arrives_while_the_listeners_of_a_waitable_are_set(
         assert wait_for(lambda: pair.got == ['before', 'after'], 5.0), spinning.error
 
 
-def test_what_happened_before_the_executor_came_is_told(make_executor, make_node):
-    node, matched = make_node(), []
-    node.create_subscription(
-        Header, '/a', lambda message: None, 10, event_callbacks=SubscriptionEventCallbacks(
-            matched=lambda event: matched.append(event.current_count)))
-    publisher = node.create_publisher(Header, '/a', 10)
-    assert wait_for(lambda: publisher.get_subscription_count() == 1)
-    executor = make_executor(nodes=[node])
-    with Spinning(executor):
-        assert wait_for(lambda: matched == [1])
-
-
 # --- guard conditions, and waitables of a user's own ---------------------------------------------
 
 
@@ -310,3 +259,81 @@ def test_each_trigger_of_a_guard_condition_is_noticed(make_executor, make_node, 
             rounds()
         assert spinning.error is None
         assert wait_set_threads() == 0
+
+
+# --- taking --------------------------------------------------------------------------------------
+
+
+# --- timers --------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(compat.TimerInfo is None, reason='this rclpy has no TimerInfo')
+def test_a_timer_gives_its_info_to_who_asks_for_it(make_executor, make_node):
+    node, seen, plain = make_node(), [], []
+
+    def tick(call) -> None:
+        seen.append(call)
+
+    tick.__annotations__['call'] = compat.TimerInfo
+    node.create_timer(0.02, tick)
+    node.create_timer(0.02, lambda: plain.append(1))
+    executor = make_executor(nodes=[node])
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: len(seen) >= 10 and len(plain) >= 10)
+    assert spinning.error is None
+    for call in seen:
+        assert call.expected_call_time <= call.actual_call_time
+        assert call.expected_call_time.clock_type == node.get_clock().clock_type
+    steps = {(b.expected_call_time - a.expected_call_time).nanoseconds
+             for a, b in zip(seen, seen[1:])}
+    assert all(step % 20_000_000 == 0 for step in steps)
+
+
+# --- futures and tasks ---------------------------------------------------------------------------
+
+
+class Always(Waitable):
+    """A waitable that its executor finds ready each time, and whose take gives nothing."""
+
+    def __init__(self, node: Any) -> None:
+        super().__init__(node.default_callback_group)
+        self.guard = node.create_guard_condition(None)
+        self.got: list[Any] = []
+
+    def __enter__(self) -> None:
+        self.guard.handle.__enter__()
+
+    def __exit__(self, *_: Any) -> None:
+        self.guard.handle.__exit__(None, None, None)
+
+    def get_num_entities(self) -> NumberOfEntities:
+        return NumberOfEntities()
+
+    def add_to_wait_set(self, wait_set: Any) -> None:
+        pass
+
+    def is_ready(self, wait_set: Any) -> bool:
+        return len(self.got) < 3
+
+    def take_data(self) -> None:
+        return None
+
+    async def execute(self, taken_data: Any) -> None:
+        self.got.append(taken_data)
+
+
+def test_a_waitable_that_takes_nothing_is_executed(make_executor, make_node):
+    node = make_node()
+    waitable = Always(node)
+    node.add_waitable(waitable)
+    executor = make_executor(nodes=[node])
+    with Spinning(executor):
+        assert wait_for(lambda: waitable.guard.trigger() or len(waitable.got) >= 3)
+    assert set(waitable.got) == {None}
+    node.remove_waitable(waitable)
+
+
+# --- executors and nodes -------------------------------------------------------------------------
+
+
+# --- what is behind a handle ---------------------------------------------------------------------

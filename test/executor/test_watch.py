@@ -1,16 +1,22 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What a live run tells the drift rules."""
+"""What a live run says of drift, of wrong names and of what never ran."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
+from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor.statistics import Watch
 from msg_graph import loads
+import pytest
+from rclpy.action import ActionClient, ActionServer
 from rclpy.node import Node
-from std_msgs.msg import Empty
+from rclpy.task import Future
+from std_msgs.msg import Empty, String
+from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
 
 from .conftest import Spinning, wait_for
 
@@ -86,3 +92,123 @@ nodes:
     texts = {each.callback: each.text for each in watch.drift(executor.statistics())}
     assert texts['/camera:grab'].endswith(': did you mean its timer of 25ms?')
     assert texts['/eye:see'].endswith(": did you mean the node '/robot/eye'?")
+
+
+LEAST_S = 0.3
+
+
+@pytest.fixture(autouse=True)
+def check_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('mddag_executor.executor.name_check.LEAST_S', LEAST_S)
+
+
+def test_undeclared_callbacks_have_names(make_executor: Any, make_node: Any) -> None:
+    executor = make_executor()
+    node = make_node('robot')
+    done: list[str] = []
+
+    def execute(goal: Any) -> Any:
+        goal.succeed()
+        return Fibonacci.Result()
+
+    def tick() -> None:
+        publisher.publish(String())
+        done.append('tick')
+
+    def hear(message: String) -> None:
+        done.append('hear')
+
+    def answer(request: Any, response: Any) -> Any:
+        done.append('answer')
+        return response
+
+    def wake() -> None:
+        done.append('wake')
+
+    server = ActionServer(node, Fibonacci, 'count', execute)
+    action = ActionClient(node, Fibonacci, 'count')
+    publisher = node.create_publisher(String, 'words', 10)
+    node.create_subscription(String, 'words', hear, 10)
+    node.create_timer(0.0125, tick)
+    node.create_service(Trigger, 'ask', answer)
+    client = node.create_client(Trigger, 'ask')
+    guard = node.create_guard_condition(wake)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert client.wait_for_service(10.0) and action.wait_for_server(10.0)
+        asked = client.call_async(Trigger.Request())
+        goal = action.send_goal_async(Fibonacci.Goal())
+        guard.trigger()
+        assert wait_for(lambda: {'tick', 'hear', 'answer', 'wake'} <= {*done})
+        assert wait_for(lambda: goal.done() and asked.done())
+        assert executor.shutdown(5.0)
+    expected = {
+        '/robot: tick (timer 12.5ms)', '/robot: hear (subscription /words)',
+        '/robot: answer (service /ask)', '/robot: wake (guard condition)',
+        '/robot: ActionServer (waitable)', '/robot: ActionClient (waitable)'}
+    assert expected <= {*executor.statistics()['callbacks']}
+    server.destroy()
+    action.destroy()
+
+
+CAMERA = """
+mddag: 1
+nodes:
+  - node: /camera
+    callbacks: [{name: capture, timer: 50ms, publishes: [/image], dag: vision}]
+  - node: /detector
+    callbacks: [{name: detect, subscription: /image, deadline: 50ms}]
+"""
+
+
+@pytest.mark.parametrize(('node', 'topic', 'expected'), [
+    ('camera', 'image', None),
+    ('kamera', 'image', 'no node here has 1 declared callback: /camera:capture '
+     "(did you mean the node '/kamera'?); undeclared callbacks that ran: "
+     '/kamera: tick (timer 50ms): '),
+    ('camera', 'robot/image', 'no node here has 1 declared callback: /detector:detect '
+     "(did you mean the topic '/robot/image'?); undeclared callbacks that ran: /detector: hear "
+     '(subscription /robot/image): ')])
+def test_a_wrong_name_is_warned_of_once(
+        ros_context: Any, make_node: Any, capfd: Any, node: str, topic: str, expected: str | None
+) -> None:
+    camera, detector = make_node(node), make_node('detector')
+    publisher = camera.create_publisher(String, topic, 10)
+    heard: list[Any] = []
+
+    def tick() -> None:
+        publisher.publish(String())
+
+    def hear(message: String) -> None:
+        heard.append(message)
+
+    camera.create_timer(0.05, tick)
+    detector.create_subscription(String, topic, hear, 10)
+    executor = MultiDeadlineExecutor(loads(CAMERA, 'camera.yaml'), context=ros_context)
+    executor.add_node(camera)
+    executor.add_node(detector)
+    executor.spin_until_future_complete(Future(), 2 * LEAST_S + 0.5)
+    executor.shutdown()
+    assert heard
+    warned = [line for line in capfd.readouterr().err.splitlines() if 'no node here has' in line]
+    if expected is None:
+        assert warned == []
+    else:
+        line, = warned
+        assert f'camera.yaml: {expected}' in line
+
+
+@pytest.mark.parametrize('change', [
+    ('', ''), ('dag: vision', 'dag: vision, release_from: header_stamp')])
+def test_what_may_run_elsewhere_is_not_missed(
+        ros_context: Any, make_node: Any, capfd: Any, change: tuple[str, str]) -> None:
+    """Neither is anything where the executor has no node yet."""
+    text = CAMERA.replace('timer: 50ms', 'subscription: /light, period: 50ms').replace(*change)
+    executor = MultiDeadlineExecutor(loads(text, 'camera.yaml'), context=ros_context)
+    if change[0]:
+        detector = make_node('detector')
+        detector.create_subscription(String, '/image', lambda message: None, 10)
+        executor.add_node(detector)
+    executor.spin_until_future_complete(Future(), LEAST_S + 0.5)
+    executor.shutdown()
+    assert 'no node here has' not in capfd.readouterr().err

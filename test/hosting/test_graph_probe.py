@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 import re
 import threading
-from typing import Any
 
 from mddag_executor.hosting.graph_probe import draft_of, Endpoints, Probe, probe, Seen
 from msg_graph import loads
@@ -24,20 +23,6 @@ def seen(interval_ms: float) -> Seen:
     """Return the messages of a second."""
     return Seen(count=int(1000 / interval_ms) + 1, first=5,
                 last=5 + round(int(1000 / interval_ms) * interval_ms * MS))
-
-
-def test_intervals() -> None:
-    topic = Seen()
-    assert topic.interval_ns() is None
-    for stamp in (50, 30, 40):
-        topic.message(stamp)
-    assert (topic.count, topic.interval_ns()) == (3, 10)
-    assert Seen(3, 7, 7).interval_ns() is None
-    assert Seen(2, 1, 9).interval_ns() is None
-    image = Seen()
-    for number in (3, 7, 9):     # of seven that were published three came
-        image.message(number * 10, number)
-    assert (image.lost, image.interval_ns(), image.interval_ns(2)) == (4, 10, 30)
 
 
 def test_what_is_supposed() -> None:
@@ -110,17 +95,3 @@ def test_a_real_system(system: None) -> None:
     worker = task_set.callback('/deep/worker:callback_0')
     assert worker.topics == ('/image',)
     assert worker.publishes == ('/never', '/result')
-
-
-def test_types_that_are_not_there(
-        system: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mddag_executor.hosting import graph_probe
-
-    def broken(kind: str) -> Any:
-        raise ModuleNotFoundError(f'No module named {kind!r}')
-
-    monkeypatch.setattr(graph_probe, '_message_type', broken)
-    found = probe(0.8)
-    assert any(w.startswith('/image: its rate is not known: its type std_msgs/msg/String cannot')
-               for w in found.warnings)
-    assert found.seen['/image'].count == 0

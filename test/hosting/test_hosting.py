@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-import gc
 import json
 import os
 from pathlib import Path
@@ -17,9 +16,7 @@ import sys
 import threading
 import time
 from typing import Any
-import weakref
 
-from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.hosting.host import Host
 from mddag_executor.hosting.loading import Program
 from mddag_executor.trace import TraceError, TraceReader
@@ -124,12 +121,6 @@ def test_programs_go_on_while_their_callbacks_run(
         until=lambda: set(lines) <= set(Path('out.txt').read_text().splitlines()))
 
 
-def test_a_program_that_leaves_early_leaves_the_others_alone(world: Path) -> None:
-    result, output = run('chat_nodes/talker', 'chat:main', 'chat:leaves_early', until=has_heard)
-    assert 'left early' in output
-    assert heard(result) > 5
-
-
 def test_the_run_ends_when_a_callback_shuts_rclpy_down(world: Path) -> None:
     _, output = run('chat_nodes/talker', 'chat:shuts_down_in_a_callback')
     assert 'shut down' in output
@@ -138,24 +129,6 @@ def test_the_run_ends_when_a_callback_shuts_rclpy_down(world: Path) -> None:
 def test_the_run_ends_when_all_programs_have_ended(world: Path) -> None:
     _, output = run('chat:never_spins')
     assert 'typed w' in output.splitlines()
-
-
-def test_what_programs_ask_in_a_terminal_stays_as_it_is(world: Path) -> None:
-    (world / 'asks.py').write_text(
-        'import time, rclpy\ndef main():\n    rclpy.init()\n'
-        "    print('speed: ', end='', flush=True)\n    time.sleep(3)\n    print('none')\n")
-    leader, follower = os.openpty()
-    with open(leader, 'rb', buffering=0) as terminal:
-        process = subprocess.Popen(
-            [sys.executable, '-m', 'mddag_executor', 'run', 'graph.yaml', '--node', 'asks:main'],
-            stdin=follower, stdout=follower, stderr=follower)
-        os.close(follower)
-        shown = b''
-        with suppress(OSError):  # of a terminal that nobody has open any more
-            while piece := terminal.read(1 << 12):
-                shown += piece
-    assert process.wait(60) == 0
-    assert b'speed: none\r\n' in shown
 
 
 @pytest.mark.parametrize(('spec', 'message'), [
@@ -227,14 +200,6 @@ def test_ros_arguments_reach_the_nodes(world: Path, mddag: Mddag) -> None:
     assert heard(json.loads(process.stdout)) >= 3
 
 
-def test_a_sigterm_ends_the_run(world: Path) -> None:
-    result, output = run(
-        'chat_nodes/talker', 'chat:main', until=has_heard, number=signal.SIGTERM)
-    assert 'sink jobs due' in output
-    assert 'listener ended after its spin' in output
-    assert heard(result) > 5
-
-
 @pytest.fixture
 def default_context(no_thread_leak: None) -> Iterator[None]:
     """Initialise the default context, in which programs are hosted."""
@@ -296,73 +261,3 @@ def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host: Host, kind
     spinning.join(2.0)
     assert not spinning.is_alive()
     assert host.executor.get_nodes() == []
-
-
-@pytest.mark.parametrize('kind', [SingleThreadedExecutor, MultiDeadlineExecutor])
-def test_an_executor_of_a_program_knows_whether_it_spins(host: Host, kind: Any) -> None:
-    other = kind()
-    spinning = threading.Thread(target=other.spin)
-    assert not other.is_spinning
-    spinning.start()
-    assert wait_for(lambda: other.is_spinning, 15.0)
-    other.shutdown()
-    spinning.join(15.0)
-    assert not spinning.is_alive() and not other.is_spinning
-
-
-def test_a_class_of_executors_of_a_program_keeps_what_it_overrides(host: Host) -> None:
-    spun: list[float | None] = []
-
-    class Theirs(SingleThreadedExecutor):
-
-        def spin_once(self, timeout_sec: float | None = None) -> None:
-            spun.append(timeout_sec)
-
-    other = Theirs()
-    other.spin_once(1.0)
-    assert spun == [1.0] and isinstance(other, Theirs)
-    other.spin_until_future_complete(rclpy.task.Future(), 0.01)
-    other.shutdown()
-
-
-def test_another_executors_tasks_run_on_ours(host: Host) -> None:
-    other = SingleThreadedExecutor()
-    task = other.create_task(lambda: 42)
-    other.spin_until_future_complete(task, timeout_sec=0.05)
-    assert not task.done()  # nobody spins ours
-    host.executor.spin_once(timeout_sec=1.0)
-    assert task.result() == 42
-    other.shutdown()
-
-
-def test_executors_of_programs_are_not_kept(host: Host) -> None:
-    def use() -> Any:
-        other = SingleThreadedExecutor()
-        other.spin_once(timeout_sec=0.0)
-        other.shutdown()
-        return weakref.ref(other)
-
-    used = [use() for _ in range(5)]
-    gc.collect()
-    assert [executor() for executor in used] == [None] * 5
-
-
-def test_nodes_that_a_program_destroys_are_not_kept(host: Host) -> None:
-    used: list[weakref.ref[Node]] = []
-    stays: list[Node] = []
-
-    def main() -> None:
-        for _ in range(5):
-            node = Node('helper', enable_rosout=False)
-            rclpy.spin_once(node, timeout_sec=0.0)
-            node.destroy_node()
-            used.append(weakref.ref(node))
-            del node
-        stays.append(Node('stays'))
-        rclpy.spin(stays[0])
-
-    host.start(host.executor, [Program('main', 'main', main)])
-    assert wait_for(lambda: bool(stays) and host.executor.get_nodes() == stays)
-    assert host.guests[0].nodes == stays
-    gc.collect()
-    assert [node() for node in used] == [None] * 5

@@ -78,21 +78,3 @@ def test_what_does_not_exist_is_said_on_one_line(world: Path, spec: str, message
     assert text.startswith(f'--node {spec}: ')
     assert message.format(site=world / 'site') in text
     assert '\n' not in text
-
-
-def test_no_ament_index_at_all_is_no_crash(
-    world: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv('AMENT_PREFIX_PATH')
-    with pytest.raises(LoadingError, match="there is no package 'chat_nodes'"):
-        resolve('chat_nodes/talker')
-    assert resolve('pip-nodes/listener')
-
-
-def test_a_module_of_the_current_folder_is_found(
-    world: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (world / 'mine_here.py').write_text('def main(): pass\n')
-    monkeypatch.setattr(sys, 'path', [p for p in sys.path if p not in ('', str(world))])
-    assert resolve('mine_here:main')
-    sys.modules.pop('mine_here')

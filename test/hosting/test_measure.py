@@ -39,36 +39,6 @@ def test_every_nominal_release_whose_deadline_lies_in_the_window_is_due() -> Non
     assert (result['sink_jobs_due'], result['on_time_ratio']) == (8, 0.5)
 
 
-def test_a_late_or_slightly_early_noted_release_counts_for_its_own_job() -> None:
-    task_set = loads(SINGLE)
-    ledger = Ledger(task_set)
-    first = 1_700_000_000 * 1000 * MS
-    ledger.first_release[0] = first
-    for job, shift in ((1, -1000), (2, 99 * MS - 1), (3, 0), (3, 0)):
-        release = first + job * 100 * MS + shift
-        ledger.completions[0][0].append((release, first + job * 100 * MS + 60 * MS))
-    ledger.window = reading(first + 150 * MS), reading(first + 450 * MS)
-    result = measure(ledger, ExecutionPlan(task_set))
-    assert (result['on_time'], result['missing']) == (3, 0)
-    assert result['dags']['/a']['sinks']['/a:a']['response_ns']['max'] == 60 * MS
-
-
-def test_cpu_is_shared_among_the_callbacks_of_the_window() -> None:
-    task_set = loads(SINGLE)
-    ledger = Ledger(task_set)
-    ledger.first_release[0] = 0
-    ledger.window = (
-        reading(0, n=10, cpu_ns=5 * MS), reading(2000 * MS, n=30, cpu_ns=405 * MS))
-    slept = measure(ledger, ExecutionPlan(task_set, mode='sleep'))
-    spun = measure(ledger, ExecutionPlan(task_set, mode='spin'))
-    assert (slept['callbacks'], slept['callbacks_per_s']) == (20, 10.0)
-    assert slept['cpu_us_per_callback'] == 20_000
-    assert spun['cpu_us_per_callback'] == 10_000  # 10 ms of each are the bodies themselves
-    ledger.busy_below_ns = 10 * MS
-    assert measure(ledger, ExecutionPlan(task_set, mode='sleep')) == {
-        **slept, 'cpu_us_per_callback': 10_000}  # too short to be slept: waited out busily
-
-
 def test_the_ledgers_of_several_processes_are_that_of_one_run():
     task_set = loads("""
 mddag: 1

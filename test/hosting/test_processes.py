@@ -166,16 +166,6 @@ def test_processes_start_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert session.waited == 2 + processes.LEAD_NS / 1e9
 
 
-def test_who_has_ended_is_not_waited_for(tmp_path: Path) -> None:
-    processes.Part.make(str(tmp_path), CHAIN)
-    for step in ('made', 'ready'):
-        (tmp_path / f'second.{step}').write_text('1')
-    session: Any = Beside(lambda: processes.Part.ended(str(tmp_path), 'second'))
-    part = processes.Part.read(str(tmp_path))
-    part.start_together('first', ['first', 'second', 'third'], session, lambda: ['/half'])
-    assert not session.happens and session.waited <= processes.LEAD_NS / 1e9
-
-
 def test_what_is_lost_until_processes_have_met_is_of_no_job(world: Path) -> None:
     (world / 'slow.py').write_text(
         'import time\ntime.sleep(1)\nfrom relay import last, second\n')
@@ -248,24 +238,3 @@ def test_an_exception_in_one_ends_the_run_with_its_status(world: Path) -> None:
     assert 'warning: process up ended with status 70: ValueError: boom' in errors
     assert '[up] Traceback' in errors
     assert result['processes'][0]['died']
-
-
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['graph.yaml', *NODES, '--processes', '0'], '--processes 0: give 1 or more'),
-    (['graph.yaml', *NODES, '--processes', '5'], 'there are only 4 nodes to place'),
-    (['graph.yaml', *NODES, '--processes', 'none.yaml'], 'none.yaml: '),
-    (['graph.yaml', *NODES[:2]], "process 'down': no --node brings one of its nodes"),
-    (['graph.yaml', *NODES, '--node', 'pair:main'], "it brings /first, which is to run in 'up'"
-     .replace("in 'up'", "in process 'up'")),
-    (['graph.yaml', *NODES, '--node', 'relay:nobody'], "has no 'nobody'"),
-    (['graph.yaml', *NODES, '--process', 'left'], "process 'left'"),
-    (['chain.yaml', *NODES, '--processes', '2', '--process', 'p1'], 'name a file'),
-    (['graph.yaml', *NODES, '--trace', 'no/where.mcap'], 'no directory no'),
-])
-def test_bad_input_is_one_line(
-        world: Path, mddag: Mddag, arguments: list[str], message: str) -> None:
-    (world / 'pair.py').write_text(
-        'from relay import first, second\ndef main():\n    return [first(), second()]\n')
-    run = mddag('run', *arguments)
-    assert (run.returncode, run.stdout) == (2, '')
-    assert message in run.stderr and run.stderr.count('\n') == 1, run.stderr

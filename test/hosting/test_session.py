@@ -68,16 +68,3 @@ def stop_at(steps: int) -> None:
     assert not thread.is_alive(), 'the handler waits for what it has interrupted'
     assert session.clean
     assert len(answers) == 1
-
-
-def test_a_wait_ends_with_its_time_and_says_so() -> None:
-    with Session(Idle()) as session:  # type: ignore[arg-type]
-        ticks: list[float] = []
-        assert session.wait(0.0, ticks.append) is False
-        assert session.wait(0.01, ticks.append) is False
-        assert not session.stopped
-        session.stop()
-        session.stop()
-        assert session.stopped
-        assert session.wait(None, ticks.append) is True
-        assert session.wait(None) is True

@@ -14,7 +14,7 @@ import threading
 import time
 
 from mddag_executor.hosting import processes as module
-from mddag_executor.hosting.processes import ProcessError, Run, Supervisor
+from mddag_executor.hosting.processes import Run, Supervisor
 import pytest
 
 WAITS = """
@@ -86,29 +86,6 @@ def test_one_that_dies_is_named_with_what_it_said() -> None:
     assert by_name['b'].how == 'was ended by SIGKILL'
 
 
-def test_bad_input_of_one_is_the_error_of_all() -> None:
-    error = 'import sys; print("error: x.yaml:1: wrong: mend it", file=sys.stderr); sys.exit(2)'
-    case = Case(True, a=WAITS, b=error)
-    with pytest.raises(ProcessError, match='^process b: x.yaml:1: wrong: mend it$'):
-        case.run()
-    assert all(run.status is not None for run in case.supervisor.runs)
-    assert case.err.getvalue() == ''
-
-
-def test_one_that_was_stuck_is_named_with_where() -> None:
-    stuck = ('import faulthandler, os, signal\ndef waits():\n    faulthandler.dump_traceback()\n'
-             '    os.kill(os.getpid(), signal.SIGKILL)\nwaits()')
-    case = Case(a=stuck)
-    case.run()
-    assert [run.said for run in case.died] == ['stuck: File "<string>", line 3 in waits']
-
-
-def test_an_error_line_of_one_that_ends_otherwise_is_printed() -> None:
-    case = Case(True, a='import sys; print("error: no", file=sys.stderr)')
-    case.run()
-    assert case.err.getvalue() == '[a] error: no\n'
-
-
 def test_all_end_when_asked_and_who_does_not_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, 'END_TIMEOUT_S', 0.1)
     deaf = WAITS.replace('lambda *_: end.set()', 'signal.SIG_IGN')
@@ -137,16 +114,6 @@ def test_who_does_not_end_when_the_run_is_over_is_asked_then_killed(
     said = case.err.getvalue().splitlines()
     assert said[0] == 'warning: process a has not ended with the others: it is asked to'
     assert said[1:] == ['warning: process a has not ended within 0.1 s: it is killed'] * is_deaf
-
-
-def test_one_that_ends_when_the_run_is_over_takes_no_other_along(tmp_path: Path) -> None:
-    mark = tmp_path / 'ended'
-    a = f'open({str(mark)!r}, "w").close()'
-    b = (f'import os, time\nwhile not os.path.exists({str(mark)!r}): time.sleep(0.01)\n'
-         'time.sleep(0.2); print("on its own")')
-    case = Case(a=a, b=b)
-    assert case.run(seconds=0.0) == [('a', 0), ('b', 0)]
-    assert case.out.getvalue() == '[b] on its own\n'
 
 
 def test_it_ends_with_who_started_it(tmp_path: Path) -> None:

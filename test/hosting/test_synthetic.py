@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 import threading
 import time
@@ -11,15 +10,14 @@ from typing import Any
 
 from mddag_executor.executor import current_job
 from mddag_executor.executor.executor import MultiDeadlineExecutor
-from mddag_executor.hosting.bodies import native, spinner
-from mddag_executor.hosting.measure import BODIES, ExecutionPlan, Ledger, measure, PlanError
+from mddag_executor.hosting.bodies import spinner
+from mddag_executor.hosting.measure import BODIES, ExecutionPlan, Ledger, measure
 from mddag_executor.hosting.session import Session
 from mddag_executor.hosting.synthetic import (
     JOIN_LIMIT,
     Role,
     SyntheticWorkload,
 )
-from mddag_executor.simulate import draw_execution_times
 from msg_graph import load, loads, TaskSet
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -82,11 +80,6 @@ def drawn(task_set: TaskSet, plan: ExecutionPlan) -> list[list[int]]:
     return [[plan.execution_ns(d.index, v.index) for v in d.vertices] for d in task_set.dags]
 
 
-def test_a_seed_gives_the_draw_that_the_simulator_gives(autoware: TaskSet) -> None:
-    assert drawn(autoware, ExecutionPlan(autoware, 5)) == draw_execution_times(autoware, 5)
-    assert drawn(autoware, ExecutionPlan(autoware, 6)) != draw_execution_times(autoware, 5)
-
-
 def test_scaling_gives_the_utilisation_asked_for(autoware: TaskSet) -> None:
     workers = 7
     plan = ExecutionPlan(autoware, 1, 0.6, workers)
@@ -118,25 +111,6 @@ nodes:
     assert (found.vertex, found.critical_path_ns, found.deadline_ns) == ('/d:d', 31 * MS, 30 * MS)
 
 
-def test_the_demo_draw_is_feasible(autoware: TaskSet) -> None:
-    from mddag_executor.cli.demo import SEED, WORKERS
-    assert ExecutionPlan(autoware, SEED, 0.6, WORKERS).infeasible() == []
-
-
-@pytest.mark.parametrize('utilisation', [0.0, -1.0, math.nan, math.inf])
-def test_an_absurd_utilisation_is_refused(autoware: TaskSet, utilisation: float) -> None:
-    with pytest.raises(PlanError, match='not a number above zero'):
-        ExecutionPlan(autoware, 0, utilisation)
-
-
-def test_nothing_to_scale_is_refused() -> None:
-    text = ('mddag: 1\nnodes:\n  - node: /a\n    callbacks: '
-            '[{name: a, timer: 100ms, deadline: 1ms}]\n')
-    assert ExecutionPlan(loads(text)).utilisation == 0
-    with pytest.raises(PlanError, match='declare execution_time'):
-        ExecutionPlan(loads(text), 0, 0.6)
-
-
 # --- emulation -----------------------------------------------------------------------------------
 
 
@@ -166,30 +140,11 @@ def test_what_bodies_do(autoware: TaskSet) -> None:
         'native'}
 
 
-def test_native_bodies_take_cpu_time() -> None:
-    emulate = native()
-    start = time.thread_time_ns()
-    emulate(0)
-    short = time.thread_time_ns() - start
-    start = time.thread_time_ns()
-    emulate(20 * MS)
-    assert time.thread_time_ns() - start > 2 * MS + short
-
-
 # --- joins and releases --------------------------------------------------------------------------
 
 
 def role(task_set: TaskSet, ledger: Ledger, senders: str) -> Role:
     return Role(task_set.vertex('/join:cb'), list(senders), '', 0, [], lambda ns: None, ledger)
-
-
-def test_only_the_last_leg_of_a_job_completes_a_join(task_set: TaskSet) -> None:
-    join = role(task_set, Ledger(task_set), 'abc')
-    assert [join.is_whole(1, s) for s in 'ab'] == [False, False]
-    assert not join.is_whole(2, 'c')
-    assert not join.is_whole(1, 'b')  # twice the same is no third
-    assert join.is_whole(1, 'c')
-    assert list(join.waiting) == [2]
 
 
 def test_incomplete_joins_are_bounded_and_counted(task_set: TaskSet) -> None:

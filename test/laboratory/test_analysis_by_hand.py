@@ -7,7 +7,6 @@ from __future__ import annotations
 from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS, NOTHING, Verdict
 from mddag_executor.laboratory.necessary import largest_demand
 from mddag_executor.laboratory.sufficient import (
-    graham,
     rad,
 )
 from mddag_executor.laboratory.tasks import AnalysisError, tasks_of
@@ -83,19 +82,6 @@ def test_demand() -> None:
     assert verdicts(FORK, 1)['demand bound'].verdict == HOLDS
 
 
-def test_graham() -> None:
-    task, = tasks_of(loads(FORK))
-    assert [bound.response for bound in graham(task, 2)] == [None, 42 * MS]  # 3 + 40 / 2 > 3
-    slower, = tasks_of(loads(FORK.replace('deadline: 3ms', 'deadline: 23ms')))
-    assert [bound.response for bound in graham(slower, 2)] == [23 * MS, 42 * MS]
-    often, = tasks_of(loads(FORK.replace('deadline: 3ms', 'deadline: 23ms').replace(
-        '100ms', '41ms')))
-    assert [bound.response for bound in graham(often, 2)] == [None, None]  # jobs overlap
-    assert verdicts(timers('10ms 10ms 1ms'), 1)["Graham's bound"].verdict == HOLDS
-    two = verdicts(timers('10ms 10ms 1ms', '10ms 10ms 1ms'), 1)["Graham's bound"]
-    assert (two.verdict, two.figure) == (NOTHING, '2 of 2 DAGs in time, each alone')
-
-
 def test_only_rad_puts_the_urgent_first() -> None:
     found = verdicts(timers('100ms 14ms 2ms', '100ms 100ms 4ms', '100ms 100ms 3ms'), 1)
     assert found['response time, any policy'].verdict == NOTHING
@@ -103,14 +89,6 @@ def test_only_rad_puts_the_urgent_first() -> None:
     assert bound.verdict == HOLDS
     # 2 of its own, a job of each other one that may be urgent, and the longest that had begun.
     assert bound.details['/n0: /n0:t'] == {'deadline_ns': 14 * MS, 'response_bound_ns': 13 * MS}
-
-
-def test_response_times_with_others() -> None:
-    found = verdicts(timers('10ms 10ms 2ms', '20ms 20ms 3ms'), 1)
-    bounds = found['response time, any policy'].details
-    # One job of the other may end late and the next follow at once: 2 + 2 * 3, and 3 + 2 * 2.
-    assert bounds['/n0: /n0:t']['response_bound_ns'] == 8 * MS
-    assert bounds['/n1: /n1:t']['response_bound_ns'] == 7 * MS
 
 
 @pytest.mark.parametrize(('right', 'wrong', 'reason'), [
@@ -131,14 +109,6 @@ def test_assumptions(right: str, wrong: str, reason: str | None) -> None:
             assert reason in verdict.reason
     if reason is None:
         assert found['response time, any policy'].verdict == HOLDS
-
-
-def test_a_bound_on_open_jobs_that_could_end_one() -> None:
-    text = FORK.replace('deadline: 3ms', 'deadline: 240ms').replace(
-        'deadline: 50ms', 'deadline: 250ms').replace('name: t,', 'name: t, max_active_jobs: 2,')
-    assert 'max_active_jobs of DAG /n' in verdicts(text, 2)['response time, any policy'].reason
-    text = text.replace('max_active_jobs: 2', 'max_active_jobs: 3')
-    assert verdicts(text, 2)['response time, any policy'].verdict == HOLDS
 
 
 def test_a_long_callback_that_has_begun_is_part_of_the_bound() -> None:

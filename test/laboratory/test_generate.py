@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Random task sets are declarations, and are what was asked for."""
+"""Random task sets, and deadlines by critical path."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from hypothesis import given, settings
 import hypothesis.strategies as st
+from mddag_executor.laboratory.assign_deadlines import proportional
 from mddag_executor.laboratory.generate import generate
 from mddag_executor.laboratory.generate_options import GenerateError, Options
 from mddag_executor.laboratory.shapes import draw_shape, MOST_COPIES
@@ -115,3 +116,42 @@ def test_impossible(change: dict[str, object], problem: str) -> None:
     with pytest.raises(GenerateError) as caught:
         generate(replace(Options(), **change))  # type: ignore[arg-type]
     assert str(caught.value).startswith(problem)
+
+
+GRAPH = """\
+mddag: 1
+workers: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: t, timer: 20ms, publishes: [/a, /b], dag: one, execution_time: 1ms}
+      - {name: x, subscription: /a, deadline: 5ms, execution_time: 1ms}
+      - name: y
+        subscription: /b
+        deadline: 50ms
+        execution_time: {quantiles_us: [1000, 3000, 9000], percent: [0, 50, 100]}
+      - {name: z, timer: 10ms, deadline: 10ms, dag: two, execution_time: 1ms}
+"""
+
+
+def test_proportional() -> None:
+    task_set = loads(GRAPH)
+    # To x it is 2 ms, to y 1 ms + 9 ms.
+    assert proportional(task_set, 'max') == {
+        '/n:x': 4_000_000, '/n:y': 20_000_000, '/n:z': 10_000_000}
+    assert proportional(task_set, 'mean')['/n:x'] == 8_000_000
+    with pytest.raises(Exception, match='no such budget'):
+        proportional(task_set, 'median')
+
+
+def test_a_callback_that_is_several_sinks() -> None:
+    task_set = loads("""\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 20ms, publishes: [/a], dag: one, execution_time: 3ms}
+      - {name: b, timer: 40ms, publishes: [/a], dag: two, execution_time: 1ms}
+      - {name: s, subscription: /a, deadline: 5ms, execution_time: 1ms}
+""")
+    assert proportional(task_set, 'max') == {'/n:s': 20_000_000}

@@ -12,7 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.recording.head import declared, Head
-from mddag_executor.replay import open_recording, replay, ReplayError
+from mddag_executor.replay import replay, ReplayError
 from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
@@ -338,32 +338,6 @@ def test_a_trace_without_a_usable_declaration(tmp_path: Path, text: str, says: s
         replay(path)
     with pytest.raises(ReplayError, match='<stdin>: '):
         replay(path, name='<stdin>')
-
-
-def test_a_trace_of_another_program(tmp_path: Path) -> None:
-    path = tmp_path / 'caret.mcap'
-    with TraceFile(path, overwrite=True) as file:
-        file.add('caret_init', START_TIME, VPID, 1, 5, 'jazzy')
-    with pytest.raises(ReplayError, match=(
-            r'caret.mcap: no run of this executor is recorded in it \(it has no event '
-            r'mddag:task_set\): record a run with mddag run')):
-        replay(path, small())
-
-
-def test_a_recording_in_memory_is_small(tmp_path: Path) -> None:
-    """Six million events fit in 300 MB: what is kept beside the tables does not grow."""
-    import tracemalloc
-    path = tmp_path / 'run.mcap'
-    VirtualRun(path, small(), 1, duration=20_000 * MS, longest=2 * MS, flush_every=1000)
-    events = TraceReader(path).message_count
-    assert events is not None and events > 20_000
-    open_recording(path)    # what is loaded once is no part of it
-    tracemalloc.start()
-    found = open_recording(path)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert found.warnings == []
-    assert peak < 8_000_000 + 60 * events
 
 
 @pytest.mark.parametrize('skip', [0, 100 * MS])

@@ -149,40 +149,6 @@ nodes:
         (9000, START, 0), (9000, START, 1)]
 
 
-def test_a_timer_is_noticed_sooner_where_fewer_run(tmp_path: Path) -> None:
-    """It is late since another runs beside the long one when it is due."""
-    path = tmp_path / 'a.mcap'
-    text = """\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: late, timer: 100ms, dag: late, deadline: 60ms}
-      - {name: long, timer: 100ms, publishes: [/x], dag: long}
-      - {name: other, subscription: /x, deadline: 90ms}
-"""
-    with TraceFile(path) as file:
-        file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 3, 100 * MS, 64, False)
-        for job in range(20):
-            noticed = 10 * MS if job % 2 else 12 * MS
-            for dag, vertex, due, ready, took in sorted((
-                    (1, 0, 0, 0, 40 * MS), (0, 0, 10 * MS, noticed, 5 * MS),
-                    (1, 1, -1, 45 * MS if job % 2 else 5 * MS, 15 * MS)), key=lambda ran: ran[3]):
-                release, ready = (START_TIME + job * 100 * MS + time for time in (due, ready))
-                worker = dag + vertex
-                if due >= 0:
-                    file.add('job_release', ready, 1, 1, dag, job, release)
-                add_execution(file, ready, ready + took, dag, vertex, job, worker,
-                              thread=10 + worker, address=9 + worker)
-        file.add('shutdown', START_TIME + 2000 * MS, 1, 1, START_TIME + 2000 * MS)
-    for workers, expected in ((3, 2 * MS), (2, 2 * MS), (1, 0)):
-        load = reschedule(path, workers=workers).work.load
-        late = [ready - release for ready, release, dag in zip(
-            load.times, load.releases, load.dags) if dag == 0]
-        assert late[::2] == [expected] * 10
-        assert late[1::2] == [0] * 10
-
-
 @pytest.mark.parametrize('seed', range(4))
 def test_the_prediction_of_a_virtual_run(tmp_path: Path, seed: int) -> None:
     """One DAG, workers enough, nothing lost: the same response times."""

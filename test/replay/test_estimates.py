@@ -19,7 +19,6 @@ from mddag_executor.replay.alone import alone, colder, Recorded
 from mddag_executor.replay.dispatches import Dispatches
 from mddag_executor.replay.noticed import Noticed
 from mddag_executor.replay.usage import group_waits, PoolUse
-from mddag_executor.simulate.intakes import Costs
 from mddag_executor.simulate.machine import SWITCH_NS
 from mddag_executor.trace import TraceFile
 import numpy as np
@@ -197,22 +196,6 @@ def recorded(count: int) -> tuple[Recorded, Noticed]:
     return Recorded(
         np.array(could), np.array(took), 5 * MS * one, one > 0, one, one, one > 0), Noticed(
         np.array(due), np.array(ready), np.ones(len(due), dtype=np.int64), np.array(timer))
-
-
-def test_who_computes_and_what_is_ready_show_what_noticing_took() -> None:
-    ran, noticed = recorded(60)
-    costs = noticed.costs(ran)
-    assert costs == Costs(TIMER, 120_000, MESSAGE, 150_000, Costs().send_ns)
-
-
-def test_what_an_intake_did_ends_when_it_had_done_all() -> None:
-    ran, noticed = recorded(60)
-    costs = noticed.costs(ran)
-    did = noticed.executions(costs)
-    rest = np.where(noticed.timer, costs.timer_rest, costs.message_rest)
-    assert (did.could + did.took == noticed.ready + rest).all()
-    assert (did.could <= noticed.due).all() and did.locks.all()
-    assert (did.took >= did.cpu).all()
 
 
 STEP = PoolUse.FIRST_STEP_NS

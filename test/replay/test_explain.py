@@ -16,7 +16,6 @@ from mddag_executor.cli import main as program
 from mddag_executor.core.tally import total
 from mddag_executor.replay import replay
 from mddag_executor.replay.causes import CAUSES, REMEDIES
-from mddag_executor.report.text import format_ns
 from msg_graph import loads, TaskSet
 import pytest
 
@@ -362,30 +361,6 @@ def test_only_misses_in_stops_are_said_to_be_in_them(
                  if line.startswith('9 misses: '))
         assert line.startswith('9 misses: 2 in 2 stops of the machine (0.')
         assert line.endswith(' s), 7 machine')
-
-
-@pytest.mark.parametrize(('deadline', 'usual'), [(12, True), (1, False)])
-def test_the_mean_of_a_cause_is_that_of_its_parts(
-    deadline: int, usual: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    # the callback takes 2 ms, but 20 ms in the last job; a deadline of 1 ms is too short for it
-    path = tmp_path / 'run.mcap'
-    with begin_trace(path, LENT.replace('50ms', f'{deadline}ms')) as file:
-        for job in range(9):
-            release = START_TIME + job * 1_000 * MS
-            file.add('job_release', release, 1, 1, 1, job, release)
-            took = (20 if job == 8 else 2) * MS
-            add_execution(file, release, release + took, 1, 0, job, address=8)
-        end_trace(file, START_TIME + 9_000 * MS)
-    result = explain(capsys, str(path))
-    assert result['causes']['ran long'] == result['missed'] == (1 if deadline == 12 else 9)
-    parts = [part for job in result['jobs'] for part in job['parts']]
-    counted = ['ran long'] if usual else ['ran long', 'ran']
-    mean = sum(part['ns'] for part in parts if part['cause'] in counted) // result['missed']
-    assert program.main(['explain', str(path)]) == 0
-    row = next(line for line in capsys.readouterr().out.splitlines()
-               if line.split()[:3] == ['x:late', 'ran', 'long'])
-    assert f' {format_ns(mean, 3)} ' in row
 
 
 @pytest.mark.parametrize(('workers', 'cause'), [(1, 'waited'), (2, 'released late')])

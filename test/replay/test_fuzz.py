@@ -36,8 +36,8 @@ import pytest
 import zstandard
 
 from .helpers import MS, small, VirtualRun
-from .test_damage import counts, never_above
 from .test_ordinary_bags import FORMATS, write_bag
+from .test_times import counts, never_above
 
 ROUNDS = 1000
 LONG_S = float(os.environ.get('FUZZ_SECONDS', '0'))

@@ -275,23 +275,6 @@ def test_each_process_has_its_workers_and_interpreter_again(
     assert '9 late' in call('replay', *two, tmp_path / 'graph.yaml', '--reschedule').stdout
 
 
-def test_slack_is_found_with_the_workers_and_interpreter_of_each(
-        two: list[str], tmp_path: Path, call: Any) -> None:
-    run = call('slack', *two, '--json', '-')
-    result = json.loads(run.stdout)
-    assert (run.returncode, result['processes'], result['left_out']) == (0, 2, [])
-    # 5 ms may become 8 ms in both, side by side
-    assert all(1.58 <= one <= 1.6 for one in (
-        result['load']['factor'], *(each['factor'] for each in result['callbacks'].values())))
-    assert result['workers'] == {'given': 2, 'least': 1, 'breaks': None}
-    (tmp_path / 'graph.yaml').write_text(TWO + 'processes: {p: [/a, /b]}')
-    run = call('slack', *two, tmp_path / 'graph.yaml')     # all in one
-    assert 'left out, because they miss' in run.stdout
-    assert '1 of 2 workers in each process are enough' in call('slack', *two).stdout
-    refused = call('slack', *two, '--offset', 'none=1ms')
-    assert refused.returncode == 2 and 'there is no trace of none' in refused.stderr
-
-
 def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path: Path, call: Any) -> None:
     for folder, takes in (('before', 2), ('after', 7)):
         (tmp_path / folder).mkdir()

@@ -245,26 +245,3 @@ def test_any_lost_event_is_said_or_changes_nothing(recorded: Recorded) -> None:
             seen.add(name.partition(':')[2])
     assert seen == {'callback_start', 'callback_end', 'dds_bind_addr_to_stamp', 'rclcpp_publish',
                     'dispatch_subscription_callback'}
-
-
-def test_what_else_the_thread_writes_is_not_the_publication(recorded: Recorded) -> None:
-    recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
-    recorded.add('ros2:rclcpp_publish', 101 * MS, 1, IMAGE, 0x50, 0)
-    recorded.add('ros2:rcl_publish', 101 * MS + 1, 1, IMAGE, 0x50)
-    recorded.add('ros2_caret:dds_write', 101 * MS + 2, 1, 0x60)     # a service's, say
-    recorded.add('ros2_caret:dds_bind_addr_to_stamp', 101 * MS + 3, 1, 0x60, BEGIN + 77)
-    # of another publication only the beginning is recorded; what comes with the next callback in
-    # the thread is not its end
-    recorded.run(CAMERA, 1, 200 * MS, 203 * MS)
-    recorded.add('ros2:rclcpp_publish', 201 * MS, 1, IMAGE, 0x50, 0)
-    recorded.run(CAMERA, 1, 300 * MS, 303 * MS)
-    recorded.add('ros2_caret:dds_write', 301 * MS + 2, 1, 0x60)
-    recorded.add('ros2_caret:dds_bind_addr_to_stamp', 301 * MS + 3, 1, 0x60, BEGIN + 88)
-    recorded.receive(DETECT, 2, 305 * MS, 306 * MS, 77)
-    recorded.receive(DETECT, 2, 307 * MS, 308 * MS, 88)
-    got, warnings = linked(recorded.write())
-    assert got.published_at == [('/image', 101 * MS), ('/image', 201 * MS)]
-    assert [link[2] for link in got.links if link[0].startswith('/detector')] == [None, None]
-    assert warnings == [
-        '2 executions for a message whose publication is not known (not all of its topic have a '
-        'source timestamp in it): of no job and no path: /detector subscription /image (2)']

@@ -234,33 +234,6 @@ def test_recorded_callback_groups_are_kept(tmp_path: Path) -> None:
     assert starts(parted.log) == [(0, 0, 1, 0), (0, 1, 0, 0)]
 
 
-def test_a_message_counts_from_its_stamp_and_is_ready_when_it_came(tmp_path: Path) -> None:
-    """Of a source that is no timer the release may be long before it can run."""
-    text = """\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: a, timer: 100ms, deadline: 50ms, dag: a}
-      - {name: b, service: /s, period: 100ms, deadline: 50ms, dag: b}
-"""
-    path = tmp_path / 'a.mcap'
-    with TraceFile(path, overwrite=True) as file:
-        file.add('task_set', START_TIME, VPID, 1, text, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
-        for dag in (0, 1):
-            file.add('job_release', START_TIME + 30 * MS, VPID, 1, dag, 0, START_TIME)
-        for dag in (0, 1):
-            start, end = START_TIME + 30 * MS, START_TIME + 33 * MS
-            add_execution(file, start, end, dag, 0, 0, dag, vpid=VPID, thread=dag)
-        file.add('shutdown', START_TIME + 90 * MS, VPID, 1, START_TIME + 90 * MS)
-    assert starts(reschedule(path).log) == [(30, 0, 0, 0), (30, 1, 1, 0)]
-    outcome = reschedule(path, overheads=False)
-    assert starts(outcome.log) == [(0, 0, 0, 0), (30, 0, 1, 0)]
-    sinks = outcome.result()['dags']
-    assert sinks['a']['sinks']['/n:a']['response_ns']['max'] == 3 * MS
-    assert sinks['b']['sinks']['/n:b']['response_ns']['max'] == 33 * MS
-
-
 def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     text = TWO.replace('timer: 100ms,', 'timer: 100ms, execution_time: 7ms,')
@@ -371,26 +344,6 @@ nodes:
         result = reschedule(tmp_path / 'a.mcap', **how).result()
         assert result['deadline_missed'] == late
         assert result['preemptive'] != late
-
-
-def test_what_a_timer_skipped_is_skipped_again(tmp_path: Path) -> None:
-    """A job that expired at its release never ran, and would not have with other workers."""
-    path, text = tmp_path / 'a.mcap', 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, ' \
-        'timer: 10ms, deadline: 10ms, dag: a}]}]'
-    with TraceFile(path, overwrite=True) as file:
-        file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
-        for job in range(3):
-            now = START_TIME + (0, 25 * MS, 25 * MS)[job]
-            file.add('job_release', now, 1, 1, 0, job, START_TIME + job * 10 * MS)
-            if job == 1:
-                file.add('expire', now, 1, 1, 0, job)
-                continue
-            add_execution(file, now, now + MS, 0, 0, job)
-        file.add('shutdown', START_TIME + 60 * MS, 1, 1, START_TIME + 60 * MS)
-    result = reschedule(path, workers=4).result()
-    sink = result['dags']['a']['sinks']['/n:a']
-    assert (sink['completed'], sink['expired'], sink['late']) == (2, 1, 0)
-    assert (result['executions'], result['estimated_executions']) == (3, 0)
 
 
 def of_python(path: Path, jobs: list[tuple[int, int, int, int, bool]], cpus: int = 2) -> None:

@@ -228,15 +228,6 @@ def test_a_warm_up_is_left_out(
     assert '6 sink jobs due, 6 in time (100.00 %)' in page.read_text()
 
 
-def test_a_warm_up_is_left_out_of_a_comparison(
-    trace: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert program.main(['diff', str(trace), str(trace), '--skip', '31ms']) == 0
-    output = capsys.readouterr().out
-    assert 'left out in both: jobs released in the first 31 ms' in output
-    assert output.splitlines()[1].split()[1:7] == ['6', '6', '100.00', '%', '100.00', '%']
-
-
 @pytest.mark.parametrize('mode', [[], ['--reschedule']])
 def test_where_nothing_was_due_nothing_is_proven(
     trace: Path, tmp_path: Path, mode: list[str], capsys: pytest.CaptureFixture[str]

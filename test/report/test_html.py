@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""HTML reports as files: what is in them, that they need nothing else, that no name breaks out."""
+"""The HTML report: figures, tables, hostile names; and what is worse in a second run."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import io
 import json
 from pathlib import Path
 import re
+from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.replay import replay
 from mddag_executor.report import html
+from mddag_executor.report.diff import callbacks_table, compare, sinks_table
 from mddag_executor.report.html_data import (
     COLOURS,
     json_for_html,
@@ -24,6 +26,7 @@ from mddag_executor.report.html_data import (
 from mddag_executor.report.html_tables import (
     html_table,
 )
+import msg_graph
 import pytest
 
 from . import runs
@@ -136,3 +139,53 @@ def test_a_run_without_anything_has_a_report_too() -> None:
     file = io.BytesIO()
     html.write(file, data)
     assert b'</html>' in file.getvalue()
+
+
+MS = runs.MS
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> dict[str, Any]:
+    return replay(runs.by_hand(tmp_path / 'run.mcap')).result()
+
+
+def changed(result: dict[str, Any], **sink: Any) -> dict[str, Any]:
+    before = result['dags']['/driver']['sinks']['/filter:run']
+    return {**result, 'dags': {'/driver': {'sinks': {'/filter:run': {**before, **sink}}}}}
+
+
+def test_a_run_is_no_worse_than_itself(result: dict[str, Any]) -> None:
+    difference = compare(result, result, 0.0)
+    sink = difference['dags']['/driver']['sinks']['/filter:run']
+    assert sink['a'] == sink['b'] and set(sink['change_ns'].values()) == {0}
+    assert difference['worse'] is sink['worse'] is False
+
+
+@pytest.mark.parametrize(('sink', 'tolerance', 'worse'), [
+    ({'late': 2}, None, True),
+    ({'late': 0}, None, False),
+    ({'completed': 6, 'late': 2}, None, False),         # the same share
+    ({'completed': 6, 'late': 3}, None, True),
+    ({'expired': 1}, None, True),
+    ({'response_ns': {'min': 1, 'median': 2, 'p99': 11 * MS, 'max': 11 * MS}}, None, False),
+    ({'response_ns': {'min': 1, 'median': 2, 'p99': 11 * MS, 'max': 11 * MS}}, 0.1, False),
+    ({'response_ns': {'min': 1, 'median': 2, 'p99': 11 * MS + 1, 'max': 12 * MS}}, 0.1, True),
+    ({'response_ns': {'min': 1, 'median': 2, 'p99': 9 * MS, 'max': 12 * MS}}, 0.0, False),
+    ({'response_ns': None}, 0.0, False)])
+def test_what_is_worse(
+    result: dict[str, Any], sink: dict[str, Any], tolerance: float | None, worse: bool
+) -> None:
+    assert compare(result, changed(result, **sink), tolerance)['worse'] is worse
+
+
+def test_what_only_one_run_has(result: dict[str, Any], tmp_path: Path) -> None:
+    graph = runs.GRAPH.replace('deadline: 8ms', 'deadline: 5ms').replace('name: whole', 'name: w')
+    other = replay(runs.by_hand(tmp_path / 'other.mcap'), msg_graph.loads(graph)).result()
+    difference = compare(result, other)
+    assert 'worse, deadline in B 5 ms' in sinks_table(difference)
+    lacking = {**result, 'dags': {}}
+    assert 'only in A' in sinks_table(compare(result, lacking))
+    difference = compare(lacking, result)
+    assert 'only in B' in sinks_table(difference) and not difference['worse']
+    assert difference['dags']['/driver']['sinks']['/filter:run']['a'] is None
+    assert 'driver:tick' in callbacks_table(compare({**result, 'callbacks': {}}, result))

@@ -202,26 +202,3 @@ def test_what_is_drawn_is_visible(browser: Any, large: Path, tmp_path: Path) -> 
     widths = browser.execute_script(
         'return [document.documentElement.scrollWidth, window.innerWidth]')
     assert widths[0] <= widths[1]       # nothing sticks out
-
-
-def test_nothing_is_cut_off_on_a_narrow_screen(browser: Any, large: Path) -> None:
-    """At 420 px every cell, legend and picture lies between the edges of the window."""
-    browser.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', {
-        'width': 420, 'height': 900, 'deviceScaleFactor': 1, 'mobile': False})
-    try:
-        opened(browser, large)
-        outside = browser.execute_script("""
-            const box = (e) => e.getBoundingClientRect();
-            return [...document.querySelectorAll('td, p, span, h1, h2, .mddag-plot > *, .stack *')]
-              .filter((e) => box(e).width && (box(e).left < 0 || box(e).right > innerWidth + 1
-                || (e.tagName === 'TD' && e.scrollWidth > e.clientWidth + 1)))
-              .map((e) => e.outerHTML.slice(0, 100));""")
-        assert outside == []
-        assert browser.execute_script('return document.documentElement.scrollWidth') <= 420
-        share = browser.execute_script("""
-            const plot = Bokeh.documents[0].get_model_by_name('callbacks');
-            return plot.inner_width / innerWidth;""")
-        assert share > 0.6      # and the pictures have most of its width
-        assert complaints(browser) == []
-    finally:
-        browser.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})

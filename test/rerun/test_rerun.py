@@ -15,7 +15,6 @@ from mddag_executor.core import Tables
 from mddag_executor.replay import replay
 from mddag_executor.rerun import (
     assert_same,
-    CallbackFailed,
     compare,
     programs,
     rerun,
@@ -296,25 +295,6 @@ def test_late_subscriptions_get_what_is_latched(bag: str, graph: Path) -> None:
     assert seen == ['a map']
 
 
-def test_a_subscription_that_comes_later(tmp_path: Path, graph: Path) -> None:
-    bag = write_bag(tmp_path / 'in.mcap', [
-        message for i in range(6) for message in (
-            (i * 100 * MS, '/points', Header(frame_id=str(i))),
-            (i * 100 * MS, '/names', String(data=f'name {i}')))])
-    seen: list[str] = []
-
-    def fill(node: Node) -> None:
-        def take(message: Header) -> None:
-            seen.append(message.frame_id)
-            if message.frame_id == '2':
-                node.create_subscription(String, '/names', lambda m: seen.append(m.data), 10)
-
-        node.create_subscription(Header, '/points', take, 10)
-
-    rerun(bag, graph, [node_with(fill)])
-    assert seen == ['0', '1', '2', 'name 2', '3', 'name 3', '4', 'name 4', '5', 'name 5']
-
-
 # --- comparing -----------------------------------------------------------------------------------
 
 def test_a_changed_constant_is_found(
@@ -354,35 +334,6 @@ def test_what_is_recorded_too_is_compared(tmp_path: Path, graph: Path) -> None:
 
 
 # --- what goes wrong -----------------------------------------------------------------------------
-
-
-def test_another_type_than_recorded(bag: str, graph: Path) -> None:
-    def fill(node: Node) -> None:
-        node.create_subscription(String, '/points', lambda message: None, 10)
-
-    with pytest.raises(RerunError, match='recorded as std_msgs/msg/Header, and the node sub'):
-        rerun(bag, graph, [node_with(fill)])
-
-
-def test_a_message_that_does_not_decode(tmp_path: Path, graph: Path) -> None:
-    bag = write_bag(tmp_path / 'in.mcap', [
-        (0, '/points', Header()), (MS, '/points', (Header, b'\0\1\0\0\1'))])
-    with pytest.raises(RerunError, match='/points: a message of it does not decode as std_msgs'):
-        rerun(bag, graph, [Filter, Sink])
-
-
-def test_a_callback_that_raises(bag: str, graph: Path) -> None:
-    def fill(node: Node) -> None:
-        def take(message: Header) -> None:
-            if message.frame_id == '7':
-                raise ValueError('seven')
-
-        node.create_subscription(Header, '/points', take, 10)
-
-    with pytest.raises(CallbackFailed) as caught:
-        rerun(bag, graph, [node_with(fill)])
-    assert str(caught.value).startswith('/filter:take: it raised ValueError: seven at 0.700000 s')
-    assert isinstance(caught.value.__cause__, ValueError)
 
 
 def test_a_circle_that_takes_no_time(bag: str, graph: Path) -> None:
