@@ -152,6 +152,7 @@ class Measurement:
 
     def __init__(self, habit: GilHabit) -> None:
         self._habit = habit
+        self._process = -1      # it rests; another thread may change that before the end
         if not habit.rests:
             self._process, self._preempted = process_time_ns(), times_preempted()
         self._own = thread_time_ns()
@@ -163,8 +164,8 @@ class Measurement:
         :param wall: the duration of the execution, ns.
         """
         own = thread_time_ns() - self._own
-        if self._habit.rests:
-            self._habit.rests -= 1
+        if self._process < 0:
+            self._habit.rests = max(0, self._habit.rests - 1)
         else:
             self._habit.ran(wall, own, process_time_ns() - self._process - own,
                             times_preempted() > self._preempted)

@@ -204,7 +204,8 @@ BREAKS: dict[str, tuple[str, Callable[[Engine], Any]]] = {
     'holders counted': ('hold the interpreter', lambda e: count(e, N_HOLDING)),
     'worker': ('runs execution', lambda e: set_state(e, running(e), WAITING)),
     'owner': ('nothing brings', lambda e: e._state.group_owner.__setitem__(0, -1)),
-    'active': ('counted are', lambda e: e._state.job_active.__setitem__(0, 9)),
+    'active': ('counted are', lambda e: e._state.job_active.__setitem__(
+        e._state.job_dag.index(0), 9)),
     'open jobs': ('jobs of DAG 0 are open', lambda e: e._state.n_open.__setitem__(0, 0)),
     'deadline': ('next deadline', lambda e: setattr(e.deadlines, 'next', 5)),
 }

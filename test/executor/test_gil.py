@@ -9,12 +9,7 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.executor import gil, publishing
-from mddag_executor.executor.gil import (
-    GilCheck,
-    LAST_CHECK_NS,
-    Schedule,
-)
+from mddag_executor.executor import publishing
 import msg_graph
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -194,31 +189,6 @@ def test_the_switch_interval_is_given_back(make_executor, make_node):
     with Spinning(executor):
         assert wait_for(lambda: seen)
     assert seen[0] == pytest.approx(0.001) and sys.getswitchinterval() == before
-
-
-def waits(
-    monkeypatch: pytest.MonkeyPatch, *steps: tuple[float, float, float, int, bool],
-) -> list[bool]:
-    """
-    Return what each check says after the first one, 10 ms after the one before.
-
-    Each step is for how long the thread computed, all others did, and it got no CPU (ms); how
-    often it got one; and whether it is asleep.
-    """
-    own, process, delay, slices, asleep = 0.0, 0.0, 0.0, 5, True
-    monkeypatch.setattr(gil, 'cpu_ns', lambda ident: int(own * MS))
-    monkeypatch.setattr(gil, 'process_time_ns', lambda: int(process * MS))
-    monkeypatch.setattr(gil, 'schedule_of', lambda tid: Schedule(int(delay * MS), slices, asleep))
-    check, found = GilCheck(), []
-    check.begin(check, 0, 0)
-    assert not check.waits(1, 1, 10 * MS)
-    for number, step in enumerate(steps, 2):
-        own, process = own + step[0], process + step[0] + step[1]
-        delay, slices, asleep = delay + step[2], slices + step[3], step[4]
-        now = number * 10 * MS
-        found.append(check.waits(1, 1, now))
-        assert now < check.at <= now + LAST_CHECK_NS
-    return found
 
 
 # --- what arrives beside a callback that computes for long ---------------------------------------
