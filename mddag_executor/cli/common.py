@@ -12,7 +12,7 @@ path costs nothing.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import json
 import os
@@ -27,7 +27,12 @@ from mddag_executor import __version__
 from mddag_executor.cli.options import Input, NamedFile, Output, Report
 from mddag_executor.cli.text import is_quiet, Progress
 from mddag_executor.errors import InputError, UsageError
-from mddag_executor.output_rules import check_distinct, check_replaced
+from mddag_executor.output_rules import (
+    check_distinct,
+    check_replaced,
+    check_results,
+    remove_results,
+)
 
 if TYPE_CHECKING:
     from mddag_executor.replay.run import Traces
@@ -252,6 +257,32 @@ def output_file(path: str) -> Iterator[BinaryIO]:
         part.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename is None:
             error.filename = path  # a full disk
+        raise
+
+
+def check_folder(path: str, names: Collection[str]) -> None:
+    """Find out whether a folder of results with files of these names can be written."""
+    check_results(Path(path), names)
+    target = Path(path).resolve()
+    if not target.parent.is_dir():
+        raise InputError(path, f'there is no directory {Path(path).parent}', 'make it first')
+    if not os.access(target.parent, os.W_OK | os.X_OK):
+        raise InputError(path, 'the directory cannot be written to', 'name another folder')
+
+
+@contextmanager
+def output_folder(path: str, names: Collection[str]) -> Iterator[Path]:
+    """Give a folder that becomes `path` when the block ends well, and vanishes otherwise."""
+    target = Path(path).resolve()   # a symbolic link stays one
+    part = target.with_name(f'.{target.name}.part')
+    remove_results(part, names)     # of a command that was killed
+    part.mkdir()
+    try:
+        yield part
+        remove_results(target, names)
+        part.rename(target)
+    except BaseException:
+        remove_results(part, names)
         raise
 
 

@@ -12,14 +12,11 @@ recording (`mddag_executor.recording.tables`), one Parquet file for each.  The r
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Collection
-import os
-from pathlib import Path, PurePath
+from pathlib import PurePath
 
 from mddag_executor.cli import common, options, recorded
 from mddag_executor.cli.text import printable, say, warn
-from mddag_executor.errors import InputError, UsageError
-from mddag_executor.output_rules import check_results, remove_results
+from mddag_executor.errors import UsageError
 
 EXAMPLE = """\
 mddag export run.mcap -o run.pftrace
@@ -55,7 +52,7 @@ def main(args: argparse.Namespace) -> int:
     check_available(form)
     span = recorded.span_of(args.begin, args.end)
     if form == _TABLES:
-        _check_folder(args.output, FILES)
+        common.check_folder(args.output, FILES)
     else:
         common.check_output(args.output)
     with recorded.opened(args) as (path, name, task_set):
@@ -63,8 +60,8 @@ def main(args: argparse.Namespace) -> int:
             recorded.check_deadlines(path, name)
         replay = recorded.as_recorded(path, name, task_set, 'exporting', span=span)
         if form == _TABLES:
-            _write_folder(
-                args.output, FILES, lambda folder: write_tables(replay.recording, folder))
+            with common.output_folder(args.output, FILES) as folder:
+                write_tables(replay.recording, folder)
         else:
             with common.output_file(args.output) as file:
                 write(form, file, replay, args.rows or 'executions')
@@ -72,32 +69,6 @@ def main(args: argparse.Namespace) -> int:
     if args.output != '-':
         say(f'exported: {printable(args.output)}')
     return 0
-
-
-def _check_folder(path: str, names: Collection[str]) -> None:
-    """Find out whether a folder can be written."""
-    target = Path(path).resolve()
-    check_results(target, names)
-    if not target.parent.is_dir():
-        raise InputError(
-            path, f'there is no directory {Path(path).parent}', 'make it first')
-    if not os.access(target.parent, os.W_OK | os.X_OK):
-        raise InputError(path, 'the directory cannot be written to', 'name another folder')
-
-
-def _write_folder(path: str, names: Collection[str], write: Callable[[Path], object]) -> None:
-    """Write a folder that is there as a whole or not at all."""
-    target = Path(path).resolve()   # a symbolic link stays one
-    part = target.with_name(f'.{target.name}.part')
-    remove_results(part, names)     # of a command that was killed
-    part.mkdir()
-    try:
-        write(part)
-        remove_results(target, names)
-        part.rename(target)
-    except BaseException:
-        remove_results(part, names)
-        raise
 
 
 def _form(args: argparse.Namespace) -> str:

@@ -3,7 +3,7 @@
 """
 The verb `generate`: random multi-deadline, multi-rate DAG sets as ordinary declarations.
 
-Several sets go into a folder, which appears when all of them are written.
+Several sets go into a folder, which appears when all of them are written (`common.output_folder`).
 """
 
 from __future__ import annotations
@@ -11,14 +11,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
-import os
-from pathlib import Path
-import shutil
 from typing import Any
 
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
-from mddag_executor.errors import InputError, UsageError
+from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.generate_options import Options
 
 EXAMPLE = """\
@@ -86,19 +83,15 @@ def main(args: argparse.Namespace) -> int:
         common.check_output(args.output)
         common.write_text(args.output, generate(every[0]))
         return 0
-    target = _check_folder(args.output)
-    part = target.with_name(f'.{target.name}.{os.getpid()}.part')
-    part.mkdir()
-    try:
-        with Progress('generating', len(every)) as line:
-            for number, each in enumerate(every):
-                text = generate(each, number)
-                (part / f'set_{number:04d}.yaml').write_text(text, encoding='utf-8')
-                line.update(number, f'of {len(every)} task sets')
-        part.replace(target)    # which is empty, if it exists
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
+    if args.output == '-':
+        raise UsageError('--sets: several declarations make a folder: name one with -o OUT')
+    names = [f'set_{number:04d}.yaml' for number in range(len(every))]
+    common.check_folder(args.output, names)
+    with common.output_folder(args.output, names) as folder, Progress(
+            'generating', len(every)) as line:
+        for number, (name, each) in enumerate(zip(names, every)):
+            (folder / name).write_text(generate(each, number), encoding='utf-8')
+            line.update(number, f'of {len(every)} task sets')
     return 0
 
 
@@ -117,15 +110,3 @@ def _every(args: argparse.Namespace) -> Iterator[Options]:
     for number in range(sets):
         share = number / (sets - 1) if sets > 1 else 0.0
         yield replace(base, utilisation=round(low + (high - low) * share, 9))
-
-
-def _check_folder(path: str) -> Path:
-    """Find out whether a new folder can be made, before the work starts."""
-    if path == '-':
-        raise UsageError('--sets: several declarations make a folder: name one with -o OUT')
-    target = Path(os.path.abspath(path))
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(path, 'it is there already, and no empty folder', 'name another one')
-    if not target.exists():
-        common.check_output(path)
-    return target
