@@ -122,7 +122,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('evaluate g.yaml --dask nonsense', '--dask nonsense: '),
     ('generate --sets 3', '--sets: several declarations make a folder: name one with -o OUT'),
     ('generate --sets 9999999 -o out', '--sets 9999999: it is too many: give at most 100000'),
-    ('generate --sets 3 -o full', 'full: this folder holds other files, for instance file: name a'),
+    ('generate --sets 3 -o full', 'full: this folder holds other files, for instance file: name'),
     ('generate --sets 3 -o none/out', 'none/out: there is no directory none: make it first'),
     ('generate --utilisation 0.6:0.2 --sets 3 -o out', '--utilisation 0.6:0.2: one task set has'),
     ('generate --utilisation 0.2:0.6', '--utilisation 0.2:0.6: one task set has one, and the sm'),

@@ -193,3 +193,13 @@ def test_schema(call: Mddag, tmp_path: Path) -> None:
     done = call('graph', 'schema', '-o', 's.json', cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, '')
     assert json.loads((tmp_path / 's.json').read_text()) == schema()
+
+
+@pytest.mark.needs('graphviz')
+def test_a_dense_picture_is_refused_at_once(call: Mddag, tmp_path: Path) -> None:
+    made = call('generate', '--dags', '1', '--vertices', '60', '--edge-probability', '1',
+                '--utilisation', '0.2', '-o', 'g.yaml', cwd=tmp_path)
+    assert made.returncode == 0
+    done = call('graph', 'draw', 'g.yaml', '-o', 'o.svg', cwd=tmp_path)
+    assert done.returncode == 2 and 'other columns, so Graphviz would take' in done.stderr
+    assert call('graph', 'draw', 'g.yaml', '-o', 'o.mmd', cwd=tmp_path).returncode == 0
