@@ -3,8 +3,9 @@
 """
 Declarations: from YAML to callbacks, paths and processes.
 
-Entries do not depend on each other, so the first error of each is collected and all are raised
-together. ``derive`` checks the rules about several entries (publishers, cycles, sinks, …).
+``include`` resolves a declaration of several files first. Entries do not depend on each other, so
+the first error of each is collected and all are raised together. ``derive`` checks the rules about
+several entries (publishers, cycles, sinks, …).
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from dataclasses import dataclass
 
 from msg_graph.duration import format_duration
 from msg_graph.errors import Collector, did_you_mean, GraphError, shown
+from msg_graph.include import as_text, read, resolve
 from msg_graph.language import CALLBACK_KEYS, Entry, FILE, NODE_KEYS, PATH_KEYS, TRIGGERS
 from msg_graph.model import Callback, Path, Process
-from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Tree
+from msg_graph.yamltext import Tree
 import yaml
 
 _WIDTH = 75
@@ -25,9 +27,9 @@ _WIDTH = 75
 @dataclass(frozen=True, slots=True)
 class Declaration:
     """
-    A declaration as written in its file; callbacks in the order of the file.
+    A declaration as written in its files; callbacks in the order of the file.
 
-    :ivar text: the text of the file.
+    :ivar text: the text of the file, or of all files as one.
     :ivar entries: the entry of each callback, by its key, and of each path, by its name, with
         their lines.
     """
@@ -41,9 +43,17 @@ class Declaration:
     entries: dict[str, Entry]
 
 
-def parse_declaration(text: str, file: str) -> Declaration:
-    """Return the declaration in a YAML text."""
-    top = _top_of(text, file)
+def parse_declaration(text: str, file: str, path: str | None = None) -> Declaration:
+    """
+    Return the declaration in a YAML text, with what it includes.
+
+    :param path: its file; None: it cannot include any.
+    """
+    tree = read(text, file)
+    resolved = resolve(tree, path)
+    if resolved is not tree:
+        text = as_text(resolved)
+    top = Entry(resolved, 'the declaration', FILE)
     found = Collector()
     workers: int | None = None
     callbacks: list[Callback] = []
@@ -55,7 +65,7 @@ def parse_declaration(text: str, file: str) -> Declaration:
     with found:
         callbacks = _callbacks(top.get('nodes'), file, entries)
     with found:
-        paths = _paths(top.get('paths') or [], file, entries)
+        paths = _paths(top.get('paths') or [], entries)
     found.check()
     with found:
         processes = read_processes(top, (callback.node for callback in callbacks))
@@ -112,25 +122,26 @@ def _callbacks(nodes: list[Tree], file: str, entries: dict[str, Entry]) -> list[
     found = Collector()
     for place, tree in enumerate(nodes, 1):
         with found:
-            entry = Entry(tree, file, f'node {place}', NODE_KEYS)
+            entry = Entry(tree, f'node {place}', NODE_KEYS)
             node = entry.get('node')
             entry.name = f'node {shown(node)}'
             for number, callback_tree in enumerate(entry.get('callbacks'), 1):
                 name = f'callback {number} of node {shown(node)}'
                 with found:
-                    each = Entry(callback_tree, file, name, CALLBACK_KEYS)
-                    callback = _callback(each, node)
+                    each = Entry(callback_tree, name, CALLBACK_KEYS)
+                    callback = _callback(each, node, file)
                     other = entries.setdefault(callback.key, each)
                     if other is not each:
+                        where = 'line ' if other.file == each.file else f'{other.file}:'
                         raise each.error(
-                            'name', f'this name is taken in line {other.line}',
+                            'name', f'this name is taken in {where}{other.line}',
                             'give each callback of a node a name of its own')
                     callbacks.append(callback)
     found.check()
     return callbacks
 
 
-def _callback(entry: Entry, node: str) -> Callback:
+def _callback(entry: Entry, node: str, top: str) -> Callback:
     name = entry.get('name')
     key = f'{node}:{name}'
     entry.name = f'callback {shown(key)}'
@@ -147,7 +158,8 @@ def _callback(entry: Entry, node: str) -> Callback:
         **{same: entry.get(same) for same in (
             'publishes', 'reads', 'release_from', 'group', 'dag', 'execution_time', 'on_late',
             'max_active_jobs', 'holds_interpreter', 'keep', 'importance', 'tolerate')},
-        line=entry.line)
+        line=entry.line,
+        file=None if entry.file == top else entry.file)
 
 
 def _period(entry: Entry, timer_period: int | None) -> int | None:
@@ -164,12 +176,12 @@ def _period(entry: Entry, timer_period: int | None) -> int | None:
     return period
 
 
-def _paths(trees: list[Tree], file: str, entries: dict[str, Entry]) -> list[Path]:
+def _paths(trees: list[Tree], entries: dict[str, Entry]) -> list[Path]:
     paths: list[Path] = []
     found = Collector()
     for place, tree in enumerate(trees, 1):
         with found:
-            entry = Entry(tree, file, f'path {place}', PATH_KEYS)
+            entry = Entry(tree, f'path {place}', PATH_KEYS)
             name = entry.get('name')
             entry.name = f'path {shown(name)}'
             path = Path(name, entry.get('callbacks'))
@@ -178,17 +190,3 @@ def _paths(trees: list[Tree], file: str, entries: dict[str, Entry]) -> list[Path
             paths.append(path)
     found.check()
     return paths
-
-
-def _top_of(text: str, file: str) -> Entry:
-    """Return the outermost mapping of a file."""
-    tree = parse_yaml(text, file)
-    if tree is None or (isinstance(tree, Scalar) and tree.is_null):
-        raise GraphError(
-            file, None, 'the file is empty', "write a declaration that starts with 'mddag: 1'")
-    if not isinstance(tree, Mapping):
-        raise GraphError(
-            file, tree.line, 'this is not a declaration', "write one that starts with 'mddag: 1'")
-    entry = Entry(tree, file, 'the declaration', FILE)
-    entry.get('mddag')
-    return entry

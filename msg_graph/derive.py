@@ -75,17 +75,19 @@ def load(path: str | PathLike[str]) -> TaskSet:
         raise GraphError(
             name, None, f'the file cannot be read ({reason or error})',
             'give the path of a declaration') from None
-    return loads(data, name)
+    return loads(data, name, name)
 
 
 def loads(
-    text: str | bytes, name: str = '<string>', *, without_deadline: list[str] | None = None
+    text: str | bytes, name: str = '<string>', path: str | PathLike[str] | None = None, *,
+    without_deadline: list[str] | None = None,
 ) -> TaskSet:
     """
     Return the task set of a declaration.
 
     :param text: the YAML; bytes must be UTF-8.
     :param name: the name used in errors.
+    :param path: its file, if it may include others from its folder.
     :param without_deadline: receives the keys of the sinks without a deadline; None: they are
         errors.
     :raises GraphError: it is not YAML, or breaks a rule of the language or of the model.
@@ -93,7 +95,9 @@ def loads(
     text = decode(text, name) if isinstance(text, bytes) else text
     try:
         with no_garbage():
-            return derive_task_set(parse_declaration(text, name), without_deadline)
+            return derive_task_set(
+                parse_declaration(text, name, None if path is None else fspath(path)),
+                without_deadline)
     except GraphError as error:
         raise with_blanks(error, text, name) from None
 

@@ -45,7 +45,7 @@ def checked(text: str, wanted: TaskSet) -> str:
 
 def without_lines(task_set: TaskSet) -> TaskSet:
     """Return the task set without line numbers."""
-    nowhere = {callback.key: {'line': 0} for callback in task_set.callbacks}
+    nowhere = {callback.key: {'line': 0, 'file': None} for callback in task_set.callbacks}
     return replace(task_set.with_callbacks(nowhere), text='')
 
 
@@ -72,7 +72,11 @@ def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Table[str, int]) 
     :param task_set: the task set of the text.
     :param deadlines: by the callback's key, ns.
     """
-    return checked(_with_deadlines(text, deadlines), with_deadlines(task_set, deadlines))
+    try:
+        result = _with_deadlines(text, deadlines)
+    except KeyError:  # the declaration has several files
+        raise _refused(task_set.file) from None
+    return checked(result, with_deadlines(task_set, deadlines))
 
 
 def _callbacks(text: str) -> Iterator[tuple[str, Any, dict[str, Any]]]:
@@ -123,7 +127,7 @@ def with_deadlines(task_set: TaskSet, deadlines: Table[str, int]) -> TaskSet:
 
 def load_processes(text: str, file: str, task_set: TaskSet) -> tuple[Process, ...]:
     """Return the processes that a file declares for a task set; its other keys are ignored."""
-    entry = Entry(parse_yaml(text, file) or Mapping(1), file, 'the file', FILE)
+    entry = Entry(parse_yaml(text, file) or Mapping(file, 1), 'the file', FILE)
     processes = read_processes(entry, (callback.node for callback in task_set.callbacks))
     if not processes:
         raise GraphError(file, None, "there is no 'processes:'",

@@ -22,6 +22,7 @@ from collections.abc import Callable
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
 import math
+import os
 import re
 from typing import Any
 
@@ -32,9 +33,14 @@ from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
 Schema = dict[str, Any]
 
+ARGUMENT = re.compile(r'[A-Za-z_][A-Za-z0-9_]*')
+ARGUMENT_USE = rf'\$\({ARGUMENT.pattern}\)'
+"""An argument of the file in a value; the JSON Schema allows it in all values."""
+
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _OF = re.compile(r'[ \t]*([0-9]{1,6})[ \t]+of[ \t]+([0-9]{1,6})[ \t]*')
 _INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
+_USE: Schema = {'type': 'string', 'pattern': ARGUMENT_USE}
 _ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
 _WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
 
@@ -140,13 +146,13 @@ class Entry:
     :ivar name: the mapping's name in errors; it may be set later.
     """
 
-    def __init__(self, tree: Tree, file: str, name: str, keys: Table[str, Key]) -> None:
-        self.file = file
+    def __init__(self, tree: Tree, name: str, keys: Table[str, Key]) -> None:
+        self.file = tree.file
         self.name = name
         self._keys = keys
         if not isinstance(tree, Mapping):
             raise GraphError(
-                file, tree.line, f'{name} is {kind_of(tree)}',
+                tree.file, tree.line, f'{name} is {kind_of(tree)}',
                 f'write a mapping with the keys {", ".join(keys)}')
         self._tree = tree
         for key in tree.entries:
@@ -231,7 +237,7 @@ def name(what: Name) -> Kind:
     return text(what.check, {
         # YAML reads some short names as numbers, and this program does not.
         'type': 'string' if what.is_global else ['string', 'integer'],
-        'pattern': f'^(?:{what.pattern.pattern})$', 'maxLength': what.longest})
+        'pattern': f'^(?:{what.pattern.pattern})$|{ARGUMENT_USE}', 'maxLength': what.longest})
 
 
 def choice(*words: str, missing: str | None = '') -> Kind:
@@ -242,7 +248,8 @@ def choice(*words: str, missing: str | None = '') -> Kind:
         return (f'{shown(word)} is not known',
                 did_you_mean(word, words, f'use {", ".join(words)}'))
 
-    return text(check, {'enum': list(words)}, words[0] if missing == '' else missing)
+    return text(
+        check, {'anyOf': [{'enum': list(words)}, _USE]}, words[0] if missing == '' else missing)
 
 
 def items(form: Schema) -> Kind:
@@ -288,7 +295,7 @@ def texts(item: Kind, least: int = 0, *too_few: str) -> Kind:
 
 def numbers(**bounds: int) -> Kind:
     """Return the kind of a non-empty list of finite numbers."""
-    trees = items({'type': 'number', **bounds})
+    trees = items({'anyOf': [{'type': 'number', **bounds}, _USE]})
 
     def read(entry: Entry, key: str, value: Tree) -> list[float]:
         found = []
@@ -328,7 +335,8 @@ def whole(least: int, most: int) -> Kind:
                               f'write a number from {least} to {most}')
         return int(value.text)
 
-    return Kind(read, {'type': 'integer', 'minimum': least, 'maximum': most})
+    return Kind(read, {'anyOf': [
+        {'type': 'integer', 'minimum': least, 'maximum': most}, _USE]})
 
 
 def truth() -> Kind:
@@ -338,7 +346,19 @@ def truth() -> Kind:
             raise entry.error(key, f'{shown(key)} is {_described(value)}', 'write true or false')
         return value.text == 'true'
 
-    return Kind(read, {'type': 'boolean'})
+    return Kind(read, {'anyOf': [{'type': 'boolean'}, _USE]})
+
+
+def pairs(value_kind: Kind) -> Kind:
+    """Return the kind of a mapping of texts: key, text and line of each."""
+    def read(entry: Entry, key: str, value: Tree) -> list[tuple[str, str, int]]:
+        if not isinstance(value, Mapping):
+            raise entry.error(key, f"'{key}' is no mapping", f'write {key}: {{name: value}}')
+        keys = dict.fromkeys(value.entries, Key(value_kind, ''))
+        inner = Entry(value, f"{entry.name}: '{key}'", keys)
+        return [(each, inner.get(each), inner.line_of(each)) for each in keys]
+
+    return Kind(read, {'type': 'object', 'additionalProperties': value_kind.schema}, [])
 
 
 def kind_of(tree: Tree) -> str:
@@ -361,6 +381,13 @@ def _check_format(given: str) -> tuple[str, str] | None:
     return f'{shown(given)} is no known version of the format', f"write 'mddag: {FORMAT}'"
 
 
+def _check_file(path: str) -> tuple[str, str] | None:
+    if os.path.isabs(path) or path.startswith('~') or '\0' in path or not path:
+        return (f'{shown(path)} is no relative path',
+                'write it as seen from the file that includes it')
+    return None
+
+
 def weakly_hard() -> Kind:
     """Return the kind of 'N of M': at most N misses in any M results in a row."""
     def read(entry: Entry, key: str, value: Tree) -> WeaklyHard:
@@ -375,14 +402,14 @@ def weakly_hard() -> Kind:
                 'tolerate at least 1 miss, and fewer than all')
         return WeaklyHard(misses, of)
 
-    return Kind(read, {'type': 'string', 'pattern': f'^(?:{_OF.pattern})$',
+    return Kind(read, {'type': 'string', 'pattern': f'^(?:{_OF.pattern})$|{ARGUMENT_USE}',
                        'examples': ['1 of 100']})
 
 
 def _read_execution_time(entry: Entry, key: str, value: Tree) -> ExecutionTime:
     if isinstance(value, Scalar):
         return ExecutionTime((time(least_ns=1).read(entry, key, value),), (50.0,))
-    inner = Entry(value, entry.file, f'execution time of {entry.name}', QUANTILES)
+    inner = Entry(value, f'execution time of {entry.name}', QUANTILES)
     quantiles_us = inner.get('quantiles_us')
     if quantiles_us[0] < 0:
         raise inner.error('quantiles_us', f'the quantile {quantiles_us[0]} is negative',
@@ -401,17 +428,15 @@ def _read_execution_time(entry: Entry, key: str, value: Tree) -> ExecutionTime:
 
 def _read_processes(entry: Entry, key: str, value: Tree) -> dict[str, dict[str, int]]:
     """Return the nodes of each process, with their lines."""
-    if not isinstance(value, Mapping):
-        raise entry.error(key, f"'{key}' is no mapping", f'write {key}: {{NAME: [/node, …], …}}')
-    nodes = texts(name(NODE))
-    inner = Entry(value, entry.file, f"{entry.name}: '{key}'", dict.fromkeys(
-        value.entries, Key(nodes, '')))
     found: dict[str, dict[str, int]] = {}
-    for process in value.entries:
+    for process, _, line in _NODES_BY_PROCESS.read(entry, key, value):
         wrong = PROCESS.check(process)
         if wrong is not None:
-            raise inner.error(process, *wrong)
-        found[process] = {node: inner.line_of(process, node) for node in inner.get(process)}
+            problem, remedy = wrong
+            raise GraphError(entry.file, line, f'{entry.name}: {shown(key)}: {problem}', remedy)
+        nodes = value.entries[process] if isinstance(value, Mapping) else None
+        assert isinstance(nodes, Sequence)
+        found[process] = {each.text: each.line for each in nodes.items if isinstance(each, Scalar)}
     return found
 
 
@@ -442,9 +467,11 @@ def _mapping(keys: dict[str, Key]) -> Schema:
                            for word, key in keys.items()}}
 
 
+_NODES_BY_PROCESS = pairs(texts(name(NODE)))
 _PROCESSES = Kind(_read_processes, {
-    'type': 'object', 'additionalProperties': texts(name(NODE)).schema,
-    'propertyNames': {'pattern': f'^(?:{PROCESS.pattern.pattern})$'}}, {})
+    **_NODES_BY_PROCESS.schema, 'propertyNames': {'pattern': f'^(?:{PROCESS.pattern.pattern})$'}},
+    {})
+_VALUES = pairs(text(lambda _: None, {'type': ['string', 'number', 'boolean', 'null']}))
 
 QUANTILES = {
     'quantiles_us': Key(numbers(minimum=0), 'Quantiles in us, rising.', needed=True),
@@ -455,6 +482,10 @@ _EXECUTION_TIME = Kind(_read_execution_time, {'oneOf': [time().schema, _mapping(
 FILE = {
     'mddag': Key(text(_check_format, {'enum': [int(FORMAT), FORMAT]}),
                  'Version of the format.', needed=True),
+    'arguments': Key(_VALUES,
+                     'Arguments of this file, $(name) in its values, with their defaults.'),
+    'include': Key(_entries('include'),
+                   'Files whose nodes and paths come before those of this one.'),
     'workers': Key(whole(1, MOST_WORKERS), 'Number of workers that the system is made for.'),
     'nodes': Key(_entries('node'),
                  'The nodes; a node may have several entries, and their order counts for ties.',
@@ -462,6 +493,13 @@ FILE = {
     'processes': Key(_PROCESSES, 'The processes that the nodes run in, each with its nodes; those '
                      'that are not named run in the first.'),
     'paths': Key(_entries('path'), 'End-to-end paths over trigger and queue edges.'),
+}
+INCLUDE = {
+    'file': Key(text(_check_file, {'type': 'string'}), 'The file, as seen from this one.',
+                needed=True),
+    'namespace': Key(name(NODE), 'Put before all names of the included file.'),
+    'remap': Key(pairs(name(TOPIC)), 'Names of the included file and what they become.'),
+    'set': Key(_VALUES, 'Values of the arguments of the included file.'),
 }
 NODE_KEYS = {
     'node': Key(name(NODE), 'Fully qualified name of the node.', needed=True),
@@ -504,7 +542,7 @@ CALLBACK_KEYS = {
 PATH_KEYS = {
     'name': Key(name(PATH), 'Name of the path.', needed=True),
     'callbacks': Key(texts(text(check_key, {'type': 'string', 'pattern': (
-        f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$')}),
+        f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$|{ARGUMENT_USE}')}),
         2, 'a path of one callback', 'give at least 2'),
         "The callbacks along it, each as '/node:callback'.", needed=True),
 }
@@ -517,7 +555,10 @@ def schema() -> Schema:
         'title': 'mddag declaration',
         'description': 'Nodes, their callbacks and what starts them, with periods and deadlines.',
         **_mapping(FILE),
+        'required': ['mddag'],
+        'anyOf': [{'required': ['nodes']}, {'required': ['include']}],
         'definitions': {
+            'include': {'oneOf': [INCLUDE['file'].kind.schema, _mapping(INCLUDE)]},
             'node': _mapping(NODE_KEYS),
             'callback': {**_mapping(CALLBACK_KEYS),
                          'oneOf': [{'required': [key]} for key in TRIGGERS]},
@@ -525,7 +566,7 @@ def schema() -> Schema:
             'time': {
                 'type': 'string',
                 'pattern': rf'^[ \t]*\+?([0-9]+(\.[0-9]*)?|\.[0-9]+)[ \t]*({"|".join(UNITS)})'
-                           r'[ \t]*$',
+                           rf'[ \t]*$|{ARGUMENT_USE}',
                 'examples': ['100ms', '20us', '1.5s'],
             },
         },

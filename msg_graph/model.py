@@ -113,6 +113,7 @@ class Callback:
         when the next job's is ready.
     :ivar importance: of a sink, in an overload.
     :ivar tolerate: of a sink: how many deadline misses are tolerated, or None.
+    :ivar file: name of the file that declares it; None: that of the task set.
     """
 
     node: str
@@ -137,6 +138,7 @@ class Callback:
     keep: Keep = 'all'
     importance: Importance = 'normal'
     tolerate: WeaklyHard | None = None
+    file: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +246,7 @@ class TaskSet:
     :ivar paths: the declared end-to-end paths, in file order.
     :ivar workers: declared number of workers, or None.
     :ivar file: name of the declaration's file.
-    :ivar text: the text of the declaration.
+    :ivar text: the text of the declaration, resolved if it includes other files.
     :ivar processes: the declared processes, which contain each declared node once; may be empty.
     :ivar vertices: the vertices of all DAGs, DAG by DAG.
     """

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-YAML text to a tree of plain values with their lines.
+YAML text to a tree of plain values with their files and lines.
 
 Theory of operation
 -------------------
@@ -39,10 +39,11 @@ _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
 class Scalar:
     """A text; ``plain`` if it is written without quotes."""
 
-    __slots__ = ('line', 'text', 'plain')
+    __slots__ = ('file', 'line', 'text', 'plain')
     size = 1
 
-    def __init__(self, line: int, text: str, plain: bool) -> None:
+    def __init__(self, file: str, line: int, text: str, plain: bool) -> None:
+        self.file = file
         self.line = line
         self.text = text
         self.plain = plain
@@ -56,20 +57,22 @@ class Scalar:
 class Sequence:
     """A list of trees."""
 
-    __slots__ = ('line', 'items', 'size')
+    __slots__ = ('file', 'line', 'items', 'size')
 
-    def __init__(self, line: int) -> None:
+    def __init__(self, file: str, line: int, items: list[Tree] | None = None) -> None:
+        self.file = file
         self.line = line
-        self.items: list[Tree] = []
+        self.items = [] if items is None else items
         self.size = 1
 
 
 class Mapping:
     """Trees by key, in file order, and the line of each key."""
 
-    __slots__ = ('line', 'entries', 'key_lines', 'size')
+    __slots__ = ('file', 'line', 'entries', 'key_lines', 'size')
 
-    def __init__(self, line: int) -> None:
+    def __init__(self, file: str, line: int) -> None:
+        self.file = file
         self.line = line
         self.entries: dict[str, Tree] = {}
         self.key_lines: dict[str, int] = {}
@@ -155,11 +158,11 @@ class _Builder:
                 event, f'the tag {shown(event.tag)} has no meaning here', 'remove the tag')
         line = event.start_mark.line + 1
         if kind is yaml.ScalarEvent:
-            scalar = Scalar(line, event.value, not event.style)
+            scalar = Scalar(self._file, line, event.value, not event.style)
             if event.anchor is not None:
                 self._anchors[event.anchor] = scalar
             return scalar
-        tree = Sequence(line) if kind is yaml.SequenceStartEvent else Mapping(line)
+        tree = (Sequence if kind is yaml.SequenceStartEvent else Mapping)(self._file, line)
         if event.anchor is not None:
             self._anchors[event.anchor] = tree
         self._open.append(tree)

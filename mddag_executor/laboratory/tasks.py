@@ -87,8 +87,8 @@ def _unknown(task_set: TaskSet) -> AnalysisError:
     missing = [callback for callback in task_set.callbacks if callback.execution_time is None]
     first, others = missing[0], len(missing) - 1
     also = f' (and {counted(others, "more callback")})' if others else ''
-    return AnalysisError(f'{task_set.file}:{first.line}: {first.key}{also} declares no '
-                         'execution_time: add one')
+    place = f'{first.file or task_set.file}:{first.line}'
+    return AnalysisError(f'{place}: {first.key}{also} declares no execution_time: add one')
 
 
 def _budget(time: ExecutionTime, budget: str) -> int:

@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import sys
 
-from benchmarks import autoware_multi
+import msg_graph
 from msg_graph.language import schema
 import pytest
 
@@ -32,7 +32,7 @@ nodes:
 
 def test_standard_input_and_output(call: Mddag, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)
-    text = autoware_multi.task_set().text
+    text = msg_graph.load(CONFIG / 'autoware_multi.yaml').text
     done = call('graph', 'check', '-', '--json', '-', stdin=text)
     assert done.returncode == 0
     warned = [line.partition(': its deadline is longer than its period, and ')[0]

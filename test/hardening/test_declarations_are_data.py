@@ -95,6 +95,27 @@ def test_layers_that_double_at_each_step() -> None:
         msg_graph.loads(f'{HEAD}nodes: [{{node: /n, callbacks: [{", ".join(rows)}]}}]')
 
 
+@pytest.mark.parametrize('name', [
+    '/etc/passwd', '../secret.yaml', 'sub/../../secret.yaml', '~/secret.yaml', 'link', 'folder',
+    'folder/link', 'fifo', '/dev/zero', '.', '"a\\0b"', '"-"', 'file:///etc/passwd', '$(HOME)/x',
+    "''", 'null'])
+def test_includes_stay_in_their_folder(tmp_path: Path, name: str) -> None:
+    """And what is outside of it is not even looked at."""
+    secret = tmp_path / 'secret.yaml'
+    secret.write_text('mddag: 1\nnodes: [the secret]\n')
+    inside = tmp_path / 'inside'
+    (inside / 'folder').mkdir(parents=True)
+    (inside / 'sub').mkdir()
+    for link in (inside / 'link', inside / 'folder' / 'link'):
+        link.symlink_to(secret)
+    os.mkfifo(inside / 'fifo')
+    (inside / 'graph.yaml').write_text(f'{HEAD}include: [{name}]\n')
+    with pytest.raises(msg_graph.GraphError) as caught:
+        msg_graph.load(inside / 'graph.yaml')
+    assert caught.value.file == str(inside / 'graph.yaml')
+    assert 'the secret' not in str(caught.value) and 'root:' not in str(caught.value)
+
+
 @pytest.mark.parametrize('text', [
     '[' * 200_000, '{"d": ' * 100_000, f'{{"d": {{"/n:x": 1{"0" * 5000}}}}}', 'NaN', '1e999', '',
     '{"control": {"/x:y": "\\u001b[2J"}}', '\ud800'.encode('utf-8', 'replace').decode()],

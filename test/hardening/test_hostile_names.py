@@ -142,6 +142,24 @@ def judge_with(tmp_path: Path, field: str, text: str) -> None:
         json.dumps(result)
 
 
+@pytest.mark.parametrize('include', ['/etc/passwd', 'secret.yaml', '../secret.yaml'])
+def test_a_declaration_in_a_trace_includes_nothing(
+    call: Mddag, tmp_path: Path, include: str
+) -> None:
+    (tmp_path / 'secret.yaml').write_text('mddag: 1\nnodes: [this is secret]\n')
+    event = next(event for event in read_events(BAG) if event['_name'] == 'mddag:task_set')
+    with TraceFile(tmp_path / 'run.mcap') as file:
+        values = dict(event, yaml=f'mddag: 1\ninclude: [{include}]\n',
+                      file=str(tmp_path / 'graph.yaml'))
+        file.add('task_set', event['_timestamp'], 1, 1, *(
+            values.get(name, 0) for name, _ in EVENTS['mddag:task_set'].fields))
+    done = call('replay', 'run.mcap', cwd=tmp_path)
+    assert done.returncode == 2
+    assert 'secret]' not in done.stderr and 'root:' not in done.stderr
+    assert done.stderr.count('\n') == 1
+    assert 'includes nothing' in done.stderr or 'relative' in done.stderr
+
+
 @pytest.mark.parametrize('names', [
     ['../secret.mcap'], ['/etc/passwd'], ['sub/../../secret.mcap'], ['\x00'], [5], {}, [[]], None])
 def test_a_bag_names_only_its_own_files(call: Mddag, tmp_path: Path, names: object) -> None:

@@ -122,7 +122,7 @@ HEAD = 'nodes:\n- node: /a\n  callbacks:\n  - {name: t, timer: 1ms, deadline: 1m
     (f'mddag: 1\nnodes:\n- /a {MARK}\n', "node 1 is the text '/a'"),
     (f'mddag: 1\nnode: [] {MARK}\n', "unknown key 'node': did you mean 'nodes'?"),
     (f'mddag: 1\nxyz: [] {MARK}\n',
-     "unknown key 'xyz': use mddag, workers, nodes, processes, paths"),
+     "unknown key 'xyz': use mddag, arguments, include, workers, nodes, processes, paths"),
     (f'mddag: 1\nworkers: 0 {MARK}\n' + HEAD, 'from 1 to 4096'),
     (f'mddag: 1\nworkers: 4097 {MARK}\n' + HEAD, 'from 1 to 4096'),
     (f'mddag: 1\nworkers: seven {MARK}\n' + HEAD, 'whole number'),

@@ -45,8 +45,9 @@ def test_it_is_a_schema() -> None:
     jsonschema.Draft7Validator.check_schema(schema())
 
 
-def test_what_ships_is_valid() -> None:
-    assert errors((CONFIG / 'autoware.yaml').read_text(encoding='utf-8')) == []
+@pytest.mark.parametrize('name', ['autoware.yaml', 'autoware_multi.yaml'])
+def test_what_ships_is_valid(name: str) -> None:
+    assert errors((CONFIG / name).read_text(encoding='utf-8')) == []
 
 
 def test_a_declaration_with_every_key_is_valid() -> None:
@@ -55,7 +56,24 @@ def test_a_declaration_with_every_key_is_valid() -> None:
     words = GRAPH.replace('{', ' ').replace(',', ' ').split()
     keys = {*language.FILE, *language.NODE_KEYS, *language.CALLBACK_KEYS,
             *language.PATH_KEYS, *language.QUANTILES}
-    assert {f'{key}:' for key in keys} <= set(words)
+    assert {f'{key}:' for key in keys} - {'arguments:', 'include:'} <= set(words)
+
+
+def test_a_declaration_of_several_files_is_valid() -> None:
+    text = """\
+mddag: 1
+arguments: {period: 10ms, workers: }
+include:
+  - other.yaml
+  - {file: one.yaml, namespace: /front, remap: {/a: /b}, set: {period: $(period), on: 3}}
+workers: $(workers)
+nodes:
+  - node: /$(period)
+    callbacks: [{name: $(period)_x, timer: $(period), deadline: 1ms, on_late: $(period)}]
+"""
+    assert errors(text) == []
+    assert errors(text.replace('namespace', 'name_space')) != []
+    assert errors(text.replace('remap: {/a: /b}', 'remap: {/a: b}')) != []
 
 
 @pytest.mark.parametrize(('right', 'wrong'), [

@@ -7,7 +7,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from benchmarks import autoware_multi
 from mddag_executor.simulate import (
     draw_execution_times,
     Load,
@@ -74,8 +73,6 @@ def by_hand(
 
 
 def autoware(name: str = 'autoware_multi') -> TaskSet:
-    if name == 'autoware_multi':
-        return autoware_multi.task_set()
     return msg_graph.load(CONFIG / f'{name}.yaml')
 
 

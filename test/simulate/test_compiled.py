@@ -16,7 +16,6 @@ import random
 import subprocess
 import sys
 
-from benchmarks import autoware_multi
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import POLICIES, Tables
@@ -24,6 +23,7 @@ from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.experiment import judge_of
 from mddag_executor.simulate import compiling, Load, schedule, Settings, simulate
 from mddag_executor.simulate.load import as_arrays, FAILS, RUNS, SKIPPED
+from msg_graph import load
 import numpy as np
 import pytest
 
@@ -33,6 +33,7 @@ pytestmark = [
     pytest.mark.skipif(not compiling.available(), reason='numba is not there'),
     pytest.mark.timeout(400),  # a first run compiles
 ]
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
 EVERY_RULE = cases(overheads=True, importance=True)
 
 
@@ -165,7 +166,7 @@ def test_runs_do_not_disturb_one_another(
 
 @pytest.mark.parametrize('policy', POLICIES)
 def test_autoware(policy: str) -> None:
-    task_set = autoware_multi.task_set()
+    task_set = load(CONFIG / 'autoware_multi.yaml')
     times = Draws(task_set, 11).times(0, 3).tolist()
     row = times[2]
     split, place = [], 0

@@ -1,0 +1,267 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Declarations that are put together from several files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import os
+from pathlib import Path
+import re
+
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+from msg_graph import GraphError, load, loads, Process, TaskSet
+from msg_graph.edit import without_lines
+import pytest
+
+TWO = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks: [{name: a, timer: 1ms, publishes: [/x]}]
+  - node: /b
+    callbacks: [{name: b, subscription: /x, deadline: 1ms}]
+  - node: /c
+    callbacks: [{name: c, subscription: /x, deadline: 1ms}]
+"""
+SENSOR = """\
+mddag: 1
+workers: 99
+arguments:
+  period: 100ms
+  late:
+nodes:
+  - node: /driver
+    callbacks:
+      - {name: read, timer: $(period), publishes: [/points, /raw], dag: lidar}
+  - node: /filter
+    callbacks:
+      - {name: crop, subscription: /points, publishes: [/cropped], reads: [/shared]}
+      - {name: log, subscription: /raw, deadline: $(late)}
+paths:
+  - {name: way, callbacks: ['/driver:read', '/filter:crop']}
+"""
+TOP = """\
+mddag: 1
+workers: 3
+include:
+  - file: parts/sensor.yaml
+    namespace: /front/left
+    remap: {/cropped: /left, /shared: /twist}
+    set: {late: 80ms}
+  - file: parts/sensor.yaml
+    namespace: /rear
+    remap: {/cropped: /behind, /shared: /twist}
+    set: {late: 70ms, period: 50ms}
+nodes:
+  - node: /vehicle
+    callbacks:
+      - {name: speed, timer: 20ms, publishes: [/twist], deadline: 20ms}
+  - node: /fuse
+    callbacks:
+      - {name: a, subscription: /left, deadline: 90ms}
+      - {name: b, subscription: /behind, deadline: 40ms}
+"""
+ONE_FILE = """\
+mddag: 1
+workers: 3
+nodes:
+  - node: /front/left/driver
+    callbacks:
+      - {name: read, timer: 100ms, publishes: [/front/left/points, /front/left/raw],
+         dag: /front/left/lidar}
+  - node: /front/left/filter
+    callbacks:
+      - {name: crop, subscription: /front/left/points, publishes: [/left], reads: [/twist]}
+      - {name: log, subscription: /front/left/raw, deadline: 80ms}
+  - node: /rear/driver
+    callbacks:
+      - {name: read, timer: 50ms, publishes: [/rear/points, /rear/raw], dag: /rear/lidar}
+  - node: /rear/filter
+    callbacks:
+      - {name: crop, subscription: /rear/points, publishes: [/behind], reads: [/twist]}
+      - {name: log, subscription: /rear/raw, deadline: 70ms}
+  - node: /vehicle
+    callbacks:
+      - {name: speed, timer: 20ms, publishes: [/twist], deadline: 20ms}
+  - node: /fuse
+    callbacks:
+      - {name: a, subscription: /left, deadline: 90ms}
+      - {name: b, subscription: /behind, deadline: 40ms}
+paths:
+  - {name: front.left.way, callbacks: ['/front/left/driver:read', '/front/left/filter:crop']}
+  - {name: rear.way, callbacks: ['/rear/driver:read', '/rear/filter:crop']}
+"""
+
+
+def write(folder: Path, **files: str) -> Path:
+    """Write files, named by their stems with `__` for a folder; return the path of `top`."""
+    for name, text in files.items():
+        path = folder / (name.replace('__', '/') + '.yaml')
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    return folder / 'top.yaml'
+
+
+def plain(task_set: TaskSet) -> TaskSet:
+    """Return the task set without what tells of files and lines."""
+    callbacks = {c.key: replace(c, line=0, file=None) for c in task_set.callbacks}
+    return replace(
+        without_lines(task_set), file='', callbacks=tuple(callbacks.values()),
+        dags=tuple(replace(dag, vertices=tuple(
+            replace(v, callback=callbacks[v.callback.key]) for v in dag.vertices))
+            for dag in task_set.dags))
+
+
+def test_it_is_what_one_file_would_be(tmp_path: Path) -> None:
+    task_set = load(write(tmp_path, top=TOP, parts__sensor=SENSOR))
+    assert plain(task_set) == plain(loads(ONE_FILE))
+    read = task_set.callback('/front/left/driver:read')
+    assert (read.file, read.line) == (str(tmp_path / 'parts/sensor.yaml'), 9)
+    assert task_set.callback('/fuse:a').file is None
+
+
+def test_the_text_needs_no_other_file(tmp_path: Path) -> None:
+    task_set = load(write(tmp_path, top=TOP, parts__sensor=SENSOR))
+    again = loads(task_set.text)
+    assert plain(again) == plain(task_set)
+    assert load(tmp_path / 'top.yaml').text == task_set.text
+
+
+def test_the_flat_text_keeps_every_key(tmp_path: Path) -> None:
+    from .test_schema import GRAPH
+    task_set = load(write(tmp_path, top=GRAPH.replace('workers: 3', 'workers: 3\narguments: {}')))
+    assert 'arguments' not in task_set.text
+    assert plain(loads(task_set.text)) == plain(loads(GRAPH)) == plain(task_set)
+
+
+def test_includes_within_includes(tmp_path: Path) -> None:
+    task_set = load(write(
+        tmp_path, top='mddag: 1\ninclude: [{file: a/mid.yaml, namespace: /x, '
+        'remap: {/in/inner: /far/inner}, set: {p: 30ms}}]\n',
+        a__mid='mddag: 1\narguments: {p: }\ninclude: [{file: ../b/leaf.yaml, namespace: /in, '
+        'set: {q: $(p)}}]\n',
+        b__leaf='mddag: 1\narguments: {q: }\nnodes: [{node: /inner, callbacks: [{name: t, '
+        'timer: $(q), deadline: $(q)}, {name: u, timer: 1s, deadline: $(q), dag: u}]}]\n'))
+    assert [(c.key, c.period_ns) for c in task_set.callbacks] == [
+        ('/far/inner:t', 30_000_000), ('/far/inner:u', 1_000_000_000)]
+
+
+@pytest.mark.parametrize(('wrong', 'right', 'place', 'problem'), [
+    ('timer: $(period)', 'timer: $(perod)', 'parts/sensor.yaml:9',
+     "'$(perod)' is no argument of this file: did you mean 'period'?"),
+    ('deadline: $(late)', 'deadline: 5', 'parts/sensor.yaml:13', 'has no unit'),
+    ('subscription: /raw', 'subscription: /rawe', 'parts/sensor.yaml:13',
+     "no callback publishes '/front/left/rawe': did you mean '/front/left/raw'?"),
+    ('set: {late: 80ms}', 'set: {}', 'parts/sensor.yaml:5', "'late' has no value"),
+    ('set: {late: 80ms}', 'set: {lat: 80ms, late: 1s}', 'parts/sensor.yaml:3',
+     "sets 'lat', which is no argument of this file: did you mean 'late'?"),
+    ('/shared: /twist}\n    set: {late: 80', '/share: /twist}\n    set: {late: 80', 'top.yaml:6',
+     "remaps '/share', which the included file does not name: did you mean '/shared'?"),
+    ('remap: {/cropped: /left,', 'remap: {/cropped: left,', 'top.yaml:6', 'not an absolute topic'),
+    ('namespace: /rear', 'namespace: rear', 'top.yaml:9', 'is not an absolute node name'),
+    ('namespace: /rear', 'name: /rear', 'top.yaml:9', "unknown key 'name'"),
+    ('parts/sensor.yaml\n    namespace: /rear', 'parts/none.yaml\n    namespace: /rear',
+     'top.yaml:8', 'cannot be read (No such file or directory)'),
+    ('parts/sensor.yaml\n    namespace: /rear', '/etc/passwd\n    namespace: /rear',
+     'top.yaml:8', "'/etc/passwd' is no relative path"),
+    ('parts/sensor.yaml\n    namespace: /rear', '../x.yaml\n    namespace: /rear',
+     'top.yaml:8', 'lies outside of the folder of the first file'),
+    ('parts/sensor.yaml\n    namespace: /rear', 'link.yaml\n    namespace: /rear',
+     'top.yaml:8', 'lies outside of the folder of the first file'),
+    ('parts/sensor.yaml\n    namespace: /rear', 'pipe.yaml\n    namespace: /rear',
+     'top.yaml:8', 'it is no regular file'),
+    ('parts/sensor.yaml\n    namespace: /rear', 'parts\n    namespace: /rear',
+     'top.yaml:8', 'it is no regular file'),
+    ('namespace: /rear', 'namespace: /front/left', 'parts/sensor.yaml:9',
+     'this name is taken in line 9'),
+    ('mddag: 1\nworkers: 99', 'mddag: 2\nworkers: 99', 'parts/sensor.yaml:1', 'no known version'),
+    ('arguments:\n', 'argument:\n', 'parts/sensor.yaml:3', "unknown key 'argument'"),
+    ('  period: 100ms', '  1period: 100ms', 'parts/sensor.yaml:4', 'is no name for an argument'),
+    ('  period: 100ms', '  period: [1]', 'parts/sensor.yaml:4', 'is no text'),
+    ('    remap: {/cropped: /behind, /shared: /twist}', '    remap: [1]', 'top.yaml:10',
+     "'remap' is no mapping"),
+])
+def test_errors_name_their_file(
+        tmp_path: Path, wrong: str, right: str, place: str, problem: str) -> None:
+    assert wrong in TOP + SENSOR
+    outside = tmp_path.parent / 'outside.yaml'
+    outside.write_text('mddag: 1\n')
+    (tmp_path / 'link.yaml').symlink_to(outside)
+    os.mkfifo(tmp_path / 'pipe.yaml')
+    top = write(tmp_path, top=TOP.replace(wrong, right),
+                parts__sensor=SENSOR.replace(wrong, right))
+    with pytest.raises(GraphError) as caught:
+        load(top)
+    texts = [str(error) for error in caught.value.errors]
+    assert any(text.startswith(f'{tmp_path / place}: ') and problem in text for text in texts), (
+        texts)
+    assert all('\n' not in text for text in texts)
+
+
+def test_errors_of_several_files_come_together(tmp_path: Path) -> None:
+    top = write(tmp_path, top=TOP.replace('deadline: 90ms', 'deadline: 90'),
+                parts__sensor=SENSOR.replace('subscription: /raw', 'subscription: raw'))
+    with pytest.raises(GraphError) as caught:
+        load(top)
+    assert [(Path(error.file).name, error.line) for error in caught.value.errors] == [
+        ('sensor.yaml', 13), ('sensor.yaml', 13), ('top.yaml', 18)]
+
+
+def test_cycles(tmp_path: Path) -> None:
+    top = write(tmp_path, top='mddag: 1\ninclude: [a.yaml]\n', a='mddag: 1\ninclude: [b.yaml]\n',
+                b='mddag: 1\n\ninclude: [a.yaml]\n')
+    with pytest.raises(GraphError, match=re.escape('include each other in a cycle')) as caught:
+        load(top)
+    assert (Path(caught.value.file).name, caught.value.line) == ('b.yaml', 3)
+    write(tmp_path, b='mddag: 1\ninclude: [./../' + tmp_path.name + '/top.yaml]\n')
+    with pytest.raises(GraphError, match='include each other in a cycle'):
+        load(top)
+
+
+def test_too_many(tmp_path: Path) -> None:
+    files = {f'f{i}': f'mddag: 1\ninclude: [{", ".join([f"f{i + 1}.yaml"] * 8)}]\n'
+             for i in range(6)}
+    with pytest.raises(GraphError, match='are included'):
+        load(write(tmp_path, top='mddag: 1\ninclude: [f0.yaml]\n', **files,
+                   f6='mddag: 1\narguments: {}\n'))
+
+
+def test_values_do_not_explode(tmp_path: Path) -> None:
+    files = {f'f{i}': f'mddag: 1\narguments: {{a: }}\ninclude: [{{file: f{i + 1}.yaml, '
+                      'set: {a: $(a)$(a)$(a)}}]\n' for i in range(14)}
+    with pytest.raises(GraphError, match='this value is too long'):
+        load(write(tmp_path, top='mddag: 1\ninclude: [{file: f0.yaml, set: {a: abc}}]\n', **files))
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_files_give_errors_and_nothing_else(tmp_path: Path, data: st.DataObject) -> None:
+    texts = []
+    for text in (TOP, SENSOR):
+        for _ in range(data.draw(st.integers(0, 2))):
+            at = data.draw(st.integers(0, len(text)))
+            end = data.draw(st.integers(at, min(len(text), at + 12)))
+            text = text[:at] + data.draw(st.sampled_from(
+                ['', '\n', ': ', '$(', '$(late)', '[', '{}', '*x', '&x', '~', 'top.yaml', '  ',
+                 '/', '\x1b', '- ', "'", 'parts/sensor.yaml', '..'])) + text[end:]
+        texts.append(text)
+    top = write(tmp_path, top=texts[0], parts__sensor=texts[1])
+    try:
+        task_set = load(top)
+    except GraphError as error:
+        assert all('\n' not in str(each) and '\x1b' not in str(each) for each in error.errors)
+    else:
+        assert plain(loads(task_set.text)) == plain(task_set)
+
+
+def test_those_of_an_included_file_do_not_count(tmp_path: Path) -> None:
+    (tmp_path / 'inner.yaml').write_text(TWO + 'processes: {inner: [/a], other: [/b]}\n')
+    top = tmp_path / 'top.yaml'
+    top.write_text('mddag: 1\ninclude: [inner.yaml]\n')
+    assert load(top).processes == ()
+    top.write_text('mddag: 1\ninclude: [inner.yaml]\nprocesses: {x: [/b], y: [/c]}\n')
+    tasks = load(top)
+    assert tasks.processes == (Process('x', ('/a', '/b')), Process('y', ('/c',)))
+    assert loads(tasks.text).processes == tasks.processes
