@@ -69,7 +69,7 @@ TASKS = {
         'evaluate': 'measure acceptance ratios over many simulated runs',
         'generate': 'make random multi-deadline, multi-rate DAG sets',
         'graph analyse': 'test whether the deadlines can hold, before the first run',
-        'graph assign-deadlines': 'give the sinks deadlines by critical path'},
+        'graph assign-deadlines': 'give the sinks deadlines, by critical path or by search'},
     'Develop': {
         'graph schema': 'print the JSON Schema of declarations, for editors'},
 }

@@ -25,7 +25,8 @@ COMMANDS = {
     'check_json': 'graph check graph.yaml --json -',
     'analyse': 'graph analyse graph.yaml --budget mean',
     'analyse_json': 'graph analyse graph.yaml --json -',
-    'assign': 'graph assign-deadlines graph.yaml -o out.yaml',
+    'assign': 'graph assign-deadlines graph.yaml --runs 20 -o out.yaml',
+    'assign_target': 'graph assign-deadlines graph.yaml --target 0.8 --runs 40 --json out.json',
     'place': 'graph place graph.yaml --processes 2 --cpus 2 --duration 200ms -o out.yaml',
     'place_json': (
         'graph place graph.yaml --processes 2 --cpus 2 --duration 200ms --json - -o out.yaml'),
