@@ -12,6 +12,7 @@ threads run on rclpy's MultiThreadedExecutor; the nodes measure both executors i
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 import json
 import os
 from pathlib import Path
@@ -19,7 +20,7 @@ import sys
 from typing import Any
 
 from mddag_executor import defaults
-from mddag_executor.cli import options
+from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, run_program, say, table
 from mddag_executor.errors import MddagError
 from mddag_executor.report.tables import percent
@@ -47,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='normalised utilisation that execution times are scaled to (default: %(default)s)')
     add('-o', '--output', default='build/demo', metavar='DIR',
         help='where the trace and the result of each step are written (default: build/demo)')
+    options.add(parser, '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -54,28 +56,39 @@ def main(args: argparse.Namespace) -> int:
     output = Path(args.output)
     output.mkdir(parents=True, exist_ok=True)
     graph, trace = str(find('config/autoware.yaml')), str(output / 'demo.mcap')
+    show = say if common.wants_tables(args) else _nothing
     live = _step(
-        output / 'run.json', args.duration / 1e9 + 3, 'run', graph, '--synthetic', 'sleep',
+        show, output / 'run.json', args.duration / 1e9 + 3, 'run', graph, '--synthetic', 'sleep',
         '--utilisation', str(args.utilisation), '--seed', str(SEED), '--workers', str(WORKERS),
         '--duration', f'{args.duration / 1e9:g}s', '--trace', trace, '--overwrite')
     if live['measured'] is None:
         raise DemoError('mddag run: it ended before it measured anything: run the demo again')
-    recorded = _step(output / 'recorded.json', None, 'replay', trace)
-    say(_agreement(live['dags'], recorded['dags']))
-    _step(output / 'rescheduled.json', None, 'replay', trace, graph, '--reschedule')
+    recorded = _step(show, output / 'recorded.json', None, 'replay', trace)
+    show(_agreement(live['dags'], recorded['dags']))
+    rescheduled = _step(
+        show, output / 'rescheduled.json', None, 'replay', trace, graph, '--reschedule')
     seconds = args.duration / 2e9
-    say(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), {seconds:g} s ==")
+    show(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), {seconds:g} s ==")
     from mddag_executor.hosting.peers import measure_peer
     with Progress('measuring', seconds + 3) as progress:
         peer = measure_peer('multi', graph, WORKERS, seconds=seconds, seed=SEED,
                             utilisation=args.utilisation, mode='sleep', tick=progress.update)
-    say(_side_by_side(live['measured'], peer))
+    show(_side_by_side(live['measured'], peer))
+    common.write_result(args, {
+        'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': peer,
+        'trace': os.path.abspath(trace)})
     return 0
 
 
-def _step(result: Path, seconds: float | None, *words: str) -> dict[str, Any]:
+def _nothing(text: str) -> None:
+    pass
+
+
+def _step(
+    show: Callable[[str], None], result: Path, seconds: float | None, *words: str
+) -> dict[str, Any]:
     """Run a command, show it and what it prints; return its result."""
-    say(f'\n$ mddag {" ".join(words)}')
+    show(f'\n$ mddag {" ".join(words)}')
     sys.stdout.flush()
     # Of this machine only: the demo must not find another one's nodes, nor be found by them.
     done = run_program(
@@ -87,7 +100,7 @@ def _step(result: Path, seconds: float | None, *words: str) -> dict[str, Any]:
         lines = errors.strip().splitlines() or [f'it ended with status {done.returncode}']
         raise DemoError(f'mddag {words[0]}: {lines[-1].removeprefix("error: ")}')
     sys.stderr.write(errors)
-    say(done.stdout.decode())
+    show(done.stdout.decode())
     found: dict[str, Any] = json.loads(result.read_text(encoding='utf-8'))
     return found
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = """\
 mddag graph place config/autoware.yaml --processes 2 --cpus 2 --utilisation 0.2 -o placed.yaml
-mddag graph place graph.yaml --processes 3 --trace run.mcap -o placed.yaml
+mddag graph place graph.yaml --processes 3 --trace run.mcap --apart /lidar,/camera -o placed.yaml
 mddag run placed.yaml --node my_robot/lidar --node my_robot/camera --node my_robot/control"""
 DESCRIPTION = """\
 Pack the nodes of a declaration into processes by the time for which they need the interpreter of
@@ -46,7 +46,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'there (default: as declared); repeat it for the traces of several processes')
     options.add(parser, '--execution-times', '--utilisation', only='without --trace: ')
     options.add_seed(parser, 'seed of the drawn execution times', int)
+    for option, which in (('--together', 'that'), ('--apart', 'of which no two')):
+        add(option, metavar='NODE,NODE…', action='append', default=[], type=_nodes,
+            help=f'nodes {which} run in one process; repeat it for more groups')
     options.add(parser, 'graph', '--duration', '--json')
+
+
+def _nodes(text: str) -> list[str]:
+    return [node.strip() for node in text.split(',')]
 
 
 def main(args: argparse.Namespace) -> int:
@@ -64,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
     workers = defaults.workers(args.workers, task_set)
     times, judged = _recorded(args.trace, task_set) if args.trace else (
         execution_times(args, task_set, workers), task_set)
-    placing = Placing(judged, args.processes, times)
+    placing = Placing(judged, args.processes, times, args.together, args.apart)
     cpus = args.cpus or defaults.processors()
     predictor = Predictor(judged, workers, cpus, args.policy, args.duration,
                           0 if args.trace else PUBLISH_NS)

@@ -26,7 +26,7 @@ EXAMPLE = """\
 mddag slack run.mcap
 mddag slack run.perception.mcap run.control.mcap
 mddag slack config/autoware.yaml --utilisation 0.6 --workers 6
-mddag slack run.mcap --fail-under 1.2 --json slack.json"""
+mddag slack run.mcap --fail-under 1.2 --json slack.json --report slack.html"""
 
 _ONLY_GRAPH = ('duration', 'execution_times', 'seed', 'utilisation')
 _GRAPHS = ('.yaml', '.yml')
@@ -51,6 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--fail-under', type=options.positive_float, metavar='FACTOR',
         help='exit with status 1 if some callback may not take this many times as long, if a '
         'deadline is missed already, or if no job was due')
+    add('--report', metavar='OUT.html', type=options.Output,
+        help="write the tables with bars as one HTML file ('-': to standard output)")
     options.add(parser, '--skip', '--json')
 
 
@@ -58,7 +60,7 @@ def main(args: argparse.Namespace) -> int:
     """Find the slack and print it."""
     from mddag_executor.core.tolerances import NOTHING_DUE
     from mddag_executor.replay.slack import find_slack, slack_result
-    from mddag_executor.report.slack import lines
+    from mddag_executor.report.slack import lines, page
     common.recording_and_graph(args)
     is_graph = str(args.trace).lower().endswith(_GRAPHS)
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
@@ -66,6 +68,8 @@ def main(args: argparse.Namespace) -> int:
     with Progress('looking for slack', callbacks) as line:
         slack = find_slack(problem, line.update, args.jobs or defaults.processors())
     result = slack_result(slack, task_set, dags, problem.settings.processes)
+    if args.report is not None:
+        common.write_text(args.report, ''.join(page(result, str(args.trace))))
     common.show(args, result, lines(result))
     if args.fail_under is None:
         return 0

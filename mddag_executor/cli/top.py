@@ -27,8 +27,8 @@ mddag top --once --json - | jq '.statuses[] | select(.level != "OK")'"""
 
 TOPIC = '/diagnostics'
 INTERVAL_S = 1.0
-# ECMA-48 and xterm: another screen without cursor, and back; to the first line; clear the rest
-_ENTER, _LEAVE = '\x1b[?1049h\x1b[?25l', '\x1b[?25h\x1b[?1049l'
+# ECMA-48 and xterm: another screen, no cursor, long lines cut; and back; to the first line; clear
+_ENTER, _LEAVE = '\x1b[?1049h\x1b[?25l\x1b[?7l', '\x1b[?7h\x1b[?25h\x1b[?1049l'
 _HOME, _TO_END, _BELOW = '\x1b[H', '\x1b[K', '\x1b[J'
 _WAITING = """\
 waiting for an executor to publish its state: mddag run does, and a program with

@@ -1,16 +1,24 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The result of the slack search as tables of text."""
+"""The result of the slack search as tables of text, and as a page with bars."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from html import escape
 import math
+from pathlib import Path
 from typing import Any
 
+from mddag_executor.report.html_tables import Html, html_table
 from mddag_executor.report.tables import percent, short_names
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
+
+_STYLE = Path(__file__).with_name('html.css')
+_BAR_PX = 240
+_COLOURS = ((1.1, '#d7191c'), (1.5, '#fd8d3c'), (2.0, '#fec44f'), (5.0, '#9ecae1'))
+_BEST = '#3182bd'
 
 
 def lines(result: Mapping[str, Any]) -> Iterator[str]:
@@ -86,6 +94,29 @@ def _load_lines(result: Mapping[str, Any]) -> Iterator[str]:
                 f'; with one less {printable(fewer["breaks"])} misses')
 
 
+def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
+    """Yield the parts of an HTML page."""
+    heading = escape(printable(f'Slack: {title}'))
+    yield (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{heading}'
+           '</title>\n<meta name="viewport" content="width=device-width">'
+           '<link rel="icon" href="data:,">\n'
+           f'<style>{_STYLE.read_text(encoding="utf-8")}</style></head><body>\n'
+           f'<h1>{heading}</h1>\n')
+    for line in (*_load_lines(result), *_summary(result)):
+        yield f'<p class="note">{escape(line)}</p>\n'
+    short = _short(result)
+    yield ('<h2>How many times as long each callback may take</h2>\n<p class="note">If the others '
+           f'take as long as now. The bars are logarithmic, up to {result["most"]:g} times.</p>\n')
+    yield '<div class="wide">' + html_table(('callback', 'then misses', 'bar', 'may take'), [
+        (short[name], short[one['breaks']], _bar(one['factor'], result['most']),
+         _times(one['factor'])) for name, one in _tightest(result)], 3) + '</div>'
+    yield '<h2>Margins of the sinks</h2>\n'
+    yield html_table(('sink', 'least margin', 'deadline', 'least', 'of it', '99 % have', 'median'),
+                     [(short[name], _margin_bar(sink), *_margins(sink))
+                      for name, sink in _least_first(result)], 2)
+    yield '</body></html>\n'
+
+
 def _short(result: Mapping[str, Any]) -> dict[str, str]:
     return short_names({*result['callbacks'], *result['sinks']})
 
@@ -107,3 +138,20 @@ def _least_first(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
 def _times(factor: float) -> str:
     """Return a factor as text, never rounded up."""
     return f'{math.floor(factor * 100) / 100:.2f} times'
+
+
+def _bar(factor: float, most: float) -> Html:
+    colour = next((each for limit, each in _COLOURS if factor < limit), _BEST)
+    return _drawn(math.log(factor) / math.log(most), colour)
+
+
+def _margin_bar(sink: Mapping[str, Any]) -> Html:
+    if sink['margin_ns'] is None:
+        return _drawn(0, _BEST)
+    share = sink['margin_ns']['min'] / sink['relative_deadline_ns']
+    return _drawn(max(0, share), '#d7191c' if share < 0.1 else _BEST)
+
+
+def _drawn(share: float, colour: str) -> Html:
+    return Html(f'<div class="stack" style="width:{_BAR_PX}px"><i style="width:'
+                f'{max(1, round(share * _BAR_PX))}px;background:{colour}"></i></div>')

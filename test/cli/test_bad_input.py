@@ -120,6 +120,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('evaluate g.yaml --samples few.npz', 'few.npz: no values for /n:x: add an array of that nam'),
     ('evaluate g.yaml --plot out.gif', 'out.gif: the ending names no kind of picture: use one of'),
     ('evaluate g.yaml --dask nonsense', '--dask nonsense: '),
+    ('graph place g.yaml --processes 2 --together /x -o out.yaml', "node '/x': g.yaml does not d"),
+    ('graph place g.yaml --processes 1 --apart /n,/m -o out.yaml', '--apart /n,/m: these are 2 n'),
     ('graph assign-deadlines g.yaml --target 1', '--target 1: it is out of range: give a ratio '),
     ('graph assign-deadlines g.yaml --target 0.99 --runs 9', '--target 0.99: 9 runs cannot show'),
     ('graph assign-deadlines busy.yaml --target 0.95 --duration 200ms --runs 100',

@@ -16,13 +16,15 @@ def test_the_main_job_end_to_end(
     tmp_path: Path, mddag: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:
     process = mddag('demo', '--duration', '3s', '--utilisation', '0.3', '--output', tmp_path,
-                    timeout=150.0)
+                    '--json', tmp_path / 'all.json', timeout=150.0)
     assert process.returncode == 0, process.stderr
     # A busy machine skips periods, and that is said.
     assert all(line.startswith('[WARN] ') for line in process.stderr.splitlines())
     live, recorded, rescheduled = (json.loads((tmp_path / f'{name}.json').read_text())
                                    for name in ('run', 'recorded', 'rescheduled'))
     assert len(live['dags']) == 11
+    every = json.loads((tmp_path / 'all.json').read_text())
+    assert every['live'] == live and every['baseline']['sink_jobs_due'] > 100
     # What the replayer counts is exactly what the executor counted.
     assert 'counts what the executor counted, for 18 of 18 sinks.' in process.stdout
     assert recorded['dags'].keys() == rescheduled['dags'].keys() == live['dags'].keys()

@@ -86,6 +86,15 @@ def test_what_cannot_hold_is_warned_of(
     assert 'dags' in json.loads(done.stdout)
 
 
+def test_rules_of_the_user(graph: Path, call: Mddag) -> None:
+    place = ['graph', 'place', 'graph.yaml', '--processes', '2', '-o', 'placed.yaml']
+    assert call(*place, '--together', '/a, /b').returncode == 0
+    assert msg_graph.load('placed.yaml').process_of('/a') == msg_graph.load(
+        'placed.yaml').process_of('/b')
+    assert call(*place, '--apart', '/a,/c', '--apart', '/b,/c').returncode == 0
+    assert [p.nodes for p in msg_graph.load('placed.yaml').processes] == [('/a', '/b'), ('/c',)]
+
+
 def test_times_of_a_recorded_run(graph: Path, call: Mddag) -> None:
     Path('times.json').write_text(json.dumps(
         {f'/{n}': {f'/{n}:t': us} for n, us in (('a', 45_000), ('b', 5_000), ('c', 40_000))}))

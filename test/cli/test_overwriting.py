@@ -53,6 +53,7 @@ def run(graph: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     'graph from-trace run.mcap -o run.mcap',
     'graph from-caret graph.yaml --trace run.mcap -o run.mcap',
     'graph place graph.yaml --processes 2 --trace run.mcap -o run.mcap',
+    'slack run.mcap --report run.mcap',
     'graph assign-deadlines graph.yaml -o graph.yaml',
     'graph check graph.yaml --json graph.yaml',
     'simulate graph.yaml --trace graph.yaml --overwrite',

@@ -4,9 +4,10 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import combinations, product
 
 from mddag_executor.core.tally import total
+from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.placement import Placing
 from mddag_executor.laboratory.prediction import (
     CALLBACK_NS,
@@ -18,6 +19,7 @@ from mddag_executor.laboratory.prediction import (
 from mddag_executor.simulate.intakes import Costs
 from mddag_executor.simulate.machine import SWITCH_NS
 from msg_graph import loads, Process, TaskSet
+import pytest
 
 MS = 1_000_000
 
@@ -165,3 +167,41 @@ def test_a_few_tries_are_enough_to_stop() -> None:
     _, tried = improve(
         placing, placing.place(), lambda p: cost_of(predictor.predict(p, times)), most=5)
     assert tried == 5
+
+
+def test_together_and_apart() -> None:
+    times = (50, 50, 10, 10)
+    tasks = workload(*times)
+    assert {'/n0', '/n1'} <= placed(tasks, 2, *times, together=[('/n0', '/n1')])[0]
+    first, second = placed(tasks, 2, *times, apart=[('/n2', '/n3')])
+    assert ('/n2' in first) != ('/n3' in first)
+    with pytest.raises(UsageError, match='together'):
+        placed(tasks, 2, *times, together=[('/n0', '/n1'), ('/n1', '/n2')],
+               apart=[('/n0', '/n2')])
+    with pytest.raises(UsageError, match='/n0,/n1,/n2: these are 3 nodes for 2 processes'):
+        placed(tasks, 2, *times, apart=[('/n0', '/n1', '/n2')])
+    with pytest.raises(UsageError, match='cannot keep'):
+        placed(tasks, 2, *times, apart=[('/n0', '/n1'), ('/n1', '/n2'), ('/n0', '/n2')])
+    with pytest.raises(UsageError, match='does not declare'):
+        placed(tasks, 2, *times, together=[('/n0', '/n9')])
+    with pytest.raises(UsageError, match='only 4 nodes'):
+        placed(tasks, 5, *times)
+
+
+def test_one_node_too_many_to_keep_apart_is_found_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which of the empty processes a node comes into does not matter: no search through all."""
+    times = (10.0,) * 11
+    tried = 0
+    cost = Placing._cost
+
+    def counted(self: Placing, place: dict[int, int]) -> tuple[float, float]:
+        nonlocal tried
+        tried += 1
+        assert tried < 1000
+        return cost(self, place)
+
+    monkeypatch.setattr(Placing, '_cost', counted)
+    pairs = list(combinations([f'/n{i}' for i in range(11)], 2))
+    with pytest.raises(UsageError, match='10 processes cannot keep all these nodes apart'):
+        placed(workload(*times), 10, *times, apart=pairs)
+    assert len(placed(workload(*times), 11, *times, apart=pairs)) == 11

@@ -127,13 +127,14 @@ def test_where_nothing_was_due_nothing_is_proven(
 
 
 def test_what_people_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    graph = tmp_path / 'g.yaml'
+    graph, page = tmp_path / 'g.yaml', tmp_path / 's.html'
     graph.write_text(BY_HAND)
-    assert program.main(['slack', str(graph), '--fail-under', '3']) == 0
+    assert program.main(['slack', str(graph), '--fail-under', '3', '--report', str(page)]) == 0
     out = capsys.readouterr().out
     assert 'b:last    3.49 times  b:last' in out
     assert '1 callback may take 100 times as long and more' in out
     assert '1 of 2 workers are enough' in out
+    assert 'b:last' in page.read_text()
     assert program.main(['slack', str(graph), '--fail-under', '3.6']) == 1
     for arguments, error in (
             ([str(graph), str(graph)], 'there is a declaration already'),
