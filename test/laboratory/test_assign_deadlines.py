@@ -12,7 +12,6 @@ from mddag_executor.laboratory.assign_deadlines import (
     least_runs,
     measure,
     PRECISION,
-    proportional,
     scaled,
     search,
 )
@@ -41,16 +40,6 @@ def experiment(**changes: object) -> Experiment:
         loads(GRAPH), ('rad',), workers=1, duration_ns=200_000_000), **changes)
 
 
-def test_proportional() -> None:
-    task_set = loads(GRAPH)
-    # To x it is 2 ms, to y 1 ms + 9 ms.
-    assert proportional(task_set, 'max') == {
-        '/n:x': 4_000_000, '/n:y': 20_000_000, '/n:z': 10_000_000}
-    assert proportional(task_set, 'mean')['/n:x'] == 8_000_000
-    with pytest.raises(Exception, match='no such budget'):
-        proportional(task_set, 'median')
-
-
 def test_scaled() -> None:
     assert scaled(loads(GRAPH), 'max', 1.5) == {
         '/n:x': 3_000_000, '/n:y': 15_000_000, '/n:z': 1_500_000}
@@ -67,7 +56,6 @@ nodes:
       - {name: b, timer: 40ms, publishes: [/a], dag: two, execution_time: 1ms}
       - {name: s, subscription: /a, deadline: 5ms, execution_time: 1ms}
 """)
-    assert proportional(task_set, 'max') == {'/n:s': 20_000_000}
     assert scaled(task_set, 'max', 2.0) == {'/n:s': 8_000_000}
 
 
