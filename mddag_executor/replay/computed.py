@@ -21,7 +21,16 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, legs_of, NEVER
-from mddag_executor.core.state import ABORTED, Decision, EXPIRED, JOB_END, OUTDATED, SINK_LATE
+from mddag_executor.core.state import (
+    ABORTED,
+    Decision,
+    DROP,
+    EXPIRED,
+    JOB_END,
+    OUTDATED,
+    SINK_DEMOTED,
+    SINK_LATE,
+)
 from mddag_executor.recording import tables
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
@@ -142,12 +151,31 @@ class _Player:
                                 DEFAULT_DEADLINE_NS, 0, False),
             task_set, task_set, who, same=False, releases=self._releases.table(),
             executions=self._executions.table(), job_ends=self._ends.table(),
+            drops=self._drops(), drop_reasons=('newer', 'aborted'), demotions=self._demotions(),
             end=schedule.end, judged=schedule.judged, judged_until=schedule.end,
             workers_each=workers,
             judge_from=() if schedule.judge_from == -NEVER else [(-1, schedule.judge_from)])
         begun = [found.releases['release'], found.executions['ready']]
         found.start = min((int(each.min()) for each in begun if len(each)), default=None)
         return found
+
+    def _drops(self) -> tables.Table:
+        """Return the dropped executions; ``reason``: whether the job was aborted."""
+        decisions = self._schedule.decisions
+        aborted = {(dag, job) for kind, dag, _, job, end, _ in decisions
+                   if kind == JOB_END and end == ABORTED}
+        drops = Rows(tables.DROPS, 'vertex', 'job', 'time', 'reason')
+        for kind, dag, vertex, job, _, now in decisions:
+            if kind == DROP and dag < self._n_dags:
+                drops.add(vertex, self._number(dag, job), now, (dag, job) in aborted)
+        return drops.table()
+
+    def _demotions(self) -> tables.Table:
+        demotions = Rows(tables.DEMOTIONS, 'dag', 'vertex', 'job', 'time')
+        for kind, dag, vertex, job, _, now in self._schedule.decisions:
+            if kind == SINK_DEMOTED:
+                demotions.add(dag, vertex, self._number(dag, job), now)
+        return demotions.table()
 
     def _next_order(self) -> int:
         self._order += 1

@@ -165,8 +165,11 @@ class Judged:
         completed = np.full(done.shape, -1)
         completed[done] = self._recording.executions['end'][jobs.done[:, local][done]]
         late = done & (completed > deadline)
+        dropped, dropped_at = self._dropped(jobs, sinks)
+        dropped &= here & ~done & ((reason < 0)[:, None] | (dropped_at < when[:, None]))
         # position at which the last sink completed
-        closed = np.where(here, np.where(done, order, NEVER), -1).max(axis=1, initial=-1)
+        closed = np.where(here & ~dropped, np.where(done, order, NEVER), -1).max(
+            axis=1, initial=-1)
         if expected is not None:
             inner = expected == LEADS_OUT
             closed = np.maximum(closed, np.where(
@@ -176,9 +179,9 @@ class Judged:
         ended = np.minimum(jobs.ended, closed)
         judged_order, judged_until = self._recording.judged_order, self._recording.judged_until
         open_then = (jobs.released < judged_order) & (ended > judged_order)
-        overdue = here & (order > judged_order) & open_then[:, None] & (
+        overdue = here & ~dropped & (order > judged_order) & open_then[:, None] & (
             deadline <= judged_until) if self._recording.judged else np.zeros_like(done)
-        given_up = here & ~done & (jobs.ended < NEVER)[:, None] & (
+        given_up = here & ~done & ~dropped & (jobs.ended < NEVER)[:, None] & (
             reason != recorded.WITHDRAWN)[:, None]
         self.contradictions += int((duplicates[0] < ended[duplicates[1]]).sum())
         self._late_ends(jobs, ends, ended)
@@ -193,6 +196,9 @@ class Judged:
                 (given_up, np.broadcast_to(kinds[:, None], done.shape),
                  np.broadcast_to(jobs.ended[:, None], done.shape),
                  np.broadcast_to(when[:, None], done.shape)),
+                (dropped, np.full(done.shape, SINK_DROPPED),
+                 np.broadcast_to(np.minimum(jobs.ended, min(judged_order, NEVER))[:, None],
+                                 done.shape), dropped_at),
                 (overdue, np.full(done.shape, SINK_MISSED),
                  np.full(done.shape, min(judged_order, NEVER)),
                  np.full(done.shape, judged_until)))
@@ -212,7 +218,7 @@ class Judged:
                 table['kind'] <= max(SINK_COMPLETED), completed[which], -1)
             verdicts.append(table)
         outcome: Ints = np.where(
-            (late & here).any(axis=1) | overdue.any(axis=1), LATE, COMPLETED)
+            ((late & here) | overdue | dropped).any(axis=1), LATE, COMPLETED)
         for of, (end, _) in _ENDS.items():
             outcome[(jobs.ended <= closed) & (reason == of)] = end
         over = (ended < NEVER) & ~((jobs.ended <= closed) & (reason == recorded.WITHDRAWN))
@@ -220,6 +226,21 @@ class Judged:
             dag, outcome, jobs.released,
             over & self._judging.is_judged(ended, jobs.release)))
         return jobs, verdicts
+
+    def _dropped(self, jobs: Jobs, sinks: list[int]) -> tuple[Mask, Ints]:
+        """Return by job and sink whether it was dropped for a newer one, and when."""
+        recording = self._recording
+        dropped = np.zeros((len(jobs.number), len(sinks)), dtype=np.bool_)
+        when = np.zeros(dropped.shape, dtype=np.int64)
+        if 'newer' in recording.drop_reasons:
+            drops = recording.drops
+            drops = drops[drops['reason'] == [*recording.drop_reasons].index('newer')]
+            for place, sink in enumerate(sinks):
+                mine = drops[drops['vertex'] == sink]
+                row = jobs.rows_of(mine['job'])
+                dropped[row[row >= 0], place] = True
+                when[row[row >= 0], place] = mine['time'][row >= 0]
+        return dropped, when
 
     def _given_up(self, jobs: Jobs, ends: Table) -> tuple[Ints, Ints]:
         """Note when jobs ended early; return the reason and the time."""

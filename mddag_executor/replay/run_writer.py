@@ -22,7 +22,6 @@ import os
 from typing import Any
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, rad_offsets, Tables
-from mddag_executor.core.state import ABORTED, DROP, JOB_END, SINK_DEMOTED
 from mddag_executor.recording import tables
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.deadlines import Judged
@@ -76,20 +75,17 @@ def _events(run: ComputedRun, knows_cpu: bool) -> Iterator[_Entry]:
     for _, dag, _, job, now, reason, order in recording.job_ends.tolist():
         if reason != tables.FAILED:
             yield (now, order, 0), _ENDS[reason], now, 0, (dag, job)
-    aborted = {(dag, job) for kind, dag, _, job, end, _ in run.decisions
-               if kind == JOB_END and end == ABORTED}
     missed = judged.missed
     for _, dag, sink, job, _, deadline, completed, until, _, order in missed.tolist():
         yield (until, min(order, NEVER), 1), 'deadline', until, 0, (
             dag, local[sink], job, deadline, completed)
     address = [place + 1 for place in run.task_set.places_of_vertices()]
-    for kind, dag, vertex, job, _, now in run.decisions:
-        if kind == DROP:
-            yield (now, NEVER - 2, 0), 'drop', now, 0, (
-                address[vertex], dag, local[vertex], job,
-                'aborted' if (dag, job) in aborted else 'newer')
-        elif kind == SINK_DEMOTED:
-            yield (now, NEVER - 2, 0), 'demote', now, 0, (dag, local[vertex], job)
+    dag_of = judged.tables.dag_of
+    for _, vertex, job, now, reason in recording.drops.tolist():
+        yield (now, NEVER - 2, 0), 'drop', now, 0, (
+            address[vertex], dag_of[vertex], local[vertex], job, recording.drop_reasons[reason])
+    for _, dag, vertex, job, now in recording.demotions.tolist():
+        yield (now, NEVER - 2, 0), 'demote', now, 0, (dag, local[vertex], job)
 
 
 def _executions(

@@ -52,9 +52,9 @@ def record(case: Case, horizon: int, trace: Path, **how: Any) -> SimulatedRun:
     return run
 
 
-@examples(150)
+@examples(60)
 @example(case=TWO_SINKS_AT_ONCE, horizon=5, stop=False)
-@given(case=cases(overheads=True), horizon=st.integers(5, 50), stop=st.booleans())
+@given(case=cases(overheads=True, newest=True), horizon=st.integers(5, 50), stop=st.booleans())
 def test_the_replayer_counts_the_same(
     trace: Path, case: Case, horizon: int, stop: bool
 ) -> None:
