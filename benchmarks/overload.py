@@ -4,74 +4,95 @@
 The benchmark `overload`: the share of results in time at loads around and above the capacity.
 
 Each declaration is simulated with execution times that are drawn and scaled to the load.  The
-capacity is that of the workers or, with `--interpreter`, of one interpreter that all callbacks
-hold.
+capacity is that of the workers or of one interpreter, which all callbacks hold.  `important`: the
+share of the sinks of a third of the DAGs, which have a high importance (`demote`); `alone`: their
+share if the other DAGs are never released, which no scheduling of the others can exceed by much.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+import random
+from typing import Any, BinaryIO, NamedTuple
 
 from benchmarks import arguments
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, table
-from mddag_executor.core.tally import total
+from mddag_executor.core import Tables, Tally
+from mddag_executor.core.tally import Counts, counts
 from mddag_executor.laboratory.generate import generate
 from mddag_executor.laboratory.generate_options import Options
 from mddag_executor.simulate import (
     draw_execution_times,
+    Load,
     periodic_load,
     scale_execution_times,
     Settings,
-    simulate,
 )
+from mddag_executor.simulate.schedule import prepare, schedule
 from msg_graph import ExecutionTime, loads, TaskSet
 
 HELP = 'measure the share of results in time in an overload'
 DESCRIPTION = 'Measure the share of results in time around and above the capacity, simulated.'
 EXAMPLE = """\
-python -m benchmarks overload --graph config/autoware.yaml
-python -m benchmarks overload --sets 1000 --interpreter --preemptive"""
+python -m benchmarks overload --graph config/autoware.yaml --duration 3s
+python -m benchmarks overload --sets 1000 --plot overload.svg"""
 
-WAYS = (('rad', 'continue'), ('rad', 'demote'), ('rad', 'abort'), ('fifo', 'continue'))
+WAYS = ('continue', 'demote', 'abort', 'fifo', 'important', 'alone')
+LOADS = (0.9, 1.0, 1.1, 1.2, 1.5, 2.0)
+
+
+class Mode(NamedTuple):
+    """What limits a run, and whether urgent executions preempt."""
+
+    interpreter: bool
+    preemptive: bool
+
+    @property
+    def title(self) -> str:
+        """Return its name."""
+        return (('interpreter' if self.interpreter else 'workers')
+                + (', preemptive' if self.preemptive else ''))
+
+
+MODES = [Mode(interpreter, preemptive) for interpreter in (False, True)
+         for preemptive in (False, True)]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     arguments.add_graph(parser)
-    options.add(parser, '--duration', '--preemptive', '--json')
+    options.add(parser, '--duration', '--json')
     add('--sets', type=options.positive_int, metavar='N',
         help='random sets instead of a declaration')
     add('--workers', type=options.positive_int, default=7, metavar='W', help='(default: 7)')
-    add('--interpreter', action='store_true', help='every callback holds the one interpreter')
-    add('--loads', default='0.9,1,1.1,1.2,1.5,2', metavar='U,U…',
-        help='multiples of the capacity (default: 0.9 to 2)')
+    add('--plot', metavar='OUT.svg', help='draw a figure')
     options.add_seed(parser, 'seed of the sets and execution times')
 
 
 def main(args: argparse.Namespace) -> int:
     """Measure and print."""
-    factors = [float(each) for each in args.loads.split(',')]
     sets = [arguments.load_workload(args.graph)] if args.sets is None else list(_random(args))
     rows: list[dict[str, Any]] = []
-    with Progress('simulating', len(factors) * len(sets)) as line:
-        for load in factors:
-            shares: dict[str, list[float]] = {}
+    steps = [(mode, load) for mode in MODES for load in LOADS]
+    with Progress('simulating', len(steps) * len(sets)) as line:
+        for step, (mode, load) in enumerate(steps):
+            shares: dict[str, list[float]] = {way: [] for way in WAYS}
             for number, task_set in enumerate(sets):
-                line.update(len(rows) * len(sets) + number)
-                for name, share in _shares(args, task_set, load, args.seed + number):
-                    shares.setdefault(name, []).append(share)
-            rows.append({'load': load, **{
-                name: sum(each) / len(each) for name, each in shares.items()}})
-    names = [name for name in rows[0] if name != 'load']
-    common.show(args, {'workers': args.workers, 'interpreter': args.interpreter,
-                       'preemptive': bool(args.preemptive), 'overload': rows}, [table(
-        ('load', *names),
-        [(f'{row["load"]:g}', *(f'{row[name]:.1%}' for name in names)) for row in rows])])
+                line.update(step * len(sets) + number)
+                _Case(args, task_set, mode, load, args.seed + number).add_to(shares)
+            rows.append({'mode': mode.title, 'load': load, **{
+                way: sum(each) / len(each) for way, each in shares.items()}})
+    if args.plot is not None:
+        with open(args.plot, 'wb') as file:
+            draw(rows, file)
+    common.show(args, {'workers': args.workers, 'sets': len(sets), 'overload': rows}, [table(
+        ('capacity', 'load', *WAYS),
+        [(row['mode'], f'{row["load"]:g}', *(f'{row[way]:.1%}' for way in WAYS))
+         for row in rows])])
     return 0
 
 
@@ -80,30 +101,82 @@ def _random(args: argparse.Namespace) -> Iterator[TaskSet]:
         yield loads(generate(Options(seed=args.seed), number), f'set {number}')
 
 
-def _with_means(task_set: TaskSet, times: Sequence[Sequence[int]]) -> TaskSet:
-    """Return a task set that declares the execution times of a run."""
-    return replace(task_set, dags=tuple(
-        replace(dag, vertices=tuple(
-            replace(vertex, callback=replace(
-                vertex.callback, execution_time=ExecutionTime((time,), (50.0,))))
-            for vertex, time in zip(dag.vertices, of_dag)))
-        for dag, of_dag in zip(task_set.dags, times)))
+class _Case:
+    """A task set with the execution times of a load."""
 
+    def __init__(
+        self, args: argparse.Namespace, task_set: TaskSet, mode: Mode, load: float, seed: int
+    ) -> None:
+        self._args, self._mode = args, mode
+        times = scale_execution_times(
+            task_set, draw_execution_times(task_set, seed),
+            1 if mode.interpreter else args.workers, load)
+        dags = task_set.dags
+        self._important = {*random.Random(seed).sample(range(len(dags)), -(-len(dags) // 3))}
+        self._task_set = replace(task_set, dags=tuple(
+            replace(dag, vertices=tuple(
+                replace(vertex, callback=replace(
+                    vertex.callback, execution_time=ExecutionTime((time,), (50.0,))))
+                for vertex, time in zip(dag.vertices, of_dag)))
+            for dag, of_dag in zip(dags, times)))
+        load_ = periodic_load(self._task_set, times, args.duration)
+        if mode.interpreter:
+            load_ = load_._replace(holds=[1] * len(load_.costs))
+        self._load = load_
 
-def _shares(
-    args: argparse.Namespace, task_set: TaskSet, load: float, seed: int
-) -> Iterator[tuple[str, float]]:
-    """Yield the share of results in time, by policy and handling of late jobs."""
-    capacity = 1 if args.interpreter else args.workers
-    times = scale_execution_times(task_set, draw_execution_times(task_set, seed), capacity, load)
-    known = _with_means(task_set, times)
-    arrivals = periodic_load(known, times, args.duration)
-    if args.interpreter:
-        arrivals = arrivals._replace(holds=[1] * len(arrivals.costs))
-    for policy, on_late in WAYS:
+    def add_to(self, shares: dict[str, list[float]]) -> None:
+        """Add the share of results in time of each way."""
+        for on_late in ('continue', 'demote', 'abort'):
+            shares[on_late].append(self._share('rad', on_late, self._task_set, self._load))
+        shares['fifo'].append(self._share('fifo', 'continue', self._task_set, self._load))
+        marked = replace(self._task_set, dags=tuple(
+            replace(dag, vertices=tuple(
+                replace(vertex, callback=replace(vertex.callback, importance='high'))
+                if index in dag.sinks else vertex for index, vertex in enumerate(dag.vertices)))
+            if dag.index in self._important else dag for dag in self._task_set.dags))
+        shares['important'].append(
+            self._share('rad', 'demote', marked, self._load, self._important))
+        mine = [i for i, dag in enumerate(self._load.dags) if dag in self._important]
+        alone = self._load._replace(**{
+            name: [getattr(self._load, name)[i] for i in mine]
+            for name in ('times', 'dags', 'jobs')})
+        shares['alone'].append(
+            self._share('rad', 'demote', self._task_set, alone, self._important))
+
+    def _share(
+        self, policy: str, on_late: str, task_set: TaskSet, load: Load,
+        dags: set[int] | None = None,
+    ) -> float:
         settings = Settings(
-            policy=policy, workers=args.workers, duration_ns=args.duration,
-            preemptive=bool(args.preemptive) and policy != 'fifo', on_late=on_late)
-        verdicts = total(simulate(known, arrivals, settings).result()['dags'])
-        yield (policy if on_late == 'continue' and policy == 'fifo' else on_late,
-               verdicts.in_time / max(1, verdicts.due))
+            policy=policy, workers=self._args.workers, duration_ns=self._args.duration,
+            preemptive=self._mode.preemptive and policy != 'fifo', on_late=on_late)
+        tables = Tables.build(task_set, on_late=on_late)
+        tally = Tally(task_set, tables)
+        compiled = prepare(tables, load, settings, 24 * len(WAYS) * (self._args.sets or 1))
+        tally.add(schedule(tables, load, settings, compiled=compiled).decisions)
+        every = Counts.total(
+            counts(vars(sink)) for v, sink in tally.sinks.items()
+            if dags is None or tables.dag_of[v] in dags)
+        return every.in_time / max(1, every.due)
+
+
+def draw(rows: list[dict[str, Any]], file: BinaryIO) -> None:
+    """Draw the shares by load, a panel for each mode, as SVG."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+    styles = dict(zip(WAYS, (
+        '#D55E00-', '#0072B2-', '#009E73-', '#000000:', '#CC79A7-', '#CC79A7:')))
+    with rc_context({'svg.hashsalt': 'mddag', 'svg.fonttype': 'none', 'font.size': 9.0}):
+        figure = Figure(figsize=(8.0, 5.0), layout='constrained')
+        for axes, mode in zip(figure.subplots(2, 2, sharex=True, sharey=True).flat, MODES):
+            mine = [row for row in rows if row['mode'] == mode.title]
+            for way, style in styles.items():
+                axes.plot([row['load'] for row in mine], [100 * row[way] for row in mine],
+                          color=style[:7], linestyle=style[7:], label=way)
+            axes.set_title(mode.title, fontsize=9)
+            axes.grid(color='0.9')
+            axes.set_ylim(-3, 103)
+        figure.supxlabel('load, as a multiple of the capacity')
+        figure.supylabel('results in time, %')
+        figure.axes[0].legend(frameon=False, fontsize=8)
+        figure.savefig(file, format='svg', metadata={'Date': None})
