@@ -47,8 +47,8 @@ class DueTimes:
         self._gil_check = GilCheck()
         # the next deadline, on the trace's clock, when the timerfd was set
         self.deadline = NEVER
-        # whether the timerfd may be set to a time at which nothing is due
-        self._may_expire_early = False
+        #: whether the timerfd may be set to a time at which nothing is due
+        self.may_expire_early = False
         self._seen = monotonic_ns(), process_time_ns()
 
     def begin(self, now: int) -> None:
@@ -89,14 +89,6 @@ class DueTimes:
             calls.append(heappop(self._calls)[2])
         return calls
 
-    def is_early(self, now: int) -> bool:
-        """Return whether nothing may be due at the set time, or a GIL check before it."""
-        engine = self._engine
-        return bool(
-            self._may_expire_early
-            or engine.holders and engine.has_waiting and (self._timer.at or NEVER)
-            > now + self._check_after(engine.holders[0]) + CHECK_NS)
-
     def arm(self, now: int) -> None:
         """Set the timerfd to the next due time."""
         pool = self._pool
@@ -119,7 +111,7 @@ class DueTimes:
         elif check.at:
             check.end()
         first = min(filter(None, at), default=0)
-        self._may_expire_early = first != at[0]
+        self.may_expire_early = first != at[0]
         if first != self._timer.at:
             self._timer.arm(first)
 
@@ -130,7 +122,7 @@ class DueTimes:
         self._watch_holder(now)
         at = self._gil_check.at
         if at and not 0 < self._timer.at <= at:
-            self._may_expire_early = True
+            self.may_expire_early = True
             self._timer.arm(at)
 
     def _watch_holder(self, now: int) -> None:

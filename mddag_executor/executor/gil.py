@@ -80,7 +80,7 @@ class GilHabit:
     :ivar holds: 1 or 0, for its next execution; ``computes``: the same, also if it is short.
     :ivar mean_ns: recent average of its executions' CPU time.
     :ivar is_known: whether ``holds`` is declared, or has been measured.
-    :ivar rests: how many of its next executions need not be measured.
+    :ivar rests: how many of its next executions need not be measured, if it is positive.
     """
 
     __slots__ = ('holds', 'computes', 'mean_ns', 'is_known', 'is_declared', 'rests', 'share',
@@ -150,10 +150,12 @@ class Measurement:
 
     __slots__ = ('_habit', '_process', '_preempted', '_own')
 
+    _process: int | None
+
     def __init__(self, habit: GilHabit) -> None:
         self._habit = habit
-        self._process = -1      # it rests; another thread may change that before the end
-        if not habit.rests:
+        self._process = None  # other threads may change the habit meanwhile
+        if habit.rests < 1:
             self._process, self._preempted = process_time_ns(), times_preempted()
         self._own = thread_time_ns()
 
@@ -164,8 +166,8 @@ class Measurement:
         :param wall: the duration of the execution, ns.
         """
         own = thread_time_ns() - self._own
-        if self._process < 0:
-            self._habit.rests = max(0, self._habit.rests - 1)
+        if self._process is None:
+            self._habit.rests -= 1
         else:
             self._habit.ran(wall, own, process_time_ns() - self._process - own,
                             times_preempted() > self._preempted)

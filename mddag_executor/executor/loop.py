@@ -213,13 +213,13 @@ class EventLoop:
         found: list[ChannelSource] = []
         asking: list[ChannelSource] = []
         expired = False
+        channels = self._channels
         for fd, _ in events:
-            channel = self._channels.get(fd)
-            if channel is not None:
+            if fd in channels:
                 if fd in self._asking_fds:
-                    asking += channel
+                    asking += channels[fd]
                 else:
-                    found += channel
+                    found += channels[fd]
             elif fd == self.timer.fd:
                 expired = True
             elif fd in self._nested_fds:

@@ -12,6 +12,8 @@ arrivals are collected when muting ends.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.inbox import Inbox
@@ -31,6 +33,10 @@ class Muting:
         self, engine: Engine, loop: EventLoop, timers: TimerQueue, inbox: Inbox
     ) -> None:
         self.until = 0
+        #: the entities with sources
+        self.entities: Iterable[Entity] = ()
+        # whether a callback has ever held the GIL for long: else nothing is worth a nested epoll
+        self._has_long = False
         self._bound = 0
         self._engine = engine
         self._loop = loop
@@ -39,6 +45,11 @@ class Muting:
 
     def update(self, now: int, is_running: bool) -> None:
         """Mute sources whose callbacks cannot start while the dispatched one holds the GIL."""
+        if not self._has_long:
+            self._has_long = True
+            for entity in list(self.entities):
+                if entity.classify is not None:
+                    entity.classify()
         bound, until = self._engine.overtaking_bound(now)
         if bound:
             self.until, self._bound = until, bound
@@ -65,7 +76,7 @@ class Muting:
             return
         entity.is_nested = habit.computes
         urgency = ALWAYS
-        if habit.computes:
+        if habit.computes and self._has_long:
             urgency = urgency_of(self._engine.relative_deadline(entity))
         self._loop.move(source, urgency)
 

@@ -77,6 +77,7 @@ class Upkeep:
         self._lock = threading.RLock()
         self._refresh_at = 0.0
         self._sources: dict[Entity, AnySource | WaitableSource] = {}
+        pool.muting.entities = self._sources
         self._deliveries: dict[str, publishing.LocalDelivery] = {}
         self._events: WaitableSource | None = None
         self._unlistened: list[Entity] = []

@@ -33,7 +33,7 @@ Theory of operation
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 import threading
@@ -77,8 +77,8 @@ class WorkerThread:
     :ivar is_polling: whether the thread waits in the epoll; ``is_parked``: for its permit.
     :ivar waits_since: since when it has waited in the epoll, on the trace's clock.
     :ivar published: when the running callback first published (monotonic ns); 0: not yet.
-    :ivar start: when the execution that has just ended began; ``end``: when it ended; both on the
-        trace's clock.
+    :ivar start: when the execution that has just ended began; ``end``: when it ended (monotonic
+        ns).
     :ivar outcome: its exception, or the future that it waits for, if it goes on later; None: it
         has finished.
     """
@@ -462,15 +462,16 @@ class WorkerPool:
         :param is_last: run nothing more in this thread.
         :return: False: there is no execution, and the thread is to wait in the epoll or is parked.
         """
-        arrived: list[ChannelSource] = []
+        arrived: Sequence[ChannelSource] = ()
         expired = False
         if events:
             arrived, asking, expired = self.loop.sources(events)
-            self._collect(asking)
+            if asking:
+                self._collect(asking)
         if self._deferred:
             self._do_deferred()
         calls: list[Callable[[], None]] = []
-        timed: list[Callable[[], None]] = []
+        timed: Sequence[Callable[[], None]] = ()
         engine = self.engine
         with self.lock:
             # inlined tick: saves a call for each execution
@@ -478,6 +479,8 @@ class WorkerPool:
             work = me.work
             if work is not None:
                 self._report_end(me, work, now, calls)
+                if self.muting.until and not engine.holders:
+                    self.muting.end(self.running)
             elif me.is_polling:
                 since = me.waits_since
                 me.is_polling = False
@@ -487,22 +490,21 @@ class WorkerPool:
             if events:
                 self._bell_rings = False  # the waiting thread may have received it
                 self._collect(arrived)
-            if self.muting.until and not engine.holders:
-                self.muting.end(self.running)
             if (expired or self.timers.has_jumped) and self.running:
                 timed = self.due.handle(now, self._waited_since(since))
             found = not is_last and not timed and self._choose(me, now, bool(events))
-            if (expired or self.timers.has_new or engine.deadlines.next < self.due.deadline
-                    or not found and self.due.is_early(now - self._offset)):
-                self.due.arm(now - self._offset)
+            due = self.due
+            if (expired or self.timers.has_new or engine.deadlines.next < due.deadline
+                    or not found and (due.may_expire_early or engine.holders)):
+                due.arm(now - self._offset)
             if (expired or not found) and self._misses != engine.verdicts.missed:
                 self._misses = engine.verdicts.missed
                 calls.append(self.missed)
         if calls or timed:
-            self._call(calls + timed)
+            self._call([*calls, *timed])
         return self._turn(me, []) if timed else found
 
-    def _collect(self, sources: list[ChannelSource]) -> None:
+    def _collect(self, sources: Sequence[ChannelSource]) -> None:
         """Collect from sources, or leave what arrived to the next spin."""
         for source in sources:
             if self.running:
@@ -550,8 +552,8 @@ class WorkerPool:
         if holders:
             if holders[0].entity.habit.mean_ns >= TURN_NS or self.muting.until:
                 self.muting.update(now, self.running)
-            if engine.has_waiting and self.due.is_early(now - self._offset):
-                self.due.arm(now - self._offset)
+            if engine.has_waiting:
+                self.due.check_holder(now - self._offset)
         if self._is_stepping:
             pass
         elif work.entity.wall_ns <= BRIEF_NS:
@@ -574,11 +576,12 @@ class WorkerPool:
         """
         if me.thread is None:  # a visitor: the thread of a spin_once
             return
-        active = len(self._threads) - self._waiting_calls - len(self._parked)
-        leader = self._leader
+        leader, n_workers = self._leader, self.engine.n_workers
         is_left_to_leader = (
-            has_events and leader is not None and leader is not me and leader.is_brief())
-        if self.running and active <= self.engine.n_workers and not is_left_to_leader:
+            has_events and leader is not me and leader is not None and leader.is_brief())
+        if self.running and not is_left_to_leader and (
+                len(self._threads) == n_workers
+                or len(self._threads) - self._waiting_calls - len(self._parked) <= n_workers):
             me.is_polling = True
             me.waits_since = self._last
             self.polling += 1
@@ -602,14 +605,13 @@ class WorkerPool:
 
     def _execute(self, me: WorkerThread) -> None:
         """Run the thread's execution until it ends or waits."""
-        work = me.work
-        assert work is not None
+        work: Any = me.work
         entity = work.entity
         must_check = entity.may_be_gone or not self.is_current
         me.published = 0
         habit = entity.habit
         measurement = None
-        if not habit.rests or self.engine.record is not None:
+        if habit.rests < 1 or self.engine.record is not None:
             measurement = Measurement(habit)
         start = monotonic_ns()
         try:
@@ -619,7 +621,7 @@ class WorkerPool:
         except BaseException as error:
             me.outcome = error
         end = monotonic_ns()
-        me.start, me.end = start + self._offset, end + self._offset
+        me.start, me.end = start, end
         if measurement is None:
             habit.rests -= 1
         else:
@@ -655,7 +657,8 @@ class WorkerPool:
         me.work = None
         if me.outcome is None and not me.has_lent:
             entity.busy_ns += me.end - me.start
-            engine.finished(work, me.start, me.end, now, me.vtid, work.worker)
+            offset = self._offset
+            engine.finished(work, me.start + offset, me.end + offset, now, me.vtid, work.worker)
             if self.callback_ended is not None:
                 calls.append(partial(self._settle_end, work, None))
         elif not self._report_unusual_end(me, work, now, calls):
@@ -674,7 +677,8 @@ class WorkerPool:
         :return: whether it ran: its callback group may have refused it.
         """
         engine, entity = self.engine, work.entity
-        outcome, start, end, worker = me.outcome, me.start, me.end, work.worker
+        start, end = me.start + self._offset, me.end + self._offset
+        outcome, worker = me.outcome, work.worker
         me.outcome = None
         if me.has_lent:
             worker = -1
