@@ -66,6 +66,7 @@ class Program:
     :ivar folders: where its packages are, in the folder of sources.
     :ivar inputs: a message for each of some topics, published at 20 Hz while it runs.
     :ivar constant: the topics whose last message must be the same.
+    :ivar parameters: ROS parameters, ``name:=value``.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Program:
     folders: tuple[str, ...]
     inputs: tuple[tuple[str, Any], ...] = ()
     constant: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
 
 
 _DEMOS = ('demos/demo_nodes_py',)
@@ -102,7 +104,8 @@ PROGRAMS = (
     Program('diagnostic_example', 'diagnostic_updater.example:main', _DIAGNOSTICS),
     Program('rosapi', 'rosapi_node:main', (*_ROSBRIDGE, 'rosbridge_suite/rosapi/scripts')),
     Program('rosbridge_websocket', 'rosbridge_websocket:main',
-            (*_ROSBRIDGE, 'rosbridge_suite/rosbridge_server/scripts')),
+            (*_ROSBRIDGE, 'rosbridge_suite/rosbridge_server/scripts'),
+            parameters=('address:=127.0.0.1',)),
     Program('tree_watcher', 'py_trees_ros.programs.tree_watcher:main', ('py_trees_ros',)),
     Program('gym_bridge', 'f1tenth_gym_ros.gym_bridge:main', ('f1tenth_gym_ros',)),
 )
@@ -170,9 +173,10 @@ def observe(program: Program, path: list[str], hosted: bool, seconds: float) -> 
     domain = str(random.randrange(1, 100))
     os.environ['ROS_DOMAIN_ID'] = domain  # of this process's context, too
     module, function = program.spec.split(':')
-    command = ['-c', f'import sys; sys.argv = [{module!r}]; import {module} as m; m.{function}()']
+    command = ['-c', f'import sys; sys.argv[0] = {module!r}; import {module} as m; m.{function}()']
     if hosted:
         command = ['-m', 'mddag_executor', 'run', '--node', program.spec, '--diagnostics', 'off']
+    command += ['--ros-args', *(part for each in program.parameters for part in ('-p', each))]
     rclpy.init()
     probe = Probe(program)
     with subprocess.Popen(
@@ -245,11 +249,15 @@ def main() -> int:
             continue
         theirs, ours = (observe(program, path, hosted, options.seconds)
                         for hosted in (False, True))
+        if theirs.end == 'by itself' and theirs.status:  # it compares nothing
+            print(f'{program.name}: skipped: {theirs.said.strip().splitlines()[-1]}', flush=True)
+            continue
         found = differences(theirs, ours)
         n_ran, n_different = n_ran + 1, n_different + bool(found)
         counts = ', '.join(f'{topic} {theirs.counts[topic]}/{ours.counts[topic]}'
                            for topic in sorted({*theirs.counts, *ours.counts}))
-        print(f'{program.name}: {"; ".join(found) or "same"} ({counts})', flush=True)
+        print(f'{program.name}: {"; ".join(found) or "same"} ({counts or "no messages"}, '
+              f'ended {theirs.end})', flush=True)
     print(f'{n_ran} programs compared, {n_different} differ')
     return 1 if n_different else 0
 
