@@ -194,26 +194,6 @@ def test_from_trace_accepts_the_proposals(call: Mddag, tmp_path: Path) -> None:
         '/n/callback_0': [(10, 1)], '/n/callback_2': [(5, 0)], '/n/callback_5': [(5, 0)]}
 
 
-def test_from_trace_of_a_cycle_says_so(call: Mddag, tmp_path: Path) -> None:
-    """Proposals do not break it, so the declaration is there to be corrected."""
-    r = Recorded(tmp_path / 'r.mcap')
-    r.node(1, '/n')
-    r.publisher(100, 1, '/ping')
-    r.publisher(101, 1, '/pong')
-    r.subscription(12, 1, '/ping')
-    r.subscription(13, 1, '/pong')
-    for k in range(1, 4):
-        for callback, publisher, at in ((12, 101, k * 10 * MS), (13, 100, k * 10 * MS + 5 * MS)):
-            r.run(callback, 1, at, at + MS)
-            r.publish(publisher, 1, at + MS // 2)
-    r.write()
-    done = call('graph', 'from-trace', 'r.mcap', '--accept', '-o', 'g.yaml', cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith('error: g.yaml:') and done.stderr.count('\n') == 1
-    assert 'start each other in a cycle' in done.stderr
-    assert (tmp_path / 'g.yaml').exists()
-
-
 def test_a_coroutine_is_one_execution_however_often_it_is_resumed(
         call: Mddag, tmp_path: Path) -> None:
     pytest.importorskip('rclpy')

@@ -161,11 +161,3 @@ def test_ctf_2_needs_babeltrace_2_1(
             f'error: {recording}: it is CTF 2, which babeltrace2 {version} does not read: install '
             'babeltrace2 2.1 or newer, or record with lttng create --trace-format=ctf-1.8\n')
         assert not out.exists()
-
-
-def test_bad_outputs(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(capsys, 'ctf', recording, '-o', '-')[0] == 2
-    status, _, errors = call(capsys, 'ctf', recording, '-o', '/nowhere/out.mcap')
-    assert status == 2
-    assert errors == ('error: /nowhere/out.mcap: there is no directory /nowhere: '
-                      'make it first\n')

@@ -171,13 +171,6 @@ def wait_for(process: subprocess.Popen[str], condition: Callable[[], bool]) -> N
         time.sleep(0.01)
 
 
-def takes_signals(process: subprocess.Popen[str]) -> bool:
-    """Tell whether a run ends in order when it gets a signal."""
-    status = Path(f'/proc/{process.pid}/status').read_text()
-    caught = int(re.findall(r'^SigCgt:\s*(\w+)$', status, re.MULTILINE)[0], 16)
-    return bool(caught >> (signal.SIGTERM - 1) & 1)
-
-
 def releases() -> list[int]:
     """Return when the jobs were due of which /slow:cb was late, as far as the trace has them."""
     with suppress(OSError, TraceError):
@@ -206,15 +199,6 @@ def test_a_signal_ends_a_synthetic_run(graph: Path, number: int) -> None:
     assert result['measured']['window_ns'] > 0
     assert result['dags']['main']['sinks']['/slow:cb']['completed'] >= len(releases()) > 0
     assert 'sink jobs due' in out
-
-
-def test_a_signal_during_the_warm_up_leaves_a_whole_result(graph: Path) -> None:
-    with started(graph) as process:
-        wait_for(process, lambda: takes_signals(process))
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=60)
-    assert process.returncode == 0, err
-    assert json.loads(Path('result.json').read_text())['measured'] is None
 
 
 def test_a_signal_that_comes_twice_is_one(graph: Path) -> None:
@@ -254,22 +238,6 @@ def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph: Path
     assert max(stop['end_ns'] - stop['begin_ns'] for stop in stops['latest']) >= 200_000_000
     # The slow sink was due every 20 ms meanwhile; it is late all the time besides.
     assert 10 <= stops['misses'] == int(line[1]) <= int(line[2]) == total(result['dags']).missed
-
-
-def test_workers_that_all_wait_in_callbacks_are_no_stop_of_the_machine(
-    folder: Path, mddag: Mddag
-) -> None:
-    Path('graph.yaml').write_text("""\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: tick, timer: 50ms, deadline: 50ms, execution_time: 1ms}
-      - {name: wait, timer: 200ms, deadline: 200ms, execution_time: 150ms}
-""")
-    mddag('run', 'graph.yaml', '--synthetic', 'sleep', '--workers', '1', '--duration', '1s',
-          '--json', 'out.json')
-    assert json.loads(Path('out.json').read_text())['stops']['total_ns'] < 500_000_000
 
 
 # --- tables --------------------------------------------------------------------------------------

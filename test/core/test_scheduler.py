@@ -20,9 +20,7 @@ from mddag_executor.core.state import (
     JOB_END,
     OPEN,
     RUNNING,
-    SINK_ABORTED,
     SINK_FAILED,
-    SINK_MISSED,
     SINK_OVERDUE,
     SUSPENDED,
     WAITING,
@@ -32,7 +30,7 @@ from mddag_executor.simulate import Settings, simulate, SimulationError
 from msg_graph import TaskSet
 import pytest
 
-from .live_helpers import J, JOIN, live, run_one, start_job, undeclared, US, X
+from .live_helpers import J, live, run_one, start_job, undeclared, US, X
 from .task_sets import Case, declaration, examples
 from .test_by_hand import case, single
 
@@ -56,21 +54,6 @@ def test_a_job_fails_with_what_fails_of_it() -> None:
     assert scheduler.state.job_state[slot] == FREE
 
 
-def test_a_stuck_job_does_not_keep_younger_ones_from_expiring() -> None:
-    scheduler = live(expire_after=10 * US)
-    stuck = scheduler.release(0, 0, 0, 0)
-    scheduler.ready(scheduler.source(stuck), 0)
-    assert scheduler.take(0, 0) == scheduler.source(stuck)
-    scheduler.suspend(scheduler.source(stuck))     # it waits for what never comes
-    lost = [start_job(scheduler, job, job) for job in (1, 2)]
-    scheduler.expire_idle(60 * US + 2)
-    assert [decision[3] for decision in scheduler.decisions() if decision[0] == JOB_END] == [1]
-    scheduler.expire_idle(60 * US + 3)
-    assert [decision[3] for decision in scheduler.decisions() if decision[0] == JOB_END] == [2]
-    states = [scheduler.state.job_state[slot] for slot in (stuck, *lost)]
-    assert states == [OPEN, FREE, FREE]
-
-
 def aborting() -> TaskSet:
     return declaration([
         {'node': '/n', 'name': 's', 'timer': '100us', 'publishes': ['/s'], 'dag': 'd',
@@ -78,17 +61,6 @@ def aborting() -> TaskSet:
         {'node': '/n', 'name': 'x', 'subscription': '/s', 'deadline': '5us'},
         {'node': '/n', 'name': 'y', 'subscription': '/s', 'deadline': '50us'},
         {'node': '/n', 'name': 'z', 'subscription': '/s', 'deadline': '60us'}])
-
-
-def test_what_comes_too_late_aborts_its_job_at_its_turn() -> None:
-    scheduler = live(aborting(), workers=1)
-    slot = start_job(scheduler)
-    y = scheduler.execution(slot, 2)
-    scheduler.ready(y, 1)
-    assert scheduler.take(0, 5 * US + 1) == -1, 'x has missed its deadline: the job is over'
-    kinds = [decision[0] for decision in scheduler.decisions()]
-    assert kinds == [SINK_ABORTED, SINK_ABORTED, SINK_ABORTED, JOB_END, DROP]
-    assert scheduler.state.job_state[slot] == FREE
 
 
 def test_a_blocked_callback_does_not_abort_its_job() -> None:
@@ -106,17 +78,6 @@ def test_a_blocked_callback_does_not_abort_its_job() -> None:
     scheduler.complete(busy, 11 * US)
     assert scheduler.take(1, 11 * US) == -1
     assert scheduler.decisions()[-1][0] == DROP
-
-
-def test_the_end_of_the_run_judges_what_is_open() -> None:
-    scheduler = live()
-    start_job(scheduler, 0, 0)
-    start_job(scheduler, 1, 10 * US)
-    start_job(scheduler, 2, 20 * US)
-    scheduler.finish(60 * US)
-    assert scheduler.decisions() == [
-        (SINK_MISSED, 0, J, 0, 50 * US, -1), (SINK_MISSED, 0, J, 1, 60 * US, -1)]
-    assert scheduler.state.n_open[0] == 3
 
 
 def test_a_recorded_execution_goes_past_queue_workers_and_groups() -> None:
@@ -146,19 +107,6 @@ def test_an_unknown_policy_is_refused_with_the_list() -> None:
 # --- workers -------------------------------------------------------------------------------------
 
 
-def test_undeclared_callbacks_have_the_default_deadline() -> None:
-    tables = Tables.build(JOIN, legs=True, groups=False, default_deadline=40 * US)
-    scheduler = Scheduler(tables, 1, propagate=False)
-    slot = scheduler.release(0, 0, 0, 0)        # RAD 50 us
-    scheduler.ready(scheduler.source(slot), 0)
-    early = undeclared(scheduler, 0, -1, 0)      # 40 us
-    later = undeclared(scheduler, 1, -1, 11 * US)  # 51 us
-    assert [scheduler.take(0, 11 * US), scheduler.complete(early, 12 * US),
-            scheduler.take(0, 12 * US), scheduler.complete(scheduler.source(slot), 12 * US),
-            scheduler.take(0, 12 * US)] == [early, True, scheduler.source(slot), True, later]
-    assert scheduler.decisions() == [], 'nobody judges what nobody declared'
-
-
 def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits() -> None:
     scheduler = live(workers=1)
     first, second = scheduler.new_group(), scheduler.new_group()
@@ -180,34 +128,6 @@ def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits() -> Non
 
 
 # --- drop ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize('grouped', [False, True])
-def test_queues_stay_bounded_when_what_waits_longest_is_dropped_for_ever(grouped: bool) -> None:
-    """As with a topic of QoS depth 5 behind a callback that never ends."""
-    scheduler = live(workers=1, policy_name='rm')
-    group = scheduler.new_group() if grouped else -1
-    busy = undeclared(scheduler, 0, group, 0)
-    assert scheduler.take(0, 0) == busy
-    scheduler.lend(busy)
-    waiting: list[int] = []
-    for i in range(3_000):
-        if len(waiting) == 5:
-            scheduler.drop(waiting.pop(0), i)
-        waiting.append(undeclared(scheduler, i, group, i))
-        if grouped:
-            assert scheduler.take(0, i) == -1
-        assert scheduler.queue_length == len(waiting)
-        entries = len(scheduler.state.ready) + sum(map(len, scheduler.state.group_heap))
-        assert entries <= 2 * (SWEEP_AT + 5)
-    assert len(scheduler.state.job_dag) <= 10, 'slots are used again'
-    scheduler.complete(busy, 4_000)
-    order = []
-    for _ in waiting:
-        order.append(scheduler.take(0, 4_000))
-        scheduler.complete(order[-1], 4_000)
-    assert order == waiting
-    assert scheduler.take(0, 4_000) == -1
 
 
 SINKS = declaration([
@@ -376,28 +296,6 @@ def test_one_that_turns_out_to_wait_gives_the_interpreter_back() -> None:
     drive.complete(holder)
     drive.complete(held_back)
     assert drive.core.idle_workers == 7
-
-
-def test_lending_and_suspending_give_it_back() -> None:
-    drive = Driver(computing(7))
-    first, second, third = (drive.ready(MIDDLE, holds=True) for _ in range(3))
-    assert drive.go() == [first]
-    drive.core.lend(first)
-    assert drive.go() == [second]
-    drive.core.suspend(second)
-    assert drive.go() == [third]
-    drive.core.resume(second)
-    assert drive.go() == []  # it holds the interpreter again when it goes on
-    drive.complete(third)
-    assert drive.go() == [second]
-
-
-def test_it_holds_under_polling_too() -> None:
-    drive = Driver(computing(7, 'ros2'))
-    first, second = drive.ready(URGENT, holds=True), drive.ready(MIDDLE, holds=True)
-    assert drive.go() == [first]
-    drive.complete(first)
-    assert drive.go() == [second]
 
 
 def may_start(core: Scheduler, x: int) -> bool:

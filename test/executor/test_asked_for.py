@@ -9,7 +9,6 @@ Turns, timers, simulated time, exceptions of tasks, shutdown, Ctrl-C.
 from __future__ import annotations
 
 from collections import Counter
-import threading
 import time
 from typing import Any
 
@@ -22,11 +21,10 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
-from .conftest import interrupted, Spinning, wait_for
+from .conftest import Spinning, wait_for
 
 MS = 1_000_000
 
@@ -190,53 +188,6 @@ def test_every_worker_may_sleep_on_the_simulated_clock(make_executor, make_node,
     assert ends == [True] * 6 and slept == [True]
 
 
-def test_every_worker_may_sleep_with_a_rate(make_executor, make_node):
-    """The timer that ends their sleep needs no worker (the same for ``create_rate``)."""
-    node = make_node()
-    executor = make_executor(nodes=[node])
-    together = threading.Barrier(7)
-    rates = [node.create_rate(100) for _ in range(7)]
-
-    def sleep(rate: Any) -> int:
-        together.wait(5.0)
-        for _ in range(3):
-            rate.sleep()
-        return 1
-
-    tasks = [executor.create_task(sleep, rate) for rate in rates]
-    with Spinning(executor):
-        done = wait_for(lambda: all(task.done() for task in tasks))
-        for rate in rates:
-            rate.destroy()
-    assert done and [task.result() for task in tasks] == [1] * 7
-
-
-def test_a_clock_that_jumps_back_does_not_stall_timers(make_executor, make_node):
-    """They go on with the clock as it is then (rclpy#1490, rclcpp#2535)."""
-    simulation = Simulation(make_node)
-    calls: list[int] = []
-    clock = simulation.node.get_clock()
-    executor = make_executor()
-    executor.add_node(simulation.node)
-
-    def run(start: int, steps: int) -> None:
-        for step in range(1, steps + 1):
-            assert simulation.set_clock(start + step * 10 * MS)
-            time.sleep(0.002)
-
-    with Spinning(executor):
-        assert simulation.matched() and simulation.set_clock(100 * 10**9)
-        simulation.node.create_timer(0.05, lambda: calls.append(clock.now().nanoseconds))
-        time.sleep(0.1)
-        run(100 * 10**9, 20)
-        assert wait_for(lambda: len(calls) >= 3)
-        for back in (50 * 10**9, 10**9):
-            before = len(calls)
-            run(back, 20)
-            assert wait_for(lambda n=before: len(calls) >= n + 3)
-            assert calls[-1] < back + 10**9
-
-
 # --- tasks ---------------------------------------------------------------------------------------
 
 
@@ -283,30 +234,6 @@ def test_an_exception_that_is_handled_does_not_end_the_executor(make_executor, k
     assert [task.result() for task in tasks] == [10, "'handled'"]
 
 
-@pytest.mark.parametrize('kept', [False, True])
-def test_an_exception_that_nobody_handles_ends_the_spin(make_executor, kept):
-    """One that was put by since its maker could have handled it comes out as well."""
-    executor = make_executor()
-    tasks: list[Any] = []
-    gate: Future = Future()
-
-    async def make() -> None:
-        task = executor.create_task(fails)
-        assert wait_for(task.done)
-        if kept:
-            tasks.append(task)
-        else:
-            del task
-            await gate  # it is under way for as long as this test lasts
-
-    maker = executor.create_task(make)
-    with Spinning(executor) as spinning:
-        assert wait_for(lambda: spinning.error is not None)
-        spinning.join()
-    assert isinstance(spinning.error, KeyError)
-    assert maker.done() == kept
-
-
 # --- ends ----------------------------------------------------------------------------------------
 
 
@@ -331,76 +258,3 @@ def test_shutdown_from_inside_a_callback(make_executor, make_node, ros_context, 
         spinning.join()
     assert calls == [1]
     assert spinning.error is None
-
-
-def test_nothing_starts_after_the_context_has_ended(make_executor, make_node, ros_context):
-    """What was ready by then neither: a worker is quicker than the thread that spins."""
-    node = make_node()
-    executor = make_executor(num_workers=1, nodes=[node])
-    calls: list[int] = []
-
-    def end() -> None:
-        calls.append(1)
-        time.sleep(0.05)  # the others become ready
-        rclpy.shutdown(context=ros_context)
-
-    for _ in range(5):
-        node.create_timer(0.02, end, ReentrantCallbackGroup())
-    with Spinning(executor) as spinning:
-        spinning.join()
-    assert calls == [1]
-    assert spinning.error is None
-
-
-PROGRAM = """
-import sys, threading, time
-import rclpy
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.executors import ExternalShutdownException
-from std_srvs.srv import Trigger
-from mddag_executor import MultiDeadlineExecutor
-
-
-def busy():
-    running.add(threading.get_ident())
-    if len(running) >= 5:
-        ready.set()
-    end = time.monotonic() + 0.02
-    while time.monotonic() < end:
-        node.get_logger().debug('busy')
-
-
-def ask():
-    client.call(Trigger.Request())
-    asked.set()
-
-running, ready, asked = set(), threading.Event(), threading.Event()
-rclpy.init()
-node = rclpy.create_node('node')
-group = ReentrantCallbackGroup()
-node.create_service(Trigger, '/ask', lambda request, response: response, callback_group=group)
-client = node.create_client(Trigger, '/ask', callback_group=group)
-for period in range(40, 47):
-    node.create_timer(period / 1000, busy, group)
-node.create_timer(0.05, ask, group)
-executor = MultiDeadlineExecutor()
-threading.Thread(target=lambda: ready.wait() and asked.wait() and print('ready', flush=True),
-                 daemon=True).start()
-try:
-    rclpy.spin(node, executor)
-except (KeyboardInterrupt, ExternalShutdownException):
-    pass
-finally:
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown()
-"""
-
-
-def test_ctrl_c_is_quiet():
-    """While all workers are busy, with the idiom of rclpy's own examples (rclpy#1279)."""
-    status, out, err = interrupted(PROGRAM)
-    assert status == 0, err
-    assert out == ''
-    # On a busy machine the timers skip periods, and that is said.
-    assert [line for line in err.splitlines() if 'cannot keep its rate' not in line] == []

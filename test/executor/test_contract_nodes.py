@@ -14,7 +14,6 @@ from rclpy.action import ActionClient, ActionServer, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
@@ -266,39 +265,3 @@ def test_a_callback_may_destroy_what_it_belongs_to(make_executor, make_node):
             assert wait_for(lambda some=calls: 'node' in some), calls
             assert calls.count('message') == calls.count('node') == 1
     assert spinning.error is None
-
-
-def test_publishers_are_destroyed_while_another_thread_publishes(make_executor, make_node):
-    """The publishing thread is told, the executor goes on (rclpy#1206 for subscriptions)."""
-    node, got = make_node(), []
-    executor = make_executor(nodes=[node])
-    node.create_subscription(Header, '/topic', got.append, 10)
-    current: list[Any] = []
-    stop = threading.Event()
-    errors: list[BaseException] = []
-
-    def publish() -> None:
-        while not stop.is_set():
-            try:
-                current[-1].publish(Header())
-            except InvalidHandle:
-                time.sleep(0.0005)
-            except BaseException as error:
-                errors.append(error)
-                return
-
-    current.append(node.create_publisher(Header, '/topic', 10))
-    thread = threading.Thread(target=publish)
-    with Spinning(executor) as spinning:
-        thread.start()
-        try:
-            for _ in range(20):
-                before = len(got)
-                assert wait_for(lambda n=before: len(got) > n)
-                old = current[-1]
-                current.append(node.create_publisher(Header, '/topic', 10))
-                node.destroy_publisher(old)
-        finally:
-            stop.set()
-            thread.join()
-    assert spinning.error is None and errors == []

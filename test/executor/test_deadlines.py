@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections import Counter
-import random
 import subprocess
 import sys
 import threading
@@ -17,7 +16,6 @@ from mddag_executor import DeadlineMiss
 from mddag_executor.executor import current_job
 from mddag_executor.executor.work import Work
 from mddag_executor.replay import replay
-from mddag_executor.trace import read_events
 from msg_graph import loads, TaskSet
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -358,24 +356,6 @@ def test_abort_drops_what_is_left_of_a_late_job(make_executor, make_node):
     assert len(chain.jobs['last']) < len(chain.jobs['tick'])
 
 
-def test_whatever_became_ready_ran_was_dropped_or_waits(make_executor, make_node):
-    """Jobs are aborted at any point: also while what is going to publish still runs."""
-    generator = random.Random(1)
-    dawdle = {name: lambda: time.sleep(generator.choice((0, 0.012, 0.03, 0.06)))
-              for name in ('relay', 'early', 'last')}
-    chain = Chain(make_node, dawdle)
-    executor = make_executor(with_source('on_late: abort'), num_workers=2)
-    with Spinning(executor):
-        chain.start(executor)
-        assert wait_for(lambda: len(chain.jobs['tick']) >= 40, 20)
-        chain.timer.cancel()
-        assert wait_for(lambda: is_idle(executor))
-    statistics = executor.statistics()
-    assert sum(statistics['dropped'].values()) > 0
-    for name, counts in statistics['callbacks'].items():
-        assert counts['ready'] == counts['ran'] + counts['dropped'] + counts['waiting'], name
-
-
 def test_a_lost_message_expires_its_job(make_executor, make_node):
     """Nobody runs the relay: its jobs cannot complete, expire, and free their places."""
     chain = Chain(make_node)
@@ -415,37 +395,6 @@ def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, r
         assert counts['/middle:early']['overdue'] > 0
         assert ended.wait(30.0)
     assert sinks(executor) == counts
-
-
-def test_deadlines_after_the_stop_are_not_judged(make_executor, make_node, tmp_path):
-    """A relay still runs when the executor stops; what it publishes then starts nothing."""
-    runs, go_on = threading.Event(), threading.Event()
-
-    def relay() -> None:
-        job = current_job()
-        if job is not None and job.job >= 3:
-            runs.set()
-            go_on.wait(30.0)
-
-    chain = Chain(make_node, {'relay': relay})
-    path = str(tmp_path / 'run.mcap')
-    executor = make_executor(loads(CHAIN), num_workers=2, trace=path)
-    with Spinning(executor):
-        chain.start(executor)
-        assert runs.wait(30.0)
-        assert not executor.shutdown(0)
-        stopped = time.time_ns()
-        time.sleep(0.1)     # the deadline of what runs comes meanwhile
-        go_on.set()
-    events = list(read_events(path))
-    end = next(event['end'] for event in events if event['_name'] == 'mddag:shutdown')
-    assert end <= stopped
-    assert all(event['deadline'] <= end for event in events
-               if event['_name'] == 'mddag:deadline' and event['completed'] < 0)
-    replayed = replay(path)
-    assert not replayed.warnings
-    assert replayed.result()['dags']['chain']['ends'] == \
-        executor.statistics()['dags']['chain']['ends']
 
 
 TWO_PUBLISHERS = """

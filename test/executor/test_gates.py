@@ -111,39 +111,6 @@ def test_messages_that_wait_are_as_many_as_the_qos_says_and_keep_their_order(mak
     assert got == [7, 8, 9]
 
 
-def test_callbacks_of_one_entity_run_at_once_where_the_group_lets_them(make_executor, node):
-    group, inside = AtMost(2), threading.Barrier(2)
-    got: list[int] = []
-
-    def callback(message: Int32) -> None:
-        inside.wait(5.0)
-        got.append(message.data)
-
-    node.create_subscription(Int32, '/pairs', callback, 20, callback_group=group)
-    publisher = node.create_publisher(Int32, '/pairs', 20)
-    executor = make_executor(num_workers=4, nodes=[node])
-    with Spinning(executor) as spinning:
-        assert wait_for(lambda: publisher.get_subscription_count() == 1)
-        for i in range(10):
-            publisher.publish(Int32(data=i))
-        assert wait_for(lambda: len(got) == 10)
-    assert spinning.error is None and group.most == 2 and sorted(got) == list(range(10))
-
-
-@pytest.mark.parametrize('method', ['can_execute', 'beginning_execution', 'ending_execution'])
-def test_what_a_group_raises_comes_out_of_spin(make_executor, node, monkeypatch, method):
-    group = AtMost(1)
-
-    def broken(entity: Any) -> bool:
-        raise ValueError('a broken group')
-
-    monkeypatch.setattr(group, method, broken)
-    node.create_timer(0.001, lambda: None, callback_group=group)
-    executor = make_executor(nodes=[node])
-    with pytest.raises(ValueError, match='a broken group'):
-        executor.spin()
-
-
 def test_a_coroutine_ends_when_it_has_run_to_its_end(make_executor, node):
     group, future, steps = AtMost(1), Future(), []
 

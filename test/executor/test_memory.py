@@ -8,15 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 import gc
 import os
-from types import SimpleNamespace
 from typing import Any
 import weakref
 
-from mddag_executor.clocks import TraceClock
 from mddag_executor.executor import publishing, waitables
-from mddag_executor.executor.recorder import Recorder
 from msg_graph import loads
-import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
@@ -183,40 +179,3 @@ def test_a_destroyed_node_is_freed_without_the_collector(make_executor, ros_cont
         del node, publisher, subscription, things
         assert wait_for(lambda: all(thing() is None for thing in left)), [
             thing() for thing in left if thing() is not None]
-
-
-class Thing:
-    """As much of a node or a publisher as the recorder looks at."""
-
-    publishers: tuple[Thing, ...] = ()
-    topic_name = '/topic'
-
-    qos_profile = SimpleNamespace(depth=10)
-
-    def get_name(self) -> str:
-        return 'node'
-
-    def get_namespace(self) -> str:
-        return '/'
-
-    def get_fully_qualified_name(self) -> str:
-        return '/node'
-
-
-@pytest.mark.parametrize('trace', ['out.mcap'])
-def test_what_gets_the_address_of_one_before_is_recorded(tmp_path, trace):
-    recorder = Recorder(str(tmp_path / trace), None, 'rad', 1, 100, 64, TraceClock())
-    recorded: list[tuple[str, int]] = []
-    recorder.record = lambda event, now, vtid, *fields: recorded.append((event, fields[0]))
-    for _ in range(20):
-        node = Thing()
-        node.publishers = (Thing(),)
-        for _ in range(3):
-            recorder.entities([node], [])
-        del node
-    recorder.writer.close()
-    for event in ('rcl_node_init', 'rcl_publisher_init'):
-        addresses = [address for name, address in recorded if name == event]
-        assert len(addresses) == 20
-        assert len(set(addresses)) < 20, 'no address came again: this tests nothing'
-    assert len(recorder._known) == 0

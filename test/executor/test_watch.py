@@ -196,19 +196,3 @@ def test_a_wrong_name_is_warned_of_once(
     else:
         line, = warned
         assert f'camera.yaml: {expected}' in line
-
-
-@pytest.mark.parametrize('change', [
-    ('', ''), ('dag: vision', 'dag: vision, release_from: header_stamp')])
-def test_what_may_run_elsewhere_is_not_missed(
-        ros_context: Any, make_node: Any, capfd: Any, change: tuple[str, str]) -> None:
-    """Neither is anything where the executor has no node yet."""
-    text = CAMERA.replace('timer: 50ms', 'subscription: /light, period: 50ms').replace(*change)
-    executor = MultiDeadlineExecutor(loads(text, 'camera.yaml'), context=ros_context)
-    if change[0]:
-        detector = make_node('detector')
-        detector.create_subscription(String, '/image', lambda message: None, 10)
-        executor.add_node(detector)
-    executor.spin_until_future_complete(Future(), LEAST_S + 0.5)
-    executor.shutdown()
-    assert 'no node here has' not in capfd.readouterr().err

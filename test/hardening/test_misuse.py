@@ -14,9 +14,7 @@ from mddag_executor.errors import MddagError
 import msg_graph
 import pytest
 import rclpy
-from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.exceptions import NotInitializedException
 
 GRAPH = """
 mddag: 1
@@ -55,18 +53,6 @@ def test_a_wrong_argument_is_named_in_one_line(
     assert not trace.exists()
 
 
-def test_arguments_as_rclpy_has_them(ros_context: Any) -> None:
-    executor = MultiDeadlineExecutor(
-        num_threads=3, context=ros_context, default_deadline=Duration(seconds=0.2),
-        diagnostics_period=Duration(seconds=1))
-    assert executor.statistics()['workers'] == 3
-    executor.shutdown()
-    with pytest.raises(MddagError, match='give one of the two'):
-        MultiDeadlineExecutor(num_threads=3, num_workers=3, context=ros_context)
-    with pytest.raises(MddagError, match='num_workers=4'):
-        MultiDeadlineExecutor(4, context=ros_context)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize('period', ['soon', '', '5', '1 parsec'])
 def test_a_wrong_time_is_a_graph_error(ros_context: Any, period: str) -> None:
     for name in ('default_deadline', 'diagnostics_period'):
@@ -79,11 +65,6 @@ def test_a_path_that_leads_nowhere(ros_context: Any, graph: str) -> None:
     with pytest.raises(msg_graph.GraphError) as caught:
         MultiDeadlineExecutor(graph, context=ros_context)
     assert str(caught.value).isprintable()
-
-
-def test_before_init() -> None:
-    with pytest.raises(NotInitializedException, match='rclpy.init'):
-        MultiDeadlineExecutor(context=Context())
 
 
 @pytest.fixture
@@ -132,40 +113,6 @@ def test_after_shutdown(executor: Any, node: Any) -> None:
         executor.add_node(node)
     assert executor.statistics()['dags']['d']['jobs'] == 0
     assert time.monotonic() - begin < 5.0
-
-
-def in_a_callback(executor: Any, node: Any, action: Any) -> Any:
-    """Have a timer's callback do something while the executor spins in a thread; what it got."""
-    got: list[Any] = []
-    ended = threading.Event()
-
-    def tick() -> None:
-        timer.cancel()
-        try:
-            got.append(action())
-        except Exception as error:
-            got.append(error)
-        ended.set()
-
-    timer = node.create_timer(0.01, tick)
-    executor.add_node(node)
-    spinning = threading.Thread(target=executor.spin)
-    spinning.start()
-    assert ended.wait(10.0), 'the callback hangs'
-    assert executor.shutdown(5.0)
-    spinning.join(5.0)
-    assert not spinning.is_alive()
-    return got[0]
-
-
-def test_stepping_within_a_callback(executor: Any, node: Any) -> None:
-    error = in_a_callback(executor, node, lambda: executor.spin_once(0.1))
-    assert isinstance(error, RuntimeError) and 'already spinning' in str(error)
-
-
-def test_removing_the_node_within_its_callback(executor: Any, node: Any) -> None:
-    assert in_a_callback(executor, node, lambda: executor.remove_node(node)) is None
-    assert executor.get_nodes() == []
 
 
 def test_everything_from_many_threads_at_once(executor: Any, ros_context: Any) -> None:

@@ -4,12 +4,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 import re
 import threading
 
-from mddag_executor.hosting.graph_probe import draft_of, Endpoints, Probe, probe, Seen
+from mddag_executor.hosting.graph_probe import draft_of, probe, Seen
 from msg_graph import loads
 from msg_graph.draft import declaration_of, MARK
 import pytest
@@ -23,34 +22,6 @@ def seen(interval_ms: float) -> Seen:
     """Return the messages of a second."""
     return Seen(count=int(1000 / interval_ms) + 1, first=5,
                 last=5 + round(int(1000 / interval_ms) * interval_ms * MS))
-
-
-def test_what_is_supposed() -> None:
-    found = Probe(
-        nodes={
-            '/source': Endpoints(publishes={'/in': 'a/b', '/slow': 'a/b', '/mute': 'a/b'}),
-            '/work': Endpoints(subscribes={'/in': 'a/b'}, publishes={'/out': 'a/b'},
-                               serves={'/serve': 'a/b'}),
-            '/other': Endpoints(publishes={'/out': 'a/b'}),
-            '/empty': Endpoints()},
-        seen={'/in': seen(10), '/slow': seen(100), '/mute': Seen(), '/out': seen(5)},
-        publishers=Counter({'/in': 1, '/slow': 1, '/mute': 1, '/out': 2}))
-    draft = draft_of(found)
-    assert [node.name for node in draft.nodes] == ['/empty', '/other', '/source', '/work']
-    empty, other, source, work = (
-        [(c.kind, c.starts, c.guessed, c.publishes, c.maybe, c.interval_ns)
-         for c in node.callbacks.values()] for node in draft.nodes)
-    # What is seen of it is its name: it may have timers.
-    assert empty == [('timer', [], True, [], [], None)]
-    assert source == [('timer', [], True, ['/in', '/mute', '/slow'], [], 10 * MS)]
-    assert work == [('subscription', ['/in'], False, [], ['/out'], None),
-                    ('service', ['/serve'], False, [], ['/out'], None)]
-    # Two publish it, so each every 10 ms.
-    assert other == [('timer', [], True, ['/out'], [], 10 * MS)]
-    text = declaration_of(draft)
-    assert f'timer: 10ms  # {MARK}: is this a timer?' in text
-    assert f'# timer: 100ms  # {MARK}: what starts it?' in text
-    assert f'# publishes: [/out]  # {MARK}: which callback publishes /out?' in text
 
 
 @pytest.fixture

@@ -11,11 +11,9 @@ from typing import Any
 from mddag_executor.executor import current_job
 from mddag_executor.executor.executor import MultiDeadlineExecutor
 from mddag_executor.hosting.bodies import spinner
-from mddag_executor.hosting.measure import BODIES, ExecutionPlan, Ledger, measure
+from mddag_executor.hosting.measure import ExecutionPlan, measure
 from mddag_executor.hosting.session import Session
 from mddag_executor.hosting.synthetic import (
-    JOIN_LIMIT,
-    Role,
     SyntheticWorkload,
 )
 from msg_graph import load, loads, TaskSet
@@ -131,30 +129,7 @@ def test_spinning_takes_cpu_of_its_own_thread_only() -> None:
     assert len(taken) == 3 and min(taken) >= 30 * MS
 
 
-def test_what_bodies_do(autoware: TaskSet) -> None:
-    """Mixed ones are drawn: the same for the same seed, whatever else there is."""
-    drawn = [[ExecutionPlan(autoware, seed, mode='mixed').body(v) for v in autoware.vertices]
-             for seed in (1, 1, 2)]
-    assert set(drawn[0]) == set(BODIES) and drawn[0] == drawn[1] != drawn[2]
-    assert {ExecutionPlan(autoware, mode='native').body(v) for v in autoware.vertices} == {
-        'native'}
-
-
 # --- joins and releases --------------------------------------------------------------------------
-
-
-def role(task_set: TaskSet, ledger: Ledger, senders: str) -> Role:
-    return Role(task_set.vertex('/join:cb'), list(senders), '', 0, [], lambda ns: None, ledger)
-
-
-def test_incomplete_joins_are_bounded_and_counted(task_set: TaskSet) -> None:
-    ledger = Ledger(task_set)
-    join = role(task_set, ledger, 'ab')
-    for release in range(JOIN_LIMIT + 3):
-        join.is_whole(release, 'a')
-    assert (len(join.waiting), len(ledger.dropped_joins)) == (JOIN_LIMIT, 3)
-    assert not join.is_whole(0, 'b')  # its first leg is gone
-    assert join.is_whole(JOIN_LIMIT + 2, 'b')
 
 
 # --- nodes ---------------------------------------------------------------------------------------

@@ -6,10 +6,7 @@ from __future__ import annotations
 
 from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS, NOTHING, Verdict
 from mddag_executor.laboratory.necessary import largest_demand
-from mddag_executor.laboratory.sufficient import (
-    rad,
-)
-from mddag_executor.laboratory.tasks import AnalysisError, tasks_of
+from mddag_executor.laboratory.tasks import tasks_of
 from msg_graph import loads
 import pytest
 
@@ -24,16 +21,6 @@ nodes:
       - {name: t, timer: 100ms, publishes: [/a], execution_time: 1ms}
       - {name: x, subscription: /a, deadline: 3ms, execution_time: 2ms}
       - {name: y, subscription: /a, deadline: 50ms, execution_time: 40ms}
-"""
-
-WIDE = """\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: t, timer: 10ms, publishes: [/a], execution_time: 1ms}
-      - {name: x, subscription: /a, deadline: 10ms, execution_time: 3ms}
-      - {name: y, subscription: /a, deadline: 10ms, execution_time: 5ms}
 """
 
 
@@ -51,16 +38,6 @@ def verdicts(text: str, workers: int, budget: str = 'max') -> dict[str, Verdict]
     found = analyse(loads(text, 'g.yaml'), workers, budget).verdicts
     assert len({verdict.name for verdict in found}) == len(found)
     return {verdict.name: verdict for verdict in found}
-
-
-def test_what_is_not_declared() -> None:
-    text = FORK.replace(', execution_time: 2ms', '')
-    with pytest.raises(AnalysisError, match='g.yaml:6: /n:x declares no execution_time: add one'):
-        verdicts(text, 2)
-    with pytest.raises(AnalysisError, match='workers: 0 is too few'):
-        verdicts(FORK, 0)
-    with pytest.raises(AnalysisError, match="budget 'min': there is no such"):
-        verdicts(FORK, 1, 'min')
 
 
 def test_a_path_that_is_too_long() -> None:
@@ -109,19 +86,6 @@ def test_assumptions(right: str, wrong: str, reason: str | None) -> None:
             assert reason in verdict.reason
     if reason is None:
         assert found['response time, any policy'].verdict == HOLDS
-
-
-def test_a_long_callback_that_has_begun_is_part_of_the_bound() -> None:
-    # 2 ms of its own, 4 ms of a job of the other with an earlier RAD, 4 ms of one with a later.
-    tasks = tasks_of(loads(timers('100ms 50ms 2ms', '1s 1s 4ms')))
-    assert [bound.response for bound in rad(tasks, 1)] == [10 * MS, 6 * MS]
-    # On two workers both of these go on beside each other, and each callback of a chain waits.
-    wide = tasks_of(loads(WIDE.replace('10ms, publishes', '100ms, publishes').replace(
-        'deadline: 10ms', 'deadline: 50ms')
-        + timers('1s 1s 4ms', '1s 1s 2ms').partition('nodes:\n')[2].replace('/n', '/m')))
-    first = rad(wide, 2)[0]
-    # To x: 4 + (5 + urgent 4 + 2 + the lesser of 2 * (4 + 2) and what there is, 6 more) / 2.
-    assert first.response == (4 + (5 + 6 + 6) / 2) * MS
 
 
 def test_without_preemption_less_is_proven() -> None:

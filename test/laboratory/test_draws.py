@@ -10,7 +10,7 @@ from pathlib import Path
 from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.errors import InputError
-from mddag_executor.laboratory.acceptance import Acceptance, BINS, bins_of, WIDE_BINS, wilson
+from mddag_executor.laboratory.acceptance import Acceptance, BINS, bins_of, wilson
 from mddag_executor.laboratory.draws import Draws, feasible, read_samples, utilisations
 from mddag_executor.laboratory.shares import Dice, dirichlet_rescale
 from msg_graph import ExecutionTime, loads, TaskSet
@@ -64,26 +64,6 @@ def test_tables_are_drawn_as_one_by_one(
             assert isinstance(times, ExecutionTime)
             column = task_set.vertices.index(vertex)
             assert drawn[row, column] == max(1, times.draw(float(u)))
-
-
-def test_a_run_is_the_same_in_any_chunk(task_set: TaskSet) -> None:
-    draws = Draws(task_set, 7)
-    whole = draws.times(0, 20)
-    parts = np.concatenate([draws.times(0, 3), draws.times(3, 1), draws.times(4, 16)])
-    assert (whole == parts).all()
-    assert (Draws(task_set, 8).times(0, 20) != whole).any()
-
-
-def test_measured_values_are_rounded_up_to_us(task_set: TaskSet, tmp_path: Path) -> None:
-    path = tmp_path / 'samples.npz'
-    np.savez(path, **{'/n:a': [0, 1, 1000, 1001], '/n:b': [2_000_000.5], '/n:c': [5, 7]})
-    samples = read_samples(task_set, path, 'samples.npz')
-    assert samples['/n:a'].tolist() == [1000, 1000, 1000, 2000]
-    assert samples['/n:b'].tolist() == [2_001_000]
-    drawn = Draws(task_set, 0, samples).times(0, 4000)
-    values, counts = np.unique(drawn[:, 0], return_counts=True)
-    assert values.tolist() == [1000, 2000]
-    assert counts[0] / 4000 == pytest.approx(0.75, abs=0.03)  # 4 standard deviations
 
 
 def npz(**arrays: object) -> bytes:
@@ -152,21 +132,6 @@ def test_bound_by_demand() -> None:
     (0.7, 0.7), (0.92501, 0.95), (0.97499, 0.95), (0.97501, 1.0), (1.0, 1.0), (3.0, 1.0)])
 def test_bins(utilisation: float, centre: float) -> None:
     assert BINS[bins_of(np.array([utilisation]))[0]] == centre
-
-
-@pytest.mark.parametrize(('utilisation', 'centre'), [
-    (0.0, 0.05), (0.0749, 0.05), (0.0751, 0.1), (0.5, 0.5), (0.97499, 0.95), (0.97501, 1.0),
-    (3.0, 1.0)])
-def test_wide_bins(utilisation: float, centre: float) -> None:
-    assert WIDE_BINS[bins_of(np.array([utilisation]), WIDE_BINS)[0]] == centre
-
-
-@pytest.mark.parametrize(('accepted', 'runs', 'low', 'high'), [
-    # Figures of R's binom.confint(method = 'wilson').
-    (0, 10, 0.0, 0.2775328), (5, 10, 0.2365931, 0.7634069), (10, 10, 0.7224672, 1.0),
-    (88, 100, 0.8019, 0.9300)])
-def test_wilson(accepted: int, runs: int, low: float, high: float) -> None:
-    assert wilson(accepted, runs) == pytest.approx((low, high), abs=1e-4)
 
 
 def test_wilson_covers_the_truth() -> None:

@@ -74,25 +74,6 @@ def test_every_callback_can_be_bound_once() -> None:
             assert binder.bind(entity) is None
 
 
-def test_release_gives_back_in_declaration_order() -> None:
-    binder = Binder(TASKS)
-    first, join, second = (binder.bind(Entity('/a', 'subscription', '/x')) for _ in range(3))
-    assert first is not None and join is not None and second is not None
-    binder.release(second)
-    binder.release(first)
-    assert key(binder.bind(Entity('/a', 'subscription', '/x'))) == '/a:s0'
-    assert key(binder.bind(Entity('/a', 'subscription', '/x'))) == '/a:s1'
-    binder.bind(Entity('/a', 'subscription', '/y'))
-    binder.release(join, '/x')
-    assert key(binder.bind(Entity('/a', 'subscription', '/x'))) == '/a:j0'
-    binder.release(join)
-    assert {key(binder.bind(entity)) for entity in entities_of(join)} == {'/a:j0'}
-    timer = binder.bind(Entity('/a', 'timer', '', 20_000_000))
-    assert timer is not None
-    binder.release(timer)
-    assert binder.bind(Entity('/a', 'timer', '', 20_000_000)) is timer
-
-
 @pytest.mark.parametrize(('callback', 'seen', 'question'), [
     ('/b:s', Entity('/robot/b', 'subscription', '/robot/x'), "did you mean the node '/robot/b'?"),
     ('/b:s', Entity('/robot/b', 'subscription', '/x'), "did you mean the node '/robot/b'?"),

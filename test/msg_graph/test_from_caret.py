@@ -99,15 +99,6 @@ def test_an_unknown_publisher_is_a_blank_on_each_callback_that_may() -> None:
     assert text.count(f'{MARK}: if it is a sink') == 2
 
 
-def test_the_only_callback_of_a_node_publishes() -> None:
-    text = declaration_from_caret(
-        HEAD + node('/a', 'timer 1000000', extra=publishes('/x', 'UNDEFINED'))
-        + node('/b', 'subscription /x'), 'arch.yaml')
-    task_set = loads(accepted(text))
-    assert task_set.dags[0].edges == ((0, 1),)
-    assert task_set.dags[0].vertices[1].deadline_ns == 1_000_000
-
-
 def test_message_contexts_become_queue_edges() -> None:
     contexts = """\
   subscribes:

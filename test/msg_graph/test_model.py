@@ -17,22 +17,10 @@ from msg_graph import (
     model,
     parse_duration,
 )
-from msg_graph.duration import DAY, exact_duration, whole_us
+from msg_graph.duration import DAY, exact_duration
 import pytest
 
 from .helpers import graph
-
-TWO = """
-- node: /a
-  callbacks:
-    - {name: t, timer: 10ms, publishes: [/x], dag: first}
-- node: /b
-  callbacks:
-    - {name: t, timer: 20ms, publishes: [/x]}
-- node: /c
-  callbacks:
-    - {name: s, subscription: /x, deadline: 5ms}
-"""
 
 
 def distribution(ns: list[int], percent: list[float]) -> ExecutionTime:
@@ -63,21 +51,6 @@ def test_mean_is_that_of_the_draws(pairs: list[tuple[int, float]]) -> None:
     assert all(time.quantiles_ns[0] <= ns <= time.quantiles_ns[-1] for ns in drawn)
     spread = time.quantiles_ns[-1] - time.quantiles_ns[0]
     assert abs(sum(drawn) / steps - time.mean_ns) <= 1 + spread * len(pairs) / steps
-
-
-def test_looks_up_by_name() -> None:
-    tasks = graph(TWO)
-    assert tasks.dag('first').index == 0
-    assert tasks.dag('/b').index == 1
-    assert tasks.vertex('/a:t').dag == 0
-    assert tasks.vertex('/c:s@first').dag == 0
-    assert tasks.vertex('/c:s@/b').dag == 1
-    assert tasks.callback('/c:s').deadline_ns == 5_000_000
-    assert [vertex.name for vertex in tasks.vertices] == [
-        '/a:t', '/c:s@first', '/b:t', '/c:s@/b']
-    for lookup in (tasks.dag, tasks.vertex, tasks.callback):
-        with pytest.raises(KeyError):
-            lookup('/c:t')
 
 
 def test_unknown_where_an_execution_time_is_missing() -> None:
@@ -214,9 +187,3 @@ def test_what_no_declaration_can_say_has_an_exact_text_too(ns: int) -> None:
 def test_exact_ones_are_short(ns: int, text: str) -> None:
     assert exact_duration(ns) == text
     assert parse_duration(text, minimum_ns=1) == ns
-
-
-def test_deadlines_are_whole_us() -> None:
-    assert [whole_us(ns) for ns in (0, 1, 1_000, 1_000.5, 1_001)] == [
-        1_000, 1_000, 1_000, 2_000, 2_000]
-    assert whole_us(float('inf')) == whole_us(DAY + 1) == DAY

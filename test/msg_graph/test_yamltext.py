@@ -51,11 +51,6 @@ def test_not_yaml(text: str) -> None:
     assert 1 <= caught.value.line <= text.count('\n') + 2
 
 
-@pytest.mark.parametrize('strange', ['\x00', '\x1b', '\x07', '\x7f', '\ud800', '\uffff'])
-def test_characters_that_yaml_has_not(strange: str) -> None:
-    assert 'not YAML' in str(error(f'mddag: 1\n# {strange} {MARK}\n'))
-
-
 def test_bytes() -> None:
     assert len(loads(SMALL.encode()).dags) == 1
     assert len(loads(b'\xef\xbb\xbf' + SMALL.encode()).dags) == 1
@@ -92,19 +87,6 @@ def test_aliases_do_not_explode() -> None:
         text += f'a{i}: &a{i} [{", ".join([f"*a{i - 1}"] * 10)}]\n'
     with pytest.raises(GraphError, match=r':7: more than 2000000 entries'):
         loads(text, 'g')
-
-
-def test_aliases_work() -> None:
-    tasks = loads("""\
-mddag: 1
-nodes:
-  - node: /a
-    callbacks:
-      - {name: t, timer: &p 10ms, deadline: *p, execution_time: &e {quantiles_us: [1, 2]}}
-      - {name: s, timer: *p, dag: s, deadline: 3ms, execution_time: *e}
-""")
-    assert tasks.callback('/a:s').timer_period_ns == 10_000_000
-    assert tasks.callback('/a:s').execution_time == tasks.callback('/a:t').execution_time
 
 
 def test_size_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -363,28 +363,6 @@ def test_only_misses_in_stops_are_said_to_be_in_them(
         assert line.endswith(' s), 7 machine')
 
 
-@pytest.mark.parametrize(('workers', 'cause'), [(1, 'waited'), (2, 'released late')])
-def test_a_timer_that_no_worker_could_notice_has_waited(
-    workers: int, cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Something undeclared runs while the timer becomes due, at every second release."""
-    path = tmp_path / 'run.mcap'
-    declaration = LENT.replace('50ms', '15ms')
-    with begin_trace(path, declaration, workers=workers) as file:
-        for job in range(0, 20, 2):
-            due = START_TIME + (job + 1) * 1_000 * MS
-            for late, number in ((20, job), (0, job + 1)):
-                release = due + number % 2 * 1_000 * MS
-                file.add('job_release', release + late * MS, 1, 1, 1, number, release)
-                if late:
-                    add_execution(file, release - MS, release + late * MS, -1, -1, -1, address=6)
-                start = release + late * MS
-                add_execution(file, start, start + MS, 1, 0, number, address=8)
-        end_trace(file, START_TIME + 21_000 * MS)
-    result = explain(capsys, str(path))
-    assert result['causes'][cause] == result['missed'] == 10
-
-
 def test_what_an_overload_takes_from_less_important_sinks(tmp_path: Path) -> None:
     graph, trace, found = (tmp_path / name for name in ('g.yaml', 'run.mcap', 'found.json'))
     graph.write_text("""\

@@ -13,7 +13,7 @@ from typing import Any
 
 from mddag_executor.cli import main as program
 from mddag_executor.replay import bags, Reschedule
-from mddag_executor.replay.bags import Bag, BagError, is_ordinary, UNKNOWN
+from mddag_executor.replay.bags import Bag, BagError, is_ordinary
 from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.simulate import SimulationError, START
 from mddag_executor.trace import TraceFile
@@ -83,28 +83,6 @@ def write_bag(
 def responses(outcome: Reschedule, dag: str, sink: str) -> dict[str, int]:
     found: dict[str, int] = outcome.result()['dags'][dag]['sinks'][sink]['response_ns']
     return found
-
-
-@pytest.mark.parametrize('kind', ['mcap', 'sqlite3'])
-def test_every_storage_gives_the_same(tmp_path: Path, kind: str) -> None:
-    path = write_bag(tmp_path / 'bag', *FORMATS[kind])
-    stamps = Bag(path, {'/points'}).stamps['/points']
-    assert list(stamps.arrival) == [BEGIN + i * 100 * MS + 5 * MS for i in range(10)]
-    assert list(stamps.header) == [BEGIN + i * 100 * MS for i in range(10)]
-    outcome = reschedule_bag(path, loads(BY_HEADER, 'g.yaml'))
-    assert outcome.warnings == []
-    assert set(responses(outcome, '/lidar', '/detector:detect').values()) == {14 * MS}
-    by_arrival = reschedule_bag(path, loads(GRAPH, 'g.yaml'))
-    assert set(responses(by_arrival, '/lidar', '/detector:detect').values()) == {9 * MS}
-    for each in (outcome, by_arrival):
-        assert sum(each.tally.jobs) == 10 + 31     # of the timer from 0 to 905 ms
-        assert each.workers == 2
-        assert each.result()['recording']['messages'] == 11
-    assert outcome.notes[0] == '/lidar: 10 jobs from the header stamp of /points'
-    assert 'nominal period' in outcome.notes[1]
-    file = next(p for p in path.iterdir() if p.name != 'metadata.yaml')
-    assert is_ordinary(str(path)) and is_ordinary(str(file))
-    assert reschedule_bag(file, loads(BY_HEADER, 'g.yaml')).log == outcome.log
 
 
 def test_the_schedule_is_that_of_the_core(tmp_path: Path) -> None:
@@ -280,15 +258,6 @@ def test_hostile_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'folder').mkdir()
     with pytest.raises(BagError, match='there is neither metadata.yaml nor a bag file'):
         Bag(tmp_path / 'folder', {'/points'})
-
-
-def test_counts_that_differ_are_said(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / 'bag')
-    metadata = path / 'metadata.yaml'
-    metadata.write_text(metadata.read_text().replace('message_count: 11', 'message_count: 12'))
-    assert Bag(path, {'/points'}).warnings == [
-        f'{path}: metadata.yaml counts 12 messages, but there are 11']
-    assert UNKNOWN < 0
 
 
 def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

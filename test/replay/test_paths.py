@@ -158,17 +158,6 @@ def test_a_recorded_take_says_more_than_the_latest() -> None:
     assert d.starts() == [[1, 2, 4, 200, None], [101, 102, 104, None, None]]
 
 
-def test_what_others_publish_is_no_flow() -> None:
-    d = Driver()
-    a = d.run('/a:send', 0)
-    m = d.send('/a:send', a, '/t', 1)
-    d.run('/b:keep', 2, NONE, '/t')         # a message of unknown origin
-    d.run('/b:keep', 3, NONE, '/t')           # one of another publisher
-    d.run('/b:keep', 4, m, '/t')
-    d.send('/c:other', NONE, '/w', 5)
-    assert d.starts() == [[1, 4, None, None, None]]
-
-
 SYNC = """\
 mddag: 1
 nodes:
@@ -202,19 +191,6 @@ def test_publications_outside_of_executions() -> None:
     message = d.send(None, NONE, '/l', 3, '/s')     # by a thread of the node
     d.run('/s:join', 4, message, '/l')
     assert d.starts() == [[3, 4, None]]
-
-
-def test_what_is_kept_may_be_of_unknown_origin() -> None:
-    d = Driver()
-    a = d.run('/a:send', 0)
-    m = d.send('/a:send', a, '/t', 1)
-    known = d.run('/b:keep', 2, m, '/t')
-    d.end('/b:keep', known, 3)
-    unknown = d.run('/b:keep', 4, NONE, '/t')
-    d.end('/b:keep', unknown, 5)
-    use = d.run('/b:use', 6)            # reads the unknown one: nobody knows how old it is
-    d.send('/b:use', use, '/u', 7)
-    assert d.starts() == [[1, 2, None, None, None]]
 
 
 Record = tuple[int, int | None]

@@ -381,17 +381,6 @@ def responses(path: Path, **how: Any) -> list[float]:
             for sink in dag['sinks'].values() if sink['response_ns'] is not None]
 
 
-def test_what_was_stretched_by_the_interpreter_is_taken_back(tmp_path: Path) -> None:
-    """Two computed 10 ms each, at the same time: alone it takes 10 ms, one after the other."""
-    path = tmp_path / 'a.mcap'
-    of_python(path, [(0, 0, 19, 10, True), (1, 0, 20, 10, True)])
-    assert responses(path, workers=1) == [10, 20]
-    assert responses(path, workers=3) == [10, 20]
-    # what waited for nobody else keeps its waiting
-    of_python(path, [(0, 0, 20, 10, True)])
-    assert responses(path, workers=1) == [20]
-
-
 def test_what_computes_without_the_interpreter_shares_the_cpus(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     of_python(path, [(0, 0, 12, 12, False), (1, 0, 12, 12, False)])

@@ -83,20 +83,6 @@ def test_a_schedule_and_its_trace_have_the_same_tables(
     same_tables(seen, open_recording(tmp_path / 'run.mcap'))
 
 
-def test_an_end_at_the_instant_of_a_release_comes_first(tmp_path: Path) -> None:
-    task_set = msg_graph.loads(runs.GRAPH, 'g.yaml')
-    load = periodic_load(task_set, [[5 * runs.MS, 5 * runs.MS]], 50 * runs.MS)
-    run = simulate(task_set, load, Settings(workers=1, duration_ns=50 * runs.MS), log=True)
-    write_trace(tmp_path / 'run.mcap', task_set, load, run)
-    seen = ComputedRun(
-        task_set, load, run.log, run.decisions, 50 * runs.MS, run.ended_ns).recording()
-    for recording in (seen, open_recording(tmp_path / 'run.mcap')):
-        executions, releases = recording.executions, recording.releases
-        ended, = executions['order'][executions['end'] == 10 * runs.MS]
-        released, = releases['order'][releases['noticed'] == 10 * runs.MS]
-        assert ended < released
-
-
 def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path: Path) -> None:
     task_set = msg_graph.loads(
         runs.GRAPH.replace('deadline: 8ms', 'deadline: 8ms, execution_time: 30ms')

@@ -312,27 +312,6 @@ def test_a_changed_constant_is_found(
         assert_same(result, out)
 
 
-def test_changed_timing_is_told_as_such(bag: str, graph: Path, tmp_path: Path) -> None:
-    out = tmp_path / 'out.mcap'
-    rerun(bag, graph, [Filter, Sink], output=out)
-    graph.write_text(GRAPH.replace('execution_time: 5ms', 'execution_time: 6ms'))
-    difference, = compare(rerun(bag, graph, [Filter, Sink]), out)
-    assert (difference.topic, difference.kind) == ('/out', 'timing')
-    assert difference.line().endswith('the time of publication is 0.016000 s, expected 0.015000 s')
-
-
-def test_what_is_recorded_too_is_compared(tmp_path: Path, graph: Path) -> None:
-    """The messages of the node under rerun count, not the recorded ones."""
-    bag = write_bag(tmp_path / 'in.mcap', [
-        message for i in range(5) for message in (
-            (i * 100 * MS, '/points', Header(frame_id=str(i))),
-            (i * 100 * MS + 15 * MS, '/out', Float64(data=2.0 * i + (i == 3))))])
-    result = rerun(bag, graph, [Filter, Sink])
-    difference, = result.recorded
-    assert difference.line() == (
-        '/out: content, first in message 3 at 0.315000 s: data is 6.0, expected 7.0')
-
-
 # --- what goes wrong -----------------------------------------------------------------------------
 
 

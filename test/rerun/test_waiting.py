@@ -37,22 +37,6 @@ from .helpers import MS, START, write_bag
 
 Seen = list[tuple[float, Any]]
 
-SLEEPY = """\
-from time import sleep, time
-from uuid import uuid4
-import rclpy
-from std_msgs.msg import Header
-
-def main():
-    rclpy.init()
-    node = rclpy.create_node('filter')
-    node.create_subscription(Header, '/points', lambda message: None, 10)
-    publisher = node.create_publisher(Header, '/slept', 10)
-    while rclpy.ok():
-        publisher.publish(Header(frame_id=f'{time()} {uuid4()}'))
-        sleep(0.5)
-"""
-
 
 class Filter(Node):
     """The declared node; what it does with each message is given."""
@@ -266,38 +250,7 @@ def test_a_program_with_a_loop_of_its_own(bag: str, graph: Path) -> None:
         (1500.0, 15)]
 
 
-def test_a_program_waits_for_a_service_of_the_next_one(bag: str, graph: Path) -> None:
-    seen: Seen = []
-
-    def main() -> None:
-        rclpy.init()
-        node = Filter(lambda node, number: None)
-        client = node.create_client(Trigger, '/greet')
-        assert client.wait_for_service(timeout_sec=5.0)
-        future = client.call_async(Trigger.Request())
-        rclpy.spin_until_future_complete(node, future)
-        node.note(future.result().message)
-        seen.extend(node.seen)
-        rclpy.spin(node)
-
-    rerun(bag, graph, [main, lambda: server(30)])
-    assert seen == [(30.0, 'hello')]
-
-
 # --- clocks --------------------------------------------------------------------------------------
-
-def test_all_clocks(bag: str, graph: Path) -> None:
-    def take(node: Filter, number: int) -> None:
-        if number in (1, 2):
-            before = time.monotonic(), time.time_ns(), time.perf_counter()
-            time.sleep(0.03)
-            after = time.monotonic(), time.time_ns(), time.perf_counter()
-            node.note([round(1000 * (after[0] - before[0])), (after[1] - before[1]) // MS,
-                       round(1000 * (after[2] - before[2]))])
-
-    seen, result = run_filter(bag, graph, take, all_clocks=True)
-    assert seen == [(130.0, [30, 30, 30]), (230.0, [30, 30, 30])]
-    assert not result.warnings
 
 
 def test_who_waits_by_looking_at_the_time_all_the_time(bag: str, graph: Path) -> None:
@@ -314,17 +267,6 @@ def test_who_waits_by_looking_at_the_time_all_the_time(bag: str, graph: Path) ->
 
     seen, _ = run_filter(bag, graph, take, all_clocks=True)
     assert seen == [(220.0, 'time'), (230.0, 'clock')]
-
-
-def test_functions_of_time_that_were_imported_by_name(
-    bag: str, graph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / 'sleepy_node.py').write_text(SLEEPY)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    results = [rerun(bag, graph, ['sleepy_node:main'], all_clocks=True) for _ in range(2)]
-    assert results[0].digest == results[1].digest
-    assert [(each.time - START) / MS for each in results[1].outputs
-            if each.topic == '/slept'] == [0, 500, 1000, 1500]
 
 
 def test_what_is_not_the_same_each_time_is_warned_of(bag: str, graph: Path) -> None:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from mddag_executor.core import Tables
@@ -70,13 +69,6 @@ def test_what_comes_is_noticed_by_a_thread_that_takes_no_worker(compiled: bool) 
     assert [(d[2], d[5]) for d in ran.decisions if d[2] >= 0] == [(1, arrived + MS)]
 
 
-def test_timers_due_together_are_noticed_together_the_most_urgent_first() -> None:
-    ran = run(loads(BOTH), [[10 * MS], [MS]])
-    starts = [(int(e[0]), int(e[4])) for e in ran.log if e[1] == START]
-    # the other one costs the intake next to nothing more
-    assert starts[:2] == [(100_000, 1), (300_001 + MS, 0)]
-
-
 def test_what_computes_stands_still_while_a_timer_is_noticed() -> None:
     ran = run(loads(BOTH), [[80 * MS], [MS]])
     ends = {(int(e[4]), int(e[5])): int(e[0]) for e in ran.log if e[1] == END}
@@ -93,10 +85,3 @@ def test_a_skipped_job_is_skipped_and_a_failed_one_fails() -> None:
         started = [e for e in ran.log if e[1] == START]
         assert len(started) == decided
         assert not any(e[4] == 1 for e in ran.log)
-
-
-def test_one_process_that_is_not_declared_has_an_intake_too() -> None:
-    task_set = replace(loads(BOTH), processes=())
-    ran = run(task_set, [[10 * MS], [MS]], costs=Costs(1, 1, 1, 1, 0))
-    assert [int(e[0]) for e in ran.log if e[1] == END and e[4] >= 0] == [
-        MS + 2, 11 * MS + 2, 51 * MS + 1]

@@ -109,41 +109,6 @@ def test_one_that_is_more_urgent_overtakes_and_they_take_turns() -> None:
     assert in_ms(times(jobs, 2)) == [(0, 10), (10, 13)]
 
 
-def test_each_process_has_its_interpreter() -> None:
-    """The second of each waits for the first of its own; what goes first of all is held back."""
-    jobs = of_ms(Job(0, 50, 4, True), Job(0, 60, 6, True, interpreter=2),
-                 Job(1, 70, 3, True), Job(1, 80, 2, True, interpreter=2))
-    assert in_ms(times(jobs, 4)) == [(0, 4), (0, 6), (4, 7), (6, 8)]
-    jobs[0].cost = 9 * MS
-    assert in_ms(times(jobs, 4)) == [(0, 9), (0, 6), (9, 12), (6, 8)]
-
-
-def test_a_worker_that_goes_on_keeps_the_lock() -> None:
-    """The second overtakes the first; the third comes at its end, and need not wait again."""
-    jobs = of_ms(Job(0, 90, 60, True), Job(1, 20, 1, True), Job(3, 20, 1, True))
-    jobs[1].cost, jobs[2].cost = MS // 4, MS // 4
-    jobs[2].release = 2 * MS + MS // 4
-    assert in_ms(times(jobs, 3))[1:] == [(1, 2.25), (2.25, 2.5)]
-
-
-def test_cpus_are_shared_by_slices() -> None:
-    """Of three at a time the first two, then the third and the first, then all that is left."""
-    jobs = of_ms(*(Job(0, 50, 6) for _ in range(3)))
-    assert in_ms(times(jobs, 3, cpus=2)) == [(0, 6), (0, 9), (0, 9)]
-    assert in_ms(times(jobs, 3)) == [(0, 6)] * 3
-    assert in_ms(times(jobs, 3, cpus=1)) == [(0, 12), (0, 15), (0, 18)]
-
-
-def test_who_waits_gets_the_lock_back_after_a_switch_interval() -> None:
-    """It publishes from 3.7 on, when the other one has computed for long."""
-    jobs = [Job(0, 90 * MS, 10 * MS, True),
-            Job(0, 50 * MS, 4 * MS, cpu=400_000)]
-    found = in_ms(times(jobs, 2, python=True))
-    # both lose 0.1 ms at the start to one another: the second asks first
-    assert found[0] == (0, 10.4)
-    assert found[1][1] == pytest.approx(4 + 1 + 0.9, abs=1.0)
-
-
 HOLDERS = """\
 mddag: 1
 nodes:

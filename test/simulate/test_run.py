@@ -5,14 +5,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-import json
 from typing import Any
 
 from mddag_executor.simulate import (
     draw_execution_times,
     Load,
     periodic_load,
-    read_execution_times,
     scale_execution_times,
     Settings,
     simulate,
@@ -25,7 +23,6 @@ import pytest
 from ..core.task_sets import declaration
 
 US = 1_000
-FILE = 'times.json'
 
 
 def two_dags(**more: Any) -> TaskSet:
@@ -39,20 +36,6 @@ def two_dags(**more: Any) -> TaskSet:
 
 
 # --- loads ---------------------------------------------------------------------------------------
-
-def test_a_periodic_load_is_in_order_of_time_and_dag() -> None:
-    load = periodic_load(two_dags(), [[2, 3], [4, 5]], 12 * US)
-    assert list(zip(load.times, load.dags, load.jobs)) == [
-        (0, 0, 0), (0, 1, 0), (4 * US, 1, 1), (8 * US, 1, 2), (10 * US, 0, 1)]
-    assert (load.costs, load.cost_base, load.cost_stride) == ([2, 3, 4, 5], [0, 2], [0, 0])
-    assert load.releases == []
-
-
-def test_each_job_may_have_execution_times_of_its_own() -> None:
-    load = Load([0, 20 * US], [0, 0], [0, 1], [1, 2, 3, 5], [0], [2])
-    run = simulate(two_dags(), load, Settings(workers=1, duration_ns=100 * US))
-    sink = run.result()['dags']['a']['sinks']['/n:x@a']
-    assert (sink['response_ns']['min'], sink['response_ns']['max']) == (3, 8)
 
 
 def test_a_source_may_get_ready_after_its_release() -> None:
@@ -128,11 +111,3 @@ def test_utilisation_and_its_scaling() -> None:
             scale_execution_times(two_dags(), times, 2, target)
     with pytest.raises(SimulationError, match='nothing|0'):
         scale_execution_times(two_dags(), [[0, 0], [0, 0]], 2, 0.5)
-
-
-GOOD = {'a': {'/n:s': 2, '/n:x@a': 3.5}, 'b': {'/n:t': 0.0001, '/n:x': 86_399_999_999}}
-
-
-def test_times_from_a_file_are_microseconds() -> None:
-    times = read_execution_times(two_dags(), json.dumps(GOOD), FILE)
-    assert times == [[2_000, 3_500], [86_399_999_999_000, 1]]  # x stands before t

@@ -162,23 +162,6 @@ def test_a_lost_chunk_is_noticed(tmp_path: Path, sample: Any) -> None:
             'says that it holds 4 chunks') in warnings[0]
 
 
-@pytest.mark.parametrize('content, problem', [
-    (b'', 'is empty'), (b'12345678', 'is no MCAP file'), (b'\x89MCAP0\r', 'is no MCAP file'),
-    (b'#ROSBAG V2.0\n' * 10, 'is no MCAP file'),
-    (records.MAGIC, 'ends or is damaged before its first event'),
-    (records.MAGIC * 2, 'ends or is damaged before its first event'),
-    (records.MAGIC + bytes(1000), 'ends or is damaged before its first event'),
-    (records.MAGIC + b'\x01' + b'\xff' * 50, 'ends or is damaged before its first event'),
-])
-def test_what_is_no_trace(tmp_path: Path, content: bytes, problem: str) -> None:
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(content)
-    with pytest.raises(TraceError) as caught:
-        TraceReader(path)
-    assert str(caught.value) == (f'{path}: {problem}: give a trace written by this program or '
-                                 'another MCAP recording')
-
-
 def test_what_is_no_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / 'pipe')
     for path in (tmp_path / 'pipe', '/dev/zero'):

@@ -18,10 +18,6 @@ from mddag_executor.trace import (
 )
 from mddag_executor.trace.cdr import ENCAPSULATION, encode
 import pytest
-from rosbags.interfaces import ConnectionExtRosbag2
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as RosbagWriter
-from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from .helpers import mixture, read, read_back, VPID, write_chunks
 
@@ -72,23 +68,6 @@ def test_files_by_the_mcap_package(tmp_path: Path, options: dict[str, Any],
     recorded = mixture(300)
     write_with_mcap(path, recorded, **options)
     assert read(path, in_time_order) == (read_back(recorded), [])
-
-
-def test_files_by_rosbags(tmp_path: Path) -> None:
-    recorded = mixture(100)
-    store = get_typestore(Stores.EMPTY)
-    with RosbagWriter(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections: dict[str, Any] = {}
-        for entry in recorded:
-            event = EVENTS[entry[0]]
-            name = f'mddag_trace/msg/{event.provider}_{event.name}'
-            if event.key not in connections:
-                store.register(get_types_from_msg(event.text, name))
-                connections[event.key] = writer.add_connection(
-                    event.topic, name, typestore=store,
-                    serialization_format=ConnectionExtRosbag2('cdr', []).serialization_format)
-            writer.write(connections[event.key], entry[1], message(entry))
-    assert read(tmp_path / 'bag' / 'bag.mcap') == (read_back(recorded), [])
 
 
 def write_one(path: Path, schema: str, data: bytes, topic: str = '/trace/ros2/callback_end',
