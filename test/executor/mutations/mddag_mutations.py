@@ -3,9 +3,9 @@
 """
 A plugin of pytest that breaks the executor on purpose, and notes how the tests noticed.
 
-It is applied in a process of its own (see ``driver``), before any test is collected.  ``report``
-gets a line of JSON when a test begins, and one for each phase of it that fails and for the end of
-its call.  So a test that never ended shows as well: it has only begun.
+MDDAG_MUTATION names the mutation ('': none).  The file MDDAG_MUTATION_REPORT gets a line of JSON
+when a test begins, and one for each phase of it that fails and for the end of its call.  So a test
+that never ended shows as well: it has only begun.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 import json
+import os
 from pathlib import Path
 import threading
 import time
@@ -332,11 +333,15 @@ def late_jobs_counted_in_time() -> None:
 # --- what pytest calls ---------------------------------------------------------------------------
 
 
-report = Path()
+
+
+def pytest_configure() -> None:
+    if name := os.environ['MDDAG_MUTATION']:
+        MUTATIONS[name]()
 
 
 def note(**what: Any) -> None:
-    with report.open('a', encoding='utf-8') as lines:
+    with Path(os.environ['MDDAG_MUTATION_REPORT']).open('a', encoding='utf-8') as lines:
         lines.write(json.dumps(what) + '\n')
 
 

@@ -3,13 +3,14 @@
 """
 The tests must fail for an executor that is broken: it is broken once in each way that matters.
 
-Each mutation (see ``mddag_mutations``) gets a run of its own, in a child process (see ``driver``),
-of a few quick tests of this project.  One of them has to fail.  That a run hangs until its time is
-over is no way to find a mistake: it does not count, and is told apart.
+Each mutation (see ``mddag_mutations``) gets a run of its own, in a child process, of a few quick
+tests of this project.  One of them has to fail.  That a run hangs until its time is over is no way
+to find a mistake: it does not count, and is told apart.
 """
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 import contextlib
 from dataclasses import dataclass, field
 import json
@@ -21,7 +22,7 @@ import sys
 
 import pytest
 
-from .mddag_mutations import MEANING, MUTATIONS
+from .mddag_mutations import MEANING
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(500)]
 
@@ -31,6 +32,10 @@ TESTS = HERE.parent.relative_to(ROOT)
 
 HUNG_S = 50
 """After so many seconds a test of a child hangs."""
+RUN_S = 170
+"""A run that takes longer is ended."""
+IN_PARALLEL = 3
+"""So many runs at a time: their tests mostly wait."""
 AT_ONCE_S = 4.0
 """A test that has failed sooner has not waited for one of its own time-outs, which are 5 s."""
 
@@ -141,29 +146,33 @@ class Result:
         return {test for test, (outcome, _) in self.tests.items() if outcome in outcomes}
 
 
-def run(folder: Path, runs: list[tuple[str, list[str], list[str]]]) -> dict[str, Result]:
-    """Run tests with broken executors ('': as it is); each is mutation, tests and options."""
+def run(folder: Path, mutation: str, tests: list[str], *options: str) -> Result:
+    """Run tests with a broken executor ('': as it is), in a process of their own."""
+    report = folder / f'{mutation}.jsonl'
     environment = {
         key: value for key, value in os.environ.items() if not key.startswith('PYTEST_')}
     environment.update(
-        PYTEST_DISABLE_PLUGIN_AUTOLOAD='1', OPENBLAS_NUM_THREADS='1', TMPDIR=str(folder))
-    jobs = [{'name': mutation or 'whole', 'mutation': mutation, 'arguments': [
-        '-q', '-p', 'pytest_timeout', '-p', 'no:cacheprovider', f'--timeout={HUNG_S}', *options,
-        *(str(TESTS / test) for test in tests)]} for mutation, tests, options in runs]
+        PYTEST_DISABLE_PLUGIN_AUTOLOAD='1', OPENBLAS_NUM_THREADS='1', TMPDIR=str(folder),
+        PYTHONPATH=str(HERE), MDDAG_MUTATION=mutation, MDDAG_MUTATION_REPORT=str(report))
     child = subprocess.Popen(
-        [sys.executable, str(HERE / 'driver.py'), str(folder)], cwd=ROOT,
-        env=environment, stdin=subprocess.PIPE, text=True, start_new_session=True)
+        [sys.executable, '-m', 'pytest', '-q', '-p', 'pytest_timeout', '-p', 'mddag_mutations',
+         '-p', 'no:cacheprovider', f'--timeout={HUNG_S}', *options,
+         *(str(TESTS / test) for test in tests)],
+        cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        start_new_session=True)
+    output = ''
     try:
-        child.communicate(json.dumps(jobs), timeout=400)
+        output, _ = child.communicate(timeout=RUN_S)
+    except subprocess.TimeoutExpired:
+        pass  # what hung is in the report
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)  # and what it may have left
-    return {str(job['name']): result(folder, str(job['name'])) for job in jobs}
+    return result(report, output)
 
 
-def result(folder: Path, name: str) -> Result:
+def result(report: Path, output: str) -> Result:
     found: dict[str, tuple[str, float]] = {}
-    report, output = folder / f'{name}.jsonl', folder / f'{name}.txt'
     for line in report.read_text().splitlines() if report.exists() else ():
         what = json.loads(line)
         test = Path(what['test']).relative_to(TESTS).as_posix()
@@ -171,7 +180,7 @@ def result(folder: Path, name: str) -> Result:
             found[test] = 'hung', 0.0
         elif found[test][0] in ('hung', 'passed'):  # of a test's failures the first one tells
             found[test] = what['outcome'], what['seconds']
-    return Result(found, output.read_text(errors='replace')[-6000:] if output.exists() else '')
+    return Result(found, output[-6000:])
 
 
 @pytest.fixture(scope='module')
@@ -181,18 +190,17 @@ def results(
     """Give the results of all cases that were asked for."""
     cases = [item.callspec.params['case'] for item in request.session.items
              if item.path == Path(__file__) and hasattr(item, 'callspec')]
-    return run(tmp_path_factory.mktemp('mutations'), [
-        (case.mutation, case.tests, [] if case.every else ['-x']) for case in cases])
+    folder = tmp_path_factory.mktemp('mutations')
+    with ThreadPoolExecutor(IN_PARALLEL) as pool:
+        found = pool.map(lambda case: run(
+            folder, case.mutation, case.tests, *([] if case.every else ['-x'])), cases)
+        return dict(zip((case.mutation for case in cases), found))
 
 
 def test_all_of_them_pass_while_nothing_is_broken(tmp_path: Path) -> None:
     tests = list(dict.fromkeys(test for case in CASES for test in case.tests))
-    result = run(tmp_path, [('', tests, [])])['whole']
+    result = run(tmp_path, '', tests)
     assert result.of('passed') == set(result.tests) == set(tests), result.output
-
-
-def test_each_mutation_has_a_case() -> None:
-    assert sorted(case.mutation for case in CASES) == sorted(MUTATIONS)
 
 
 @pytest.mark.parametrize('case', CASES, ids=lambda case: case.mutation)
