@@ -198,7 +198,8 @@ def run_all(
 
 _COUNTS = ('published', 'received', 'lost')
 _FIGURES = (
-    'utilisation', 'sink_jobs_due', 'on_time', 'late', 'missing', 'callbacks_per_s',
+    'utilisation', 'sink_jobs_due', 'on_time', 'late', 'missing', 'important_due',
+    'important_on_time', 'callbacks_per_s',
     'cpu_us_per_callback', 'middleware_cpu_us_per_callback', 'utilisation_taken',
     'dispatch_latency_us', 'hot_path_us')
 _OF_ROBOT = ('sinks', 'cpu_cores')

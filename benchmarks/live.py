@@ -242,6 +242,9 @@ def _row(load: str, result: dict[str, Any]) -> list[tuple[str, Cell]]:
     if load in DECLARED:
         row += [('due', due),
                 ('in time', None if due is None else percent(result['on_time'], due))]
+        if result['important_due']:
+            row.append(('important in time', percent(
+                result['important_on_time'], result['important_due'])))
     else:
         row += [('published', result['published']), ('lost', result['lost'])]
     row += [('callbacks/s', _number(result['callbacks_per_s'], '.0f')),

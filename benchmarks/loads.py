@@ -113,9 +113,14 @@ def _plan(spec: Spec) -> ExecutionPlan:
 
 
 def result_of(plan: ExecutionPlan, ledger: Ledger, latencies: list[int]) -> dict[str, Any]:
-    """Return the figures of ``measure``, ``dispatch_latency_us`` and ``hot_path_us``."""
+    """Return the figures of ``measure``, those of important sinks, and latencies."""
     result = measure(ledger, plan)
+    important = [
+        result['dags'][dag.name]['sinks'][dag.vertices[i].name] for dag in plan.task_set.dags
+        for i in dag.sinks if dag.vertices[i].callback.importance == 'high']
     return {
+        **{f'important_{name}': sum(sink[name] for sink in important)
+           for name in ('due', 'on_time')},
         **result, 'infeasible_sinks': len(plan.infeasible()),
         'dispatch_latency_us': quantiles_us(latencies),
         'hot_path_us': hot_path(plan.task_set, result)}
