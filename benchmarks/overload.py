@@ -32,7 +32,8 @@ from mddag_executor.simulate import (
     Settings,
 )
 from mddag_executor.simulate.schedule import prepare, schedule
-from msg_graph import ExecutionTime, loads, TaskSet
+from mddag_executor.simulate.workload import with_execution_times
+from msg_graph import loads, TaskSet
 
 HELP = 'measure the share of results in time in an overload'
 DESCRIPTION = 'Measure the share of results in time around and above the capacity, simulated.'
@@ -113,12 +114,7 @@ class _Case:
             1 if mode.interpreter else args.workers, load)
         dags = task_set.dags
         self._important = {*random.Random(seed).sample(range(len(dags)), -(-len(dags) // 3))}
-        self._task_set = replace(task_set, dags=tuple(
-            replace(dag, vertices=tuple(
-                replace(vertex, callback=replace(
-                    vertex.callback, execution_time=ExecutionTime((time,), (50.0,))))
-                for vertex, time in zip(dag.vertices, of_dag)))
-            for dag, of_dag in zip(dags, times)))
+        self._task_set = with_execution_times(task_set, times)
         load_ = periodic_load(self._task_set, times, args.duration)
         if mode.interpreter:
             load_ = load_._replace(holds=[1] * len(load_.costs))

@@ -17,6 +17,7 @@ from typing import Any
 
 from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, POLICIES, processes_of, Tables
 from mddag_executor.core import policy as find_policy
+from mddag_executor.core.tables import DEMOTE
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
 from mddag_executor.recording.head import Head, ReplayError
@@ -30,6 +31,7 @@ from mddag_executor.replay.usage import share
 from mddag_executor.simulate import LogEntry, schedule, Settings
 from mddag_executor.simulate.intakes import Intakes
 from mddag_executor.simulate.load import edge_numbers
+from mddag_executor.simulate.workload import with_execution_times
 from mddag_executor.text import counted, listed
 from msg_graph import Process, TaskSet
 from msg_graph.derive import no_garbage
@@ -194,9 +196,10 @@ def reschedule(
     if preemptive is None:
         preemptive = head.preemptive and not find_policy(policy).polling
     bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
-    tables = Tables.build(
-        run.task_set, default_deadline=head.default_deadline, max_active_jobs=bound,
+    tables_of = partial(
+        Tables.build, default_deadline=head.default_deadline, max_active_jobs=bound,
         expire_after=EXPIRE_AFTER_NS, on_late=on_late)
+    tables = tables_of(run.task_set)
     recorded = Replay(run, skip)
     with no_garbage():
         builder = LoadBuilder(run, tables, each, max(0, head.cpus), _processes(run, ran))
@@ -205,6 +208,8 @@ def reschedule(
         run.task_set, builder.times())
     if len(placed) < 2:
         placed = ()
+    if DEMOTE in tables.on_late:  # by measured times, as the executor does
+        tables = tables_of(with_execution_times(run.task_set, builder.times()))
     tables = tables._replace(process=[*_processes(run, placed), 1])
     find_policy(policy).mode(preemptive, len(placed))
     with no_garbage():

@@ -10,6 +10,7 @@ whole run, as in the paper's experiment. (``draws`` has those of many runs, as a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 import json
 import math
 import random
@@ -18,7 +19,7 @@ from typing import Any
 from mddag_executor.core import processes_of
 from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.load import Load
-from msg_graph import Dag, TaskSet
+from msg_graph import Dag, ExecutionTime, TaskSet
 from msg_graph.duration import DAY, MICROSECOND
 
 _FORMAT = 'write {"DAG": {"/node:callback": microseconds}}'
@@ -131,6 +132,16 @@ def scale_execution_times(
         raise SimulationError('utilisation: all execution times are 0: give times to scale')
     factor = target / now
     return [[round(time * factor) for time in row] for row in times]
+
+
+def with_execution_times(task_set: TaskSet, times: Sequence[Sequence[int]]) -> TaskSet:
+    """Return a task set whose vertices declare these execution times, ns."""
+    return replace(task_set, dags=tuple(
+        replace(dag, vertices=tuple(
+            replace(vertex, callback=replace(
+                vertex.callback, execution_time=ExecutionTime((time,), (50.0,))))
+            for vertex, time in zip(dag.vertices, row)))
+        for dag, row in zip(task_set.dags, times)))
 
 
 def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns: int) -> Load:

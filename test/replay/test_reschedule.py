@@ -12,9 +12,11 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mddag_executor.cli import main as program
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core import PolicyError, Tally
 from mddag_executor.core.state import Decision, new_state
+from mddag_executor.core.tally import counts
 from mddag_executor.errors import UsageError
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.run_writer import write_trace
@@ -459,3 +461,25 @@ def test_what_was_not_published_is_not_published_again(
     # 8 ms in each of 40 jobs, but 1 ms less in those without an object
     assert found[1]['utilisation'] * found[1]['workers'] * found[1]['duration_ns'] == \
         pytest.approx((40 * 7 + 14) * MS)
+
+
+def test_what_would_have_been_with_demote(tmp_path: Path) -> None:
+    """The recorded execution times say what is too much; nothing is declared."""
+    graph, trace, times = (tmp_path / name for name in ('g.yaml', 'run.mcap', 'times.json'))
+    graph.write_text("""\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: main, timer: 30ms, deadline: 30ms, importance: high, dag: main}
+      - {name: rest, timer: 20ms, deadline: 20ms, dag: rest}
+""")
+    times.write_text('{"main": {"/n:main": 20000}, "rest": {"/n:rest": 10000}}')
+    assert program.main([
+        'simulate', str(graph), '--workers', '1', '--preemptive', '--duration', '3s',
+        '--execution-times', str(times), '--trace', str(trace)]) == 0
+    in_time = {}
+    for on_late in ('continue', 'demote'):
+        sink = reschedule(trace, on_late=on_late).result()['dags']['main']['sinks']['/n:main']
+        in_time[on_late] = counts(sink).in_time
+    assert in_time['continue'] < 20 and in_time['demote'] >= 99
