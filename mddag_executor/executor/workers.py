@@ -288,7 +288,8 @@ class WorkerPool:
     def _guard(self, now: int) -> None:
         """Let a thread start what waits if a short callback runs longer than expected."""
         guard, at = self.guard, now + GUARD_NS
-        if not guard.is_set and not (self.polling and 0 < self.loop.timer.at <= at):
+        if self.engine.idle_workers and not guard.is_set and not (
+                self.polling and 0 < self.loop.timer.at <= at):
             self._guarded = None if self._leader is None else self._leader.work
             guard.set(at)
 
