@@ -20,7 +20,7 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
         'no declaration was given, so no deadline was judged')
     stops = result['stops']
     if stops['misses']:
-        yield (f'{stops["misses"]} of {counted(total(result["dags"]).missed, "miss", "misses")} '
+        yield (f'{stops["misses"]} of {total(result["dags"]).missed} misses '
                f'are due to {counted(stops["count"], "stop")} ({stops["total_ns"] / 1e9:.2f} s), '
                'in which no thread of this process ran')
     yield from never_due_lines(result['dags'])
