@@ -176,7 +176,8 @@ def observe(program: Program, path: list[str], hosted: bool, seconds: float) -> 
     command = ['-c', f'import sys; sys.argv[0] = {module!r}; import {module} as m; m.{function}()']
     if hosted:
         command = ['-m', 'mddag_executor', 'run', '--node', program.spec, '--diagnostics', 'off']
-    command += ['--ros-args', *(part for each in program.parameters for part in ('-p', each))]
+    for parameter in program.parameters:
+        command += ['--ros-args', '-p', parameter]
     rclpy.init()
     probe = Probe(program)
     with subprocess.Popen(
@@ -250,7 +251,8 @@ def main() -> int:
         theirs, ours = (observe(program, path, hosted, options.seconds)
                         for hosted in (False, True))
         if theirs.end == 'by itself' and theirs.status:  # it compares nothing
-            print(f'{program.name}: skipped: {theirs.said.strip().splitlines()[-1]}', flush=True)
+            why = (theirs.said.strip().splitlines() or ['it ends at once'])[-1]
+            print(f'{program.name}: skipped: {why}', flush=True)
             continue
         found = differences(theirs, ours)
         n_ran, n_different = n_ran + 1, n_different + bool(found)
