@@ -329,7 +329,7 @@ def whole(least: int, most: int) -> Kind:
     """Return the kind of an integer within bounds."""
     def read(entry: Entry, key: str, value: Tree) -> int:
         if not (isinstance(value, Scalar) and value.plain and _INTEGER.fullmatch(value.text)):
-            raise entry.error(key, f'{shown(key)} is {_described(value)}', 'write a whole number')
+            raise entry.error(key, f'{shown(key)} is {_described(value)}', 'write an integer')
         if not least <= int(value.text) <= most:
             raise entry.error(key, f'{shown(key)} is {value.text}',
                               f'write a number from {least} to {most}')

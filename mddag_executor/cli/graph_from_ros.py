@@ -42,7 +42,7 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.cli.systems import write_declaration
     from mddag_executor.hosting.graph_probe import draft_of, probe
     from msg_graph.draft import declaration_of
-    with Progress('looking at the nodes', args.timeout) as line:
+    with Progress('listening to the nodes', args.timeout) as line:
         found = probe(args.timeout, line.update)
     warn(*found.warnings)
     draft = draft_of(found)

@@ -258,7 +258,7 @@ def add_policy(
 
 
 def add_on_late(parser: argparse.ArgumentParser, default: str, prefix: str = '') -> None:
-    """Declare `--on-late`; a default with a blank in it is words, and stands for none."""
+    """Declare `--on-late`; a default that is no such word is only shown."""
     from mddag_executor.core.tables import ON_LATE
     parser.add_argument(
         '--on-late', choices=(*ON_LATE,), default=default if default in ON_LATE else None,

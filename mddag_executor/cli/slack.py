@@ -65,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
     is_graph = str(args.trace).lower().endswith(_GRAPHS)
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
     callbacks = len(set(problem.callback_of))
-    with Progress('looking for slack', callbacks) as line:
+    with Progress('searching', callbacks) as line:
         slack = find_slack(problem, line.update, args.jobs or defaults.processors())
     result = slack_result(slack, task_set, dags, problem.settings.processes)
     if args.report is not None:

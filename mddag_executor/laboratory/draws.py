@@ -157,7 +157,7 @@ def feasible(
     overhead_ns: int = 0,
 ) -> npt.NDArray[np.bool_]:
     """
-    Return for each run whether it could be accepted, as far as that is easy to tell.
+    Return for each run whether it could be accepted, as far as that is easily known.
 
     A run is not accepted by any scheduler that never lets a worker idle without need,
 

@@ -111,7 +111,7 @@ def _check(experiments: Sequence[Experiment], runs: int, first_run: int, jobs: i
 
 
 def compiling_pays(experiments: Sequence[Experiment], runs: int, jobs: int) -> bool:
-    """Return whether the compiled core is sooner done with so many runs of each experiment."""
+    """Return whether the compiled core is faster for so many runs of each experiment."""
     from mddag_executor.simulate.compiled import ACCEPT_RUNS, pays
     plain_s = _plain_s(experiments, runs) / jobs
     return plain_s > SOON_S and pays(ACCEPT_RUNS, plain_s)

@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 m workers; len and vol are the longest path and the sum of the budgets; a release of task i comes
 at least T_i after the one before. Work is never idle: a worker is free only if nothing is ready.
-Nothing is preempted, as an executor of callbacks cannot. No test looks at overheads.
+Nothing is preempted, as an executor of callbacks cannot. No test includes overheads.
 
 1. *Graham* (Bounds on multiprocessing timing anomalies, SIAM J. Appl. Math. 1969). Walk back
    from sink v: whenever no vertex of that chain runs, all workers are busy with other vertices. So

@@ -172,7 +172,7 @@ class _Topic:
 
 
 def _same_array(a: Any, b: Any) -> bool:
-    """Return whether arrays are the same without a look at each number."""
+    """Return whether arrays are the same, without comparing each number."""
     try:
         return bool(a.tobytes() == b.tobytes())
     except AttributeError:

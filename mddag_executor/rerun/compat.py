@@ -43,5 +43,5 @@ def goal_states(server: Any) -> Iterator[tuple[Any, int]]:
     """Yield the goals (``GoalInfo``) that an action server knows, with their status."""
     for goal in list(server._goal_handles.values()):
         handle = goal._goal_handle
-        if handle is not None:  # not by its property: that takes a lock that may be held here
+        if handle is not None:  # not by its property: that takes a lock that may be locked here
             yield goal._goal_info, handle.get_status()

@@ -12,9 +12,9 @@ threads``); then the core dispatches until it has nothing left to do. All that t
 same instant is done before time goes on.
 
 A callback runs, for real and at once, when the core dispatches it. In virtual time it takes as
-long as ``times`` says, or as long as it has waited, if that is more. What it sends is *held*
-until its virtual end, or until it begins to wait, for others may have to answer it. A message
-whose recorded transport time is negative left before the end, and does so here, too.
+long as ``times`` says, or as long as it has waited, if that is more. What it sends is kept until
+its virtual end, or until it begins to wait, because others may have to answer it. A message whose
+recorded transport time is negative left before the end, and does so here, too.
 
 A message that another thread sends has no virtual time: it gets the time at which it arrives, and
 a warning says so.
@@ -54,7 +54,7 @@ from mddag_executor.rerun.shared_cpus import SharedCpus
 DRAIN_NS = 10_000_000_000
 """What has begun may go on this long after the end of the recording, and in a pause of it."""
 POLL_NS = 1_000_000
-"""How often a waiting callback looks again, or asks again for the interpreter."""
+"""How often a waiting callback polls, or asks again for the interpreter."""
 MOST_POLLS = 1000
 """A callback that reads the time this often at one instant waits for time to pass."""
 MOST_AT_ONCE = 20_000
@@ -155,7 +155,7 @@ class Loop:
         return time if place < 0 else max(time, self._pauses[place][1])
 
     def call_in_run(self, function: Callable[[], None]) -> None:
-        """Do something at once, or, where a thread of others calls, as soon as possible."""
+        """Call a function at once, or, if a foreign thread calls, as soon as possible."""
         if self.run_threads.current() is not None:
             function()
         else:
@@ -246,8 +246,8 @@ class Loop:
         self._at_once += 1
         if self._at_once > MOST_AT_ONCE:
             raise RerunError(
-                f'{work.entity.name}: virtual time stands still at '
-                f'{(self.now - self.start) / 1e9:.6f} s: callbacks start one another and take no '
+                f'{work.entity.name}: virtual time does not advance after '
+                f'{(self.now - self.start) / 1e9:.6f} s: callbacks start each other and take no '
                 'time: declare their execution_time')
         origin = work.origin
         release = 0 if origin is None else self.engine.release_of(work)
@@ -263,12 +263,12 @@ class Loop:
         waited = self.now > execution.start
         if self.computing is not None and execution.worker >= 0 and not waited:
             self.computing.begin(execution, work, takes, [
-                (max(0, takes + early), partial(self._leave, held, execution, early))
-                for early, held in self._take_early(execution, takes)])
+                (max(0, takes + early), partial(self._leave, sent, execution, early))
+                for early, sent in self._take_early(execution, takes)])
             return
         end = max(self.now, execution.start + takes)
-        for early, held in self._take_early(execution, takes):
-            self.at(max(self.now, end + early), ARRIVED, self._leave, held, execution, early)
+        for early, sent in self._take_early(execution, takes):
+            self.at(max(self.now, end + early), ARRIVED, self._leave, sent, execution, early)
         order = (work.worker << _WORKER_BITS) + next(self._order)
         heappush(self._events, (end, ENDED, order, self.ended, (execution, end)))
 
@@ -301,19 +301,19 @@ class Loop:
         if origin is None or not takes:
             return []
         found, kept = [], []
-        for held in execution.sent:
-            early = held.early(origin, execution.release)
+        for sent in execution.sent:
+            early = sent.early(origin, execution.release)
             if early < 0:
-                found.append((early, held))
+                found.append((early, sent))
             else:
-                kept.append(held)
+                kept.append(sent)
         execution.sent = kept
         return found
 
-    def _leave(self, held: Sent, execution: Execution, early: int) -> None:
+    def _leave(self, sent: Sent, execution: Execution, early: int) -> None:
         """Let something leave before its execution ends."""
-        held.record(execution.thread)
-        held.leave(execution.origin, execution.release, self.now - early)
+        sent.record(execution.thread)
+        sent.leave(execution.origin, execution.release, self.now - early)
 
     def _execution_time(self, work: Work, origin: Origin | None, release: int) -> int:
         """Return how long a callback takes: its first piece all of it, a sync its last leg."""
@@ -338,8 +338,7 @@ class Loop:
         work, engine, worker = execution.work, self.engine, execution.worker
         start, waits_for = execution.start, execution.waits_for
         work.entity.busy_ns += now - start
-        held = execution.sent
-        for each in held:
+        for each in execution.sent:
             each.record(execution.thread)  # before its callback's end
         if waits_for is None:
             engine.finished(work, start, now, now, execution.thread, worker)
@@ -348,7 +347,7 @@ class Loop:
             engine.suspended(work, start, now, execution.thread, worker)
             self._resumed.add(work)
             self._resume_when_done(work, waits_for)
-        for each in held:
+        for each in execution.sent:
             each.leave(execution.origin, execution.release, now)
         if engine.to_ask_again:
             engine.ask_again()
@@ -360,13 +359,13 @@ class Loop:
         else:
             waits_for.add_done_callback(QuickCallback(partial(self.call_in_run, resume)))
 
-    def send(self, held: Sent) -> None:
+    def send(self, sent: Sent) -> None:
         """Send something: when the callback that runs ends, or else at once."""
         execution = self.current
         if execution is not None:
-            execution.sent.append(held)
+            execution.sent.append(sent)
         else:
-            self.call_in_run(partial(held.leave, None, 0, self.now))
+            self.call_in_run(partial(sent.leave, None, 0, self.now))
 
     def call_at_end(self, function: Callable[[], None]) -> None:
         """Do something when the callback that runs ends, or else at once."""
@@ -399,8 +398,8 @@ class Loop:
             deadline = self.after_pause(deadline, DRAIN_NS)
         execution = self._current
         if execution is not None:
-            held, execution.sent = execution.sent, []
-            for each in held:
+            sent, execution.sent = execution.sent, []
+            for each in sent:
                 each.record(execution.thread)
                 each.leave(execution.origin, execution.release, self.now)
             if lends and execution.worker >= 0 and execution.work.x >= 0:

@@ -5,7 +5,7 @@ Messages from publishers to subscriptions, without a middleware.
 
 Theory of operation
 -------------------
-``publish`` serialises the message, so that nothing changes it any more, and hands it to the loop,
+``publish`` serialises the message, so that nothing changes it any more, and passes it to the loop,
 which lets it *leave* later. Then it is an output of the run, and goes to all subscriptions of its
 topic whose QoS fits: each gets a message of its own, after the transport time.
 
@@ -76,7 +76,7 @@ class Outlet:
         self.count = 0
         qos = publisher.qos_profile
         latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        # for those who come later
+        # for later subscriptions
         self.kept: deque[tuple[int, bytes]] = deque(maxlen=max(1, qos.depth) if latched else 0)
 
     def fits(self, inlet: Inlet) -> bool:
@@ -112,7 +112,7 @@ class Messages:
         self._publishers: dict[str, int] = {}
         self._sequence = 0
 
-    # --- who is there ----------------------------------------------------------------------------
+    # --- publishers and subscriptions ------------------------------------------------------------
 
     def refresh(self, nodes: Iterable[Any], subscriptions: Iterable[Entity]) -> None:
         """Update which subscriptions and publishers there are."""

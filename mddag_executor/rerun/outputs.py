@@ -113,7 +113,7 @@ class VirtualTraceWriter:
 
     def __init__(self, path: str) -> None:
         self.path = path
-        self._file = TraceFile(path, overwrite=True)  # who starts the run has checked that
+        self._file = TraceFile(path, overwrite=True)  # checked before the run
         self._events: list[tuple[Any, ...]] = []
 
     def record(self, *event: Any) -> None:

@@ -32,9 +32,9 @@ import threading
 import time
 from typing import Any
 
-_LOOK_S = 0.05
-_LONGEST_LOOK_S = 1.0
-"""More time between two looks is that of a process that was stopped."""
+_CHECK_S = 0.05
+_LONGEST_CHECK_S = 1.0
+"""More time between two checks is that of a process that was stopped."""
 _COMPUTES = 10
 _LITTLE = 0.1
 """A process that uses less than this share of a CPU waits."""
@@ -99,7 +99,7 @@ class RunThreads:
         self.over = False
         self.error: BaseException | None = None
 
-    # --- who has the turn ------------------------------------------------------------------------
+    # --- the turn --------------------------------------------------------------------------------
 
     def current(self) -> RunThread | None:
         """Return the run thread that calls, if it has the turn; None for threads of others."""
@@ -259,10 +259,10 @@ class RunThreads:
         watch = _StallWatch(self, progress, patience_s)
         ending_at = 0.0
         try:
-            while not self._done.acquire(timeout=_LOOK_S):
+            while not self._done.acquire(timeout=_CHECK_S):
                 tick()
                 if not self.over:
-                    watch.look()
+                    watch.check()
                 elif not ending_at:
                     ending_at = time.monotonic() + _END_S
                 elif time.monotonic() > ending_at:
@@ -288,15 +288,15 @@ class _StallWatch:
         self._patience_s = patience_s
         self._seen: object = None
         self._owner: RunThread | None = None
-        self._looked_at, self._cpu_s = time.monotonic(), time.process_time()
+        self._checked_at, self._cpu_s = time.monotonic(), time.process_time()
         self._waited_s = self._computed_s = 0.0
 
-    def look(self) -> None:
+    def check(self) -> None:
         now, cpu_s, owner = time.monotonic(), time.process_time(), self._run_threads.owner
-        passed_s = min(now - self._looked_at, _LONGEST_LOOK_S)
+        passed_s = min(now - self._checked_at, _LONGEST_CHECK_S)
         computes = cpu_s - self._cpu_s > _LITTLE * passed_s
         before, self._owner = self._owner, owner
-        self._looked_at, self._cpu_s = now, cpu_s
+        self._checked_at, self._cpu_s = now, cpu_s
         seen = self._progress()
         if owner is None or seen != self._seen:
             self._seen, self._waited_s, self._computed_s = seen, 0.0, 0.0

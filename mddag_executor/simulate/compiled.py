@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mddag_executor.simulate.schedule import Settings
 
 ACCEPT_RUNS, RUN_ONCE = 'accept_runs', 'run_once'
-"""The entry points: of ``evaluate``, and of everything else."""
+"""The entry points: of ``evaluate``, and of all other runs."""
 _WORD = 8
 _COMPILE_S = {ACCEPT_RUNS: 15.0, RUN_ONCE: 40.0}    # approximate compile times
 

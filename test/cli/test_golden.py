@@ -34,6 +34,7 @@ COMMANDS = {
     'simulate': 'simulate graph.yaml --duration 200ms',
     'simulate_json': 'simulate graph.yaml --duration 200ms --policy fifo --json -',
     'evaluate': 'evaluate graph.yaml --runs 30 --policies rad,fifo --jobs 1 --duration 200ms',
+    'from_caret': 'graph from-caret architecture.yaml -o out.yaml',
     'evaluate_json': 'evaluate graph.yaml --runs 30 --policies rad --jobs 1 --json -',
 }
 _CHANGING = (
@@ -47,7 +48,8 @@ def test_output(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    shutil.copy(GOLDEN / 'graph.yaml', tmp_path)
+    for file in GOLDEN.glob('*.yaml'):
+        shutil.copy(file, tmp_path)
     monkeypatch.chdir(tmp_path)
     assert program.main(COMMANDS[name].split()) == 0
     out, err = capsys.readouterr()

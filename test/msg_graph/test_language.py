@@ -125,8 +125,8 @@ HEAD = 'nodes:\n- node: /a\n  callbacks:\n  - {name: t, timer: 1ms, deadline: 1m
      "unknown key 'xyz': use mddag, arguments, include, workers, nodes, processes, paths"),
     (f'mddag: 1\nworkers: 0 {MARK}\n' + HEAD, 'from 1 to 4096'),
     (f'mddag: 1\nworkers: 4097 {MARK}\n' + HEAD, 'from 1 to 4096'),
-    (f'mddag: 1\nworkers: seven {MARK}\n' + HEAD, 'whole number'),
-    (f'mddag: 1\nworkers: {"9" * 5000} {MARK}\n' + HEAD, 'whole number'),
+    (f'mddag: 1\nworkers: seven {MARK}\n' + HEAD, 'write an integer'),
+    (f'mddag: 1\nworkers: {"9" * 5000} {MARK}\n' + HEAD, 'write an integer'),
 ])
 def test_head(text: str, says: str) -> None:
     # Without a line of its own to blame, the mapping that lacks something starts at the top.
