@@ -15,9 +15,8 @@ of callbacks that may run in another process (``msg_graph.drift``).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mddag_executor.executor.entity import SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.text import counted, listed
@@ -39,19 +38,15 @@ class NameCheck:
     Compares the names of the nodes with those of the declaration, once.
 
     :param process: the declared process that this is.
-    :param warn: receives the warning; None: it is logged.
     """
 
     def __init__(
-        self, task_set: TaskSet | None, registry: Registry, process: str | None,
-        warn: Callable[[str], Any] | None = None, clock: Callable[[], float] = time.monotonic,
+        self, task_set: TaskSet | None, registry: Registry, process: str | None
     ) -> None:
         self._task_set = task_set
         self._dags = {} if task_set is None else dags_of(task_set)
         self._registry = registry
         self._process = process
-        self._warn = warn
-        self._clock = clock
         self._begin: float | None = None
         self._done = task_set is None
 
@@ -63,7 +58,7 @@ class NameCheck:
         """Warn if it is time to; the spinning thread calls this repeatedly."""
         if self._done or not is_judging or not self._registry.by_id:
             return
-        now = self._clock()
+        now = time.monotonic()
         if self._begin is None:
             self._begin = now
         if now - self._begin < LEAST_S:
@@ -74,7 +69,7 @@ class NameCheck:
             return
         self._done = True
         if missing:
-            (self._warn or get_logger('mddag_executor').warning)(printable(self._text(missing)))
+            get_logger('mddag_executor').warning(printable(self._text(missing)))
 
     def _missing(self) -> list[Callback]:
         assert self._task_set is not None

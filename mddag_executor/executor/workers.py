@@ -632,6 +632,8 @@ class WorkerPool:
                     entity.classify()
         if measurement is not None or me.published or end - start > BRIEF_NS:
             self._note_times(entity, start, end, me.published)
+        if self.callback_ended is not None and me.outcome is None:
+            self.callback_ended(entity.rclpy, None)
 
     @staticmethod
     def _note_times(entity: Entity, start: int, end: int, published: int) -> None:
@@ -660,8 +662,6 @@ class WorkerPool:
             entity.busy_ns += me.end - me.start
             offset = self._offset
             engine.finished(work, me.start + offset, me.end + offset, now, me.vtid, work.worker)
-            if self.callback_ended is not None:
-                calls.append(partial(self._settle_end, work, None))
         elif not self._report_unusual_end(me, work, now, calls):
             return
         if engine.to_ask_again:
@@ -685,7 +685,7 @@ class WorkerPool:
             worker = -1
             me.has_lent = False
             self._waiting_calls -= 1
-        if outcome is not None or self.callback_ended is not None:
+        if outcome is not None:
             calls.append(partial(self._settle_end, work, outcome))
         if isinstance(outcome, Refused):
             engine.refused(work, now)
@@ -710,10 +710,9 @@ class WorkerPool:
             self.call_at(monotonic_ns() + AGAIN_NS, self._ask_again)
         elif isinstance(outcome, Destroyed):
             pass
-        elif outcome is None or isinstance(outcome, BaseException):
-            handled = self.callback_ended is not None and self.callback_ended(
-                work.entity.rclpy, outcome)
-            if outcome is not None and not handled:
+        elif isinstance(outcome, BaseException):
+            if self.callback_ended is None or not self.callback_ended(
+                    work.entity.rclpy, outcome):
                 self._fail(outcome)
         elif outcome is NEXT_TURN or not hasattr(outcome, 'add_done_callback'):
             if self._is_stepping:
