@@ -136,7 +136,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 ROS = (
     'executor', 'hosting', 'benchmarks', 'launch', 'examples', 'hardening/test_misuse.py',
     'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph_systems.py',
-    'replay/test_known_causes.py', 'replay/test_live_replay.py', 'test_docs.py')
+    'replay/test_live_replay.py', 'test_docs.py')
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

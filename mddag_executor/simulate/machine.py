@@ -34,7 +34,14 @@ from typing import NamedTuple
 
 from mddag_executor.core.queues import first_waiting, overtaking_pays, overtaking_pays_from
 from mddag_executor.core.rules import progress
-from mddag_executor.core.state import add_queue, empty, N_HOLDING, PREEMPTIVE, State
+from mddag_executor.core.state import (
+    add_process,
+    add_queue,
+    empty,
+    N_HOLDING,
+    PREEMPTIVE,
+    State,
+)
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.simulate.load import Load, place_of
 
@@ -108,7 +115,7 @@ def fill_machine(
         m.scalars.append(value)
     for vertex in range(len(t.process)):
         while len(s.overtaking) <= t.process[vertex]:
-            s.overtaking.append(1)
+            add_process(s)
     for _ in range(len(s.overtaking)):
         add_queue(m.lock_queue)
         m.lock_had.append(-1)

@@ -1,25 +1,30 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The program as a whole: verbs, exit status, the one line on standard error."""
+"""The program as a whole: verbs, exit status, one line of error, text for people, `ros2 mddag`."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
 from contextlib import nullcontext
+from importlib.metadata import distribution
+from importlib.util import find_spec
+import io
 import os
 from pathlib import Path
 import re
 import subprocess
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
+from hypothesis import given, strategies
 from mddag_executor import __version__, defaults
 from mddag_executor.cli import main as program
+from mddag_executor.cli.text import format_ns, one_line, printable, Progress
 from mddag_executor.errors import InputError, MddagError, UsageError
 from mddag_executor.simulate import Settings
 from mddag_executor.simulate.run import check
-from msg_graph import GraphError, loads
+from msg_graph import errors, GraphError, loads
 import pytest
 
 Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
@@ -266,3 +271,135 @@ def test_the_limit_of_workers_is_the_same_everywhere(tmp_path: Path) -> None:
             resolve(str(graph), workers, 1)
         with refused:
             check(Settings(workers=workers))
+
+
+@pytest.mark.parametrize(('ns', 'text'), [
+    (0, '0 ns'),
+    (999, '999 ns'),
+    (1_000, '1 us'),
+    (12_345, '12.35 us'),
+    (999_960, '1.000 ms'),
+    (999_940, '999.9 us'),
+    (100_000_000, '100 ms'),
+    (100_040_000, '100.0 ms'),
+    (100_060_000, '100.1 ms'),
+    (30_500_000, '30.5 ms'),
+    (1_500_000_000, '1.5 s'),
+    (20_000_000_000, '20 s'),
+    (123_456_789_012_345, '123457 s'),
+    (-1_500_000, '-1.5 ms'),
+])
+def test_times(ns: int, text: str) -> None:
+    assert format_ns(ns) == text
+
+
+@given(strategies.integers(-10**15, 10**15))
+def test_times_are_right_to_four_digits(ns: int) -> None:
+    number, unit = format_ns(ns).split()
+    value = float(number) * {'ns': 1, 'us': 1e3, 'ms': 1e6, 's': 1e9}[unit]
+    assert value == pytest.approx(ns, rel=5.01e-4)
+    assert abs(float(number)) < 1000 or unit == 's'
+
+
+@given(strategies.text())
+def test_no_control_character_reaches_the_terminal(text: str) -> None:
+    for line in (printable(text), one_line(text)):
+        assert line.isprintable()
+    if text.isprintable():
+        assert printable(text) == text
+
+
+class Terminal(io.StringIO):
+
+    def isatty(self) -> bool:
+        return True
+
+
+class Clock:
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_progress_waits_two_seconds() -> None:
+    stream, clock = Terminal(), Clock()
+    with Progress('simulating', 10, stream=stream, clock=clock) as progress:
+        clock.now += 1.9
+        progress.update(3)
+        assert stream.getvalue() == ''
+        clock.now += 0.2
+        progress.update(4, 'run\x1b 4')
+        assert stream.getvalue() == '\rsimulating: 40 % run\\x1b 4'
+        progress.update(5)
+        assert '50 %' not in stream.getvalue(), 'more often than five times a second'
+        clock.now += 0.2
+        progress.update(20)
+        assert '100 %' in stream.getvalue()
+    assert stream.getvalue().endswith('\r'), 'the line is wiped'
+
+
+def test_both_packages_make_names_harmless_alike() -> None:
+    every = ''.join(map(chr, range(0x11000))) + '\U000e0001\U0010ffff'
+    assert printable(every) == errors.printable(every)
+    assert printable(every).isprintable()
+
+
+GRAPH = """
+mddag: 1
+nodes:
+  - {node: /n, callbacks: [{name: tick, timer: 10ms, deadline: 10ms, execution_time: 1ms}]}
+"""
+
+
+@pytest.fixture
+def ros2(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Give what ros2cli does with a command line, in short: parse it, call the command's main."""
+    if find_spec('ros2cli') is None:
+        command_module = ModuleType('ros2cli.command')
+        command_module.CommandExtension = object    # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, 'ros2cli', ModuleType('ros2cli'))
+        monkeypatch.setitem(sys.modules, 'ros2cli.command', command_module)
+        monkeypatch.delitem(sys.modules, 'mddag_executor.cli.ros2', raising=False)
+    entry, = (each for each in distribution('mddag_executor').entry_points
+              if each.group == 'ros2cli.command')
+    assert entry.name == 'mddag'
+    extension = entry.load()()
+
+    def main(*arguments: str) -> int:
+        parser = argparse.ArgumentParser('ros2')
+        commands = parser.add_subparsers(dest='command')
+        extension.add_arguments(commands.add_parser(entry.name), 'ros2 mddag')
+        args = parser.parse_args(['mddag', *arguments])
+        status: int = extension.main(parser=parser, args=args)
+        return status
+    return SimpleNamespace(main=main, summary=extension.__doc__)
+
+
+def test_it_is_the_same_program(
+    ros2: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = tmp_path / 'graph.yaml'
+    graph.write_text(GRAPH)
+    assert ros2.main('graph', 'check', str(graph)) == 0
+    assert 'deadline' in capsys.readouterr().out
+    assert ros2.main('simulate', '--duration', '100ms', '--', str(graph)) == 0
+    assert ros2.main('graph', 'check', 'none.yaml') == 2
+    assert capsys.readouterr().err.startswith('error: none.yaml: ')
+    assert ros2.main() == 2
+    assert capsys.readouterr().err.startswith('error: mddag: ')
+
+
+def test_completion_is_that_of_mddag(
+    ros2: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    monkeypatch.setattr('mddag_executor.cli.completion.complete', lambda: asked.append(
+        (os.environ['COMP_LINE'], os.environ['COMP_POINT'])))
+    for name, value in (('_ARGCOMPLETE', '1'), ('COMP_LINE', 'ros2 mddag expl'),
+                        ('COMP_POINT', '15')):
+        monkeypatch.setenv(name, value)
+    ros2.main('graph')
+    assert asked[0] == ('mddag expl', '10')

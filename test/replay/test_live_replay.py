@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Live against replay: real nodes run under the executor, and their trace is replayed."""
+"""Real runs are replayed, and their misses have the cause that they were given."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import threading
 import time
 from typing import Any
 
+from benchmarks.known_causes import causes, record
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.trace import read_events
 from msg_graph import loads
@@ -211,3 +212,16 @@ def test_a_process_that_was_killed_loses_the_last_second_at_most(tmp_path: Path)
     with pytest.warns(UserWarning, match='without a finish record'):
         first, *_, last = [event['_timestamp'] for event in read_events(path)]
     assert last - first > 1.2e9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('cause', ['waited', 'group', 'machine', 'lost'])
+def test_the_cause_of_most_misses(cause: str, tmp_path: Path) -> None:
+    for misses in (9, 36):  # a busy machine has stops of its own, so that fewer are made
+        trace = tmp_path / f'{misses}.mcap'
+        record(cause, trace, misses, scale=3.0)
+        told = causes(trace)
+        if told.get(cause, 0) >= 5:
+            break
+    assert told.get(cause, 0) >= 5
+    assert all(n <= told[cause] for other, n in told.items() if other != 'machine'), told

@@ -118,15 +118,6 @@ def shuts_down_in_a_callback():
     print('shut down')
 
 
-def leaves_early():
-    rclpy.init()
-    node = Node('short')
-    rclpy.spin_once(node, timeout_sec=0.1)
-    node.destroy_node()
-    rclpy.try_shutdown()
-    print('left early')
-
-
 def catches_signals():
     import signal
     rclpy.init()
@@ -244,14 +235,6 @@ def ends_in_a_thread():
     print('over' if not rclpy.ok() else 'it goes on')
 
 
-def starts_slowly():
-    import time
-    rclpy.init()
-    time.sleep(1.5)
-    print('started at', time.time_ns())
-    rclpy.spin(Listener())
-
-
 def leaves_a_thread():
     import threading
     import time
@@ -276,19 +259,8 @@ def blocks_in_a_callback():
     rclpy.spin(node)
 
 
-def fails():
-    rclpy.init()
-    raise RuntimeError('no camera\nfound')
-
-
 def exits():
     raise SystemExit(3)
-
-
-def fails_later():
-    rclpy.init()
-    rclpy.spin_once(Listener(), timeout_sec=0.2)
-    raise RuntimeError('later')
 
 
 def raises_in_a_callback():
