@@ -136,10 +136,11 @@ def run(
     which the first miss is known: a late completion, an expiry or an abort.  ``progress`` receives
     the virtual time at each event.  The busy time of each worker is added to ``busy``.
     """
-    for v in range(t.n_vertices):
-        place = load.cost_base[t.dag_of[v]] + t.region_offset[v]  # of its first job, if any
-        if place < len(load.holds):
-            s.holder[v] = load.holds[place]
+    if len(load.holds) > 0:
+        for v in range(t.n_vertices):
+            place = load.cost_base[t.dag_of[v]] + t.region_offset[v]  # of its first job, if any
+            if place < len(load.holds):
+                s.holder[v] = load.holds[place]
     overload.admit(t, s)
     n_workers = len(s.worker_x)
     finish_at = [NEVER] * n_workers
