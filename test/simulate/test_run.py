@@ -50,7 +50,7 @@ def two_dags(**more: Any) -> TaskSet:
 
 def test_a_source_may_get_ready_after_its_release() -> None:
     """As with a header stamp: the deadline counts from the release."""
-    load = Load([5 * US], [0], [0], [2 * US, 2 * US], [0], [0], releases=[1])
+    load = Load([5 * US], [0], [0], [2 * US, 2 * US], [0, 2], [0, 0], releases=[1])
     run = simulate(two_dags(), load, Settings(workers=1, duration_ns=100 * US))
     sink = run.result()['dags']['a']['sinks']['/n:x@a']
     assert (sink['completed'], sink['late']) == (1, 0)
