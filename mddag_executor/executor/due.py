@@ -19,7 +19,6 @@ from mddag_executor.core import NEVER
 from mddag_executor.executor.bounds import AGAIN_NS, BRIEF_NS, STOP_NS
 from mddag_executor.executor.gil import CHECK_NS, GilCheck, LAST_CHECK_NS
 from mddag_executor.executor.listeners import TimerFd
-from mddag_executor.executor.work import Work
 
 if TYPE_CHECKING:
     from mddag_executor.executor.workers import WorkerPool
@@ -117,25 +116,26 @@ class DueTimes:
 
     # --- the GIL ---------------------------------------------------------------------------------
 
-    def check_holder(self, now: int) -> None:
-        """Check whether the execution that holds the GIL computes, as another one waits for it."""
-        self._watch_holder(now)
+    def check_holder(self, now: int, is_late: bool = False) -> None:
+        """
+        Check whether the execution that holds the GIL computes, as another one waits for it.
+
+        :param is_late: it is short, but runs longer than expected.
+        """
+        self._watch_holder(now, is_late)
         at = self._gil_check.at
         if at and not 0 < self._timer.at <= at:
             self.may_expire_early = True
             self._timer.arm(at)
 
-    def _watch_holder(self, now: int) -> None:
+    def _watch_holder(self, now: int, is_late: bool = False) -> None:
         holder = self._engine.interpreter_holder()
-        if holder is not None:
-            self._gil_check.begin(holder, now, self._check_after(holder))
-
-    @staticmethod
-    def _check_after(holder: Work) -> int:
-        """Return the time until the first check of an execution that holds the GIL, ns."""
-        if holder.entity.wall_ns <= BRIEF_NS:
-            return LAST_CHECK_NS
-        return max(CHECK_NS, 2 * holder.entity.habit.mean_ns)
+        if holder is None:
+            return
+        after = LAST_CHECK_NS
+        if is_late or holder.entity.wall_ns > BRIEF_NS:
+            after = max(CHECK_NS, 2 * holder.entity.habit.mean_ns)
+        self._gil_check.begin(holder, now, after)
 
     def _check_gil(self, now: int) -> None:
         """Take the GIL from an execution that waits for anything else."""

@@ -243,11 +243,11 @@ class GilCheck:
 
     def begin(self, subject: object, now: int, after: int) -> None:
         """
-        Start checking an execution, unless it is being checked already.
+        Start checking an execution, unless it is being checked already as soon.
 
         :param after: time until the first check, ns.
         """
-        if self._subject is not subject:
+        if self._subject is not subject or after < self._step:
             self._subject = subject
             self._step = after
             self._last = None

@@ -287,11 +287,11 @@ class WorkerPool:
 
     def _guard(self, now: int) -> None:
         """Let a thread start what waits if a short callback runs longer than expected."""
-        guard, at = self.guard, now + GUARD_NS
+        guard = self.guard
         if self.engine.idle_workers and not guard.is_set and not (
-                self.polling and 0 < self.loop.timer.at <= at):
+                self.polling and 0 < self.loop.timer.at <= now + 2 * GUARD_NS):
             self._guarded = None if self._leader is None else self._leader.work
-            guard.set(at)
+            guard.set(now + GUARD_NS)
 
     def _guard_expired(self) -> None:
         """
@@ -313,6 +313,8 @@ class WorkerPool:
                 self._admit()
             elif self.engine.may_start_more(now):
                 self._wake_one()
+            elif self.engine.holders and self.engine.has_waiting:
+                self.due.check_holder(now - self._offset, is_late=True)
 
     def _wake_one(self) -> None:
         if self.polling or self._is_stepping:
