@@ -74,7 +74,7 @@ def declared(head: Head, name: str) -> TaskSet:
     except GraphError as error:
         raise ReplayError(
             name, f'the declaration that it was recorded with is wrong ({error})',
-            'record the run anew') from None
+            'record the run again') from None
 
 
 def no_end(name: str) -> str:

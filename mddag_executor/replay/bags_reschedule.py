@@ -205,7 +205,7 @@ def reschedule_bag(
     bag = Bag(path, topics, name)
     if bag.start is None:
         what = '; '.join(bag.warnings) or 'there are no messages in it'
-        raise BagError(bag.name, what.removeprefix(f'{bag.name}: '), 'record one anew')
+        raise BagError(bag.name, what.removeprefix(f'{bag.name}: '), 'record one again')
     builder = _Builder(bag, task_set)
     work = builder.build(times, seed)
     end = (bag.end or 0) + 1

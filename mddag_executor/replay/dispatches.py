@@ -22,7 +22,6 @@ from __future__ import annotations
 from typing import Any
 
 from mddag_executor.recording.tables import Ints
-from mddag_executor.simulate.machine import WARM_NS
 import numpy as np
 
 
@@ -45,13 +44,7 @@ class Dispatches:
         self._start, self._end, self._process = start, end, process
         # when it was free, and when its worker was free, too
         self._free = np.maximum(ready, _end_before(group, end))
-        ended = _end_before(worker, end)
-        self._worker = np.maximum(self._free, ended)
-        self._warm = start - ended <= WARM_NS
-
-    def warm(self) -> Any:
-        """Return by number whether its worker had just ended another one, as an array."""
-        return self._warm
+        self._worker = np.maximum(self._free, _end_before(worker, end))
 
     def late(self, holding: Any = ()) -> Any:
         """

@@ -17,8 +17,10 @@ Theory of operation
 * A sync vertex has the execution time of the leg that completed it.  Earlier legs, which only
   store their message, load the workers like undeclared callbacks: each piece is a job of the
   undeclared DAG, ready when it was in the recording.  Their callback groups are ignored.
-* If CPU times are recorded, execution times are isolated execution times (see ``alone``), and the
+* If CPU times are recorded, execution times are isolated execution times (``isolation``), and the
   load has the CPU time and whether the GIL was held (as recorded or declared).
+* A timer that was due while all workers ran callbacks was noticed late for that reason.  Its
+  latency is that of other timers; how long it waits for a worker is simulated.
 * *Transport* is the time from the end of the publishing execution until the successor is ready;
   negative if it published early.
 * *Dispatch* is the time from when an execution could have started until it started (see
@@ -47,9 +49,9 @@ from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded_tables
 from mddag_executor.recording.tables import Ints, Recording, sort_by
-from mddag_executor.replay.alone import alone, colder, ENOUGH, Recorded
 from mddag_executor.replay.deadlines import look_up
 from mddag_executor.replay.dispatches import Dispatches
+from mddag_executor.replay.isolation import ENOUGH, isolated_times, Recorded
 from mddag_executor.replay.noticed import Noticed
 from mddag_executor.replay.usage import ran
 from mddag_executor.simulate import Load
@@ -140,7 +142,7 @@ class LoadBuilder:
         self._first = tables.first_vertex
         self._process = [*(processes or [1] * tables.n_vertices), 1]
         self._callbacks = task_set.places_of_vertices()
-        self._cpus = cpus
+        self._cpus, self._n_workers = cpus, n_workers
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
         # by global vertex and leg: the edge (number in its DAG) that its message satisfies
         numbers = edge_numbers(tables)
@@ -327,21 +329,21 @@ class LoadBuilder:
 
     def build(
         self, overheads: bool = True, process: Sequence[int] | None = None, workers: int = NEVER,
-        anew: bool = False,
+        notices: bool = False,
     ) -> RecordedLoad:
         """
         Return the load.
 
         :param process: by vertex the process to run it in; None: as recorded.
         :param workers: workers of each process, if fewer than in the recording.
-        :param anew: whether intakes notice timers and messages, instead of the recorded times;
+        :param notices: whether intakes notice timers and messages, instead of the recorded times;
             this needs CPU times, which say how long others computed.
         """
         self._close()
         process = process or self._process
-        anew = anew and bool((self._whole['cpu'] >= 0).any())
-        every, usual, warmth, late, intakes = self._alone(workers, anew)
-        if anew:
+        notices = notices and bool((self._whole['cpu'] >= 0).any())
+        every, usual, late, intakes = self._isolate(workers, notices)
+        if notices:
             self._skipped.clear()
         unsent = self._unsent()
         delays, transport = self._transports(overheads, process, intakes)
@@ -365,13 +367,11 @@ class LoadBuilder:
         columns: dict[str, Any] = {
             'holds': np.concatenate([held, more]) if held.any() else [],
             'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
-            # with as many workers in parallel, workers sleep and wake as recorded
-            'warmth': np.concatenate([warmth, more]) if overheads and workers < NEVER else [],
             'delays': delays, 'delay_stride': [jobs.n_edges for jobs in self._jobs],
             'delay_base': [0, *accumulate(
                 len(jobs.numbers) * jobs.n_edges for jobs in self._jobs[:-1])]}
         load = self._load(costs, bases, others[:, 0],
-                          overheads and not anew)._replace(
+                          overheads and not notices)._replace(
             fates=self._fates(bases, len(costs)), **columns)
         return RecordedLoad(
             load, [jobs.numbers.tolist() for jobs in self._jobs], demand, executions, estimated,
@@ -465,65 +465,59 @@ class LoadBuilder:
             np.tile(numbers[first:first + jobs.size], len(jobs.numbers))
             for first, jobs in zip(self._first, self._jobs)])
 
-    def _alone(
-        self, workers: int, anew: bool
-    ) -> tuple[Any, int | None, Any, Any, Costs | None]:
+    def _isolate(
+        self, workers: int, notices: bool
+    ) -> tuple[Any, int | None, Any, Costs | None]:
         """
-        Convert times to isolated execution times (see ``alone``).
+        Convert times to isolated execution times (see ``isolation``).
 
         ``took`` becomes the isolated times of callbacks.
 
         :return: dispatch time by number of an execution, with the usual one last; the usual one;
-            by execution the extra time if its worker slept (see ``Load.warmth``); the executor's
-            own cost per execution; and the costs of intakes, if ``anew``.
+            the executor's own cost per execution; and the costs of intakes, if ``notices``.
         """
         intakes = None
         number, took, start, cpu, held = (
             self._whole[name] for name in ('dispatch', 'took', 'start', 'cpu', 'held'))
         locks = (held > 0) & (cpu >= 0)
         every = self._dispatches.late(number[locks & (number >= 0)])
-        warm = np.append(self._dispatches.warm(), True)[number]
         known = number[number >= 0]
         usual = quantile(memoryview(np.sort(every[known])), 0.5) if len(known) else None
         every = np.append(every, usual or 0)     # number -1
         late = every[number]
         del self._dispatches, number, known
         self._drop('dispatch')
-        if workers < NEVER:
-            self._notice_sooner(start - late, workers)
+        self._notice_at_once(start - late)
         ran: Any = (took >= 0) & (start >= 0)
         if ran.all():
             ran = slice(None)   # a slice copies nothing: there may be millions
-        warmth = np.zeros(len(took) * (workers < NEVER), dtype=np.int64)
         if (cpu[ran] >= 0).any():
             recorded = Recorded(
                 start[ran] - late[ran], took[ran] + late[ran], cpu[ran], locks[ran],
                 self._by_execution(self._process)[ran],
-                self._by_execution(self._callbacks)[ran], warm[ran])
+                self._by_execution(self._callbacks)[ran])
             give_back()
             beyond = recorded
-            if anew:
+            if notices:
                 noticed = self._noticed()
                 intakes = noticed.costs(recorded)
-                beyond = recorded.beside(noticed.executions(intakes))
-            cost = alone(beyond, self._cpus, workers)[:len(recorded.took)]
+                beyond = recorded.followed_by(noticed.executions(intakes))
+            cost = isolated_times(beyond, self._cpus, workers)[:len(recorded.took)]
             del beyond
-            if workers < NEVER:
-                warmth[ran] = colder(recorded.callback, recorded.warm, cost)
             # the reduction: it began late, or was paused later
             began = recorded.took - cost
             del recorded
             began = np.minimum(began, np.maximum(0, late[ran] - (usual or 0)))
             took[ran] = np.maximum(0, cost - late[ran] + began)
             late[ran] = cost - took[ran]
-        return every, usual, warmth, late, intakes
+        return every, usual, late, intakes
 
-    def _notice_sooner(self, could: Any, workers: int) -> None:
+    def _notice_at_once(self, could: Any) -> None:
         """
-        Reduce the latency of rounds for which more executions ran than the new pool allows.
+        Reduce the latency of timers that were due while all workers ran callbacks.
 
-        Timer latency is taken from the recorded rounds at which as many executions ran as the new
-        pool allows, rank by rank.
+        How long such a timer waits for a worker is simulated.  Its own latency is at most the
+        median of those that were due while a worker was idle.
 
         :param could: when executions could have started.
         """
@@ -532,18 +526,14 @@ class LoadBuilder:
         of = np.flatnonzero(number >= 0)
         due, ends, home = self._when_due()
         process = self._by_execution(self._process)
-        taken = ends - due
         for here in np.unique(home):
             mine = (start >= 0) & (end >= 0) & (process == here)
             running = (np.searchsorted(np.sort(could[mine]), due, 'right')
                        - np.searchsorted(np.sort(end[mine]), due, 'right'))
-            those = np.flatnonzero((running > workers) & (home == here))
-            those = those[np.argsort(taken[those], kind='stable')]
-            usual = taken[(running == workers) & (home == here)]
-            if len(usual) >= ENOUGH and len(those):
-                ranks = (np.arange(len(those)) + 0.5) / len(those)
-                more = np.maximum(0, taken[those] - np.quantile(usual, ranks))
-                ends[those] -= np.rint(more).astype(np.int64)
+            blocked = (running >= self._n_workers) & (home == here)
+            idle = (ends - due)[~blocked & (home == here)]
+            usual = int(np.median(idle)) if len(idle) >= ENOUGH else 0
+            ends[blocked] = np.minimum(ends[blocked], due[blocked] + usual)
         self._rounds = ends
         noticed[of] = np.minimum(noticed[of], ends[number[of]])
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from mddag_executor.recording.tables import Ints
-from mddag_executor.replay.alone import ENOUGH, Flags, Recorded
+from mddag_executor.replay.isolation import ENOUGH, Flags, Recorded
 from mddag_executor.simulate.intakes import Costs
 from mddag_executor.simulate.machine import SWITCH_NS
 import numpy as np
@@ -41,30 +41,31 @@ class Noticed(NamedTuple):
     def costs(self, ran: Recorded) -> Costs:
         """Measure what noticing costs in parallel with these executions; defaults if unknown."""
         ran = ran.of(ran.locks & (ran.cpu >= 0))
-        beside = np.zeros(len(self.due), dtype=np.bool_)
-        alone = np.zeros(len(ran.could), dtype=np.bool_)
+        during = np.zeros(len(self.due), dtype=np.bool_)
+        single = np.zeros(len(ran.could), dtype=np.bool_)
         timers, messages = (np.zeros(len(ran.could), dtype=np.int64) for _ in range(2))
         begins, ends = ran.could, ran.could + ran.took
         for number in np.unique(ran.interpreter):
             here, came = ran.interpreter == number, self.interpreter == number
             order = np.flatnonzero(here)[np.argsort(begins[here], kind='stable')]
-            beside[came] = (np.searchsorted(begins[order], self.due[came], 'right')
+            during[came] = (np.searchsorted(begins[order], self.due[came], 'right')
                             > np.searchsorted(np.sort(ends[order]), self.due[came], 'right'))
             latest = np.maximum.accumulate(ends[order])
-            alone[order] = ((np.append(0, latest[:-1]) <= begins[order])
+            single[order] = ((np.append(0, latest[:-1]) <= begins[order])
                             & (ends[order] <= np.append(begins[order][1:], latest[-1:])))
             for counted, kind in ((timers, self.timer), (messages, ~self.timer)):
                 ready = np.sort(self.ready[came & kind])
                 counted[order] = (np.searchsorted(ready, ends[order], 'left')
                                   - np.searchsorted(ready, begins[order], 'right'))
-        stood = (ran.took - ran.cpu)[alone]
-        late = self.ready - self.due - SWITCH_NS * beside
+        stood = (ran.took - ran.cpu)[single]
+        late = self.ready - self.due - SWITCH_NS * during
         found: dict[str, int] = {}
-        for name, kind, here, other in (('timer', self.timer, timers[alone], messages[alone]),
-                                        ('message', ~self.timer, messages[alone], timers[alone])):
+        timers, messages = timers[single], messages[single]
+        for name, kind, here, other in (('timer', self.timer, timers, messages),
+                                        ('message', ~self.timer, messages, timers)):
             for what, values in (('ns', stood[(here == 1) & (other == 0)]),
-                                 ('ready_ns', late[kind & ~beside]),
-                                 ('ready_ns', late[kind & beside])):
+                                 ('ready_ns', late[kind & ~during]),
+                                 ('ready_ns', late[kind & during])):
                 if len(values) >= ENOUGH:
                     value = max(0, int(np.median(values)))
                     found[f'{name}_{what}'] = min(value, found.get(f'{name}_{what}', value))
@@ -78,4 +79,4 @@ class Noticed(NamedTuple):
         due = self.ready + more - took
         n = len(due)
         return Recorded(due, took, takes, np.ones(n, dtype=np.bool_), self.interpreter,
-                        np.full(n, -1), np.ones(n, dtype=np.bool_))
+                        np.full(n, -1))

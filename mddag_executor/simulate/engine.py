@@ -182,8 +182,6 @@ def run(
                 if log is not None:
                     running[w] = -1
                     _note(t, s, log, now, END, w, x)
-                if machine is not None:
-                    machine.ended_at[w] = now
                 if deliveries is not None:
                     ends_sending(t, s, key, load, deliveries, machine, x, now)
                 else:

@@ -127,7 +127,7 @@ class Intakes:
             np.asarray(load.dags, dtype=np.int64), minlength=len(self._ways)).tolist()
         given: dict[str, Any] = {
             name: np.asarray(getattr(load, name), dtype=np.int64)
-            for name in ('costs', 'holds', 'computed', 'locks', 'warmth', 'fates')}
+            for name in ('costs', 'holds', 'computed', 'locks', 'fates')}
         if not len(given['locks']):
             given['locks'] = np.zeros(len(given['costs']), dtype=np.int64)
         columns: dict[str, Any] = {}

@@ -27,8 +27,6 @@ class Load(NamedTuple):
     * ``computed``: its CPU time; -1: it only waits, as far as is known.  Empty: it computes all
       the time;
     * ``locks``: whether it computes with the GIL, as executions that hold the interpreter do;
-    * ``warmth``: its extra time because its worker had slept before, ns; negative: its extra time
-      on a worker that has slept;
     * ``fates``: its fate (``RUNS``, …; ``SKIPPED`` only at a source).
 
     ``delays[delay_base[d] + k * delay_stride[d] + e]`` is how long after a vertex's completion its
@@ -46,7 +44,6 @@ class Load(NamedTuple):
     holds: list[int] = []
     computed: list[int] = []
     locks: list[int] = []
-    warmth: list[int] = []
     fates: list[int] = []
     delays: list[int] = []
     delay_base: list[int] = []

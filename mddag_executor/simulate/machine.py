@@ -51,8 +51,6 @@ SLICE_NS = 3_000_000
 """Time slice of the operating system if threads wait for a CPU."""
 BRIEF_NS = 100_000
 """Maximum CPU time with the GIL at the end of an execution that computes without it."""
-WARM_NS = 100_000
-"""A worker is warm for this time after an execution has ended: its thread does not sleep yet."""
 HARDLY = 8
 """An execution that waits for at most 1 / HARDLY of its CPU time keeps the GIL meanwhile."""
 
@@ -92,7 +90,6 @@ class Machine(NamedTuple):
     lock_had: list[int]
     switch_at: list[int]
     # by worker: end of its last execution if it has not started another; or -NEVER
-    ended_at: list[int]
 
 
 def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = False) -> Machine:
@@ -120,8 +117,6 @@ def fill_machine(
         add_queue(m.lock_queue)
         m.lock_had.append(-1)
         m.switch_at.append(NEVER)
-    for _ in range(len(s.worker_x)):
-        m.ended_at.append(-NEVER)
 
 
 def settle(s: State, m: Machine, now: int) -> None:
@@ -157,23 +152,8 @@ def decide(t: Tables, s: State, m: Machine, now: int) -> None:
                     m.scalars[OVERTAKE_AT] = pays_at
 
 
-def _is_warm(s: State, m: Machine, worker: int, now: int) -> bool:
-    """Return whether a worker of the process has just ended another execution; true once."""
-    for w in range(len(s.worker_x)):
-        if (now - m.ended_at[w] <= WARM_NS and (w == worker or s.worker_x[w] < 0)
-                and (len(s.pool) == 0 or s.pool[w] == s.pool[worker])):
-            m.ended_at[w] = -NEVER
-            return True
-    return False
-
-
 def starts(s: State, load: Load, m: Machine, x: int, now: int) -> None:
     """Note that an execution has been dispatched."""
-    if len(load.warmth) > 0 and s.scalars[PREEMPTIVE] == 0:
-        more = load.warmth[place_of(s, load, x)]
-        if _is_warm(s, m, s.x_worker[x], now) == (more > 0):
-            s.x_cost[x] -= more
-            s.x_left[x] -= more
     cost = s.x_cost[x]
     cpu, locks = cost, False
     if len(load.computed) > 0:

@@ -54,7 +54,7 @@ from mddag_executor.trace.trace_file import TraceFile
 INSTALL = 'apt install python3-bt2'
 _HELPER = Path(__file__).with_name('ctf_helper.py')
 _CACHE = 'caret_converted'
-_RECORD = 'check the recording, or record it anew'
+_RECORD = 'check the recording, or record it again'
 
 Row = list[Any]
 

@@ -13,10 +13,10 @@ from mddag_executor.core import NEVER
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import EXECUTIONS, Recording, rows
-from mddag_executor.replay import alone as module
+from mddag_executor.replay import isolation as module
 from mddag_executor.replay import replay
-from mddag_executor.replay.alone import alone, colder, Recorded
 from mddag_executor.replay.dispatches import Dispatches
+from mddag_executor.replay.isolation import isolated_times, Recorded
 from mddag_executor.replay.noticed import Noticed
 from mddag_executor.replay.usage import group_waits, PoolUse
 from mddag_executor.simulate.machine import SWITCH_NS
@@ -41,8 +41,7 @@ def of(
     cpu = np.where(cpu < 0, -1, np.rint(cpu * 1e6)).astype(np.int64)
     interpreter = np.array(here) if here is not None else np.maximum(held, 1)
     callback = np.arange(len(ran)) if callbacks is None else np.array(callbacks)
-    warm = np.zeros(len(ran), dtype=np.bool_)
-    found = alone(Recorded(*times, cpu, held > 0, interpreter, callback, warm), cpus, workers)
+    found = isolated_times(Recorded(*times, cpu, held > 0, interpreter, callback), cpus, workers)
     return [float(each) for each in np.round(found / 1e6, 1)]
 
 
@@ -72,14 +71,6 @@ def test_cpus_that_were_busy() -> None:
     assert of((0, 17, 10, 0), (0, 20, 10, 0), cpus=1) == approx([10, 10], abs=1.2)
     assert of((0, 20, 10, 0), (0, 20, 10, 0), cpus=3) == [20, 20]
     assert of((0, 20, 10, 0), (0, 20, 10, 0)) == [20, 20]
-
-
-def test_what_takes_more_where_the_worker_had_slept() -> None:
-    """Of the second callback too little is known: the difference is that of the first."""
-    callback = np.array([0] * 10 + [1, 1])
-    warm = np.array([True, False] * 6)
-    took = np.array([100, 130] * 5 + [500, 10])
-    assert colder(callback, warm, took).tolist() == [-30, 30] * 5 + [-30, 5]
 
 
 @settings(deadline=None)
@@ -136,13 +127,6 @@ def test_by_hand(workers: int, executions: Executions, expected: list[int]) -> N
     assert late(workers, *executions) == expected
 
 
-def test_a_worker_is_warm_that_has_only_just_ended_another() -> None:
-    found = dispatches(2, [
-        (worker, None, 1000 * start, 1000 * start, 1000 * end) for worker, start, end in (
-            (0, 500, 510), (0, 600, 700), (1, 710, 720), (0, 801, 810))])
-    assert found.warm().tolist() == [False, True, False, False]
-
-
 @given(st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), max_size=20))
 def test_a_schedule_without_overhead_has_none(jobs: list[tuple[int, int]]) -> None:
     free = [0, 0, 0]
@@ -194,7 +178,7 @@ def recorded(count: int) -> tuple[Recorded, Noticed]:
         timer += [True, False]
     one = np.ones(count, dtype=np.int64)
     return Recorded(
-        np.array(could), np.array(took), 5 * MS * one, one > 0, one, one, one > 0), Noticed(
+        np.array(could), np.array(took), 5 * MS * one, one > 0, one, one), Noticed(
         np.array(due), np.array(ready), np.ones(len(due), dtype=np.int64), np.array(timer))
 
 

@@ -483,3 +483,29 @@ nodes:
         sink = reschedule(trace, on_late=on_late).result()['dags']['main']['sinks']['/n:main']
         in_time[on_late] = counts(sink).in_time
     assert in_time['continue'] < 20 and in_time['demote'] >= 99
+
+
+def test_timers_that_were_noticed_late_because_no_worker_was_idle_are_noticed_with_more(
+    tmp_path: Path
+) -> None:
+    graph = """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: long, timer: 100ms, dag: long, deadline: 100ms, group: a}
+      - {name: short, timer: 50ms, dag: short, deadline: 50ms, group: b}
+"""
+    file = begin_trace(tmp_path / 'a.mcap', graph)
+    at = START_TIME
+    for job in range(10):
+        begin = at + job * 100 * MS
+        file.add('job_release', begin, 1, 10, 0, job, begin)
+        add_execution(file, begin, begin + 80 * MS, 0, 0, job, ready=begin)
+        # due during the long callback, and noticed after it
+        file.add('job_release', begin + 80 * MS, 1, 10, 1, job, begin + 10 * MS)
+        add_execution(file, begin + 80 * MS, begin + 81 * MS, 1, 0, job, ready=begin + 80 * MS)
+    end_trace(file, at + 1000 * MS)
+    medians = [reschedule(tmp_path / 'a.mcap', workers=workers).result()['dags']['short']['sinks'][
+        '/n:short']['response_ns']['median'] for workers in (1, 2)]
+    assert medians == [71 * MS, MS]

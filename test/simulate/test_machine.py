@@ -55,7 +55,7 @@ class Job:
 
 def times(
     jobs: Sequence[Job], workers: int, cpus: int | None = None, python: bool = False,
-    preemptive: bool = False, divided: bool = False, warmth: Sequence[int] = (),
+    preemptive: bool = False, divided: bool = False,
 ) -> list[tuple[int, int]]:
     """Return when each job starts first, and when it ends."""
     task_set = declaration([
@@ -67,8 +67,7 @@ def times(
     n = len(jobs)
     load = Load([jobs[i].release for i in order], order, [0] * n, [job.cost for job in jobs],
                 list(range(n)), [0] * n, holds=[job.interpreter * job.holds for job in jobs],
-                computed=[job.cost if job.cpu is None else job.cpu for job in jobs],
-                warmth=list(warmth))
+                computed=[job.cost if job.cpu is None else job.cpu for job in jobs])
     state = new_state(tables, workers * (1 + divided), preemptive=preemptive)
     if divided:
         divide(state, [workers, workers])

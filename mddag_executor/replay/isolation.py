@@ -57,8 +57,7 @@ class Recorded(NamedTuple):
 
     ``could`` is when they could have started, ``took`` the time from then to the end, ``cpu`` the
     CPU time (-1: unknown), ``locks`` whether they hold the GIL while they compute, ``interpreter``
-    the number of the process's interpreter, from 1, ``callback`` a number, and ``warm`` whether
-    the worker had not slept.
+    the number of the process's interpreter, from 1, and ``callback`` a number.
     """
 
     could: Ints
@@ -67,7 +66,6 @@ class Recorded(NamedTuple):
     locks: Flags
     interpreter: Ints
     callback: Ints
-    warm: Flags
 
     @property
     def least(self) -> Ints:
@@ -79,15 +77,15 @@ class Recorded(NamedTuple):
         """Return the chosen executions."""
         return Recorded(
             self.could[which], self.took[which], self.cpu[which], self.locks[which],
-            self.interpreter[which], self.callback[which], self.warm[which])
+            self.interpreter[which], self.callback[which])
 
-    def beside(self, others: Recorded) -> Recorded:
+    def followed_by(self, others: Recorded) -> Recorded:
         """Return these executions, followed by others."""
         columns: Any = map(np.concatenate, zip(self, others))
         return Recorded(*columns)
 
 
-def alone(ran: Recorded, cpus: int = 0, workers: int = NEVER) -> Ints:
+def isolated_times(ran: Recorded, cpus: int = 0, workers: int = NEVER) -> Ints:
     """
     Return isolated execution times.
 
@@ -100,16 +98,16 @@ def alone(ran: Recorded, cpus: int = 0, workers: int = NEVER) -> Ints:
     for which in _windows(ran):
         window = ran.of(which)
         ends = window.could + window.took
-        beside = _beside(window.could, ends)
+        overlap = _overlap(window.could, ends)
         if workers < NEVER:
-            some[which], more[which] = beside, _beside(window.could, ends, at_once)
-        disturbed = which[beside > 0]
+            some[which], more[which] = overlap, _overlap(window.could, ends, at_once)
+        disturbed = which[overlap > 0]
         if len(disturbed):
             took[disturbed] = _explained(
                 ran.of(disturbed), cpus, TURNS * len(took) // len(disturbed))
     if workers < NEVER:
         took -= np.rint(
-            _theirs(ran, took, some) * more / np.maximum(1, some)).astype(np.int64)
+            _waited_for_others(ran, took, some) * more / np.maximum(1, some)).astype(np.int64)
     return took
 
 
@@ -126,25 +124,6 @@ def _windows(ran: Recorded) -> Iterator[Ints]:
             window = WINDOW + int(running[WINDOW:].argmin())
         yield order[:window]
         order = order[window:]
-
-
-def colder(callback: Ints, warm: Flags, took: Ints) -> Ints:
-    """
-    Return the extra time of executions whose worker slept before, or would have if it slept.
-
-    A thread that slept must be woken and finds cold caches.  The extra time is the difference of a
-    callback's medians or, if unknown, the median difference; it is negative for cache-warm
-    executions.
-    """
-    found = np.full(len(took), -1)
-    for which in _by_callback(callback, np.ones(len(took), dtype=np.bool_)):
-        times = [took[which][warm[which] == how] for how in (True, False)]
-        if min(map(len, times)) >= ENOUGH:
-            found[which] = max(0, np.median(times[1]) - np.median(times[0]))
-    known = found[found >= 0]
-    found[found < 0] = np.median(known) if len(known) else 0
-    more: Ints = np.where(warm, -found, np.minimum(found, took // 2))
-    return more
 
 
 def _by_callback(callback: Ints, those: Flags) -> Iterator[Ints]:
@@ -212,17 +191,17 @@ def _interpreters(n: int) -> Tables:
         first_sink=[0] * (n + 1), first_successor=[0] * (n + 1))
 
 
-def _theirs(ran: Recorded, took: Ints, beside: Ints) -> Ints:
-    """Return how long executions waited for others, which ran for ``beside``."""
+def _waited_for_others(ran: Recorded, took: Ints, overlap: Ints) -> Ints:
+    """Return how long executions waited for others, which ran for ``overlap``."""
     waited = took - ran.least
-    theirs = np.zeros_like(took)
+    lost = np.zeros_like(took)
     for which in _by_callback(ran.callback, ran.cpu >= 0):
-        theirs[which] = waited[which] - np.quantile(waited[which], LEAST)
-    lost: Ints = np.clip(theirs, 0, beside)
-    return lost
+        lost[which] = waited[which] - np.quantile(waited[which], LEAST)
+    found: Ints = np.clip(lost, 0, overlap)
+    return found
 
 
-def _beside(begins: Ints, ends: Ints, others: int = 1) -> Ints:
+def _overlap(begins: Ints, ends: Ints, others: int = 1) -> Ints:
     """Return by interval how long at least ``others`` other intervals overlapped it."""
     times = np.concatenate([begins, ends])
     order = np.argsort(times, kind='stable')
@@ -230,5 +209,5 @@ def _beside(begins: Ints, ends: Ints, others: int = 1) -> Ints:
     passed[np.cumsum(np.where(order < len(begins), 1, -1))[:-1] <= others] = 0
     total = np.zeros_like(times)
     total[order[1:]] = np.cumsum(passed)
-    beside: Ints = total[len(begins):] - total[:len(begins)]
-    return beside
+    overlap: Ints = total[len(begins):] - total[:len(begins)]
+    return overlap
