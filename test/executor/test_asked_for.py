@@ -8,7 +8,6 @@ Turns, timers, simulated time, exceptions of tasks, shutdown, Ctrl-C.
 
 from __future__ import annotations
 
-from collections import Counter
 import time
 from typing import Any
 
@@ -17,12 +16,10 @@ from mddag_executor.executor import current_job
 from msg_graph import loads
 import pytest
 import rclpy
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.duration import Duration
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import Header
 
 from .conftest import Spinning, wait_for
 
@@ -30,77 +27,6 @@ MS = 1_000_000
 
 
 # --- starvation ----------------------------------------------------------------------------------
-
-
-def test_those_that_are_always_ready_do_not_starve_others(make_executor, make_node):
-    """
-    One worker, far more to do than it can, and still everybody gets his turn (rclcpp#2645).
-
-    The declared timer's key is 5 ms after its release and so smaller than that of what becomes
-    ready at the same time, 100 ms after that; but after 100 ms those are the older ones.
-    """
-    graph = loads("""
-mddag: 1
-nodes:
-  - node: /greedy
-    callbacks: [{name: tick, timer: 1ms, dag: greedy, deadline: 5ms}]
-""")
-    greedy, modest = make_node('greedy'), make_node('modest')
-    runs: Counter[str] = Counter()
-
-    def note(name: str, seconds: float = 0.0) -> Any:
-        def run(*_: Any) -> None:
-            runs[name] += 1
-            time.sleep(seconds)
-        return run
-
-    greedy.create_timer(0.001, note('greedy', 0.003))
-    group = ReentrantCallbackGroup()
-    publisher = modest.create_publisher(Header, '/topic', 10)
-    modest.create_subscription(Header, '/topic', note('message'), 10, callback_group=group)
-    modest.create_timer(0.005, lambda: publisher.publish(Header()), group)
-    modest.create_timer(0.01, note('timer'), group)
-    executor = make_executor(graph, num_workers=1, nodes=[greedy, modest])
-
-    def again() -> None:  # and one that makes itself ready again and again
-        runs['task'] += 1
-        executor.create_task(again)
-
-    with Spinning(executor):
-        executor.create_task(again)
-        assert wait_for(lambda: min(runs[n] for n in (
-            'greedy', 'message', 'timer', 'task')) >= 10, 10.0), runs
-
-
-def test_all_of_one_group_get_their_turn(make_executor, make_node):
-    """Also where their callbacks exclude each other, on several workers (rclcpp#2702)."""
-    node = make_node()
-    group = MutuallyExclusiveCallbackGroup()
-    runs: Counter[int] = Counter()
-
-    def note(number: int) -> Any:
-        def run(_: Header) -> None:
-            runs[number] += 1
-            time.sleep(0.002)
-        return run
-
-    publishers = []
-    for number in range(5):
-        node.create_subscription(Header, f'/t{number}', note(number), 10, callback_group=group)
-        publishers.append(node.create_publisher(Header, f'/t{number}', 10))
-    others = ReentrantCallbackGroup()
-
-    def publish() -> None:
-        for publisher in publishers:
-            publisher.publish(Header())
-
-    node.create_timer(0.002, publish, others)
-    executor = make_executor(num_workers=3, nodes=[node])
-    with Spinning(executor):
-        assert wait_for(lambda: min(runs[n] for n in range(5)) >= 20, 10.0), runs
-        counts = [runs[number] for number in range(5)]
-    # In the order of becoming ready: a queue that is full has its ten, like the others.
-    assert max(counts) - min(counts) <= 12
 
 
 # --- timers --------------------------------------------------------------------------------------
@@ -159,33 +85,6 @@ class Simulation:
         return any(
             self._publisher.publish(message)
             or wait_for(lambda: clock.now().nanoseconds == now, 0.1) for _ in range(20))
-
-
-def test_every_worker_may_sleep_on_the_simulated_clock(make_executor, make_node, ros_context):
-    """They would wait for a clock that waits for them (rclpy#792)."""
-    simulation = Simulation(make_node)
-    node = simulation.node
-    executor = make_executor(nodes=[node])
-    clock = node.get_clock()
-    ends: list[bool] = []
-
-    def sleep() -> None:
-        ends.append(clock.sleep_for(Duration(seconds=1), context=ros_context))
-
-    slept: list[bool] = []
-
-    def sleep_in_the_group_of_the_clock() -> None:
-        timer.cancel()
-        slept.append(clock.sleep_for(Duration(seconds=1), context=ros_context))
-
-    with Spinning(executor):
-        assert simulation.matched() and simulation.set_clock(10**9)
-        timer = node.create_timer(1e-3, sleep_in_the_group_of_the_clock)
-        for _ in range(6):
-            executor.create_task(sleep)
-        assert wait_for(lambda: len(ends) == 6 and slept or simulation.set_clock(
-            clock.now().nanoseconds + 200 * MS) and False)
-    assert ends == [True] * 6 and slept == [True]
 
 
 # --- tasks ---------------------------------------------------------------------------------------

@@ -15,7 +15,6 @@ from builtin_interfaces.msg import Time
 from mddag_executor import DeadlineMiss
 from mddag_executor.executor import current_job
 from mddag_executor.executor.work import Work
-from mddag_executor.replay import replay
 from msg_graph import loads, TaskSet
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -395,61 +394,3 @@ def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, r
         assert counts['/middle:early']['overdue'] > 0
         assert ended.wait(30.0)
     assert sinks(executor) == counts
-
-
-TWO_PUBLISHERS = """
-mddag: 1
-nodes:
-  - node: /source
-    callbacks: [{name: tick, timer: 30ms, publishes: [/a], dag: joined}]
-  - node: /middle
-    callbacks:
-      - {name: quick, subscription: /a, publishes: [/x, /y]}
-      - {name: slow, subscription: /a, publishes: [/x]}
-  - node: /sink
-    callbacks: [{name: join, sync: [/x, /y], deadline: 200ms}]
-"""
-
-
-def test_a_leg_that_two_publishers_feed_waits_for_both(make_executor, make_node, tmp_path):
-    """As in the simulator: the sync completes with the last of the three messages."""
-    task_set = loads(TWO_PUBLISHERS)
-    group = ReentrantCallbackGroup()
-    source, middle, sink = (make_node(name) for name in ('source', 'middle', 'sink'))
-    publishers = {topic: node.create_publisher(Header, topic, 10)
-                  for topic, node in (('/a', source), ('/x', middle), ('/y', middle))}
-    slow: list[int] = []
-
-    def publish(*topics: str, after: float = 0.0) -> None:
-        time.sleep(after)
-        for topic in topics:
-            publishers[topic].publish(Header())
-        if after:
-            slow.append(time.time_ns() - current_job().release_ns)
-
-    timer = source.create_timer(0.03, lambda: publish('/a'), group, autostart=False)
-    middle.create_subscription(
-        Header, '/a', lambda _: publish('/x', '/y'), 10, callback_group=group)
-    middle.create_subscription(
-        Header, '/a', lambda _: publish('/x', after=0.02), 10, callback_group=group)
-    for topic in ('/x', '/y'):
-        sink.create_subscription(Header, topic, lambda _: None, 10, callback_group=group)
-    executor = make_executor(task_set, num_workers=3, trace=str(tmp_path / 'run.mcap'))
-    with Spinning(executor):
-        for node in (source, middle, sink):
-            executor.add_node(node)
-        assert wait_for(lambda: publishers['/a'].get_subscription_count() == 2 and all(
-            publishers[topic].get_subscription_count() == 1 for topic in ('/x', '/y')))
-        timer.reset()
-        executor.wake()
-        assert wait_for(lambda: len(slow) >= 10)
-        timer.cancel()
-        assert wait_for(lambda: is_idle(executor) and (
-            sinks(executor)['/sink:join']['completed'] == len(slow)))
-    statistics = executor.statistics()
-    assert statistics['undeclared'] == 0
-    assert statistics['callbacks']['/sink:join']['ran'] == 3 * len(slow)
-    assert statistics['dags']['joined']['sinks']['/sink:join']['response_ns']['min'] >= 20_000_000
-    executor.shutdown()
-    replayed = replay(str(tmp_path / 'run.mcap')).result()
-    assert replayed['dags']['joined']['ends'] == statistics['dags']['joined']['ends']

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from typing import Any
@@ -271,40 +270,3 @@ def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):
 def test_bad_arguments_say_what_to_do(ros_context, kwargs, says):
     with pytest.raises(MddagError, match=says):
         MultiDeadlineExecutor(context=ros_context, **kwargs)
-
-
-def test_statistics_while_entities_come_and_go(make_executor, make_node):
-    """No exception, and nothing that has been counted is lost."""
-    node, errors, counts = make_node(), [], [0]
-    executor = make_executor(num_workers=1, nodes=[node])
-    ended = threading.Event()
-
-    def ask() -> None:
-        while not ended.is_set():
-            try:
-                callbacks = executor.statistics()['callbacks']
-            except RuntimeError as error:
-                errors.append(error)
-                return
-            counts.append(sum(each['ran'] for each in callbacks.values()))
-
-    interval = sys.getswitchinterval()
-    asking = threading.Thread(target=ask)
-    try:
-        with Spinning(executor) as spinning:
-            sys.setswitchinterval(1e-6)
-            asking.start()
-            for number in range(30):
-                # each period has a name of its own in the counts
-                timers = [node.create_timer((1_000_000 + 20 * number + i) / 1e9, lambda: None)
-                          for i in range(20)]
-                assert wait_for(lambda n=number: counts[-1] >= 10 * n or errors), spinning.error
-                for timer in timers:
-                    node.destroy_timer(timer)
-            ended.set()
-            asking.join()
-    finally:
-        ended.set()
-        sys.setswitchinterval(interval)
-    assert errors == []
-    assert counts == sorted(counts)

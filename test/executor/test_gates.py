@@ -4,14 +4,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 import threading
 from typing import Any
 
-from mddag_executor.executor import current_job
-from mddag_executor.replay import replay
-from mddag_executor.trace import read_events
-from msg_graph import loads
 import pytest
 from rclpy.callback_groups import CallbackGroup
 from rclpy.task import Future
@@ -134,54 +129,3 @@ def test_a_coroutine_ends_when_it_has_run_to_its_end(make_executor, node):
         assert wait_for(lambda: len(steps) == 4 and group.ended == 2)
     assert spinning.error is None
     assert steps == [('begins', 1), ('ends', 1), ('begins', 2), ('ends', 2)]
-
-
-def test_a_declared_callback_completes_its_jobs_when_its_group_lets_it(
-        make_executor, make_node, tmp_path: Path) -> None:
-    group, trace = Tokens(), tmp_path / 'run.mcap'
-    source, sink = make_node('source'), make_node('sink')
-    publisher = source.create_publisher(Int32, '/a', 100)
-    jobs: list[Any] = []
-    ran: list[tuple[int, int]] = []
-
-    def tick() -> None:
-        jobs.append(current_job())
-        publisher.publish(Int32(data=jobs[-1].job))
-
-    def last(message: Int32) -> None:
-        ran.append((current_job().job, message.data))
-
-    timer = source.create_timer(0.01, tick, autostart=False)
-    sink.create_subscription(Int32, '/a', last, 100, callback_group=group)
-    executor = make_executor(loads("""
-mddag: 1
-nodes:
-  - node: /source
-    callbacks: [{name: tick, timer: 10ms, publishes: [/a], dag: chain, max_active_jobs: 100}]
-  - node: /sink
-    callbacks: [{name: last, subscription: /a, deadline: 60s}]
-"""), trace=trace)
-    executor.add_node(source)
-    executor.add_node(sink)
-    with Spinning(executor) as spinning:
-        assert wait_for(lambda: publisher.get_subscription_count() == 1)
-        timer.reset()
-        executor.wake()
-        assert wait_for(lambda: len(jobs) >= 10)
-        timer.cancel()
-        group.give(3)
-        assert wait_for(lambda: len(ran) == 3)
-        assert wait_for(lambda: executor.statistics()['queue'] == len(jobs) - 3)
-        group.give(100)
-        assert wait_for(lambda: len(ran) == len(jobs))
-    assert spinning.error is None
-    assert sorted(ran) == [(job.job, job.job) for job in jobs]
-    completed = executor.statistics()['dags']['chain']['sinks']['/sink:last']['completed']
-    assert completed == len(jobs) == group.ended
-    recorded = replay(trace)
-    assert recorded.warnings == []
-    assert recorded.result()['dags']['chain']['sinks']['/sink:last']['completed'] == len(jobs)
-    assert ['reentrant'] == [
-        event['group_type_name'] for event in read_events(trace)
-        if event['_name'] == 'ros2_caret:add_callback_group'
-        and event['callback_group_addr'] == id(group)]

@@ -10,14 +10,13 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.executor.loop import EventLoop
 import pytest
 from rclpy.task import Future
 from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import is_idle, Spinning, wait_for
+from .conftest import Spinning, wait_for
 from .pulse import Pulse
 
 
@@ -180,48 +179,6 @@ def test_every_task_wakes_a_loop_of_spin_once_and_a_spin_after_it(make_executor,
             executor.wake()
             ran[9].set()
             thread.join(0.1)
-
-
-def test_a_wake_up_that_another_worker_hears_is_not_the_last_one(make_executor, monkeypatch):
-    """
-    One worker looks whether something has come, since nobody waits for it; now another one waits.
-
-    The first one hears what was to wake the second one.
-    """
-    looks, waits, rung, looked = (threading.Event() for _ in range(4))
-    wait = EventLoop.wait
-
-    def wait_in_this_order(self: EventLoop, timeout_s: float = -1) -> Any:
-        if threading.current_thread().name.startswith('mddag-worker') and go_on[0].is_set():
-            if timeout_s == 0 and not looks.is_set():
-                looks.set()
-                rung.wait(15.0)
-                events = wait(self, 0)
-                looked.set()
-                return events
-            if timeout_s == -1 and not looked.is_set():
-                waits.set()
-                looked.wait(15.0)
-        return wait(self, timeout_s)
-
-    monkeypatch.setattr(EventLoop, 'wait', wait_in_this_order)
-    executor = make_executor(num_workers=2)
-    go_on = threading.Event(), threading.Event()
-    with Spinning(executor):
-        for event in go_on:
-            executor.create_task(event.wait, 15.0)
-        assert wait_for(lambda: not executor.statistics()['idle_workers'])
-        go_on[0].set()
-        assert looks.wait(15.0)
-        go_on[1].set()
-        assert waits.wait(15.0)
-        task = executor.create_task(lambda: 'first')
-        rung.set()
-        for _ in range(3):
-            assert wait_for(task.done, 5.0)
-            assert wait_for(lambda: is_idle(executor))
-            task = executor.create_task(lambda: 'next')
-        assert wait_for(task.done, 5.0)
 
 
 def test_spinning_twice_is_an_error(make_executor):

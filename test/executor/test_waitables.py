@@ -8,14 +8,13 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor.executor import compat, waitables
+from mddag_executor.executor import compat
 import pytest
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.guard_condition import GuardCondition
 from rclpy.qos import QoSProfile
 from rclpy.waitable import NumberOfEntities, Waitable
-from std_msgs.msg import Header
 from test_msgs.action import Fibonacci
 
 from .conftest import is_idle, Spinning, wait_for
@@ -139,69 +138,6 @@ class spun:
 
 
 # --- QoS events ----------------------------------------------------------------------------------
-
-
-class Pair(Waitable):
-    """Two subscriptions; to add these to a wait set takes a while."""
-
-    def __init__(self, subscriptions: Any) -> None:
-        super().__init__(ReentrantCallbackGroup())
-        self.subscriptions = subscriptions
-        self.got: list[str] = []
-        self._places: list[int] = []
-        self._ready: list[Any] = []
-
-    def __enter__(self) -> None:
-        pass  # the test destroys none; rclpy of Kilted wants this method
-
-    def __exit__(self, *error: object) -> None:
-        pass
-
-    def get_num_entities(self) -> NumberOfEntities:
-        return NumberOfEntities(num_subs=len(self.subscriptions))
-
-    def add_to_wait_set(self, wait_set: Any) -> None:
-        time.sleep(0.1)
-        self._places = [wait_set.add_subscription(s.handle) for s in self.subscriptions]
-
-    def is_ready(self, wait_set: Any) -> bool:
-        self._ready = [s for s, place in zip(self.subscriptions, self._places)
-                       if wait_set.is_ready('subscription', place)]
-        return bool(self._ready)
-
-    def take_data(self) -> list[str]:
-        taken = [s.handle.take_message(s.msg_type, False) for s in self._ready]
-        return [message[0].frame_id for message in taken if message is not None]
-
-    async def execute(self, data: list[str]) -> None:
-        self.got += data
-
-
-def test_something_arrives_while_the_listeners_of_a_waitable_are_set(
-    make_executor, make_node, monkeypatch
-):
-    """It must not look for it with the wait set that shows which listeners to set."""
-    set_listener = waitables.set_listener
-
-    def slowly(*args: Any) -> None:
-        set_listener(*args)
-        time.sleep(0.05)
-
-    monkeypatch.setattr(waitables, 'set_listener', slowly)
-    apart, node = make_node('apart'), make_node('node')
-    publishers = [apart.create_publisher(Header, topic, 10) for topic in ('/one', '/two')]
-    pair = Pair([
-        apart.create_subscription(Header, topic, print, 10) for topic in ('/one', '/two')])
-    assert wait_for(lambda: all(p.get_subscription_count() for p in publishers))
-    publishers[0].publish(Header(frame_id='before'))
-    executor = make_executor(num_workers=2)
-    with Spinning(executor) as spinning:
-        assert wait_for(executor.create_task(print).done)
-        node.add_waitable(pair)
-        executor.add_node(node)
-        assert wait_for(lambda: pair.got == ['before'] or spinning.error is not None)
-        publishers[1].publish(Header(frame_id='after'))
-        assert wait_for(lambda: pair.got == ['before', 'after'], 5.0), spinning.error
 
 
 # --- guard conditions, and waitables of a user's own ---------------------------------------------

@@ -302,32 +302,6 @@ def test_misses_that_are_not_those_recorded_are_said(tmp_path: Path) -> None:
     assert replay(path, loads(SMALL.replace('12ms', '13ms'), 'g.yaml')).warnings == []
 
 
-def test_events_that_make_no_sense_are_counted(tmp_path: Path) -> None:
-    good = job_of_the_camera(0, 10)
-    nonsense: list[tuple[object, ...]] = [
-        ('job_release', 20, 2, 7, 0, START_TIME), ('job_release', 20, 2, -5, 0, START_TIME),
-        ('complete', 20, 2, 1, 0, 99, 0, True, START_TIME, 0),
-        ('complete', 20, 2, 1, 1, -3, 0, True, START_TIME, 0),
-        ('expire', 20, 2, 2**31 - 1, 0), ('abort', 20, 2, -1, 0),
-        ('complete', 20, 2, 1, 0, 4, 0, True, START_TIME, 2**31 - 1),
-        ('dispatch', 20, 2, 1, 2**31 - 1, -2**31, 2**63 - 1, -5, -2**63, 0),
-        ('callback_end', 20, 2, 1), ('callback_end', 20, 3, 5),
-        ('complete', 24, 2, 1, 0, 1, 0, True, START_TIME, 0),      # a second time
-        ('complete', 25, 2, 1, 0, 1, 55, True, START_TIME, 0),     # of an unknown job
-        ('job_release', 26, 2, 0, 0, START_TIME),                  # a second time
-        ('expire', 27, 2, 0, 44),
-    ]
-    events = sorted([*good, *nonsense], key=lambda event: int(str(event[1])))
-    path = write(tmp_path / 'a.mcap', *events, ('shutdown', 110, 1, START_TIME + 110 * MS),
-                 ('shutdown', 120, 1, START_TIME + 120 * MS))
-    outcome = replay(path)
-    assert outcome.result()['dags']['/camera']['ends']['completed'] == 1
-    assert outcome.warnings == [
-        f'{path}: left out: 9 events that make no sense, most often (2) mddag:complete of a '
-        'vertex that is not declared',
-        f'{path}: left out: 3 events that contradict earlier ones']
-
-
 @pytest.mark.parametrize(('text', 'says'), [
     ('', 'it was recorded without a declaration'),
     ('nonsense', r'the declaration that it was recorded with is wrong \(small.yaml'),

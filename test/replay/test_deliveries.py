@@ -10,7 +10,7 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
 from mddag_executor.core.state import new_state, SINK_COMPLETED
 from mddag_executor.replay import reschedule
-from mddag_executor.simulate import END, Load, LogEntry, START
+from mddag_executor.simulate import Load, LogEntry, START
 from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import run
 from mddag_executor.simulate.load import edge_numbers, edges_of
@@ -118,35 +118,6 @@ def test_overheads_are_measured_and_reproduced(
     assert ideal['dags']['a']['sinks']['/n:c']['response_ns']['max'] == 15 * MS
     added = reschedule(path, overheads=False, dispatch_overhead=MS).result()
     assert added['dags']['a']['sinks']['/n:c']['response_ns']['max'] == 18 * MS
-
-
-def test_waiting_for_a_worker_is_no_overhead(tmp_path: Path) -> None:
-    """Of what waited while its worker was busy only what came after that is dispatch."""
-    path = tmp_path / 'a.mcap'
-    text = """\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: a, timer: 100ms, dag: a, deadline: 50ms}
-      - {name: b, timer: 100ms, dag: b, deadline: 60ms}
-"""
-    with TraceFile(path) as file:
-        file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
-        # one round of timers: neither starts before both have been noticed
-        file.add('job_release', START_TIME + 1000, 1, 1, 1, 0, START_TIME)
-        file.add('job_release', START_TIME + 9000, 1, 1, 0, 0, START_TIME)
-        for dag, start, end in ((0, 9000, 5 * MS), (1, 5 * MS + 2000, 8 * MS)):
-            ready = START_TIME + (9000 if dag == 0 else 1000)
-            start, end = START_TIME + start, START_TIME + end
-            add_execution(file, start, end, dag, 0, 0, ready=ready, address=9 + dag)
-        file.add('shutdown', START_TIME + 50 * MS, 1, 1, START_TIME + 50 * MS)
-    outcome = reschedule(path)
-    assert [(time - START_TIME, kind, vertex) for time, kind, _, _, vertex, _ in outcome.log] == [
-        (9000, START, 0), (5 * MS, END, 0), (5 * MS, START, 1), (8 * MS, END, 1)]
-    two = reschedule(path, workers=2)
-    assert [(time - START_TIME, kind, vertex) for time, kind, _, _, vertex, _ in two.log][:2] == [
-        (9000, START, 0), (9000, START, 1)]
 
 
 @pytest.mark.parametrize('seed', range(4))

@@ -39,7 +39,7 @@ from .helpers import MS, small, VirtualRun
 from .test_ordinary_bags import FORMATS, write_bag
 from .test_times import counts, never_above
 
-ROUNDS = 1000
+ROUNDS = 500
 LONG_S = float(os.environ.get('FUZZ_SECONDS', '0'))
 SLOW_S = 5.0
 MEMORY = 400 << 20

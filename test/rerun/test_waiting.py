@@ -19,7 +19,7 @@ from typing import Any
 
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
-from mddag_executor.rerun import rerun, RerunError, Result
+from mddag_executor.rerun import rerun, Result
 import pytest
 import rclpy
 from rclpy.action import ActionClient, ActionServer, CancelResponse
@@ -326,20 +326,6 @@ def test_who_is_there_is_known_at_once(bag: str, graph: Path) -> None:
 
 
 # --- what blocks ---------------------------------------------------------------------------------
-
-def test_a_node_that_blocks_for_ever_is_named(bag: str, graph: Path) -> None:
-    lock = threading.Lock()
-
-    def take(node: Filter, number: int) -> None:
-        if number == 3:
-            lock.acquire()
-            lock.acquire(timeout=60.0)
-
-    with pytest.raises(RerunError) as caught:
-        run_filter(bag, graph, take, patience_s=3.0)
-    assert str(caught.value).startswith(
-        f'/filter:take: it has been blocking at {__file__}:')
-    assert 'at 0.300000 s of the run' in str(caught.value)
 
 
 def sleep_for_ever() -> None:

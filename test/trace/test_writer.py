@@ -61,34 +61,6 @@ def test_a_live_trace_is_readable(tmp_path: Path) -> None:
         assert len(warnings) == 1 and 'without a finish record' in warnings[0]
 
 
-def test_many_threads_lose_nothing(tmp_path: Path) -> None:
-    path = tmp_path / 'a.mcap'
-    count, threads = 20_000, 6
-    writer = TraceWriter(path, capacity=count * threads, flush_interval_s=FAST)
-    start = threading.Barrier(threads)
-
-    def run(thread: int) -> None:
-        start.wait()
-        for number in range(count):
-            writer.record('callback_start', START + number, thread, number, number % 2 == 0)
-
-    workers = [threading.Thread(target=run, args=(thread,)) for thread in range(threads)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    writer.close()
-    assert writer.dropped == 0
-    events, warnings = read(path)
-    assert not warnings
-    by_thread: dict[int, list[int]] = {thread: [] for thread in range(threads)}
-    for _, _, _, thread, number, _ in events:
-        by_thread[thread].append(number)
-    assert all(numbers == list(range(count)) for numbers in by_thread.values())
-    in_time_order, _ = read(path, in_time_order=True)
-    assert in_time_order == sorted(events, key=lambda event: event[1])
-
-
 def test_every_event_is_in_the_file_or_counted(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     writer = TraceWriter(path, capacity=500, flush_interval_s=0.001)
