@@ -76,7 +76,7 @@ def interrupted_after(folder: Path, seconds: float, *arguments: str) -> tuple[st
     while group_seconds(process.pid) < seconds and time.monotonic() < begin + 30:
         time.sleep(0.1)
     os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=120)
     assert process.returncode == 130
     with pytest.raises(ProcessLookupError):  # nobody of the group is left
         for _ in range(50):
