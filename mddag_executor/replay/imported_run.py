@@ -57,7 +57,8 @@ from mddag_executor.recording.tables import (
     WITHDRAWN,
 )
 from mddag_executor.replay.doubts import Doubts
-from mddag_executor.replay.links import KINDS, Links, Losses, Lost, read_events, START
+from mddag_executor.replay.imported_events import KINDS, read_events, START
+from mddag_executor.replay.links import Links, Losses, Lost
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import renamed

@@ -33,17 +33,17 @@ from mddag_executor.recording.entities import Callback, INIT_EVENTS
 from mddag_executor.recording.head import Head, no_end
 from mddag_executor.recording.mapping import Target
 from mddag_executor.recording.tables import DROPS, Ints, Recording, rows, UNKNOWN
-from mddag_executor.replay.imported_run import ImportedRun
-from mddag_executor.replay.links import (
+from mddag_executor.replay.imported_events import (
     END,
     KINDS,
-    Links,
     OWN_KINDS,
     READY,
     SHUTDOWN,
     START,
     TAKE,
 )
+from mddag_executor.replay.imported_run import ImportedRun
+from mddag_executor.replay.links import Links
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.times import NEVER
 from msg_graph import Dag, TaskSet

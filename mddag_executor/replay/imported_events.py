@@ -1,0 +1,139 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reads the events of an imported recording into one table, in the order of time.
+
+Each event of ``KINDS`` is a row with the same columns; names of fields differ between versions of
+the tracers.  Other events are tuples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable as Function
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from mddag_executor.recording.tables import Ints, sort_by, Table
+from mddag_executor.text import counted
+from mddag_executor.trace import TraceReader
+from mddag_executor.trace.events import Event
+from mddag_executor.trace.times import NEVER
+import numpy as np
+
+ADDRESSES = 2 ** 64
+
+(START, END, INTRA, RCLCPP, RCL, DDS_WRITE, BECAME, BIND, RMW_PUBLISH, WRITE_PRE, WRITTEN,
+ DISPATCH, TAKE_ERASED, DISPATCH_ERASED, TAKE, WITHIN, COPY, ENQUEUE, DEQUEUE, LOST, READY,
+ SHUTDOWN) = range(22)
+
+_CARET = {
+    'dds_write': (DDS_WRITE, 'message message_addr', 'timestamp_'),
+    'dds_bind_addr_to_addr': (BECAME, 'addr_from', 'addr_to'),
+    'dds_bind_addr_to_stamp': (BIND, 'addr addr_from', 'source_stamp stamp_to')}
+KINDS: dict[str, tuple[Any, ...]] = {
+    **{f'{provider}:{name}': kind for name, kind in _CARET.items()
+       for provider in ('ros2_caret', 'ros2_hook')},
+    'ros2:callback_start': (START, 'callback'),
+    'ros2:callback_end': (END, 'callback'),
+    'ros2:rclcpp_intra_publish': (INTRA, 'publisher_handle', 'message'),
+    'ros2:rclcpp_publish': (RCLCPP, 'publisher_handle', 'message'),
+    'ros2:rcl_publish': (RCL, 'publisher_handle', 'message'),
+    'ros2:rmw_publish': (RMW_PUBLISH, 'message', 'timestamp_ source_timestamp'),
+    'dds:write_pre': (WRITE_PRE, 'data'),
+    'dds:write': (WRITTEN, '', 'timestamp_'),
+    'ros2:dispatch_subscription_callback': (
+        DISPATCH, 'callback', 'source_stamp', 'message_timestamp'),
+    'ros2_hook:take_type_erased': (TAKE_ERASED, 'message', 'source_stamp'),
+    'ros2:dispatch': (DISPATCH_ERASED, 'callback', 'message'),
+    'ros2:rmw_take': (TAKE, 'rmw_subscription_handle', 'source_timestamp', 'taken'),
+    'ros2:dispatch_intra_process_subscription_callback': (WITHIN, 'callback', 'message'),
+    'ros2:dispatch_intra_process': (WITHIN, 'callback', 'message'),
+    'ros2:message_construct': (COPY, 'original_message', 'constructed_message'),
+    'ros2:rclcpp_ring_buffer_enqueue': (ENQUEUE, 'buffer', 'index', 'overwritten'),
+    'ros2:rclcpp_ring_buffer_dequeue': (DEQUEUE, 'buffer', 'index'),
+    'mddag:lost': (LOST, 'count'),
+}
+"""By full name of an event its kind, and the fields of its columns ``a``, ``b`` and ``c``."""
+OWN_KINDS: dict[str, tuple[Any, ...]] = {
+    'mddag:dispatch': (READY, 'callback', 'ready'), 'mddag:shutdown': (SHUTDOWN, 'end')}
+"""The same of this executor's own events, for a trace without declaration."""
+
+_EVENT = np.dtype([('time', 'i8'), ('place', 'i8'), ('thread', 'i8'), ('kind', 'i1'),
+                   ('a', 'i8'), ('b', 'i8'), ('c', 'i8')])
+
+
+class Events(NamedTuple):
+    """
+    The events of a recording.
+
+    :ivar table: events of ``KINDS`` in the order of time; ``thread`` is an index of ``threads``.
+    :ivar threads: process and thread id.
+    :ivar others: the other events, as tuples with a ``Layout``, in the order of time.
+    :ivar warning: events at impossible times, which were left out; empty: none.
+    """
+
+    table: Table
+    threads: list[tuple[int, int]]
+    others: list[Event]
+    warning: str
+
+
+def read_events(
+    reader: TraceReader, kinds: Mapping[str, tuple[Any, ...]], others: Sequence[str],
+    progress: Function[[int], None] | None = None,
+) -> Events:
+    """Return the events of a trace: those of ``kinds`` as a table, and ``others`` as tuples."""
+    parts: list[Table] = [np.zeros(0, _EVENT)]
+    tuples: list[tuple[int, Event]] = []
+    count = 0
+    for batch in reader.batches({*kinds, *others}, as_table=False):
+        for column in batch.columns:
+            head, rows, places = batch.table(column)
+            if head[0].name in kinds:
+                parts.append(_normal(rows, places, kinds[head[0].name]))
+            if head[0].name not in kinds or head[0].name in others:
+                tuples += zip(places.tolist(), (head + row for row in rows.tolist()))
+        for place, event in batch.others():
+            layout = event[0]
+            if layout.name in kinds:
+                names = ('timestamp', 'vpid', 'vtid', *layout.fields)
+                numbers = {name: value for name, value in zip(names, event[1:])
+                           if isinstance(value, int)}
+                row = np.zeros(1, [(name, 'i8') for name in numbers])
+                for name, value in numbers.items():
+                    row[name] = (value + ADDRESSES // 2) % ADDRESSES - ADDRESSES // 2
+                parts.append(_normal(row, np.array([place]), kinds[layout.name]))
+            if layout.name not in kinds or layout.name in others:
+                tuples.append((place, event))
+        count += len(batch)
+        if progress is not None:
+            progress(count)
+    table = np.concatenate(parts)
+    table = table[sort_by(table['time'], table['place'])]
+    tuples.sort(key=lambda each: (each[1][1], each[0]))
+    possible = (table['time'] >= 0) & (table['time'] < NEVER)
+    kept = [event for _, event in tuples if 0 <= event[1] < NEVER]
+    impossible = table['time'][~possible].tolist() + [
+        event[1] for _, event in tuples if not 0 <= event[1] < NEVER]
+    threads, which = np.unique(table['thread'], return_inverse=True)
+    table['thread'] = which
+    warning = '' if not impossible else (
+        f'left out: {counted(len(impossible), "event")} at an impossible time, the first at '
+        f'{impossible[0]} ns')
+    return Events(
+        table[possible], [(each >> 32, (each & 0xFFFFFFFF) - (each & 0x80000000) * 2)
+                          for each in threads.tolist()], kept, warning)
+
+
+def _normal(rows: Table, places: Ints, kind: tuple[Any, ...]) -> Table:
+    """Return events of one kind as rows of the table; missing fields are 0."""
+    found = np.zeros(len(rows), _EVENT)
+    found['time'], found['place'], found['kind'] = rows['timestamp'], places, kind[0]
+    found['thread'] = (rows['vpid'].astype(np.int64) << 32) | (
+        rows['vtid'].astype(np.int64) & 0xFFFFFFFF)
+    for name, fields in zip('abc', kind[1:]):
+        for field in reversed(fields.split()):
+            if field in (rows.dtype.names or ()):
+                value = rows[field].astype(np.int64)
+                found[name] = np.where(value != 0, value, found[name])
+    return found
