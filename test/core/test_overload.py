@@ -11,6 +11,7 @@ from typing import Any
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from mddag_executor.core.tally import counts
+from mddag_executor.simulate import Settings, simulate
 from msg_graph import ExecutionTime
 
 from .task_sets import Case, cases, declaration, examples, TICK
@@ -153,6 +154,23 @@ def test_a_sink_that_tolerates_no_further_miss_goes_first() -> None:
         return [sinks[name]['completed'] for name in ('plain', 'other')]
     (plain, other), (plain_then, other_then) = run(), run(tolerate='1 of 10')
     assert other_then > other and plain_then < plain
+
+
+def test_a_backlog_of_a_heavy_callback_leaves_the_others_in_time() -> None:
+    # One interpreter for all; the heavy one has a long deadline, but its late jobs have the first.
+    callbacks = [single(name, period, deadline, execution_time=f'{time}us', on_late='demote')
+                 for name, period, deadline, time in (
+                     ('publisher', 2000, 2000, 50), ('heavy', 5000, 50000, 4000),
+                     ('other', 10000, 10000, 2500))]
+    task_set = declaration(callbacks)
+    case = Case(task_set, ((50,), (4000,), (2500,)), 7, 'rad', False)
+    load = case.load(1_000_000)._replace(holds=[1, 1, 1])
+    for on_late in ('demote', 'continue'):
+        dags = tuple(replace(dag, on_late=on_late) for dag in task_set.dags)
+        run = simulate(replace(task_set, dags=dags), load, Settings(
+            workers=7, duration_ns=1_000_000 * TICK))
+        publisher = run.result()['dags']['publisher']['sinks']['/n:publisher']
+        assert (counts(publisher).in_time >= 0.96 * 500) == (on_late == 'demote')
 
 
 def test_only_the_newest_is_kept() -> None:
