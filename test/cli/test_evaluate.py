@@ -78,7 +78,7 @@ def interrupted_after(folder: Path, seconds: float, *arguments: str) -> tuple[st
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 130
-    with pytest.raises(ProcessLookupError):  # nobody of the group is left
+    with pytest.raises(ProcessLookupError):  # no process of the group is left
         for _ in range(50):
             os.killpg(process.pid, 0)
             time.sleep(0.1)

@@ -72,7 +72,7 @@ def test_what_is_asked_for_is_done(
     near = judged['dags']['lidar']['sinks']['/filter:near']
     assert (near['completed'], near['late'], near['overdue']) == (9, 6, 0)
     # With more time for far the next tick goes before it: late are the jobs 3 to 7 only; with
-    # preemption near waits for nobody.
+    # preemption near does not wait.
     graph.write_text(GRAPH.replace('12ms', '60ms'), encoding='utf-8')
     for option, late in (([], 5), (['--preemptive'], 0)):
         result = result_of(capsys, graph, '--workers', 1, '--duration', '100ms', *option)

@@ -5,7 +5,7 @@ A second simulator, slow and plain, to compare the core with.
 
 Written from the project's documents (the model, its rules, and what the paper's own program does
 exactly), not from the core, with which it shares no code: it goes tick by tick through time, keeps
-what waits in an unsorted list and looks everything up anew each time.
+what waits in an unsorted list and looks everything up again each time.
 
 Its reading of the documents:
 

@@ -55,7 +55,7 @@ def test_a_tally_of_everything() -> None:
     counts = tally()
     for _ in range(5):
         counts.released(0)
-    counts.released(1)  # the undeclared DAG's jobs are nobody's to judge
+    counts.released(1)  # the undeclared DAG's jobs are not judged
     counts.add([done(1, 0, 10 * US), done(2, 0, 3 * US), (JOB_END, 0, -1, 0, COMPLETED, 1)])
     assert not counts.missed
     counts.add([done(1, 1, 10 * US + 1), done(2, 1, 20 * US), (JOB_END, 0, -1, 1, LATE, 1)])

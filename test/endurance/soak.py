@@ -198,7 +198,7 @@ class Soak:
         for fault in FAULTS:
             if fault != 'burst':
                 self._inject(fault, 0.1)
-        time.sleep(RECOVERY_S)  # a timer made anew is known by its period: that is not altered yet
+        time.sleep(RECOVERY_S)  # a new timer is known by its period: that is not altered yet
         self._burst(FAULT_S, list(self.nodes.workload.timers.values()))
         time.sleep(RECOVERY_S)
 

@@ -5,8 +5,8 @@ How much memory a process has in use, and how much the middleware keeps of nodes
 
 Theory of operation
 -------------------
-glibc keeps what was freed, for each thread apart: a spin that an exception ends and that begins
-anew has new threads, and leaves a megabyte or two behind that nobody uses.  So ``in_use`` collects
+glibc keeps what was freed, for each thread apart: a spin that begins again after an exception has
+new threads, and leaves a megabyte or two behind that are not used.  So ``in_use`` collects
 garbage and gives free memory back to the system (``malloc_trim``) before it looks.
 
 rclpy and the middleware keep something of each node that is destroyed and made again.  A process

@@ -3,33 +3,22 @@
 """
 What users have asked rclpy and rclcpp for, by issue, as far as no other test here has it.
 
-Turns, timers, simulated time, exceptions of tasks, shutdown, Ctrl-C.
+Overruns of timers, exceptions of tasks, shutdown from a callback.
 """
 
 from __future__ import annotations
 
 import time
-from typing import Any
 
-from builtin_interfaces.msg import Time as TimeMessage
 from mddag_executor.executor import current_job
 from msg_graph import loads
 import pytest
 import rclpy
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock
 
 from .conftest import Spinning, wait_for
 
 MS = 1_000_000
-
-
-# --- starvation ----------------------------------------------------------------------------------
-
-
-# --- timers --------------------------------------------------------------------------------------
 
 
 def test_an_overrun_gives_no_burst_and_the_phase_is_kept(make_executor, make_node):
@@ -61,33 +50,6 @@ nodes:
     assert counts['skipped'] >= 4
     jobs = round((releases[-1] - releases[0]) / (20 * MS)) + 1
     assert executor.statistics()['dags']['alone']['jobs'] >= jobs
-
-
-# --- simulated time ------------------------------------------------------------------------------
-
-
-class Simulation:
-    """A node with simulated time and somebody who tells it the time."""
-
-    def __init__(self, make_node: Any) -> None:
-        self.node = make_node(
-            'simulated', parameter_overrides=[Parameter('use_sim_time', value=True)])
-        self._publisher = make_node('clock').create_publisher(
-            Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-
-    def matched(self) -> bool:
-        return wait_for(lambda: self._publisher.get_subscription_count() == 1)
-
-    def set_clock(self, now: int) -> bool:
-        """Tell the time until the node has it."""
-        message = Clock(clock=TimeMessage(sec=now // 10**9, nanosec=now % 10**9))
-        clock = self.node.get_clock()
-        return any(
-            self._publisher.publish(message)
-            or wait_for(lambda: clock.now().nanoseconds == now, 0.1) for _ in range(20))
-
-
-# --- tasks ---------------------------------------------------------------------------------------
 
 
 def fails() -> None:
@@ -128,12 +90,9 @@ def test_an_exception_that_is_handled_does_not_end_the_executor(make_executor, k
     tasks = [executor.create_task(work) for work in (handle, look)]
     with Spinning(executor) as spinning:
         assert wait_for(lambda: all(task.done() for task in tasks))
-        time.sleep(0.15)  # somebody looks for exceptions every 100 ms
+        time.sleep(0.15)  # exceptions are checked every 100 ms
     assert spinning.error is None
     assert [task.result() for task in tasks] == [10, "'handled'"]
-
-
-# --- ends ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('what', ['context', 'executor', 'executor, waiting'])

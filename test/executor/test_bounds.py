@@ -115,7 +115,7 @@ def test_few_requests_wait_in_python_and_none_is_lost(make_executor, make_node):
         for _ in range(60):
             client.call_async(Trigger.Request()).add_done_callback(
                 lambda future: answered.append(future.result().message))
-        # one runs, and nobody takes more than wait
+        # one runs, and no more are taken than wait
         assert wait_for(lambda: waiting(executor) == SERVICE_DEPTH)
         go_on.set()
         assert wait_for(lambda: len(answered) == 60, 10.0), len(answered)

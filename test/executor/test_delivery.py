@@ -80,7 +80,7 @@ def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
         with subprocess.Popen([sys.executable, '-c', FOREIGN]) as foreign:
             number = 0
             while foreign.poll() is None:
-                # in the end only the other one publishes: nobody here takes for it then
+                # in the end only the other one publishes: no thread here receives for it then
                 if 'foreign:100' not in got:
                     publisher.publish(Header(frame_id=f'here:{number}'))
                     number += 1
@@ -164,7 +164,7 @@ def test_a_message_from_before_the_subscription_comes_first(make_executor, make_
 def test_work_does_not_wait_for_a_callback_that_goes_on_after_publishing(
     make_executor, make_node, waits,
 ):
-    """It waits until its message has been heard: nobody else would start that callback."""
+    """It waits until its message has been heard: no other thread would start that callback."""
     node, group, heard, waited = make_node(), ReentrantCallbackGroup(), threading.Event(), []
     publisher = node.create_publisher(Header, '/one', 10)
     calls = iter(range(10 ** 6))

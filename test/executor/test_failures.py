@@ -101,7 +101,7 @@ def test_the_job_of_a_callback_that_raises_has_failed(
 
 def test_what_had_been_published_before_still_runs(
         make_executor, make_node, tmp_path: Path) -> None:
-    """The source raises after it has published: its messages are taken, and judged by nobody."""
+    """The source raises after it has published: its messages are received, and not judged."""
     node, sink = make_node('source'), make_node('sink')
     publisher = node.create_publisher(Header, '/a', 10)
     came: list[int] = []

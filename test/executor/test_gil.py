@@ -299,7 +299,7 @@ def test_of_two_arrivals_beside_a_long_callback_one_overtakes(beside):
 
 @pytest.mark.parametrize('beside', ['elsewhere'], indirect=True)
 def test_what_cannot_start_is_left_in_the_middleware(beside):
-    """While the long one computes for as long as usual, nobody wakes for the patient one."""
+    """While the long one computes for as long as usual, no thread wakes for the patient one."""
     queued: list[int] = []
 
     def meanwhile() -> bool:

@@ -149,7 +149,7 @@ def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context)
 
 @contextmanager
 def without_collector() -> Iterator[None]:
-    """Let only that be freed which nobody refers to."""
+    """Let only that be freed to which nothing refers."""
     gc.collect()
     gc.disable()
     try:

@@ -81,7 +81,7 @@ class Handler:
         future = self._client.call_async(Empty.Request())
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
-        done.wait(0.2)  # at the end nobody answers any more
+        done.wait(0.2)  # at the end nothing answers any more
 
 
 class SpinningOn(Spinning):

@@ -121,7 +121,7 @@ def test_a_coroutine_that_awaits_something_unknown_is_asked_again(make_executor,
     else:
         executor.spin_until_future_complete(task, 3.0)
     assert task.done() and task.result() == 'done' and turns == [0, 1, 2, 3, 4]
-    assert not getattr(executor, '_ready_tasks', ())  # rclpy's own, which nobody looks at here
+    assert not getattr(executor, '_ready_tasks', ())  # rclpy's own, which are not used here
 
 
 def test_spin_once_runs_one_callback_and_has_finished_it(make_executor, make_node):

@@ -3,7 +3,7 @@
 """
 Names in traces, bags and diagnostics may be hostile: they are shown, and do nothing.
 
-A recorded run is written anew with all of its texts changed into ones that would work as terminal
+A recorded run is written again with all of its texts changed into ones that would work as terminal
 escapes, HTML, paths, templates, formulas or code, and given to every verb that reads traces.
 """
 

@@ -112,7 +112,7 @@ def changed(rows: list[Row], dice: random.Random) -> list[Row]:
 
 
 def lie(kind: str, dice: random.Random) -> Any:
-    """Return a value of a type that nobody expects."""
+    """Return a value of an unexpected type."""
     if kind == 'string':
         return dice.choice(TEXTS)
     if kind == 'bool':

@@ -210,7 +210,7 @@ def default_context(no_thread_leak: None) -> Iterator[None]:
 
 @pytest.fixture
 def host(default_context: None) -> Iterator[Host]:
-    """Give a host whose executor nobody spins."""
+    """Give a host whose executor does not spin."""
     with Host() as host:
         host.start(SingleThreadedExecutor(), [])
         yield host

@@ -134,7 +134,7 @@ def test_the_path(recorded: Recorded, graph: TaskSet) -> None:
 
 
 def test_a_job_whose_message_was_lost_has_expired(recorded: Recorded, graph: TaskSet) -> None:
-    """What reached nobody is the robot's fault, whatever else comes from outside."""
+    """A message that was not received is the robot's fault, whatever else comes from outside."""
     recorded.run(PLAN, 5, 3000 * MS, 3001 * MS)
     recorded.run(GRAB, 1, 2007 * MS, 2009 * MS)
     recorded.publish(IMAGE, 1, 2008 * MS)

@@ -99,7 +99,7 @@ def test_a_job_goes_on_in_the_other_trace(tmp_path: Path, late: int) -> None:
         release = i * 10 * MS
         up.runs(release, release + MS)
         down.job += i == 0  # its jobs have other numbers
-        down.runs(release + 5, release + 3 * MS, takes * MS)  # its clock was read anew
+        down.runs(release + 5, release + 3 * MS, takes * MS)  # its clock was read again
     outcome = replay([up.end(100 * MS), down.end(90 * MS)])
     result = outcome.result()
     assert result['warnings'] == []

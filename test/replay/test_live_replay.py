@@ -44,7 +44,7 @@ nodes:
 
 
 def build_nodes(context: Any) -> list[Any]:
-    """Make the declared nodes, and a timer that nobody declares; some callbacks are slow."""
+    """Make the declared nodes, and a timer that is not declared; some callbacks are slow."""
     from rclpy.callback_groups import ReentrantCallbackGroup
     from rclpy.node import Node
     from rclpy.task import Future
