@@ -28,14 +28,14 @@ class MeanTimes:
         self._mean = s.mean
         admit(t, s)
 
-    def note(self, vertex: int, mean: int, holds: bool) -> None:
+    def note(self, vertex: int, mean: int, holds: int) -> None:
         """Note the recent mean execution time of a vertex, ns, and whether it holds the GIL."""
         known = self._mean[vertex]
         change = mean - known
         if (change * CHANGE > known + LEAST_CHANGE_NS or -change * CHANGE > known + LEAST_CHANGE_NS
                 or holds != self._s.holder[vertex]):
             self._mean[vertex] = mean
-            self._s.holder[vertex] = int(holds)
+            self._s.holder[vertex] = holds
             self._update(self._t.dag_of[vertex])
 
     def _update(self, dag: int) -> None:
