@@ -9,14 +9,17 @@ import threading
 import time
 from typing import Any
 
+from builtin_interfaces.msg import Time as TimeMessage
 from msg_graph import loads
 import pytest
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Header
 
 from .conftest import is_idle, Spinning, wait_for
-from .test_asked_for import Simulation
 
 MS = 1_000_000
 
@@ -88,6 +91,27 @@ def test_timers_of_each_clock_run(make_executor, make_node, kind):
 
 
 # --- simulated time ------------------------------------------------------------------------------
+
+
+class Simulation:
+    """A node with simulated time, and a publisher of that time."""
+
+    def __init__(self, make_node: Any) -> None:
+        self.node = make_node(
+            'simulated', parameter_overrides=[Parameter('use_sim_time', value=True)])
+        self._publisher = make_node('clock').create_publisher(
+            ClockMessage, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+
+    def matched(self) -> bool:
+        return wait_for(lambda: self._publisher.get_subscription_count() == 1)
+
+    def set_clock(self, now: int) -> bool:
+        """Publish the time until the node has it."""
+        message = ClockMessage(clock=TimeMessage(sec=now // 10**9, nanosec=now % 10**9))
+        clock = self.node.get_clock()
+        return any(
+            self._publisher.publish(message)
+            or wait_for(lambda: clock.now().nanoseconds == now, 0.1) for _ in range(20))
 
 
 class Simulated(Simulation):
