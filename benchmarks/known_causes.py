@@ -118,7 +118,7 @@ class Run:
                 due += round(self._long * 1e9)
             push(queue, source, due)
 
-        TimerQueue._push = late     # type: ignore[method-assign]
+        TimerQueue._push = late     # type: ignore[method-assign, assignment]
 
     def spin(self, seconds: float) -> None:
         """Run for a time."""
