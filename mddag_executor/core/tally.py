@@ -34,7 +34,7 @@ from mddag_executor.core.state import (
     SINK_MISSED,
     SINK_OVERDUE,
 )
-from mddag_executor.core.tables import DEMOTE, Tables
+from mddag_executor.core.tables import Tables
 from mddag_executor.core.weakly_hard import MissWindow
 from msg_graph import Dag, TaskSet, Vertex, WeaklyHard
 
@@ -100,7 +100,7 @@ def counts(sink: Mapping[str, Any]) -> Counts:
     in_time = sink['completed'] - (sink['late'] - overdue)
     due = sink['completed'] + overdue + sink['expired'] + aborted + failed + dropped
     return Counts(due, in_time, sink['late'], sink['expired'], aborted, failed, dropped,
-                  sink.get('demoted') or 0)
+                  sink.get('demoted', 0))
 
 
 def is_kept(sink: Mapping[str, Any]) -> bool:
@@ -222,7 +222,7 @@ class SinkTally:
         self.failed = 0
         self.aborted = 0
         self.dropped = 0
-        self.demoted: int | None = None  # None: late jobs are not demoted, or it is not known
+        self.demoted = 0
         self.overdue = 0
         self.shortest: int | None = None
         self.longest: int | None = None
@@ -251,7 +251,7 @@ class SinkTally:
             'late': self.late, 'overdue': self.overdue, 'expired': self.expired,
             'failed': self.failed, 'aborted': self.aborted, 'dropped': self.dropped,
             'response_ns': response}
-        if self.demoted is not None:
+        if self.demoted:
             result['demoted'] = self.demoted
         return result
 
@@ -269,9 +269,6 @@ class Tally:
         self.jobs = [0] * tables.n_dags
         self.ends = [dict.fromkeys(OUTCOMES, 0) for _ in range(tables.n_dags)]
         self.sinks = {v: SinkTally(tables.sink_deadline[v], keep) for v in tables.sinks}
-        for v, sink in self.sinks.items():
-            if tables.on_late[tables.dag_of[v]] == DEMOTE:
-                sink.demoted = 0
         #: By sink: its misses in any window, if the declaration tolerates some.
         self.windows = {v: MissWindow(tolerate.of) for v in self.sinks
                         if (tolerate := self._tolerate(v)) is not None}
@@ -299,8 +296,7 @@ class Tally:
             elif kind == DROP:
                 self.dropped += 1
             elif kind == SINK_DEMOTED:
-                sink = self.sinks[vertex]
-                sink.demoted = (sink.demoted or 0) + 1
+                self.sinks[vertex].demoted += 1
             elif kind == SINK_OVERDUE:
                 self.overdue[vertex, job] = deadline
                 self.sinks[vertex].late += 1

@@ -368,7 +368,7 @@ class Judged:
             sink = tally.sinks[v]
             kinds = np.bincount(mine['kind'], minlength=SINK_DROPPED + 1).tolist()
             sink.completed = kinds[SINK_IN_TIME] + kinds[SINK_LATE]
-            sink.demoted = demoted.get(v)
+            sink.demoted = demoted[v]
             sink.late, sink.overdue = kinds[SINK_LATE] + kinds[SINK_MISSED], kinds[SINK_MISSED]
             sink.expired, sink.failed, sink.aborted, sink.dropped = (
                 kinds[kind] for kind in (SINK_EXPIRED, SINK_FAILED, SINK_ABORTED, SINK_DROPPED))
