@@ -25,7 +25,7 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import IMPORTANT, NEVER, Tables
 
-PATIENCE = 10
+LATE_PATIENCE = 10
 """A late job is ordered as if it were released this many relative deadlines after it was demoted:
 so demoted callbacks run, however long the overload lasts, with about a tenth of what they need."""
 USED_UP_PATIENCE = 1
@@ -77,7 +77,7 @@ def _demoted_priority(t: Tables, s: State, x: int, now: int) -> int:
         s.refused_late[process] = 0
         admit(t, s)
         refused = is_refused(t, s, vertex)
-    patience = PATIENCE
+    patience = LATE_PATIENCE
     deadline = NEVER
     start = NEVER
     for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):

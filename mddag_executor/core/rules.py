@@ -46,8 +46,9 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     queue after the deadline of an incomplete sink; started ones finish.  ``DEMOTE`` lowers the
     priority of an execution that comes first in a queue, if none of its sinks can be in time: the
     time plus the mean execution times on the longest path to the sink is past its deadline.  From
-    then on its job counts as released ``PATIENCE`` relative deadlines later (one, if a sink has
-    used up the misses that it tolerates).  So demoted jobs age, and each callback gets some time.
+    then on its job counts as released ``LATE_PATIENCE`` relative deadlines later (one, if a sink
+    has used up the misses that it tolerates).  So demoted jobs age, and each callback gets some
+    time.
     Executions of one vertex keep their order: one that became ready later than a demoted one goes
     behind it.  An execution with sinks of both kinds has as RAD the earliest deadline of those
     that can be in time.  Running executions keep their keys.  Only policies whose keys are times

@@ -7,9 +7,10 @@ Theory of operation
 -------------------
 The functions of the core and of the event loop are used unchanged: each is bound to a common
 namespace, in which the names of the others refer to their compiled versions, and the names of
-``heapq`` to those of ``vectors``.  No rule exists twice.  Only ``add_queue`` is replaced, because
-an empty list has no type.  The policy is an additional field of the tables; the key function
-selects by it, so one compilation is enough for all policies.
+``heapq`` to those of ``vectors``.  So a name, also of a constant, must mean the same in all
+modules.  No rule exists twice.  Only ``add_queue`` is replaced, because an empty list has no type.
+The policy is an additional field of the tables; the key function selects by it, so one compilation
+is enough for all policies.
 
 numba stores the machine code of the entry points (``kernel``) on disk (``cache=True``).  It only
 checks the file of the entry point itself, so a hash of all sources is part of the stored name.
@@ -52,12 +53,13 @@ def entry_points() -> dict[str, Callable[..., Any]]:
     from numba import njit
     space = dict(vars(kernel))  # with its name: code loaded from disk looks its module up
     for module in (*_MODULES, kernel):
-        space.update((k, v) for k, v in vars(module).items() if not k.startswith('__'))
+        for name, value in vars(module).items():
+            if not name.startswith('__'):
+                assert space.setdefault(name, value) is value, f'there are two of {name}'
     space.update((name, getattr(vectors, name)) for name in _REPLACED)
     for module in (*_MODULES, kernel):
         inner = ModuleType(module.__name__)  # for names such as `rules.complete`
         for name, function in _functions(module):
-            assert space[name] is function or name in _REPLACED, f'there are two of {name}'
             space[name] = njit(error_model='numpy')(_bound(function, space))
             setattr(inner, name, space[name])
         if module in (jobs, overload, rules):

@@ -21,19 +21,20 @@ from hypothesis import strategies as st
 from mddag_executor.core import POLICIES, Tables
 from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.experiment import judge_of
-from mddag_executor.simulate import compiling, Load, schedule, Settings, simulate
+from mddag_executor.simulate import compiling, Load, schedule, Settings, simulate, START
 from mddag_executor.simulate.load import as_arrays, FAILS, RUNS, SKIPPED
 from msg_graph import load
 import numpy as np
 import pytest
 
-from ..core.task_sets import Case, cases, examples, TICK
+from ..core.task_sets import Case, cases, declaration, examples, TICK
 
 pytestmark = [
     pytest.mark.skipif(not compiling.available(), reason='numba is not there'),
     pytest.mark.timeout(400),  # a first run compiles
 ]
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
+MS = 1_000_000
 EVERY_RULE = cases(overheads=True, importance=True)
 
 
@@ -137,6 +138,17 @@ def test_machine_messages_and_processes(
         for compiled in (False, True))
     assert found == plain
     assert schedule(tables, as_arrays(load_), settings, log=True) == plain
+
+
+@pytest.mark.parametrize('compiled', [False, True])
+def test_a_short_wait_for_the_interpreter_is_no_reason_to_overtake(compiled: bool) -> None:
+    tables = Tables.build(declaration([
+        {'node': '/n', 'name': name, 'timer': '1s', 'deadline': deadline, 'dag': name}
+        for name, deadline in (('heavy', '200ms'), ('urgent', '100ms'))]))
+    load_ = Load([0, 10 * MS], [0, 1], [0, 0], [40 * MS, 5 * MS], [0, 1], [0, 0], holds=[1, 1])
+    found = schedule(
+        tables, load_, Settings('rad', 2, 500 * MS), log=True, compiled=compiled)
+    assert [time // MS for time, kind, *_ in found.log if kind == START] == [0, 40]
 
 
 @examples(15)
