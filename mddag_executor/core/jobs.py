@@ -60,7 +60,7 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     s.job_sinks_left[slot] = t.first_sink[dag + 1] - t.first_sink[dag]
     s.job_late[slot] = 0
     s.job_hope[slot] = NEVER
-    if t.on_late[dag] == DEMOTE and s.scalars[URGENCY] != OTHER_KEYS:
+    if demotes(t, s, dag):
         s.job_hope[slot] = release
         s.job_demoted[slot] = -1
         s.job_refused[slot] = -1
@@ -74,6 +74,11 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     if s.partial[dag] != 0:
         _leave_out(t, s, slot)
     return slot
+
+
+def demotes(t: Tables, s: State, dag: int) -> bool:
+    """Return whether jobs of a DAG are demoted when they are late, or refused (rule 7)."""
+    return t.on_late[dag] == DEMOTE and s.scalars[URGENCY] != OTHER_KEYS
 
 
 def expect(t: Tables, s: State, dag: int, here: list[int]) -> None:

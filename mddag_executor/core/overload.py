@@ -12,7 +12,7 @@ arithmetic and list indexing.
 
 from __future__ import annotations
 
-from mddag_executor.core.jobs import judge
+from mddag_executor.core.jobs import demotes, judge
 from mddag_executor.core.state import (
     DEADLINE_KEYS,
     ELSEWHERE,
@@ -160,7 +160,8 @@ def _demand(t: Tables, s: State, process: int, importance: int) -> tuple[int, in
 
 def is_refused(t: Tables, s: State, vertex: int) -> bool:
     """Return whether jobs are refused at a vertex in its process, for more important ones."""
-    return t.importance[vertex] < s.refused_below[_process(t, s, vertex)]
+    return (t.importance[vertex] < s.refused_below[_process(t, s, vertex)]
+            and demotes(t, s, t.dag_of[vertex]))
 
 
 def _process(t: Tables, s: State, vertex: int) -> int:

@@ -17,12 +17,12 @@ from msg_graph import ExecutionTime
 from .task_sets import Case, cases, declaration, examples, TICK
 
 
-def with_times(case: Case, on_late: Any = None) -> Case:
-    """Return a case that declares its execution times."""
+def with_times(case: Case, on_late: Any = None, **more: Any) -> Case:
+    """Return a case that declares its execution times, and ``more`` for each callback."""
     return replace(case, task_set=replace(case.task_set, dags=tuple(
         replace(dag, on_late=on_late, vertices=tuple(
             replace(vertex, callback=replace(
-                vertex.callback, execution_time=ExecutionTime((ticks * TICK,), (50.0,))))
+                vertex.callback, execution_time=ExecutionTime((ticks * TICK,), (50.0,)), **more))
             for vertex, ticks in zip(dag.vertices, row)))
         for dag, row in zip(case.task_set.dags, case.ticks))))
 
@@ -42,6 +42,16 @@ def demand(case: Case) -> float:
     """Return how many workers the executions need."""
     return sum(sum(row) * TICK / dag.period_ns
                for dag, row in zip(case.task_set.dags, case.ticks))
+
+
+@examples(300)
+@given(cases(importance=True), st.integers(5, 60))
+def test_importance_means_nothing_if_late_jobs_are_not_demoted(case: Case, horizon: int) -> None:
+    """They are not under a policy whose keys are no times."""
+    by_time = case.policy in ('rad', 'gedf', 'llf')
+    important = with_times(case, on_late='continue' if by_time else 'demote')
+    plain = with_times(case, on_late='continue', importance='normal', tolerate=None)
+    assert case.events(important.run(horizon)) == case.events(plain.run(horizon))
 
 
 @examples(300)
