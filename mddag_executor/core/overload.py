@@ -48,7 +48,9 @@ def demote(t: Tables, s: State, x: int, now: int) -> bool:
         last = -1
         s.last_demoted[vertex] = -1
         set_start(t, s, vertex)
-    if last >= 0 and s.x_key[last][3] < old[3] and s.x_started[x] < 0:  # it became ready before
+    if last == x:
+        last = -1
+    if last >= 0 and s.x_started[x] < 0 and _is_behind(t, s, x, last):
         priority = s.x_key[last][0]
         for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
             _announce_demoted(t, s, s.x_slot[x], t.reach_sink[i], now)
@@ -57,10 +59,38 @@ def demote(t: Tables, s: State, x: int, now: int) -> bool:
     if priority <= old[0]:
         return False
     s.x_key[x] = (priority, old[1], old[2], old[3], x)
-    if last < 0 or priority >= s.x_key[last][0]:
+    if last < 0 or s.x_started[last] >= 0 or old[3] < s.first_demoted[vertex]:
+        s.first_demoted[vertex] = old[3]
+    if last < 0 or s.x_key[x] > s.x_key[last]:
         s.last_demoted[vertex] = x
         s.start_by[vertex] = -NEVER
     return True
+
+
+def _is_behind(t: Tables, s: State, x: int, last: int) -> bool:
+    """
+    Return whether an execution became ready later than a demoted one, which it must not overtake.
+
+    That may not be the last one: messages of a sync's topics may alternate, and those of one topic
+    be of older jobs.
+    """
+    order = s.x_key[x][3]
+    if s.x_key[last][3] < order:
+        return True
+    vertex = s.x_vertex[x]
+    own = _priority(
+        t, s, x, s.job_release[s.x_slot[x]], t.rad_offset[vertex], t.latest_start[vertex])
+    return (s.x_started[last] < 0 and s.first_demoted[vertex] < order  # else it was preempted
+            and s.x_key[x][0] == own)
+
+
+def _priority(t: Tables, s: State, x: int, release: int, deadline: int, start: int) -> int:
+    """Return the priority by a policy whose keys are times."""
+    if s.scalars[URGENCY] == DEADLINE_KEYS:
+        return release + deadline
+    if s.scalars[URGENCY] == START_KEYS:
+        return release + start
+    return release + t.dag_deadline[s.job_dag[s.x_slot[x]]]
 
 
 def _demoted_priority(t: Tables, s: State, x: int, now: int) -> int:
@@ -102,11 +132,7 @@ def _demoted_priority(t: Tables, s: State, x: int, now: int) -> int:
             release = s.job_demoted[slot]
         deadline = t.rad_offset[vertex]
         start = t.latest_start[vertex]
-    if s.scalars[URGENCY] == DEADLINE_KEYS:
-        return release + deadline
-    if s.scalars[URGENCY] == START_KEYS:
-        return release + start
-    return release + t.dag_deadline[dag]
+    return _priority(t, s, x, release, deadline, start)
 
 
 def set_start(t: Tables, s: State, vertex: int) -> None:

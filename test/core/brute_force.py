@@ -106,6 +106,7 @@ class BruteForce:
         self.running: list[Execution | None] = [None] * workers
         self.waiting: list[Execution] = []
         self.last_demoted: dict[tuple[int, int], Execution] = {}
+        self.first_demoted: dict[tuple[int, int], int] = {}
         self.round: list[Execution] = []
         self.jobs: list[Job] = []
         self.events: list[Event] = []
@@ -167,18 +168,23 @@ class BruteForce:
         if ((job.dag.on_late or self.on_late) != 'demote'
                 or self.policy not in ('rad', 'gedf', 'llf')):
             return False
-        last = self.last_demoted.get((job.dag.index, vertex.index))
+        key = job.dag.index, vertex.index
+        last = self.last_demoted.get(key)
         if last not in self.waiting or last is execution:
             last = None
-        if last is not None and last.arrival < execution.arrival and not execution.has_run:
+        if last is not None and not execution.has_run and (
+                last.arrival < execution.arrival or not last.has_run
+                and self.first_demoted[key] < execution.arrival and execution.lowered is None):
             lowest = self.priority(last)
         else:
             lowest = self._demoted_priority(execution)
         if lowest <= self.priority(execution):
             return False
         execution.lowered = lowest
-        if last is None or lowest >= self.priority(last):
-            self.last_demoted[job.dag.index, vertex.index] = execution
+        if last is None or last.has_run or execution.arrival < self.first_demoted[key]:
+            self.first_demoted[key] = execution.arrival
+        if last is None or (lowest, execution.arrival) > (self.priority(last), last.arrival):
+            self.last_demoted[key] = execution
         return True
 
     def _demoted_priority(self, execution: Execution) -> int:

@@ -23,7 +23,7 @@ S, X, Y, J = range(4)
 
 
 def live(task_set: TaskSet | None = JOIN, workers: int = 2, **more: Any) -> Scheduler:
-    options = {name: more.pop(name) for name in ('max_active_jobs', 'expire_after')
+    options = {name: more.pop(name) for name in ('max_active_jobs', 'expire_after', 'on_late')
                if name in more}
     tables = Tables.build(task_set, legs=True, groups=False, **options)
     return Scheduler(tables, workers, propagate=False, **more)

@@ -14,6 +14,7 @@ from mddag_executor.core.tally import counts
 from mddag_executor.simulate import Settings, simulate
 from msg_graph import ExecutionTime
 
+from .live_helpers import J, live, start_job, US
 from .task_sets import Case, cases, declaration, examples, TICK
 
 
@@ -64,6 +65,35 @@ def test_messages_of_a_callback_keep_their_order(case: Case, horizon: int) -> No
         if kind == 'start':
             assert job == latest.get((dag, vertex), -1) + 1
             latest[dag, vertex] = job
+
+
+@examples(300)
+@given(st.lists(st.sampled_from((0, 1, 'run', 'wait')), min_size=4, max_size=40))
+def test_messages_of_each_topic_of_a_sync_keep_their_order(steps: list[int | str]) -> None:
+    """Also if those of the other topic belong to jobs released earlier or later."""
+    scheduler = live(workers=1, on_late='demote')
+    jobs = len(steps) + 1
+    slots = [start_job(scheduler, job, 10 * US * job) for job in range(jobs)]
+    now = 10 * US * jobs
+    arrived, ran = [0, 0], [0, 0]
+    jobs_of = {scheduler.execution(slots[job], J, leg): (leg, job)
+               for job in range(jobs) for leg in (0, 1)}
+    executions = {each: x for x, each in jobs_of.items()}
+    for step in (*steps, *['run'] * len(steps)):
+        if step == 'wait':
+            now += 5 * US
+        elif step == 'run':
+            x = scheduler.take(0, now)
+            if x >= 0:
+                leg, job = jobs_of[x]
+                assert job == ran[leg]
+                ran[leg] += 1
+                scheduler.complete(x, now)
+        else:
+            leg = int(step)
+            scheduler.ready(executions[leg, arrived[leg]], now)
+            arrived[leg] += 1
+    assert ran == arrived
 
 
 def _until(case: Case, run: Any, end: int) -> list[Any]:
