@@ -9,8 +9,8 @@ A robot of ordinary nodes, which mix numpy and Python as nodes do.
 The camera's images go through a detector to a brake.  The lidar's points are segmented, fused
 with the detections that are closest in time, and planned around; a controller follows the path at
 50 Hz.  An operator changes a parameter of the detector now and then, with a service call in a
-callback.  No node knows of an executor: `make_nodes` returns them, and whoever ends a chain keeps
-a log of stamps.
+callback.  No node knows of an executor: `make_nodes` returns them, and the node at the end
+of a chain keeps a log of stamps.
 """
 
 import argparse

@@ -61,7 +61,7 @@ class Deadlines:
             if self._state.job_state[slot] == OPEN:
                 time = next_deadline(*self._rule, slot, judged)
                 if self._entry.get(slot, NEVER) > time:
-                    yield f'nobody watches the deadline {time} of the job in slot {slot}'
+                    yield f'no timer is set for the deadline {time} of the job in slot {slot}'
 
     def _add(self, slot: int, after: int) -> None:
         time = next_deadline(*self._rule, slot, after)

@@ -8,7 +8,7 @@ Those about the GIL only are in ``gil`` and ``core.queues``.
 
 from __future__ import annotations
 
-BRIEF_NS = 300_000
+SHORT_CALLBACK_NS = 300_000
 """
 While a callback runs that usually takes no longer than this, no other thread is woken.
 

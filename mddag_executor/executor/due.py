@@ -16,7 +16,7 @@ from time import monotonic_ns, process_time_ns
 from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER
-from mddag_executor.executor.bounds import AGAIN_NS, BRIEF_NS, STOP_NS
+from mddag_executor.executor.bounds import AGAIN_NS, SHORT_CALLBACK_NS, STOP_NS
 from mddag_executor.executor.gil import CHECK_NS, GilCheck, LAST_CHECK_NS
 from mddag_executor.executor.listeners import TimerFd
 
@@ -133,7 +133,7 @@ class DueTimes:
         if holder is None:
             return
         after = LAST_CHECK_NS
-        if is_late or holder.entity.wall_ns > BRIEF_NS:
+        if is_late or holder.entity.wall_ns > SHORT_CALLBACK_NS:
             after = max(CHECK_NS, 2 * holder.entity.habit.mean_ns)
         self._gil_check.begin(holder, now, after)
 

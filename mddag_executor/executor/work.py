@@ -27,7 +27,7 @@ class RunningThread(Protocol):
     def publishes(self, publisher: Any, msg: Any, topic: str) -> None:
         """Note that the callback publishes."""
 
-    def is_brief(self) -> bool:
+    def is_short(self) -> bool:
         """Return whether it runs a callback that will probably end soon."""
 
     def lend(self) -> AbstractContextManager[None]:

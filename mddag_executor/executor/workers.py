@@ -9,10 +9,11 @@ Theory of operation
     the engine for the next execution: all in one section under one lock.  If there is none, the
     thread waits in the epoll (``loop``).  The kernel wakes exactly one thread for each event.
 2.  *No event is overlooked.*  When no thread waits in the epoll, a thread that has more to run
-    polls it first, every ``BRIEF_NS``.  So an urgent arrival is known before the next choice.
+    polls it first, every ``SHORT_CALLBACK_NS``.  So an urgent arrival is known before the next
+    choice.
 3.  *Waking others.*  If more than one execution may start, one waiting thread is woken, which does
     the same.  No thread is woken while a *short* callback runs, because its thread will be free in
-    time.  A callback is short if it usually ends within ``BRIEF_NS``, or within ``BRIEF_NS`` of a
+    time.  A callback is short if it usually ends within ``SHORT_CALLBACK_NS`` of its start or of a
     publication that it has made.  If it runs longer, the guard (``due``) wakes another thread.
 4.  *Admission to the epoll.*  A spin begins with one waiting thread.  Another one is admitted when
     an execution starts and no thread waits.  All other threads are parked, each on its own lock,
@@ -44,11 +45,11 @@ from mddag_executor.clocks import TraceClock
 from mddag_executor.core.queues import TURN_NS
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
-    BRIEF_NS,
     END_S,
     GUARD_NS,
     MOST,
     MOST_YIELD_NS,
+    SHORT_CALLBACK_NS,
 )
 from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.debugging import engine_lock
@@ -105,12 +106,12 @@ class WorkerThread:
         """Note the ids of the calling thread."""
         self.vtid, self.ident = threading.get_native_id(), threading.get_ident()
 
-    def is_brief(self) -> bool:
-        """Return whether the thread runs a callback that will probably end within ``BRIEF_NS``."""
+    def is_short(self) -> bool:
+        """Return whether the thread runs a short callback."""
         work = self.work
         return work is not None and (
-            work.entity.wall_ns <= BRIEF_NS
-            or self.published > 0 and work.entity.tail_ns <= BRIEF_NS)
+            work.entity.wall_ns <= SHORT_CALLBACK_NS
+            or self.published > 0 and work.entity.tail_ns <= SHORT_CALLBACK_NS)
 
     def publishes(self, publisher: Any, msg: Any, topic: str) -> None:
         """Note that the running callback publishes."""
@@ -277,7 +278,7 @@ class WorkerPool:
         if not self.running:
             return
         running = current.running
-        if running is not None and running.pool is self and running.is_brief():
+        if running is not None and running.pool is self and running.is_short():
             if not self.guard.is_set:
                 self._guard(self._last - self._offset)
         elif self.engine.may_start_more(self._last):
@@ -305,7 +306,7 @@ class WorkerPool:
             leader, self._leader = self._leader, None
             if not self.running:
                 return
-            if (leader is not None and leader.is_brief() and leader.work is not self._guarded
+            if (leader is not None and leader.is_short() and leader.work is not self._guarded
                     and self.engine.waits_since(now) > now - GUARD_NS):
                 self._leader = leader
                 self._guard(now - self._offset)
@@ -444,7 +445,7 @@ class WorkerPool:
             if turn(me, events):
                 execute(me)
                 events = []
-                if not self.polling and self._last - self._polled_at > BRIEF_NS:
+                if not self.polling and self._last - self._polled_at > SHORT_CALLBACK_NS:
                     events = wait(0)
                     self._polled_at = self._last
             elif me.is_parked:
@@ -559,7 +560,7 @@ class WorkerPool:
                 self.due.check_holder(now - self._offset)
         if self._is_stepping:
             pass
-        elif work.entity.wall_ns <= BRIEF_NS:
+        elif work.entity.wall_ns <= SHORT_CALLBACK_NS:
             self._leader = me
             if not self.polling and not self.guard.is_set:
                 self._admit()
@@ -581,7 +582,7 @@ class WorkerPool:
             return
         leader, n_workers = self._leader, self.engine.n_workers
         is_left_to_leader = (
-            has_events and leader is not me and leader is not None and leader.is_brief())
+            has_events and leader is not me and leader is not None and leader.is_short())
         if self.running and not is_left_to_leader and (
                 len(self._threads) == n_workers
                 or len(self._threads) - self._waiting_calls - len(self._parked) <= n_workers):
@@ -632,7 +633,7 @@ class WorkerPool:
             if entity.is_nested != habit.computes and entity.classify is not None:
                 with self.lock:
                     entity.classify()
-        if measurement is not None or me.published or end - start > BRIEF_NS:
+        if measurement is not None or me.published or end - start > SHORT_CALLBACK_NS:
             self._note_times(entity, start, end, me.published)
         if self.callback_ended is not None and me.outcome is None:
             self.callback_ended(entity.rclpy, None)
@@ -641,7 +642,7 @@ class WorkerPool:
     def _note_times(entity: Entity, start: int, end: int, published: int) -> None:
         """Note how long an execution took, and when it published (monotonic ns; 0: it did not)."""
         wall = end - start
-        if wall > BRIEF_NS:
+        if wall > SHORT_CALLBACK_NS:
             entity.habit.rests = 0  # long callbacks are measured each time
         if entity.ran:
             entity.wall_ns += (wall - entity.wall_ns) >> 3

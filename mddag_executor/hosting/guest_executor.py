@@ -119,7 +119,7 @@ class GuestExecutor:
         for node in nodes:
             self.host.adopt(node, self.guest)
         if nodes and self.guest is not None:
-            self.guest.settled = True
+            self.guest.is_complete = True
 
     def wake_waiting(self) -> None:
         """Let waiting threads check their conditions again."""

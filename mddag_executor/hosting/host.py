@@ -65,7 +65,7 @@ class Guest:
     A running program.
 
     :ivar nodes: its nodes on the executor.
-    :ivar settled: whether ``nodes`` holds all initial nodes, or the program has ended.
+    :ivar is_complete: whether ``nodes`` holds all initial nodes, or the program has ended.
     :ivar ended: whether its nodes run no more callbacks.
     :ivar returned: whether its main has returned nodes.
     :ivar uses_ros: whether it has initialised rclpy.
@@ -74,7 +74,7 @@ class Guest:
 
     program: Program
     nodes: list[Node] = field(default_factory=list)
-    settled: bool = False
+    is_complete: bool = False
     ended: bool = False
     returned: bool = False
     uses_ros: bool = False
@@ -176,14 +176,14 @@ class Host:
                 target=self._run, args=(guest,), daemon=True, name=f'main of {program.spec}')
             self.guest_of[guest.thread] = guest
             guest.thread.start()
-            self._wait_settled(guest)
+            self._wait_for_nodes(guest)
             self._check_start(guest)
         self._all_started = True
         self._end_run_after_last()
 
-    def _wait_settled(self, guest: Guest) -> None:
+    def _wait_for_nodes(self, guest: Guest) -> None:
         end = time.monotonic() + START_TIMEOUT_S
-        while not guest.settled and time.monotonic() < end and not self._is_ending():
+        while not guest.is_complete and time.monotonic() < end and not self._is_ending():
             time.sleep(0.01)
 
     def _check_start(self, guest: Guest) -> None:
@@ -216,7 +216,7 @@ class Host:
             guest.error = error
         if guest.error is not None or not guest.returned:
             self.program_ended(guest)
-        guest.settled = True
+        guest.is_complete = True
 
     def program_ended(self, guest: Guest) -> None:
         """Remove a program's nodes and end its spins; end the run after the last program."""

@@ -91,9 +91,9 @@ class RerunHost(Host):
         """End the run."""
         self.end_run()
 
-    def _wait_settled(self, guest: Guest) -> None:
+    def _wait_for_nodes(self, guest: Guest) -> None:
         loop = self._loop
-        loop.wait(lambda: guest.settled or loop.run_threads.has_waiting(guest.thread), None,
+        loop.wait(lambda: guest.is_complete or loop.run_threads.has_waiting(guest.thread), None,
                   'for a program to start')
 
     def wait(

@@ -296,7 +296,7 @@ class Rerun:
         """Begin to deliver, when each program has come to where it waits for something."""
         self._started_s = time.monotonic() - self._begun
         gc.freeze()  # else each full collection visits all objects of the nodes
-        if all(guest.settled for guest in self._host.guests) and not self._hosted:
+        if all(guest.is_complete for guest in self._host.guests) and not self._hosted:
             raise RerunError(self._none_hosted())
         self._check_topics()
         if self._source.pauses:

@@ -49,7 +49,7 @@ SWITCH_NS = 1_000_000
 """Python's switch interval while an executor spins."""
 SLICE_NS = 3_000_000
 """Time slice of the operating system if threads wait for a CPU."""
-BRIEF_NS = 100_000
+TAIL_NS = 100_000
 """Maximum CPU time with the GIL at the end of an execution that computes without it."""
 HARDLY = 8
 """An execution that waits for at most 1 / HARDLY of its CPU time keeps the GIL meanwhile."""
@@ -62,7 +62,7 @@ _LOCK, _CPU, _NOTHING = range(3)
 # slices end, if nothing happens before; when an execution needs something else; how often the CPUs
 # were assigned; when overtaking pays that does not pay now; number of interpreters, which the
 # additional pools (``intakes``) use, too.
-CPUS, PYTHON, SETTLED, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT, INTERPRETERS = range(8)
+CPUS, PYTHON, COUNTED_UNTIL, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT, INTERPRETERS = range(8)
 
 
 class Machine(NamedTuple):
@@ -121,10 +121,10 @@ def fill_machine(
 
 def settle(s: State, m: Machine, now: int) -> None:
     """Advance the machine to the present time."""
-    passed = now - m.scalars[SETTLED]
+    passed = now - m.scalars[COUNTED_UNTIL]
     for i in range(len(m.still)):
         s.x_left[m.still[i]] += passed
-    m.scalars[SETTLED] = now
+    m.scalars[COUNTED_UNTIL] = now
 
 
 def decide(t: Tables, s: State, m: Machine, now: int) -> None:
@@ -181,8 +181,8 @@ def begins(s: State, m: Machine, x: int, cost: int, cpu: int, locks: bool) -> No
     elif m.scalars[PYTHON] == 0:
         _set_parts(m, x, -NEVER, cpu, cost)
     elif 2 * cpu >= cost:
-        brief = min(cpu, BRIEF_NS)
-        _set_parts(m, x, -NEVER, cpu - brief, cost - brief)
+        tail = min(cpu, TAIL_NS)
+        _set_parts(m, x, -NEVER, cpu - tail, cost - tail)
     else:
         _set_parts(m, x, cpu // 4, cpu // 4, cost - cpu + cpu // 4)
 

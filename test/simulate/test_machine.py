@@ -139,7 +139,7 @@ def test_declared_holders_in_the_simulator() -> None:
 
 # --- a model that goes by ticks ------------------------------------------------------------------
 
-SWITCH, SLICE, BRIEF, TURN, LONG = 3, 5, 2, 2, 10
+SWITCH, SLICE, TAIL, TURN, LONG = 3, 5, 2, 2, 10
 
 
 @dataclass(eq=False)
@@ -249,7 +249,7 @@ class Ticks:
         elif not self.python:
             parts = [CPU] * cpu + [NOTHING] * waits
         elif cpu >= waits:
-            brief = min(cpu, BRIEF)
+            brief = min(cpu, TAIL)
             parts = [CPU] * (cpu - brief) + [NOTHING] * waits + [LOCK] * brief
         else:
             parts = [LOCK] * (cpu // 4) + [NOTHING] * waits + [LOCK] * (cpu - cpu // 4)
@@ -287,7 +287,7 @@ def test_as_the_model_that_goes_by_ticks(
     jobs: list[Job], workers: int, cpus: int, python: bool, divided: bool
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        for name, ticks in (('SWITCH_NS', SWITCH), ('SLICE_NS', SLICE), ('BRIEF_NS', BRIEF)):
+        for name, ticks in (('SWITCH_NS', SWITCH), ('SLICE_NS', SLICE), ('TAIL_NS', TAIL)):
             patch.setattr(machine, name, ticks)
         for name, ticks in (('TURN_NS', TURN), ('LONG_NS', LONG)):
             patch.setattr(queues, name, ticks)
