@@ -40,7 +40,7 @@ class Entity:
         'kind', 'rclpy', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
         'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
         'busy_ns', 'unattributed', 'removed', 'may_be_gone', 'address', 'handle',
-        'remote_publishers', 'awaits', 'is_own', 'wall_ns', 'tail_ns',
+        'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns',
         'publishes', 'at_once',
         'habit', 'since', 'gate', 'most_waiting', 'collect_more', 'classify', 'is_nested',
         '__weakref__')
@@ -79,6 +79,8 @@ class Entity:
         # recent averages: duration of its callback, and time from its first publication to its end
         self.wall_ns = UNKNOWN_NS
         self.tail_ns = 0
+        # of a subscription: the policy because of which a publisher's messages do not arrive
+        self.incompatible_qos: str | None = None
         # the topics that its callback has published on
         self.publishes: set[str] = set()
         # whether it was destroyed; whether that, or a timer's end, must be checked first
@@ -138,12 +140,13 @@ class Entity:
             return
         total = counts.setdefault(self.name, {
             'kind': self.kind, 'declared': self.callback is not None, 'waiting': 0,
-            'holds_interpreter': False, 'interpreter_share': None,
+            'holds_interpreter': False, 'interpreter_share': None, 'incompatible_qos': None,
             **dict.fromkeys(COUNTS, 0)})
         for key in COUNTS:
             total[key] += getattr(self, key)
         total['waiting'] += len(self.waiting)
         total['holds_interpreter'] |= bool(self.habit.holds)
+        total['incompatible_qos'] = total['incompatible_qos'] or self.incompatible_qos
         share = self.habit.share
         if share is not None:
             total['interpreter_share'] = max(total['interpreter_share'] or 0.0, round(share, 3))

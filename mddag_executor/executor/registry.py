@@ -29,9 +29,10 @@ from mddag_executor.executor.work import Work
 from msg_graph import binding, Callback, TaskSet
 from msg_graph.duration import exact_duration
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import EventHandler, QoSSubscriptionEventType
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy
+from rclpy.qos import HistoryPolicy, qos_policy_name_from_kind
 
 LISTS = {
     'timers': TIMER, 'subscriptions': SUBSCRIPTION, 'services': SERVICE, 'clients': CLIENT,
@@ -236,6 +237,15 @@ class Registry:
     def subscriptions(self) -> list[Entity]:
         """Return the current subscriptions."""
         return [entity for entity in self.by_id.values() if entity.kind == SUBSCRIPTION]
+
+    def note_event(self, handler: EventHandler, status: Any) -> None:
+        """Note a QoS event: the policy because of which a subscription gets no messages."""
+        incompatible = QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS
+        if status is None or handler.event_type != incompatible:
+            return
+        for entity in self.subscriptions():
+            if handler in entity.rclpy.event_handlers:
+                entity.incompatible_qos = qos_policy_name_from_kind(status.last_policy_kind)
 
     def timers(self) -> list[Entity]:
         """Return the current timers."""

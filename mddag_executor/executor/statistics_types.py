@@ -95,7 +95,8 @@ class CallbackCounts(TypedDict):
     executions (``failed``: they raised an exception), ``dropped`` those that did not run (QoS
     depth, destroyed, aborted), ``skipped`` releases of a timer that was too slow, ``unattributed``
     messages of a declared callback whose job was not found. ``interpreter_share`` is the fraction
-    of its time in which it needs the interpreter, None: not known yet.
+    of its time in which it needs the interpreter, None: not known yet. ``incompatible_qos`` is the
+    policy because of which a subscription gets nothing from a publisher.
     """
 
     kind: str
@@ -110,6 +111,7 @@ class CallbackCounts(TypedDict):
     waiting: int
     holds_interpreter: bool
     interpreter_share: float | None
+    incompatible_qos: str | None
 
 
 class Unattributed(TypedDict):

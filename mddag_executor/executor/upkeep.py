@@ -281,6 +281,8 @@ class Upkeep:
             return None
         except ListenerError:
             return None
+        if isinstance(source, EventsSource):
+            source.note = self._registry.note_event
         with pool.lock:
             pool.loop.add(source)
         try:

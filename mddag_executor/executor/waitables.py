@@ -184,7 +184,13 @@ _known: weakref.WeakKeyDictionary[Entity, list[int]] = weakref.WeakKeyDictionary
 
 
 class EventsSource(WaitableSource):
-    """QoS events (rclpy's ``EventHandler``) that share a descriptor."""
+    """
+    QoS events (rclpy's ``EventHandler``) that share a descriptor.
+
+    :ivar note: called with each event and its status.
+    """
+
+    note: Callable[[Any, Any], None]
 
     def _collect(self) -> None:
         found: list[Work] = []
@@ -198,6 +204,7 @@ class EventsSource(WaitableSource):
             _known[entity] = counts
             if counts != before or any(
                     value for name, value in values.items() if name.endswith('_change')):
+                self.note(event, status)
                 found.append(Work(entity, event.execute, (status,)))
 
         self._set.wait(None, take)

@@ -44,6 +44,12 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
         for name, each in result['callbacks'].items()}
     yield (f'{counted(result["undeclared"], "run")} of undeclared callbacks'
            + _details({name: count for name, count in undeclared.items() if count}))
+    deaf = {name: each['incompatible_qos'] for name, each in result['callbacks'].items()
+            if each.get('incompatible_qos') and not each['ran']}
+    if deaf:
+        yield (f'{counted(len(deaf), "callback")} without messages, as a publisher has an '
+               'incompatible QoS: '
+               + listed([f'{name} ({policy})' for name, policy in deaf.items()]))
     never = [*result['never_ran'], *(
         name for name, each in result['callbacks'].items()
         if each['declared'] and not each['ran'])]

@@ -9,12 +9,14 @@ from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor.statistics import Watch
+from mddag_executor.report.live_runs import summary
 from msg_graph import loads
 import pytest
 from rclpy.action import ActionClient, ActionServer
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
-from std_msgs.msg import Empty, String
+from std_msgs.msg import Empty, Header, String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
@@ -153,3 +155,33 @@ def test_a_wrong_name_is_warned_of_once(
     else:
         line, = warned
         assert f'camera.yaml: {expected}' in line
+
+
+def test_a_subscription_that_gets_nothing_for_its_qos_is_named(
+        make_executor: Callable[..., Any], make_node: Callable[..., Node]) -> None:
+    source, sink = make_node('source'), make_node('sink')
+    publisher = source.create_publisher(
+        Header, '/a', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    source.create_timer(0.05, lambda: publisher.publish(Header()))
+    sink.create_subscription(Header, '/a', lambda message: None, 10)
+    executor = make_executor(loads("""
+mddag: 1
+nodes:
+  - node: /source
+    callbacks: [{name: tick, timer: 50ms, publishes: [/a], dag: d}]
+  - node: /sink
+    callbacks: [{name: hear, subscription: /a, deadline: 50ms}]
+"""))
+    executor.add_node(source)
+    executor.add_node(sink)
+
+    def callbacks() -> Any:
+        return executor.statistics()['callbacks']
+
+    with Spinning(executor):
+        assert wait_for(lambda: callbacks().get('/sink:hear', {}).get('incompatible_qos'))
+    assert callbacks()['/sink:hear']['incompatible_qos'] == 'RELIABILITY'
+    assert callbacks()['/source:tick']['incompatible_qos'] is None
+    lines = list(summary({**executor.statistics(), 'measured': None}))
+    assert ('1 callback without messages, as a publisher has an incompatible QoS: '
+            '/sink:hear (RELIABILITY)') in lines
