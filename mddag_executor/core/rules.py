@@ -48,11 +48,10 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     time plus the mean execution times on the longest path to the sink is past its deadline.  From
     then on its job counts as released ``LATE_PATIENCE`` relative deadlines later (one, if a sink
     has used up the misses that it tolerates).  So demoted jobs age, and each callback gets some
-    time.
-    Executions of one vertex keep their order: one that became ready later than a demoted one goes
-    behind it.  An execution with sinks of both kinds has as RAD the earliest deadline of those
-    that can be in time.  Running executions keep their keys.  Only policies whose keys are times
-    demote.
+    time.  Executions of one vertex keep their order: one that became ready later than a demoted
+    one goes behind it.  An execution with sinks of both kinds has as RAD the earliest deadline of
+    those that can be in time.  Running executions keep their keys.  Only policies whose keys are
+    times demote.
 8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
     when an execution of it fails (its callback raises): each incomplete sink is missed.
     Executions that have not started are dropped after an abort.  After an expiry or a failure they

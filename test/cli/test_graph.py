@@ -154,7 +154,7 @@ def test_without_graphviz(
         call: Mddag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('PATH', str(Path(sys.executable).parent))
     if shutil.which('dot') is not None:
-        pytest.skip('Graphviz lies beside Python')
+        pytest.skip('Graphviz is in the folder of Python')
     done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr == (

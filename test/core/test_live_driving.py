@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Random driving of the scheduler as the live executor does it, with a model beside it.
+Random driving of the scheduler as the live executor does it, in parallel with a model.
 
 The model remembers every execution that was made ready, under an identity of its own, and what
 became of it; it knows nothing of slots, heaps and keys but what the scheduler's interface shows.

@@ -213,7 +213,7 @@ def test_the_sequence_number_decides_between_publishers():
     bench.published(2000, 2010, 3, publisher=1)
     bench.published(3000, 3100, 4, publisher=0)
     bench.published(3050, 3150, 5, publisher=1)
-    assert bench.job(3080) is None, 'without a number nobody knows'
+    assert bench.job(3080) is None, 'without a number the job is unknown'
     assert bench.jobs.doubtful == 1
     assert bench.job(3080, 2) == 4
     assert bench.job(3080, 3) == 5

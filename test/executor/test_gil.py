@@ -191,9 +191,9 @@ def test_the_switch_interval_is_given_back(make_executor, make_node):
     assert seen[0] == pytest.approx(0.001) and sys.getswitchinterval() == before
 
 
-# --- what arrives beside a callback that computes for long ---------------------------------------
+# --- what arrives next to a callback that computes for long --------------------------------------
 
-BESIDE = """
+COMPUTING = """
 mddag: 1
 nodes:
   - node: /node
@@ -207,7 +207,7 @@ nodes:
 """
 
 
-class Beside:
+class Computing:
     """
     Three callbacks, one of which computes for long.
 
@@ -264,12 +264,12 @@ class Beside:
 
 
 @pytest.fixture(params=['here', 'elsewhere'])
-def beside(request, make_executor, make_node, monkeypatch) -> Any:
+def computing(request, make_executor, make_node, monkeypatch) -> Any:
     """Give these callbacks; messages come from threads of this process, or as from elsewhere."""
     if request.param == 'elsewhere':
         monkeypatch.setattr(publishing, 'replace_delivery', lambda *args: None)
-    executor = make_executor(msg_graph.loads(BESIDE, 'g.yaml'))
-    found = Beside(executor, make_node())
+    executor = make_executor(msg_graph.loads(COMPUTING, 'g.yaml'))
+    found = Computing(executor, make_node())
     with Spinning(executor):
         for name in found.publishers:  # so it is known how long each takes
             found.publish(name)
@@ -277,43 +277,43 @@ def beside(request, make_executor, make_node, monkeypatch) -> Any:
         yield found
 
 
-def test_it_does_so_at_once(beside):
+def test_it_does_so_at_once(computing):
     """The long one does not wait for it, however long it usually takes."""
-    beside.meanwhile = lambda: 'urgent' in beside.ran
-    beside.habit.mean_ns = 20_000 * MS
-    assert beside.order('urgent') == ['begins', 'urgent', 'ends']
+    computing.meanwhile = lambda: 'urgent' in computing.ran
+    computing.habit.mean_ns = 20_000 * MS
+    assert computing.order('urgent') == ['begins', 'urgent', 'ends']
 
 
-def test_an_arrival_with_a_later_deadline_is_collected_after_a_long_callback(beside):
+def test_an_arrival_with_a_later_deadline_is_collected_after_a_long_callback(computing):
     """
     Its callback never begins before the long one has ended.
 
     As nobody is to be woken for it, it may only be taken then; so it must not be overlooked.
     """
     for _ in range(3):
-        assert beside.order('patient') == ['begins', 'ends', 'patient']
-    assert beside.executor.statistics()['dropped'] == {}
+        assert computing.order('patient') == ['begins', 'ends', 'patient']
+    assert computing.executor.statistics()['dropped'] == {}
 
 
-def test_of_two_arrivals_beside_a_long_callback_one_overtakes(beside):
-    beside.meanwhile = lambda: 'urgent' in beside.ran
+def test_of_two_arrivals_beside_a_long_callback_one_overtakes(computing):
+    computing.meanwhile = lambda: 'urgent' in computing.ran
     for names in (('patient', 'urgent'), ('urgent', 'patient')):
-        assert beside.order(*names) == ['begins', 'urgent', 'ends', 'patient']
+        assert computing.order(*names) == ['begins', 'urgent', 'ends', 'patient']
 
 
-@pytest.mark.parametrize('beside', ['elsewhere'], indirect=True)
-def test_what_cannot_start_is_left_in_the_middleware(beside):
+@pytest.mark.parametrize('computing', ['elsewhere'], indirect=True)
+def test_what_cannot_start_is_left_in_the_middleware(computing):
     """While the long one computes for as long as usual, no thread wakes for the patient one."""
     queued: list[int] = []
 
     def meanwhile() -> bool:
-        queued.append(beside.executor.statistics()['queue'])
+        queued.append(computing.executor.statistics()['queue'])
         return True
 
-    beside.meanwhile = meanwhile
+    computing.meanwhile = meanwhile
     for _ in range(20):  # on a busy machine it may take longer than usual
-        beside.habit.mean_ns = 50 * MS
-        assert beside.order('patient') == ['begins', 'ends', 'patient']
+        computing.habit.mean_ns = 50 * MS
+        assert computing.order('patient') == ['begins', 'ends', 'patient']
         if queued[-1] == 0:
             break
     assert queued[-1] == 0

@@ -19,20 +19,7 @@ from mddag_executor.laboratory.evaluate import Experiment
 from msg_graph import loads
 import pytest
 
-GRAPH = """\
-mddag: 1
-workers: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: t, timer: 20ms, publishes: [/a, /b], dag: one, execution_time: 1ms}
-      - {name: x, subscription: /a, deadline: 5ms, execution_time: 1ms}
-      - name: y
-        subscription: /b
-        deadline: 50ms
-        execution_time: {quantiles_us: [1000, 3000, 9000], percent: [0, 50, 100]}
-      - {name: z, timer: 10ms, deadline: 10ms, dag: two, execution_time: 1ms}
-"""
+from .graphs import GRAPH
 
 
 def experiment(**changes: object) -> Experiment:

@@ -17,6 +17,8 @@ from msg_graph import loads, TaskSet
 from msg_graph.model import load_of
 import pytest
 
+from .graphs import GRAPH
+
 
 def pairs(low: int, high: int) -> st.SearchStrategy[tuple[int, int]]:
     return st.tuples(st.integers(low, high), st.integers(low, high)).map(
@@ -116,22 +118,6 @@ def test_impossible(change: dict[str, object], problem: str) -> None:
     with pytest.raises(GenerateError) as caught:
         generate(replace(Options(), **change))  # type: ignore[arg-type]
     assert str(caught.value).startswith(problem)
-
-
-GRAPH = """\
-mddag: 1
-workers: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: t, timer: 20ms, publishes: [/a, /b], dag: one, execution_time: 1ms}
-      - {name: x, subscription: /a, deadline: 5ms, execution_time: 1ms}
-      - name: y
-        subscription: /b
-        deadline: 50ms
-        execution_time: {quantiles_us: [1000, 3000, 9000], percent: [0, 50, 100]}
-      - {name: z, timer: 10ms, deadline: 10ms, dag: two, execution_time: 1ms}
-"""
 
 
 def test_proportional() -> None:

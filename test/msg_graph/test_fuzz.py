@@ -146,7 +146,7 @@ def many(size: int) -> str:
 
 
 def square(size: int) -> str:
-    """One topic with many publishers, beside many sinks, and queue edges from one variable."""
+    """One topic with many publishers, with many sinks, and queue edges from one variable."""
     text = HEAD + '  - {name: t, timer: 10ms, publishes: [/a]}\n'
     for i in range(size // 2):
         text += f'  - {{name: p{i}, subscription: /a, publishes: [/b], reads: [p0]}}\n'
