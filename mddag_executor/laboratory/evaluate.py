@@ -112,9 +112,9 @@ def _check(experiments: Sequence[Experiment], runs: int, first_run: int, jobs: i
 
 def compiling_pays(experiments: Sequence[Experiment], runs: int, jobs: int) -> bool:
     """Return whether the compiled core is faster for so many runs of each experiment."""
-    from mddag_executor.simulate.compiled import ACCEPT_RUNS, pays
+    from mddag_executor.simulate.compiled import pays
     plain_s = _plain_s(experiments, runs) / jobs
-    return plain_s > SOON_S and pays(ACCEPT_RUNS, plain_s)
+    return plain_s > SOON_S and pays(plain_s)
 
 
 def _plain_s(experiments: Sequence[Experiment], runs: int) -> float:

@@ -36,6 +36,7 @@ from mddag_executor.laboratory.draws import (
     Times,
     utilisations,
 )
+from mddag_executor.simulate.load import as_arrays
 from mddag_executor.simulate.run import check
 from mddag_executor.simulate.schedule import schedule, Settings
 from mddag_executor.simulate.workload import periodic_load
@@ -101,17 +102,18 @@ def judge_of(task_set: TaskSet, duration_ns: int, compiled: bool) -> Judge:
     tables = Tables.build(task_set)
     load = periodic_load(
         task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
-    if compiled and not load.holds:
-        from mddag_executor.simulate.compiled import AcceptRuns
-        return AcceptRuns(tables, load)
+    if compiled:
+        from mddag_executor.simulate.compiled import prepare
+        prepare()
+        tables, load = as_arrays(tables), as_arrays(load)
 
     def judge(settings: Settings, times: Times) -> Bools:
         accepted = np.zeros(len(times), dtype=np.bool_)
-        for row in range(len(times)):
-            decisions = schedule(
-                tables, load._replace(costs=times[row].tolist()), settings,
-                compiled=False).decisions
-            accepted[row] = not any(is_miss(decision[0]) for decision in decisions)
+        for row, costs in enumerate(times):
+            decisions = np.array(schedule(
+                tables, load._replace(costs=costs), settings, compiled=compiled).decisions)
+            kinds = decisions.reshape(-1, 6)[:, 0].tolist()
+            accepted[row] = not any(map(is_miss, set(kinds)))
         return accepted
 
     return judge

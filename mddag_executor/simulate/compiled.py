@@ -10,14 +10,12 @@ A structure has three words for each field: the words of a vector (address, leng
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from copy import copy
 import ctypes
 from pathlib import Path
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple
 
 from mddag_executor import progress
 from mddag_executor.core.policies import POLICIES
-from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.core.state import Decision, State
 from mddag_executor.core.tables import Tables
 from mddag_executor.simulate.compiling import available, entry_points
@@ -29,13 +27,7 @@ from mddag_executor.simulate.machine import Machine
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from mddag_executor.simulate.schedule import Settings
-
-ACCEPT_RUNS, RUN_ONCE = 'accept_runs', 'run_once'
-"""The entry points: of ``evaluate``, and of all other runs."""
-_WORD = 8
-_COMPILE_S = {ACCEPT_RUNS: 15.0, RUN_ONCE: 40.0}    # approximate compile times
+_COMPILE_S = 25.0   # approximate compile time
 
 
 def check_available() -> None:
@@ -45,68 +37,31 @@ def check_available() -> None:
                               "'mddag_executor[batch]' with pip")
 
 
-def pays(name: str, plain_s: float) -> bool:
+def pays(plain_s: float) -> bool:
     """Return whether compiled code is faster for work that takes plain Python this long."""
-    return available() and (plain_s > _COMPILE_S[name] or _is_compiled(name))
+    return available() and (plain_s > _COMPILE_S or _is_compiled())
 
 
-def _is_compiled(name: str) -> bool:
-    entry: Any = entry_points()[name]
+def _is_compiled() -> bool:
+    entry: Any = entry_points()['run_once']
     folder = entry.stats.cache_path
     return bool(entry.signatures) or (folder is not None and any(
         Path(folder).glob(f'*{entry.py_func.__qualname__}*.nbi')))
 
 
-def prepare(name: str) -> None:
-    """Compile an entry point, or load it from disk, with a call that runs nothing."""
-    if not _is_compiled(name):
-        progress.report(f'compiling the core, once: about {_COMPILE_S[name]:.0f} s')
-    if name == RUN_ONCE:
-        run_once(Tables.build(None), Load([], [], [], [], [], []), 'rad',
-                 Orders(*[0] * len(Orders._fields)))
-        return
-    nothing = EmptyMemory(max(len(Tables._fields) + 1, len(State._fields)))
-    entry_points()[ACCEPT_RUNS](
-        nothing.address, nothing.address, nothing.address, 0, 0, 1, 0, 0, 0, 0, 0, 1, False,
-        np.zeros(0, dtype=np.bool_))
-
-
-class AcceptRuns:
-    """
-    Simulates runs up to their first miss, in compiled code; several threads may call it.
-
-    :param load: the load of all runs, except for its costs.
-    """
-
-    def __init__(self, tables: Tables, load: Load) -> None:
-        prepare(ACCEPT_RUNS)
-        self._tables = [LentTuple(tables, number) for number in range(len(POLICIES))]
-        self._load = LentTuple(load)
-        self._row = tables.n_vertices * _WORD
-
-    def __call__(
-        self, settings: Settings, times: npt.NDArray[np.int64]
-    ) -> npt.NDArray[np.bool_]:
-        """Return which runs, with the execution times of their rows, have no miss."""
-        load = self._load.copy()  # its costs are replaced for each run
-        working = EmptyMemory(len(State._fields))
-        times = np.ascontiguousarray(times, dtype=np.int64)
-        accepted = np.zeros(len(times), dtype=np.bool_)
-        entry_points()[ACCEPT_RUNS](
-            self._tables[list(POLICIES).index(settings.policy)].address, load.address,
-            working.address, times.ctypes.data, self._row, settings.workers,
-            int(settings.preempts), int(find_policy(settings.policy).polling),
-            find_policy(settings.policy).urgency, settings.dispatch_overhead_ns,
-            settings.switch_overhead_ns, settings.duration_ns, settings.judge == 'horizon',
-            accepted)
-        return accepted
+def prepare() -> None:
+    """Compile the core, or load it from disk, with a call that runs nothing."""
+    if not _is_compiled():
+        progress.report(f'compiling the core, once: about {_COMPILE_S:.0f} s')
+    run_once(Tables.build(None), Load([], [], [], [], [], []), 'rad',
+             Orders(*[0] * len(Orders._fields)))
 
 
 def run_once(
     tables: Tables, load: Load, policy: str, orders: Orders
 ) -> tuple[int, Sequence[LogEntry], Sequence[Decision], list[int]]:
     """
-    Run a load like ``engine.run_load``.
+    Run a load like ``engine.run``.
 
     :return: the end, the log of every worker, the decisions, the busy time of each worker.
     """
@@ -115,7 +70,7 @@ def run_once(
         EmptyMemory(len(fields)) for fields in (
             State._fields, Deliveries._fields, Machine._fields, ('busy',), ('log',))]
     addresses = [each.address for each in working]
-    ended = entry_points()[RUN_ONCE](*(each.address for each in lent), *addresses)
+    ended = entry_points()['run_once'](*(each.address for each in lent), *addresses)
     try:
         place = State._fields.index('decisions')
         return (int(ended), log.rows(0, 6), state.rows(place, 6),  # type: ignore[return-value]
@@ -143,12 +98,6 @@ class LentTuple:
     def address(self) -> int:
         """Return the address of the structure, valid as long as this object lives."""
         return int(self._words.ctypes.data)
-
-    def copy(self) -> LentTuple:
-        """Return another structure with the same columns."""
-        copied = copy(self)
-        copied._words = self._words.copy()
-        return copied
 
 
 class EmptyMemory:

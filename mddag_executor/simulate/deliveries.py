@@ -25,7 +25,7 @@ from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import OPEN, PREEMPTIVE, QueueEntry, State
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.simulate.load import FAILS, Load, place_of
-from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.machine import is_used, Machine
 
 DELAY_NS = 1_000_000
 """Time of a message to another process of this machine whose interpreter is busy."""
@@ -60,14 +60,14 @@ def delay_of(t: Tables, s: State, load: Load, x: int, edge: int) -> int:
 
 
 def sends_at_start(
-    t: Tables, s: State, load: Load, d: Deliveries, m: Machine | None, x: int, now: int
+    t: Tables, s: State, load: Load, d: Deliveries, m: Machine, x: int, now: int
 ) -> None:
     """Send the messages of a started execution, as far as their times are known."""
     vertex = s.x_vertex[x]
     first, end = t.first_successor[vertex], t.first_successor[vertex + 1]
     if s.scalars[PREEMPTIVE] != 0 or first == end:
         return
-    if m is not None:
+    if is_used(m):
         while len(d.next_vertex) <= x:
             d.next_vertex.append(-1)
         d.next_vertex[x] = -1
@@ -99,13 +99,13 @@ def _find_next_place(
 
 
 def ends_sending(
-    t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine | None, x: int,
+    t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine, x: int,
     now: int,
 ) -> None:
     """End an execution, and send its messages."""
     slot, vertex = s.x_slot[x], s.x_vertex[x]
     job = s.job_index[slot]
-    if m is not None:
+    if is_used(m):
         while m.publishes_at[x] < NEVER:
             _publish_next(t, s, key, load, d, m, x, now)
     if len(load.fates) > 0 and load.fates[place_of(s, load, x)] == FAILS:
@@ -117,18 +117,18 @@ def ends_sending(
         delay = delay_of(t, s, load, x, edge)
         if delay == 0 or (delay < 0 and preemptive):
             _arrive(t, s, key, slot, job, t.successors[edge], now)
-        elif delay > 0 and (m is not None or preemptive):
+        elif delay > 0 and (is_used(m) or preemptive):
             _post(s, d, now + delay, x, t.successors[edge])
 
 
 def arrive_due(
-    t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine | None, now: int
+    t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine, now: int
 ) -> None:
     """Satisfy the edges whose messages arrive now, in the order of sending."""
     while len(d.messages) > 0 and d.messages[0][0] <= now:
         message = heappop(d.messages)
         _arrive(t, s, key, message[2], message[3], message[4], now)
-    if m is not None:  # publications of running executions before their end
+    if is_used(m):  # publications of running executions before their end
         for worker in range(len(s.worker_x)):
             x = s.worker_x[worker]
             if x >= 0 and m.publishes_at[x] < NEVER:

@@ -17,8 +17,7 @@ the GIL, ``machine`` computes after each instant when the running executions fin
 A job's deadlines count from its release.  This is the time at which its source becomes ready,
 unless ``releases`` has an earlier time (a sensor's message that arrived later).
 
-Like the rules this is integer arithmetic on lists, so that it can be compiled unchanged; arguments
-that are None then cost nothing.
+Like the rules this is integer arithmetic on lists, so that it can be compiled unchanged.
 """
 
 from __future__ import annotations
@@ -41,6 +40,7 @@ from mddag_executor.simulate.load import Load, needs_python, SKIPPED
 from mddag_executor.simulate.machine import (
     decide,
     fill_machine,
+    is_used,
     Machine,
     NEXT_TIME,
     settle,
@@ -74,17 +74,80 @@ class Orders(NamedTuple):
     keep_log: int
 
 
-def run_load(
+def run(
     t: Tables, s: State, d: Deliveries, m: Machine, key: KeyFunction, load: Load, o: Orders,
     busy: list[int], log: list[LogEntry], progress: Callable[[int], None] | None,
 ) -> int:
     """
-    Run the core over a load (see ``run``) with an empty state, deliveries and machine.
+    Run the core over a load, with an empty state, deliveries and machine; return the end, ns.
+
+    Decisions are in ``s.decisions``.  With ``Orders.stop_at_first_miss`` the run ends with the
+    instant at which the first miss is known: a late completion, an expiry or an abort.
 
     :param busy: receives by worker its busy time, ns; ``log``: the log of the workers, if wanted.
+    :param progress: receives the virtual time at each event.
     """
+    _fill(t, s, d, m, load, o)
+    sends, stops = len(load.delay_base) > 0, is_used(m)
+    n_workers, n_releases = len(s.worker_x), len(load.times)
+    finish_at, running, since = [NEVER] * n_workers, [-1] * n_workers, [-1] * n_workers
+    for _ in range(n_workers):
+        busy.append(0)
+    now = next_release = 0
+    while now < o.horizon:
+        instant = NEVER
+        if next_release < n_releases and load.times[next_release] < o.horizon:
+            instant = load.times[next_release]
+        for w in range(n_workers):
+            if finish_at[w] < instant:
+                instant = finish_at[w]
+        if sends:
+            instant = min(instant, next_arrival(d))
+        if stops:
+            instant = min(instant, m.scalars[NEXT_TIME])
+        now = min(instant, o.horizon)
+        if instant > o.horizon:
+            break
+        if progress is not None:
+            progress(now)
+        seen = len(s.decisions)
+        if stops:
+            settle(s, m, now)
+        for w in range(n_workers):
+            if finish_at[w] == now:
+                finish_at[w] = NEVER
+                x = s.worker_x[w]
+                busy[w] += now - since[w]
+                since[w] = running[w] = -1
+                if o.keep_log != 0:
+                    _note(t, s, log, now, END, w, x)
+                if sends:
+                    ends_sending(t, s, key, load, d, m, x, now)
+                else:
+                    rules.complete(t, s, key, x, now)
+        if now == o.horizon:
+            break
+        if sends:
+            arrive_due(t, s, key, load, d, m, now)
+        while next_release < n_releases and load.times[next_release] == now:
+            release_load(t, s, key, load, next_release, now)
+            next_release += 1
+        _dispatch(t, s, d, m, key, load, o, now, finish_at, running, since, busy, log)
+        if stops:
+            share(t, s, m, now, finish_at)
+        if o.stop_at_first_miss != 0 and any_missed(s, seen):
+            break
+    for w in range(n_workers):
+        if since[w] >= 0:
+            busy[w] += now - since[w]
+    if o.judge_open != 0 and now == o.horizon:
+        jobs.finish(t, s, now)
+    return now
+
+
+def _fill(t: Tables, s: State, d: Deliveries, m: Machine, load: Load, o: Orders) -> None:
+    """Fill the columns of an empty state, and of deliveries and machine if the load needs them."""
     sends = len(load.delay_base) > 0
-    stops = len(load.holds) > 0 or o.cpus < NEVER
     workers = [o.workers] * o.processes + [1] * (o.processes * o.intakes)
     fill_state(
         t, s, sum(workers), o.preemptive, 2 if sends else 1, o.dispatch_overhead,
@@ -92,123 +155,17 @@ def run_load(
     if len(workers) > 1:
         divide(s, workers)
     s.scalars[JUDGE_FROM] = o.judge_from
-    stop, keep = o.stop_at_first_miss != 0, o.keep_log != 0
-    for _ in range(sum(workers)):
-        busy.append(0)
-    if stops:
-        fill_machine(
-            t, s, m, o.cpus, int(needs_python(load)), o.processes if o.intakes != 0 else NEVER)
     if sends:
         d.sent.append(0)
-        if stops:
-            ended = run(t, s, key, load, o.horizon, stop, log, progress, d, m, busy, keep)
-        else:
-            ended = run(t, s, key, load, o.horizon, stop, log, progress, d, None, busy, keep)
-    elif stops:
-        ended = run(t, s, key, load, o.horizon, stop, log, progress, None, m, busy, keep)
-    else:
-        ended = run(t, s, key, load, o.horizon, stop, log, progress, None, None, busy, keep)
-    if o.judge_open != 0 and ended == o.horizon:
-        jobs.finish(t, s, ended)
-    if not keep:
-        log.clear()
-    return ended
-
-
-def run(
-    t: Tables,
-    s: State,
-    key: KeyFunction,
-    load: Load,
-    horizon: int,
-    stop_at_first_miss: bool,
-    log: list[LogEntry] | None = None,
-    progress: Callable[[int], None] | None = None,
-    deliveries: Deliveries | None = None,
-    machine: Machine | None = None,
-    busy: list[int] | None = None,
-    keep_log: bool = True,
-) -> int:
-    """
-    Run the core over a load and return the time at which the run ended, ns.
-
-    Decisions are in ``s.decisions``.  With ``stop_at_first_miss`` the run ends with the instant at
-    which the first miss is known: a late completion, an expiry or an abort.  ``progress`` receives
-    the virtual time at each event.  The busy time of each worker is added to ``busy``.
-    """
+    if len(load.holds) > 0 or o.cpus < NEVER:
+        fill_machine(
+            t, s, m, o.cpus, int(needs_python(load)), o.processes if o.intakes != 0 else NEVER)
     if len(load.holds) > 0:
         for v in range(t.n_vertices):
             place = load.cost_base[t.dag_of[v]] + t.region_offset[v]  # of its first job, if any
             if place < len(load.holds):
                 s.holder[v] = load.holds[place]
     overload.admit(t, s)
-    n_workers = len(s.worker_x)
-    finish_at = [NEVER] * n_workers
-    running = [-1] * n_workers
-    since = [-1] * n_workers
-    next_release = 0
-    n_releases = len(load.times)
-    now = 0
-    while True:
-        if log is not None:
-            if not keep_log:
-                log.clear()
-        instant = NEVER
-        if next_release < n_releases and load.times[next_release] < horizon:
-            instant = load.times[next_release]
-        for w in range(n_workers):
-            if finish_at[w] < instant:
-                instant = finish_at[w]
-        if deliveries is not None:
-            instant = min(instant, next_arrival(deliveries))
-        if machine is not None:
-            instant = min(instant, machine.scalars[NEXT_TIME])
-        if instant > horizon:
-            _end_busy(busy, since, horizon)
-            return horizon
-        now = instant
-        if progress is not None:
-            progress(now)
-        seen = len(s.decisions)
-        if machine is not None:
-            settle(s, machine, now)
-        for w in range(n_workers):
-            if finish_at[w] == now:
-                finish_at[w] = NEVER
-                x = s.worker_x[w]
-                if busy is not None:
-                    busy[w] += now - since[w]
-                    since[w] = -1
-                if log is not None:
-                    running[w] = -1
-                    _note(t, s, log, now, END, w, x)
-                if deliveries is not None:
-                    ends_sending(t, s, key, load, deliveries, machine, x, now)
-                else:
-                    rules.complete(t, s, key, x, now)
-        if now == horizon:
-            _end_busy(busy, since, horizon)
-            return horizon
-        if deliveries is not None:
-            arrive_due(t, s, key, load, deliveries, machine, now)
-        while next_release < n_releases and load.times[next_release] == now:
-            release_load(t, s, key, load, next_release, now)
-            next_release += 1
-        _dispatch(t, s, key, load, now, finish_at, running, since, busy, log, deliveries,
-                  machine)
-        if machine is not None:
-            share(t, s, machine, now, finish_at)
-        if stop_at_first_miss and any_missed(s, seen):
-            _end_busy(busy, since, now)
-            return now
-
-
-def _end_busy(busy: list[int] | None, since: list[int], now: int) -> None:
-    """Count the executions that still run at the end."""
-    if busy is not None:
-        for w in range(len(since)):
-            if since[w] >= 0:
-                busy[w] += now - since[w]
 
 
 def release_load(
@@ -244,32 +201,32 @@ def release_load(
 
 
 def _dispatch(
-    t: Tables, s: State, key: KeyFunction, load: Load, now: int, finish_at: list[int],
-    running: list[int], since: list[int], busy: list[int] | None, log: list[LogEntry] | None,
-    deliveries: Deliveries | None, machine: Machine | None,
+    t: Tables, s: State, d: Deliveries, m: Machine, key: KeyFunction, load: Load, o: Orders,
+    now: int, finish_at: list[int], running: list[int], since: list[int], busy: list[int],
+    log: list[LogEntry],
 ) -> None:
     """Dispatch executions; ``running`` has the preempted executions for the log."""
-    if machine is not None:
-        decide(t, s, machine, now)
+    sends, stops = len(load.delay_base) > 0, is_used(m)
+    if stops:
+        decide(t, s, m, now)
     x = rules.schedule(t, s, key, now)
     while x >= 0:
         worker = s.x_worker[x]
         finish_at[worker] = now + s.x_left[x]
-        if busy is not None:
-            if since[worker] >= 0:
-                busy[worker] += now - since[worker]
-            since[worker] = now
-        if log is not None:
+        if since[worker] >= 0:
+            busy[worker] += now - since[worker]
+        since[worker] = now
+        if o.keep_log != 0:
             if running[worker] >= 0:
                 _note(t, s, log, now, PREEMPT, worker, running[worker])
-            running[worker] = x
             _note(t, s, log, now, START, worker, x)
-        if machine is not None:
-            starts(s, load, machine, x, now)
-        if deliveries is not None:
-            sends_at_start(t, s, load, deliveries, machine, x, now)
-        if machine is not None:
-            decide(t, s, machine, now)
+        running[worker] = x
+        if stops:
+            starts(s, load, m, x, now)
+        if sends:
+            sends_at_start(t, s, load, d, m, x, now)
+        if stops:
+            decide(t, s, m, now)
         x = rules.schedule(t, s, key, now)
 
 

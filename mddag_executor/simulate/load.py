@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from mddag_executor.core.state import State
 from mddag_executor.core.tables import Tables
@@ -50,15 +50,21 @@ class Load(NamedTuple):
     delay_stride: list[int] = []
 
 
+Arrays = TypeVar('Arrays', Load, Tables)
+
+
 def as_lists(load: Load) -> Load:
     """Return a load whose columns are lists, not arrays."""
     return Load(*(column if isinstance(column, list) else column.tolist() for column in load))
 
 
-def as_arrays(load: Load) -> Load:
-    """Return a load whose columns are arrays, which are faster to change and to pass."""
+def as_arrays(columns: Arrays) -> Arrays:
+    """Return a load or tables whose columns are arrays, which are faster to change and to pass."""
     import numpy as np
-    return Load(*(np.array(column, dtype=np.int64) for column in load))  # type: ignore[arg-type]
+    arrays: list[Any] = [
+        column if isinstance(column, int) else np.array(column, dtype=np.int64)
+        for column in columns]
+    return type(columns)(*arrays)
 
 
 def needs_python(load: Load) -> bool:

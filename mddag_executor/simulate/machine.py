@@ -66,7 +66,7 @@ CPUS, PYTHON, COUNTED_UNTIL, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT, INTERPRET
 
 
 class Machine(NamedTuple):
-    """Which running executions compute; made by ``new_machine``."""
+    """Which running executions compute; made by ``new_machine``, or empty if all do."""
 
     scalars: list[int]
     # by started execution: the progress up to which it computes with the GIL, computes without it,
@@ -117,6 +117,11 @@ def fill_machine(
         add_queue(m.lock_queue)
         m.lock_had.append(-1)
         m.switch_at.append(NEVER)
+
+
+def is_used(m: Machine) -> bool:
+    """Return whether executions may be stopped."""
+    return len(m.scalars) > 0
 
 
 def settle(s: State, m: Machine, now: int) -> None:

@@ -13,7 +13,7 @@ from mddag_executor.core import NEVER, Tables
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.state import as_object, Decision, empty, State
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import LogEntry, Orders, run_load
+from mddag_executor.simulate.engine import LogEntry, Orders, run
 from mddag_executor.simulate.load import as_lists, Load
 from mddag_executor.simulate.machine import Machine
 
@@ -105,10 +105,9 @@ def schedule(
     state = as_object(empty(State))
     entries: list[LogEntry] = []
     busy: list[int] = []
-    ended = run_load(
+    ended = run(
         as_object(tables), state, empty(Deliveries), empty(Machine),
-        find_policy(settings.policy).key, as_lists(load), orders, busy,
-        entries, progress)
+        find_policy(settings.policy).key, as_lists(load), orders, busy, entries, progress)
     return Scheduled(ended, entries, state.decisions, busy)
 
 
@@ -120,7 +119,7 @@ def prepare(tables: Tables, load: Load, settings: Settings, runs: int = 1) -> bo
     if plain_s < SOON_S:
         return False
     from mddag_executor.simulate import compiled
-    if not compiled.pays(compiled.RUN_ONCE, plain_s):
+    if not compiled.pays(plain_s):
         return False
-    compiled.prepare(compiled.RUN_ONCE)
+    compiled.prepare()
     return True

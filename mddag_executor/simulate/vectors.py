@@ -346,11 +346,3 @@ def heapify(heap):
     """Do the same as ``heapq.heapify``."""
     for place in range(len(heap) // 2 - 1, -1, -1):
         _sink(heap, place)
-
-
-# --- memory of others --------------------------------------------------------------------------
-
-@njit
-def set_address(vector, address):
-    """Point a vector without own memory at other data of the same length."""
-    _set_word(vector, 0, address)

@@ -31,7 +31,7 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.simulate import END, LogEntry, PREEMPT, Settings
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import run_load
+from mddag_executor.simulate.engine import run
 from mddag_executor.simulate.machine import Machine
 from msg_graph import Dag, TaskSet
 import pytest
@@ -104,10 +104,9 @@ def test_whatever_gets_ready_ends_or_is_dropped_or_is_there(case: Case, horizon:
         switch_overhead_ns=case.switch_overhead * TICK)
     state = empty(State)
     log: list[LogEntry] = []
-    run_load(
+    run(
         tables, state, empty(Deliveries), empty(Machine), policy(case.policy).key,
-        case.load(horizon), replace(settings, judge='completions').orders, [], log,
-        None)
+        case.load(horizon), replace(settings, judge='completions').orders, [], log, None)
     kinds = Counter(kind for _, kind, *_ in log)
     ready = state.scalars[ORDER] - kinds[PREEMPT]
     dropped = sum(kind == DROP for kind, *_ in state.decisions)

@@ -6,13 +6,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
-from mddag_executor.core.state import new_state, SINK_COMPLETED
+from mddag_executor.core.state import SINK_COMPLETED
 from mddag_executor.replay import reschedule
-from mddag_executor.simulate import Load, LogEntry, START
-from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import run
+from mddag_executor.simulate import Load, schedule, Settings, START
 from mddag_executor.simulate.load import edge_numbers, edges_of
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
@@ -56,13 +53,12 @@ def engine(
         (numbers[edge] for edge in ((0, 1), (0, 2), (1, 2))), delays))]
     load = load._replace(
         delays=by_edge * jobs, delay_base=[0, 0], delay_stride=[3, 0])
-    state = new_state(tables, workers, preemptive=preemptive, propagate=2)
-    log: list[LogEntry] = []
-    key = find_policy('rad').key
-    run(tables, state, key, load, horizon, False, log, deliveries=Deliveries([], [0], []))
-    starts = [(time // 1000, worker, vertex) for time, kind, worker, _, vertex, _ in log
+    found = schedule(
+        tables, load, Settings('rad', workers, horizon, preemptive, 'completions'), log=True,
+        compiled=False)
+    starts = [(time // 1000, worker, vertex) for time, kind, worker, _, vertex, _ in found.log
               if kind == START]
-    done = [(d[2], d[5] // 1000) for d in state.decisions if d[0] in SINK_COMPLETED]
+    done = [(d[2], d[5] // 1000) for d in found.decisions if d[0] in SINK_COMPLETED]
     assert edges_of(tables) == [3, 0]
     return starts, done
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import json
 from pathlib import Path
 import random
@@ -13,15 +14,22 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mddag_executor.cli import main as program
-from mddag_executor.core import policy as find_policy
 from mddag_executor.core import PolicyError, Tally
-from mddag_executor.core.state import Decision, new_state
+from mddag_executor.core.state import Decision
 from mddag_executor.core.tally import counts
 from mddag_executor.errors import UsageError
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.run_writer import write_trace
-from mddag_executor.simulate import periodic_load, Settings, simulate
-from mddag_executor.simulate.engine import END, LogEntry, PREEMPT, run, START
+from mddag_executor.simulate import (
+    END,
+    LogEntry,
+    periodic_load,
+    PREEMPT,
+    Settings,
+    simulate,
+    START,
+)
+from mddag_executor.simulate import schedule as schedule_load
 from mddag_executor.simulate.load import Load
 from mddag_executor.trace import TraceFile
 from msg_graph import loads, TaskSet
@@ -72,17 +80,17 @@ def random_load(task_set: TaskSet, seed: int, longest: int, undeclared: int) -> 
 
 def schedule(
     task_set: TaskSet, load: Load, policy: str, workers: int, end: int
-) -> tuple[list[LogEntry], Tally, list[Decision]]:
+) -> tuple[Sequence[LogEntry], Tally, Sequence[Decision]]:
     """Simulate a load, non-preemptively."""
     tables = loose(task_set)
-    state = new_state(tables, workers)
-    log: list[LogEntry] = []
-    run(tables, state, find_policy(policy).key, load, end, False, log)
+    found = schedule_load(
+        tables, load, Settings(policy, workers, end, judge='completions'), log=True,
+        compiled=False)
     tally = Tally(task_set, tables)
     for dag in load.dags:
         tally.released(dag)
-    tally.add(state.decisions)
-    return log, tally, state.decisions
+    tally.add(found.decisions)
+    return found.log, tally, found.decisions
 
 
 @given(declarations(), st.integers(0, 2**32), st.integers(1, 4),

@@ -10,24 +10,21 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.core import policy as find_policy
 from mddag_executor.core import queues, Tables
-from mddag_executor.core.state import divide, new_state
 from mddag_executor.simulate import (
     END,
+    engine,
     Load,
-    LogEntry,
     machine,
     periodic_load,
+    schedule,
     Settings,
     simulate,
     SimulationError,
     START,
 )
-from mddag_executor.simulate.engine import run
 from mddag_executor.simulate.intakes import Costs, Intakes
 from mddag_executor.simulate.load import FAILS, RUNS, SKIPPED
-from mddag_executor.simulate.machine import new_machine
 from msg_graph import loads, TaskSet
 import pytest
 
@@ -68,12 +65,11 @@ def times(
     load = Load([jobs[i].release for i in order], order, [0] * n, [job.cost for job in jobs],
                 list(range(n)), [0] * n, holds=[job.interpreter * job.holds for job in jobs],
                 computed=[job.cost if job.cpu is None else job.cpu for job in jobs])
-    state = new_state(tables, workers * (1 + divided), preemptive=preemptive)
-    if divided:
-        divide(state, [workers, workers])
-    log: list[LogEntry] = []
-    run(tables, state, find_policy('rad').key, load, 10 ** 12, False, log,
-        machine=new_machine(tables, state, cpus, python))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine, 'needs_python', lambda load: python)
+        log = schedule(
+            tables, load, Settings('rad', workers, 10 ** 12, preemptive, cpus=cpus,
+                                   processes=1 + divided), log=True, compiled=False).log
     found = [(-1, -1)] * n
     for now, kind, _, dag, _, _ in log:
         if kind == START and found[dag][0] < 0:
