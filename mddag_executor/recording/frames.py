@@ -10,6 +10,7 @@ version of the tables (``mddag.tables``), which changes when the meaning of a co
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,12 +52,8 @@ def arrow_table(recording: Recording, name: str) -> Any:
         metadata = {'unit': 'ns'} if column in _TIMES else None
         array = _names(recording, name, column, values)
         if array is None:
-            values = np.ascontiguousarray(values)
-            unknown = values == UNKNOWN if values.dtype.kind == 'i' else None
-            if column == 'leg':
-                unknown = None
-            array = pyarrow.array(values, mask=unknown if unknown is not None and unknown.any()
-                                  else None)
+            has_unknown = values.dtype.kind == 'i' and column != 'leg'
+            array = numbers(values, values != UNKNOWN if has_unknown else None)
         arrays.append(array)
         fields.append(pyarrow.field(column, array.type, metadata=metadata))
     return pyarrow.table(arrays, schema=pyarrow.schema(
@@ -65,15 +62,14 @@ def arrow_table(recording: Recording, name: str) -> Any:
 
 def _names(recording: Recording, table: str, column: str, values: Any) -> Any:
     """Return the names of a column of numbers; None if its numbers have no names."""
-    import pyarrow
     task_set = recording.task_set
     if column in ('dag', 'vertex'):
         names = [each.name for each in (
             task_set.dags if column == 'dag' else task_set.vertices)]
         codes = values.astype(np.int32)
     elif column in ('callback', 'publisher'):
-        numbers, codes = np.unique(values, return_inverse=True)
-        names = [_name(recording, column, each) for each in numbers.tolist()]
+        addresses, codes = np.unique(values, return_inverse=True)
+        names = [_name(recording, column, each) for each in addresses.tolist()]
     elif column == 'reason':
         names = list(recording.drop_reasons if table == 'drops' else REASONS)
         codes = values.astype(np.int32)
@@ -81,15 +77,38 @@ def _names(recording: Recording, table: str, column: str, values: Any) -> Any:
         names, codes = [_COMPLETES[each] for each in sorted(_COMPLETES)], values
     else:
         return None
-    codes = codes.astype(np.int32)
-    unknown = codes < 0
+    known = codes >= 0
     different = list(dict.fromkeys(names))
     if len(different) < len(names):     # some numbers have the same name
         place = {name: i for i, name in enumerate(different)}
         codes = np.array([place[name] for name in names] or [0], dtype=np.int32)[codes]
+    return named(codes, different, known)
+
+
+def numbers(values: Any, known: Any = None) -> Any:
+    """
+    Return numbers as an Arrow array; from its buffers, because ``pyarrow.array`` imports pandas.
+
+    :param known: which ones have a value; None: all.
+    """
+    import pyarrow
+    plain = np.ascontiguousarray(values)
+    data, mask = (
+        each if each is None or each.dtype != np.bool_ else np.packbits(each, bitorder='little')
+        for each in (plain, None if known is None or known.all() else known))
+    return pyarrow.Array.from_buffers(
+        pyarrow.from_numpy_dtype(plain.dtype), len(plain),
+        [None if mask is None else pyarrow.py_buffer(mask), pyarrow.py_buffer(data)])
+
+
+def named(codes: Any, names: Sequence[str], known: Any = None) -> Any:
+    """Return indices of names as an Arrow array, the names as a dictionary."""
+    import pyarrow
+    texts = [name.encode('utf-8', 'backslashreplace') for name in names]
+    ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
     return pyarrow.DictionaryArray.from_arrays(
-        pyarrow.array(codes, mask=unknown if unknown.any() else None),
-        pyarrow.array(different, pyarrow.string()))
+        numbers(codes.astype(np.int32), known), pyarrow.StringArray.from_buffers(
+            len(texts), pyarrow.py_buffer(ends), pyarrow.py_buffer(b''.join(texts))))
 
 
 def _name(recording: Recording, column: str, number: int) -> str:

@@ -27,6 +27,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.errors import MddagError
+from mddag_executor.recording.frames import named, numbers
 from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by
 from mddag_executor.replay import Replay
 from mddag_executor.replay.usage import ran
@@ -160,21 +161,13 @@ def _harmless(name: str) -> str:
 def arrow_table(columns: Sequence[Column]) -> Any:
     """Return columns as an Arrow table, names as dictionaries."""
     import pyarrow
-    arrays, fields = [], []
-    for column in columns:
-        mask = None if column.known is None else ~column.known
-        if column.names:
-            indices = pyarrow.array(column.values.astype(np.int32), mask=mask)
-            array = pyarrow.DictionaryArray.from_arrays(
-                indices, pyarrow.array(list(column.names), pyarrow.string()))
-        else:
-            values = column.values
-            if values.dtype.kind == 'i':
-                values = values.astype(np.int64)
-            array = pyarrow.array(np.ascontiguousarray(values), mask=mask)
-        arrays.append(array)
-        fields.append(pyarrow.field(column.name, array.type, nullable=column.known is not None))
-    return pyarrow.table(arrays, schema=pyarrow.schema(fields))
+    arrays = [
+        named(column.values, column.names, column.known) if column.names else numbers(
+            column.values.astype(np.int64) if column.values.dtype.kind == 'i' else column.values,
+            column.known) for column in columns]
+    return pyarrow.table(arrays, schema=pyarrow.schema([
+        pyarrow.field(column.name, array.type, nullable=column.known is not None)
+        for column, array in zip(columns, arrays)]))
 
 
 def write_parquet(file: BinaryIO, columns: Sequence[Column]) -> None:

@@ -20,70 +20,68 @@ tracks of one name, because Perfetto requires slices of a track to nest. An exec
 first of them that is free when it starts.
 
 A trace is a sequence of packets in protobuf's encoding; field numbers are those of Perfetto's
-``trace_packet.proto``. Names of events are in the first packet of an event (interned); a flag in
-each packet says that it needs them. Times are the recording's, in nanoseconds.
+``trace_packet.proto``. The first packet has the names of events (interned); a flag in each other
+packet says that it needs them. Times are the recording's, in nanoseconds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, BinaryIO
 
 from mddag_executor.core import legs_of
 from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.recording.tables import NOTHING, sort_by, VERTEX
+from mddag_executor.recording.tables import Ints, NOTHING, pick, sort_by, VERTEX
 from mddag_executor.replay import Replay
 from mddag_executor.report.export import executions
+from mddag_executor.report.protobuf import Bytes, fixed, joined, message, number, texts, where
 from mddag_executor.report.text import format_ns, printable
 import numpy as np
 
 _SEQUENCE = 1
 _CLEARED, _NEEDED = 1, 2        # SEQ_INCREMENTAL_STATE_CLEARED, SEQ_NEEDS_INCREMENTAL_STATE
+_TOP = 'workers', 'callbacks', 'jobs by sink', 'missed deadlines', 'ready callbacks'
 _WORKERS, _CALLBACKS, _JOBS, _MISSED, _READY = range(1, 6)
 _BEGIN, _END, _INSTANT, _COUNTER = range(1, 5)
 _EXPLICIT = 3
-_MASK = 2 ** 64 - 1
 # Fields of messages, by number.
 _PACKET = 1
 _TIMESTAMP, _SEQUENCE_ID, _TRACK_EVENT, _INTERNED, _FLAGS, _TRACK = 8, 10, 11, 12, 13, 60
 _TYPE, _UUID, _NAME_IID, _NAME, _NOTE, _FLOW, _FLOW_ENDS, _VALUE = 9, 11, 10, 23, 4, 47, 48, 30
-_PENDING_BYTES = 1 << 20
-
-
-def varint(value: int) -> bytes:
-    """Return a number in protobuf's encoding."""
-    value &= _MASK
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
-
-
-def number(field: int, value: int) -> bytes:
-    """Return a field with a number."""
-    return varint(field << 3) + varint(value)
-
-
-def text(field: int, value: str) -> bytes:
-    """Return a field with a text."""
-    return message(field, value.encode('utf-8', 'backslashreplace'))
-
-
-def message(field: int, content: bytes) -> bytes:
-    """Return a field with a message."""
-    return varint(field << 3 | 2) + varint(len(content)) + content
-
-
-def _fixed(field: int, value: int) -> bytes:
-    return varint(field << 3 | 1) + (value & _MASK).to_bytes(8, 'little')
+_NOTES = ('DAG', 'job', 'waiting_ns', 'since_release_ns', 'reference_slack_ns', 'deadline_ns',
+          'slack_ns', 'verdict', 'late_by_ns')
+_KINDS = [VERDICTS[kind] for kind in sorted(VERDICTS)]
+_BATCH = 1 << 14
 
 
 def write_perfetto(file: BinaryIO, replay: Replay) -> None:
     """Write a recording as a Perfetto trace."""
     _Writer(file, replay).write()
+
+
+def _batches(columns: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield some rows of columns at a time."""
+    for begin in range(0, len(next(iter(columns.values()))), _BATCH):
+        yield {name: values[begin:begin + _BATCH] for name, values in columns.items()}
+
+
+def _lanes(of: Ints, start: Ints, end: Ints) -> Ints:
+    """Return the lane of each slice, the first one of its track that is free at its start."""
+    ends: dict[int, list[int]] = {}
+    lanes = np.empty(len(of), dtype=np.int64)
+    for i, (track, begin, until) in enumerate(zip(of.tolist(), start.tolist(), end.tolist())):
+        busy = ends.setdefault(track, [])
+        lane = next((lane for lane, each in enumerate(busy) if each <= begin), len(busy))
+        busy[lane:lane + 1] = [until]
+        lanes[i] = lane
+    return lanes
+
+
+def _padded(rows: Sequence[Sequence[int]]) -> Ints:
+    """Return a table; -1 fills short rows, and the last one, which is that of no vertex."""
+    width = max(map(len, rows), default=0)
+    return np.array([[*row, *[-1] * (width - len(row))] for row in (*rows, ())], dtype=np.int64)
 
 
 class _Writer:
@@ -92,134 +90,139 @@ class _Writer:
     def __init__(self, file: BinaryIO, replay: Replay) -> None:
         self._file, self._replay = file, replay
         self._recording, self._task_set = replay.recording, replay.task_set
-        self._pending: list[bytes] = []
-        self._size = 0
-        self._uuid = _READY
-        # by kind and number: end of the last slice and uuid of each of its tracks
-        self._lanes: dict[tuple[Any, ...], list[list[int]]] = {}
+        dags = self._task_set.dags
+        self._dag_names = [printable(dag.name) for dag in dags] or ['']
+        # by vertex the vertices that get its messages; by vertex and leg the one that sent it
+        firsts = replay.judged.tables.first_vertex
+        self._after = _padded([[first + after for after in vertex.successors]
+                               for first, dag in zip(firsts, dags) for vertex in dag.vertices])
+        self._before = _padded([[first + before for _, before in legs_of(vertex, dag.vertices)]
+                                for first, dag in zip(firsts, dags) for vertex in dag.vertices])
+        self._uuid = 0
         self._groups: dict[int, int] = {}
-        self._names: dict[str, int] = {}
-        self._keys: dict[str, int] = {}
-        self._interned = b''
-        head = number(_SEQUENCE_ID, _SEQUENCE)
-        self._head = head + number(_FLAGS, _NEEDED)
-        self._first_head = head + number(_FLAGS, _NEEDED | _CLEARED)
-        self._first = True
-        self._edges()
-
-    def _edges(self) -> None:
-        """Count the edges: by vertex those to its successors, by leg those of its message."""
-        self._out: list[list[int]] = []
-        self._into: list[list[int]] = []
-        count = 0
-        for dag in self._task_set.dags:
-            edges: dict[tuple[int, int], int] = {}
-            for vertex in dag.vertices:
-                for after in vertex.successors:
-                    edges[vertex.index, after] = count
-                    count += 1
-                self._out.append([edges[vertex.index, after] for after in vertex.successors])
-            self._into.extend(
-                [edges[before, vertex.index] for _, before in legs_of(vertex, dag.vertices)]
-                for vertex in dag.vertices)
-        self._n_edges = count
+        self._head = number(_SEQUENCE_ID, _SEQUENCE), number(_FLAGS, _NEEDED)
 
     def write(self) -> None:
-        for uuid, name in ((_WORKERS, 'workers'), (_CALLBACKS, 'callbacks'),
-                           (_JOBS, 'jobs by sink'), (_MISSED, 'missed deadlines')):
-            self._describe(uuid, name, None, uuid)
-        self._describe(_READY, 'ready callbacks', None, _READY, counts=True)
-        self._executions()
+        columns, rows = executions(self._replay)
+        self._columns = {column.name: column for column in columns}
+        self._names = [printable(name) for name in self._columns['vertex'].names]
+        n_declared = len(self._task_set.vertices)
+        interned = [*self._names, *(f'{name} missed' for name in self._names[:n_declared])]
+        self._put(
+            self._head[0], number(_FLAGS, _NEEDED | _CLEARED), message(_INTERNED, *(
+                message(field, number(1, i), texts(2, [name]))
+                for field, names in ((2, interned), (3, _NOTES))
+                for i, name in enumerate(names, 1))))
+        for rank, name in enumerate(_TOP, 1):
+            self._track(name, 0, rank, *[message(8)] * (rank == _READY))    # a counter
+        self._executions(rows)
         self._verdicts()
-        self._flush()
 
     # --- contents --------------------------------------------------------------------------------
 
-    def _executions(self) -> None:
-        columns, rows = executions(self._replay)
-        of = {column.name: column for column in columns}
-        table = self._recording.executions
+    def _executions(self, rows: Ints) -> None:
+        of = self._columns
         order = sort_by(of['start_ns'].values)
-        names = [printable(name) for name in of['vertex'].names]
-        dags = [dag.name for dag in self._task_set.dags]
-        rows = rows[order]
-        released = of['release_ns'].known[order] if of['release_ns'].known is not None else order
-        waiting = np.where(of['first'].values, of['waiting_ns'].values, 0)[order]
-        waits = waiting > 0
-        self._ready(of['ready_ns'].values[order][waits], of['start_ns'].values[order][waits])
-        columns_of = [each.tolist() for each in (
-            of['vertex'].values[order], of['first'].values[order], of['release_ns'].values[order],
-            released, of['slack_ns'].values[order], *(table[name][rows] for name in (
-                'callback', 'dag', 'vertex', 'job', 'leg', 'worker', 'ready', 'start', 'end',
-                'completes')))]
-        for (name, first, release, known, slack, callback, dag, vertex, job, leg, worker, ready,
-             start, end, completes) in zip(*columns_of):
-            track = self._lane(
-                ('worker', worker), f'worker {worker}' if worker >= 0 else 'spare threads',
-                _WORKERS, worker if worker >= 0 else 1 << 20, start, end)
-            parts = [self._name(names[name])]
-            if vertex >= 0:
-                parts += (self._note('DAG', dags[dag]), self._note('job', job))
-            if first:
-                parts.append(self._note('waiting_ns', start - ready))
-            if known:
-                parts += (self._note('since_release_ns', start - release),
-                          self._note('reference_slack_ns', slack))
-            if completes != NOTHING and vertex >= 0:
-                self._flows(parts, vertex, job, leg, completes == VERTEX)
-            self._event(start, _BEGIN, track, *parts)
-            self._event(end, _END, track)
-            key = 'callback', vertex if vertex >= 0 else -1 - callback
-            track = self._lane(
-                key, names[name], self._group(dag if vertex >= 0 else -1), vertex + 1, start, end)
-            self._event(start, _BEGIN, track, self._name(names[name]) if vertex < 0
-                        else text(_NAME, f'job {job}'))
-            self._event(end, _END, track)
+        table = pick(self._recording.executions, rows[order])
+        start, end, declared = table['start'], table['end'], table['vertex'] >= 0
+        name, first, release, slack, waiting = (of[key].values[order] for key in (
+            'vertex', 'first', 'release_ns', 'slack_ns', 'waiting_ns'))
+        known = of['release_ns'].known
+        assert known is not None
+        self._ready(table['ready'][first & (waiting > 0)], start[first & (waiting > 0)])
 
-    def _flows(
-        self, parts: list[bytes], vertex: int, job: int, leg: int, whole: bool
-    ) -> None:
-        """End the flows of received messages, and begin those of sent ones."""
-        base, into = job * self._n_edges + 1, self._into[vertex]
-        legs: Iterable[int] = range(len(into)) if leg < 0 else (leg,)
-        parts += (_fixed(_FLOW_ENDS, base + into[each]) for each in legs if each < len(into))
-        if whole:
-            parts += (_fixed(_FLOW, base + edge) for edge in self._out[vertex])
+        def of_worker(row: int) -> tuple[str, int, int]:
+            worker = int(table['worker'][row])
+            return (f'worker {worker}', _WORKERS, worker) if worker >= 0 else (
+                'spare threads', _WORKERS, 1 << 20)
 
-    def _ready(self, ready: Any, started: Any) -> None:
+        def of_callback(row: int) -> tuple[str, int, int]:
+            dag = int(table['dag'][row]) if declared[row] else -1
+            return self._names[name[row]], self._group(dag), int(table['vertex'][row]) + 1
+
+        columns = {
+            **{key: table[key] for key in (
+                'dag', 'vertex', 'job', 'leg', 'start', 'end', 'completes')},
+            'name': name, 'first': first, 'waiting': waiting, 'slack': slack,
+            'since': start - release, 'known': known[order],
+            'on_worker': self._tracks(table['worker'], start, end, of_worker),
+            'on_callback': self._tracks(
+                np.where(declared, table['vertex'], -1 - table['callback']), start, end,
+                of_callback)}
+        for each in _batches(columns):
+            declared, named = each['vertex'] >= 0, number(_NAME_IID, each['name'] + 1)
+            self._write(
+                self._event(
+                    each['start'], _BEGIN, each['on_worker'], named,
+                    where(declared, *self._of_job(each)),
+                    where(each['first'], self._note('waiting_ns', each['waiting'])),
+                    where(each['known'], self._note('since_release_ns', each['since']),
+                          self._note('reference_slack_ns', each['slack'])),
+                    *self._flows(each)),
+                self._event(each['end'], _END, each['on_worker']),
+                self._event(
+                    each['start'], _BEGIN, each['on_callback'], where(~declared, named),
+                    where(declared, self._job_name(each['job']))),
+                self._event(each['end'], _END, each['on_callback']))
+
+    def _of_job(self, each: dict[str, Any]) -> tuple[Bytes, Bytes]:
+        return (self._word('DAG', self._dag_names, np.maximum(each['dag'], 0)),
+                self._note('job', each['job']))
+
+    def _flows(self, each: dict[str, Any]) -> Iterator[Bytes]:
+        """Yield the ends of the flows of received messages, and begins of those of sent ones."""
+        vertex, leg, n = each['vertex'].astype(np.int64), each['leg'], len(self._after)
+        done, base = (each['completes'] != NOTHING) & (vertex >= 0), each['job'] * n
+        for place, other in enumerate(self._before[vertex].T):
+            taken = done & (other >= 0) & ((leg < 0) | (leg == place))
+            yield where(taken, fixed(_FLOW_ENDS, (base + other) * n + vertex + 1))
+        for other in self._after[vertex].T:
+            sent = done & (other >= 0) & (each['completes'] == VERTEX)
+            yield where(sent, fixed(_FLOW, (base + vertex) * n + other + 1))
+
+    def _ready(self, ready: Ints, started: Ints) -> None:
         """Write the number of ready callbacks over time."""
-        times = np.concatenate([ready, started])
-        step = np.repeat([1, -1], len(ready))
-        when, place = np.unique(times, return_inverse=True)
+        when, place = np.unique(np.concatenate([ready, started]), return_inverse=True)
         change = np.zeros(len(when), dtype=np.int64)
-        np.add.at(change, place, step)
-        for time, count in zip(when.tolist(), np.cumsum(change).tolist()):
-            self._event(time, _COUNTER, _READY, number(_VALUE, count))
+        np.add.at(change, place, np.repeat([1, -1], len(ready)))
+        for each in _batches({'time': when, 'count': np.cumsum(change)}):
+            self._write(self._event(
+                each['time'], _COUNTER, _READY, number(_VALUE, each['count'])))
 
     def _verdicts(self) -> None:
         """Write jobs on the tracks of their sinks, and missed deadlines on their track."""
         verdicts = self._replay.judged.verdicts
         verdicts = verdicts[sort_by(verdicts['release'], verdicts['sink'])]
-        names = [vertex.name for vertex in self._task_set.vertices]
-        for kind, dag, sink, job, release, deadline, completed, *_ in verdicts.tolist():
-            name, verdict = names[sink], VERDICTS[kind]
-            label = f'job {job}' + ('' if kind == SINK_IN_TIME else f' ({verdict})')
-            if completed >= release:
-                track = self._lane(('sink', sink), name, _JOBS, sink, release, completed)
-                self._event(release, _BEGIN, track, text(_NAME, label),
-                            self._note('deadline_ns', deadline),
-                            self._note('slack_ns', deadline - completed))
-                self._event(completed, _END, track)
-            track = self._lane(('deadline', sink), f'{name} deadline', _JOBS, sink, 0, 0)
-            self._event(deadline, _INSTANT, track, text(_NAME, f'job {job}'))
-            if kind == SINK_IN_TIME:
-                continue
-            late = () if completed < 0 else (self._note('late_by_ns', completed - deadline),)
-            self._event(
-                deadline if completed < 0 else completed, _INSTANT, _MISSED,
-                self._name(f'{printable(name)} missed'),
-                self._note('DAG', self._task_set.dags[dag].name), self._note('job', job),
-                self._note('verdict', verdict), self._note('deadline_ns', deadline), *late)
+        sink, release, completed = (verdicts[key] for key in ('sink', 'release', 'completed'))
+        done = completed >= release
+
+        def of_sink(row: int) -> tuple[str, int, int]:
+            return self._names[sink[done][row]], _JOBS, int(sink[done][row])
+
+        tracks = np.zeros(len(sink), dtype=np.int64)
+        tracks[done] = self._tracks(sink[done], release[done], completed[done], of_sink)
+        deadlines = self._tracks(
+            sink, np.zeros_like(sink), np.zeros_like(sink),
+            lambda row: (f'{self._names[sink[row]]} deadline', _JOBS, int(sink[row])))
+        for each in _batches({
+                **{key: verdicts[key] for key in (
+                    'kind', 'dag', 'sink', 'job', 'release', 'deadline', 'completed')},
+                'done': done, 'track': tracks, 'deadlines': deadlines}):
+            deadline, completed = each['deadline'], each['completed']
+            never = completed < 0
+            note = self._note('deadline_ns', deadline)
+            self._write(
+                where(each['done'], self._event(
+                    each['release'], _BEGIN, each['track'],
+                    self._job_name(each['job'], each['kind']), note,
+                    self._note('slack_ns', deadline - completed)),
+                    self._event(completed, _END, each['track'])),
+                self._event(deadline, _INSTANT, each['deadlines'], self._job_name(each['job'])),
+                where(each['kind'] != SINK_IN_TIME, self._event(
+                    np.where(never, deadline, completed), _INSTANT, _MISSED,
+                    number(_NAME_IID, each['sink'] + len(self._names) + 1),
+                    *self._of_job(each), self._word('verdict', _KINDS, each['kind']), note,
+                    where(~never, self._note('late_by_ns', completed - deadline)))))
 
     # --- tracks ----------------------------------------------------------------------------------
 
@@ -230,71 +233,57 @@ class _Writer:
             if dag >= 0:
                 one = self._task_set.dags[dag]
                 name = f'{one.name}, every {format_ns(one.period_ns)}'
-            self._groups[dag] = self._new(name, _CALLBACKS, dag + 1)
+            self._groups[dag] = self._track(name, _CALLBACKS, dag + 1)
         return self._groups[dag]
 
-    def _lane(
-        self, key: tuple[Any, ...], name: str, parent: int, rank: int, start: int, end: int
-    ) -> int:
-        """Reserve a track of a name that is free at ``start``; return it."""
-        lanes = self._lanes.setdefault(key, [])
-        for lane in lanes:
-            if lane[0] <= start:
-                lane[0] = end
-                return lane[1]
-        lanes.append([end, self._new(name, parent, rank)])
-        return lanes[-1][1]
+    def _tracks(
+        self, keys: Ints, start: Ints, end: Ints, of: Callable[[int], tuple[str, int, int]]
+    ) -> Ints:
+        """
+        Return the track of each slice; slices that overlap get different ones of the same name.
 
-    def _new(self, name: str, parent: int, rank: int) -> int:
+        :param keys: which slices belong together.
+        :param of: returns name, parent and rank of the track of a row.
+        """
+        key = np.unique(keys, return_inverse=True)[1]
+        lanes = _lanes(key, start, end)
+        _, first, place = np.unique(
+            key * (lanes.max(initial=0) + 1) + lanes, return_index=True, return_inverse=True)
+        tracks = np.array([self._track(*of(row)) for row in first.tolist()], dtype=np.int64)
+        return tracks[place]
+
+    def _track(self, name: str, parent: int, rank: int, *more: Bytes) -> int:
+        """Describe a new track; without a parent it is at the top."""
         self._uuid += 1
-        self._describe(self._uuid, name, parent, rank)
+        above = [number(5, parent)] if parent else []
+        self._put(self._head[0], message(
+            _TRACK, number(1, self._uuid), texts(2, [printable(name)]), *above, *more,
+            number(11, _EXPLICIT), number(12, rank)))
         return self._uuid
-
-    def _describe(
-        self, uuid: int, name: str, parent: int | None, rank: int, counts: bool = False
-    ) -> None:
-        track = number(1, uuid) + text(2, printable(name))
-        if parent is not None:
-            track += number(5, parent)
-        if counts:
-            track += message(8, b'')
-        track += number(11, _EXPLICIT) + number(12, rank)
-        self._put(number(_SEQUENCE_ID, _SEQUENCE) + message(_TRACK, track))
 
     # --- events ----------------------------------------------------------------------------------
 
-    def _name(self, name: str) -> bytes:
-        iid = self._names.get(name)
-        if iid is None:
-            iid = self._names[name] = len(self._names) + 1
-            self._interned += message(2, number(1, iid) + text(2, name))
-        return number(_NAME_IID, iid)
+    def _job_name(self, job: Ints, kind: Any = SINK_IN_TIME) -> Bytes:
+        """Return the names of slices: the jobs, and how they ended if not in time."""
+        different, which = np.unique(job * len(_KINDS) + kind, return_inverse=True)
+        names = [f'job {each // len(_KINDS)} ({_KINDS[each % len(_KINDS)]})'.removesuffix(
+            f' ({_KINDS[SINK_IN_TIME]})') for each in different.tolist()]
+        return texts(_NAME, names, which)
 
-    def _note(self, key: str, value: int | str) -> bytes:
-        iid = self._keys.get(key)
-        if iid is None:
-            iid = self._keys[key] = len(self._keys) + 1
-            self._interned += message(3, number(1, iid) + text(2, key))
-        return message(_NOTE, number(1, iid) + (
-            number(4, value) if isinstance(value, int) else text(6, printable(value))))
+    def _note(self, key: str, values: Any) -> Bytes:
+        return message(_NOTE, number(1, _NOTES.index(key) + 1), number(4, values))
 
-    def _event(self, time: int, kind: int, track: int, *parts: bytes) -> None:
-        event = number(_TYPE, kind) + number(_UUID, track) + b''.join(parts)
-        packet = number(_TIMESTAMP, max(0, time)) + (
-            self._first_head if self._first else self._head) + message(_TRACK_EVENT, event)
-        self._first = False
-        if self._interned:
-            packet += message(_INTERNED, self._interned)
-            self._interned = b''
-        self._put(packet)
+    def _word(self, key: str, words: Sequence[str], which: Ints) -> Bytes:
+        return message(_NOTE, number(1, _NOTES.index(key) + 1),
+                       texts(6, words, which))
 
-    def _put(self, packet: bytes) -> None:
-        self._pending.append(message(_PACKET, packet))
-        self._size += len(packet)
-        if self._size > _PENDING_BYTES:
-            self._flush()
+    def _event(self, time: Ints, kind: int, track: Any, *parts: Bytes) -> Bytes:
+        return message(
+            _PACKET, number(_TIMESTAMP, np.maximum(0, time)), *self._head,
+            message(_TRACK_EVENT, number(_TYPE, kind), number(_UUID, track), *parts))
 
-    def _flush(self) -> None:
-        self._file.write(b''.join(self._pending))
-        self._pending.clear()
-        self._size = 0
+    def _put(self, *parts: Bytes) -> None:
+        self._write(message(_PACKET, *parts))
+
+    def _write(self, *packets: Bytes) -> None:
+        self._file.write(joined(packets).packed())
