@@ -31,10 +31,9 @@ _LONGEST_NS = 60_000_000_000
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     arguments.add_graph(parser)
-    options.add(parser, '--workers', '--duration', '--json')
+    options.add(parser, '--workers', '--duration', '--seed', '--json')
     parser.add_argument(
         '--policies', default=','.join(POLICIES), metavar='P,P…', help='(default: all)')
-    options.add_seed(parser, 'seed of the drawn execution times')
     arguments.add_repeat(parser, 5)
 
 

@@ -94,10 +94,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='threads of this executor and of MultiThreadedExecutor (default: %(default)s)')
     add('--seconds', type=options.positive_float, default=10.0, metavar='S',
         help='how long each measurement is, after a warm-up of 1 s (default: 10)')
-    options.add_seed(
-        parser, 'seed of the drawn execution times and phases, the same for all executors; with '
-        'the default every deadline of the Autoware workload can be kept', int,
-        default=arguments.LIVE_SEED)
+    add('--seed', type=options.seed, default=arguments.LIVE_SEED, metavar='N',
+        help='seed of the drawn execution times and phases, the same for all executors; with the '
+        'default (%(default)s) every deadline of the Autoware workload can be kept')
     arguments.add_repeat(parser, 1, 'measure everything R times in turn, and take the medians')
     arguments.add_graph(parser)
     options.add(parser, '--json')
@@ -278,7 +277,7 @@ def notes(results: Sequence[dict[str, Any]]) -> Iterator[str]:
     if first['load'] == ROBOT:
         yield "in time: by the nodes' own stamps, of what was due; cores: CPU of the whole process"
     elif first['load'] in DECLARED:
-        yield ('in time: of the sink jobs that were due, noticed by the executor or not; CPU: of '
+        yield ('in time: of the results that were due, noticed by the executor or not; CPU: of '
                'the whole process')
     else:
         yield ('lost: published and never run, warm-up included; CPU: of the whole process, '

@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='random sets instead of a declaration')
     add('--workers', type=options.positive_int, default=7, metavar='W', help='(default: 7)')
     add('--plot', metavar='OUT.svg', help='draw a figure')
-    options.add_seed(parser, 'seed of the sets and execution times')
+    options.add(parser, '--seed', help='seed of the sets and execution times')
 
 
 def main(args: argparse.Namespace) -> int:

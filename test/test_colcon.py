@@ -113,7 +113,7 @@ def test_ros2_launch_ends_with_the_verdict(
         workspace, f'ros2 launch {NAME} run.launch.py graph:=graph.yaml synthetic:=sleep '
         'duration:=500ms trace:=out.mcap fail_on_miss:=true', tmp_path)
     said = done.stdout + done.stderr
-    assert done.returncode == status and 'sink jobs due' in said, said
+    assert done.returncode == status and 'results due' in said, said
     assert ('process has finished cleanly' in said) == (status == 0)
     assert ('mddag run ended with status 1' in said) == (status == 1)
     replayed = in_workspace(workspace, 'ros2 mddag replay out.mcap --fail-on-miss', tmp_path)
@@ -155,7 +155,7 @@ def test_a_signal_ends_ros2_launch_and_the_run(
         said = process.stdout.read()    # to its end: the run has it, too
     wait_until(lambda: not Path(f'/proc/{pid}').exists())
     if number == signal.SIGINT:
-        assert 'sink jobs due' in said and 'process has finished cleanly' in said
+        assert 'results due' in said and 'process has finished cleanly' in said
     assert 'Traceback' not in said.replace('see debug for traceback', '')
     replayed = in_workspace(workspace, 'ros2 mddag replay out.mcap', tmp_path)
     assert (replayed.returncode, replayed.stderr) == (0, ''), replayed.stdout

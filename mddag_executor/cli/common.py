@@ -355,11 +355,18 @@ def write_result(args: argparse.Namespace, result: Any) -> bool:
     return wants_tables(args)
 
 
-def show(args: argparse.Namespace, result: Any, lines: Iterable[str]) -> None:
-    """Write a result where `--json` says, and print its lines for people if those are wanted."""
-    if write_result(args, result):
+def show(
+    args: argparse.Namespace, result: Any, lines: Iterable[str], aside: bool = False
+) -> None:
+    """
+    Write a result where `--json` says, and print its lines for people if those are wanted.
+
+    :param aside: print them on standard error if the output of `--output` is on standard output.
+    """
+    aside = aside and args.output == '-' and not is_quiet()
+    if write_result(args, result) or aside:
         for line in lines:
-            print(line)
+            print(line, file=sys.stderr if aside else sys.stdout)
 
 
 def wants_tables(args: argparse.Namespace) -> bool:

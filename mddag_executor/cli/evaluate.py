@@ -52,7 +52,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'adding their counts (default: 0)')
     add('--policies', default=','.join(defaults.POLICIES), metavar='P,P…',
         help=f'any of {", ".join(POLICIES)} (default: %(default)s)')
-    options.add_seed(parser, 'seed of the drawn execution times')
     add('--samples', metavar='FILE.npz', type=options.Input,
         help="measured execution times, an array of ns for each 'node:callback' (default: the "
         'quantile tables of the declaration)')
@@ -66,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scheduler, as tcp://host:8786 (extra 'dask')")
     add('--plot', metavar='OUT', type=options.NamedFile,
         help="draw the paper's figure (.png, .svg or .pdf)")
-    options.add(parser, '--workers', '--duration', '--overhead', '--jobs', '--json')
+    options.add(parser, '--workers', '--seed', '--duration', '--overhead', '--jobs', '--json')
 
 
 def main(args: argparse.Namespace) -> int:

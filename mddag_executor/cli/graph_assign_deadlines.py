@@ -6,12 +6,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-import sys
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import Cell, format_ns, is_quiet, one_line, Progress, table
+from mddag_executor.cli.text import Cell, format_ns, one_line, Progress, table
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
@@ -38,11 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='search the tightest deadlines with at least this acceptance ratio')
     add('--budget', choices=defaults.BUDGETS, default='p99',
         help='which value of each execution time makes the critical path (default: %(default)s)')
-    options.add_policy(parser, 'to simulate, ')
+    options.add(parser, '--policy', only='to simulate, ')
     options.add(parser, '--preemptive', otherwise="as in the paper's experiment")
     add('--runs', type=options.positive_int, default=1000, metavar='N',
         help='runs that measure the acceptance (default: %(default)s)')
-    options.add_seed(parser, 'seed of the drawn execution times')
+    options.add(parser, '--seed')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -58,10 +57,7 @@ def main(args: argparse.Namespace) -> int:
     if found is not None:
         result |= {'scale': found.scale, 'target': args.target, 'tried': [
             {'scale': scale, **each.result()} for scale, each in found.tried]}
-    common.write_result(args, result)
-    if args.json != '-' and not is_quiet():
-        for line in _lines(args, task_set, deadlines, measured, found):
-            print(line, file=sys.stderr if args.output == '-' else sys.stdout)
+    common.show(args, result, _lines(args, task_set, deadlines, measured, found), aside=True)
     return 0
 
 
@@ -90,8 +86,10 @@ def _lines(
     args: argparse.Namespace, task_set: TaskSet, deadlines: dict[str, int], measured: Measured,
     found: Found | None,
 ) -> Iterator[str]:
+    from mddag_executor.report.tables import short_names
+    short = short_names(vertex.name for vertex in task_set.vertices if vertex.deadline_ns)
     rows: list[list[Cell]] = [
-        [dag.name if i == 0 else '', dag.vertices[sink].name, format_ns(dag.period_ns),
+        [dag.name if i == 0 else '', short[dag.vertices[sink].name], format_ns(dag.period_ns),
          format_ns(deadlines[dag.vertices[sink].callback.key])]
         for dag in task_set.dags for i, sink in enumerate(dag.sinks)]
     yield table(['DAG', 'sink', 'period', 'deadline'], rows)

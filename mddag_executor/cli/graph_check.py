@@ -132,6 +132,8 @@ def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
 
 def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
     """Yield a row for each sink; the first one of a DAG has the figures of the whole DAG."""
+    from mddag_executor.report.tables import short_names
+    short = short_names(sink for dag in result['dags'].values() for sink in dag['sinks'])
     for name, dag in result['dags'].items():
         path, load = dag['critical_path_ns'], dag['load']
         row: list[Cell] = [
@@ -139,7 +141,7 @@ def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
             None if path is None else format_ns(path),
             None if load is None else f'{load:.4f}']
         for sink, deadline in dag['sinks'].items():
-            yield [*row, sink, format_ns(deadline)]
+            yield [*row, short[sink], format_ns(deadline)]
             row = [''] * len(row)
 
 

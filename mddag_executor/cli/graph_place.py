@@ -6,12 +6,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-import sys
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import Cell, is_quiet, one_line, Progress, table
+from mddag_executor.cli.text import Cell, one_line, Progress, table
 from mddag_executor.errors import UsageError
 from mddag_executor.text import counted
 
@@ -40,12 +39,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the declaration to write ('-': to standard output)")
     options.add(parser, '--cpus', otherwise='those of this machine')
     options.add(parser, '--workers', only='in each process, ')
-    options.add_policy(parser)
+    options.add(parser, '--policy')
     add('--trace', metavar='TRACE', type=options.Input, action='append', default=[],
         help='use the execution times of a recorded run, and which callbacks compute in Python '
         'there (default: as declared); repeat it for the traces of several processes')
-    options.add(parser, '--execution-times', '--utilisation', only='without --trace: ')
-    options.add_seed(parser, 'seed of the drawn execution times', int)
+    options.add(parser, '--execution-times', '--utilisation', '--seed', only='without --trace: ')
     for option, which in (('--together', 'that'), ('--apart', 'of which no two')):
         add(option, metavar='NODE,NODE…', action='append', default=[], type=_nodes,
             help=f'nodes {which} run in one process; repeat it for more groups')
@@ -89,11 +87,7 @@ def main(args: argparse.Namespace) -> int:
                for name, where in (('predicted', processes),
                                    ('one_process', (Process('all', tuple(placing.nodes)),)))}}
     common.write_text(args.output, with_processes(task_set, processes).text)
-    common.write_result(args, result)
-    if args.json != '-' and not is_quiet():
-        stream = sys.stderr if args.output == '-' else sys.stdout
-        for text in _lines(result):
-            print(text, file=stream)
+    common.show(args, result, _lines(result), aside=True)
     return 0
 
 

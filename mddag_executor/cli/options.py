@@ -18,6 +18,8 @@ from mddag_executor import defaults
 from mddag_executor.errors import UsageError
 
 T = TypeVar('T')
+Arguments = argparse._ActionsContainer
+"""A parser, or a group of its options."""
 _MOST_OFFSET = 10 ** 18
 
 
@@ -144,7 +146,7 @@ class Export(Output):
 
 # --- options that several verbs have -------------------------------------------------------------
 
-_SHARED: dict[str, dict[str, Any]] = {
+_SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
     'graph': {
         'metavar': 'GRAPH', 'type': Input,
         'help': "the declaration, a YAML file ('-': standard input)"},
@@ -173,8 +175,14 @@ _SHARED: dict[str, dict[str, Any]] = {
         'help': 'JSON {"DAG": {"/node:callback": microseconds}} with fixed execution times, '
         "'-' for standard input", 'otherwise': 'drawn from the declared ones'},
     '--seed': {
-        'type': int, 'metavar': 'N', 'help': 'seed of the drawn execution times',
+        'type': seed, 'default': 0, 'metavar': 'N', 'help': 'seed of the drawn execution times',
         'otherwise': '0'},
+    '--policy': lambda: _policy(),
+    '--on-late': lambda: _on_late(),
+    '--fail-on-miss': {
+        'action': 'store_true',
+        'help': 'exit with status 1 if more deadlines were missed than are tolerated '
+        '(`tolerate:` in the declaration), or no job was due'},
     '--duration': {
         'type': duration, 'default': defaults.DURATION_NS, 'metavar': 'TIME',
         'help': 'virtual time of each run',
@@ -212,17 +220,34 @@ _SHARED: dict[str, dict[str, Any]] = {
 }
 
 
+def _policy() -> dict[str, Any]:
+    from mddag_executor.core import POLICIES, policy
+    return {
+        'type': lambda text: policy(text).name, 'default': 'rad', 'metavar': 'P',
+        'help': f'one of {", ".join(POLICIES)}', 'otherwise': 'rad'}
+
+
+def _on_late() -> dict[str, Any]:
+    from mddag_executor.core.tables import ON_LATE
+    return {
+        'choices': (*ON_LATE,), 'default': 'continue', 'otherwise': '%(default)s',
+        'help': 'what is done with a job that can no longer be in time, if the declaration does '
+        'not say it'}
+
+
 def add(
-    parser: argparse.ArgumentParser, *names: str, only: str = '', otherwise: str | None = None
+    parser: Arguments, *names: str, only: str = '', otherwise: str | None = None, **changes: Any
 ) -> None:
     """
     Declare some of the arguments that have the same meaning in all verbs.
 
     :param only: what the help begins with, if an option belongs to another one.
     :param otherwise: the default in words; the value of the option is None then.
+    :param changes: other arguments of ``add_argument`` than usual.
     """
     for name in names:
-        kept = dict(_SHARED[name])
+        shared = _SHARED[name]
+        kept = {**(shared() if callable(shared) else shared), **changes}
         default = kept.pop('otherwise', None)
         if otherwise is not None:
             default, kept['default'] = otherwise, None
@@ -244,35 +269,3 @@ def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
         help="the declaration to judge by, a YAML file ('-': standard input; default: the one "
         'that the trace was recorded with)')
     add(parser, '--offset')
-
-
-def add_policy(
-    parser: argparse.ArgumentParser, prefix: str = '', default: str = 'rad',
-) -> None:
-    """Declare `--policy`; a default that is no policy is only shown, and its value is None."""
-    from mddag_executor.core import POLICIES, policy
-    parser.add_argument(
-        '--policy', metavar='P', type=lambda text: policy(text).name,
-        default=default if default in POLICIES else None,
-        help=f'{prefix}one of {", ".join(POLICIES)} (default: {default})')
-
-
-def add_on_late(parser: argparse.ArgumentParser, default: str, prefix: str = '') -> None:
-    """Declare `--on-late`; a default that is no such word is only shown."""
-    from mddag_executor.core.tables import ON_LATE
-    parser.add_argument(
-        '--on-late', choices=(*ON_LATE,), default=default if default in ON_LATE else None,
-        help=f'{prefix}what is done with a job that can no longer be in time, where the '
-        f'declaration does not say it (default: {default})')
-
-
-def add_seed(
-    parser: argparse.ArgumentParser, what: str, kind: Callable[[str], int] = seed, default: int = 0
-) -> None:
-    """
-    Declare `--seed`.
-
-    :param what: is drawn with it; the help begins with it.
-    """
-    parser.add_argument('--seed', type=kind, default=default, metavar='N',
-                        help=f'{what} (default: %(default)s)')

@@ -24,9 +24,8 @@ if TYPE_CHECKING:
     from mddag_executor.replay.run import Given
     from msg_graph import Process, TaskSet
 
-_WITH = 'with --reschedule: '
 _ONLY_RESCHEDULED = (
-    'workers', 'cpus', 'processes', 'policy', 'preemptive', 'overheads',
+    'workers', 'cpus', 'processes', 'policy', 'on_late', 'preemptive', 'overheads',
     'execution_times', 'seed')
 _RECORDED = -1
 """Overheads as they were recorded."""
@@ -34,23 +33,23 @@ _RECORDED = -1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare `--reschedule` and what belongs to it."""
-    add = parser.add_argument
-    add('--reschedule', action='store_true',
+    parser.add_argument(
+        '--reschedule', action='store_true',
         help='run the scheduler over the recorded releases and execution times')
-    options.add(parser, '--workers', only=f'{_WITH}in each process, ', otherwise='as recorded')
-    options.add(parser, '--cpus', only=_WITH, otherwise='as recorded, else enough for all')
+    group = parser.add_argument_group('with --reschedule')
+    add = group.add_argument
+    options.add(group, '--workers', only='in each process, ', otherwise='as recorded')
+    options.add(group, '--cpus', otherwise='as recorded, else enough for all')
     add('--processes', metavar='N|FILE', type=options.Input,
-        help=f'{_WITH}run the nodes in N processes, packed by the recorded times, or in those of '
+        help='run the nodes in N processes, packed by the recorded times, or in those of '
         'a YAML file with `processes:` (default: as recorded)')
-    options.add_policy(parser, _WITH, 'as recorded')
-    options.add_on_late(parser, 'continue', _WITH)
-    options.add(
-        parser, '--preemptive', only=_WITH, otherwise='as recorded, if the policy can')
+    options.add(group, '--policy', otherwise='as recorded')
+    options.add(group, '--on-late', otherwise='continue')
+    options.add(group, '--preemptive', otherwise='as recorded, if the policy can')
     add('--overheads', type=_overheads, metavar='WHICH',
-        help=f'{_WITH}the time that noticing, dispatch and transport take: recorded (default), '
+        help='the time that noticing, dispatch and transport take: recorded (default), '
         'none, or a time for each dispatch (50us); of a bag: none (default) or a time')
-    options.add(parser, '--execution-times', '--seed',
-                only='with --reschedule of an ordinary bag: ')
+    options.add(group, '--execution-times', '--seed', only='of an ordinary bag: ', default=None)
 
 
 def _overheads(text: str) -> int:
@@ -162,7 +161,7 @@ def _rescheduled(
     with Progress('replaying') as line:
         return reschedule(
             path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
-            on_late=args.on_late,
+            on_late=args.on_late or 'continue',
             overheads=recorded, dispatch_overhead=0 if recorded else args.overheads, name=name,
             progress=line.events, skip=args.skip, cpus=args.cpus, processes=_processes(args))
 
@@ -187,7 +186,7 @@ def _rescheduled_bag(
     with Progress('replaying'):
         return reschedule_bag(
             path, task_set, policy=args.policy, workers=args.workers,
-            preemptive=bool(args.preemptive), on_late=args.on_late, times=times,
+            preemptive=bool(args.preemptive), on_late=args.on_late or 'continue', times=times,
             seed=args.seed or 0,
             dispatch_overhead=args.overheads or 0, name=name, skip=args.skip, cpus=args.cpus)
 

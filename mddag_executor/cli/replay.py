@@ -36,7 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'ordinary bag, a folder or a file')
     recorded.add_arguments(parser)
     add('--callbacks', action='store_true', help='show a table of all callbacks, too')
-    verdicts.add_arguments(parser)
+    options.add(parser, '--fail-on-miss')
+    add('--github', action='store_true',
+        help='print an annotation for GitHub Actions for each sink that missed more than that')
+    add('--junit', metavar='OUT.xml', type=options.Output,
+        help="write JUnit XML, a test case for each sink ('-': to standard output)")
     options.add(parser, '--from', '--to', '--skip', '--report', '--json')
 
 

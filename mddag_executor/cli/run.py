@@ -77,35 +77,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='make the nodes from the declaration; for the declared execution times their '
         'callbacks sleep, compute in Python, compute without the interpreter lock, or, drawn for '
         'each callback, do one of the three')
-    options.add(parser, '--utilisation', only='with --synthetic: ')
-    options.add_seed(parser, 'with --synthetic: seed of the drawn execution times', int)
+    options.add(parser, '--utilisation', '--seed', only='with --synthetic: ')
     add('--duration', type=options.duration, metavar='TIME',
         help='end after this time, for instance 20s, with --synthetic after a warm-up of 1 s '
         '(default: run until Ctrl-C)')
-    options.add_policy(parser)
-    options.add_on_late(parser, 'demote')
+    options.add(parser, '--policy', '--workers', '--fail-on-miss')
+    options.add(parser, '--on-late', default='demote')
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
         help="how often to publish the executor's state on /diagnostics, for mddag top and other "
         "tools; 'off': never (default: 1s)")
     add('--trace', metavar='OUT.mcap', type=options.TraceOfRun,
         help='record the run to this file; of several processes each to OUT.NAME.mcap, or to '
         'NAME.mcap in OUT if that is a directory')
-    add('--processes', metavar='N|FILE', type=options.Input,
+    several = parser.add_argument_group('several processes').add_argument
+    several('--processes', metavar='N|FILE', type=options.Input,
         help='run the nodes in N processes, or in those of a YAML file with `processes:` '
         "(default: those of the declaration); '1': in this process")
-    add('--process', metavar='NAME',
+    several('--process', metavar='NAME',
         help='run only the nodes of this declared process, for a launch file that starts each '
         'process; give the --node options of these nodes only')
-    add('--on-exit', choices=('end', 'continue'), default='end',
+    several('--on-exit', choices=('end', 'continue'), default='end',
         help='if one of several processes ends by itself: end the run, or continue without it '
         '(default: end)')
-    verdicts.add_fail_on_miss(parser)
     add('--part', help=argparse.SUPPRESS)  # the folder of a run of several processes
     parser.add_argument(
         'graph', metavar='GRAPH', nargs='?', type=options.Input,
         help="the declaration, a YAML file ('-': standard input); with --node it may be left out: "
         'then nothing is judged, and a trace shows what there is to declare')
-    options.add(parser, '--workers', '--json', '--overwrite', '--ros-args')
+    options.add(parser, '--json', '--overwrite', '--ros-args')
 
 
 def _or_off(text: str) -> int:

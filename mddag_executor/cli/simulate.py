@@ -29,19 +29,16 @@ mddag simulate graph.yaml --execution-times times.json --json - --fail-on-miss""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    options.add_policy(parser)
-    options.add_on_late(parser, 'continue')
-    options.add_seed(parser, 'seed of the drawn execution times', int)
     add('--judge', choices=('horizon', 'completions'), default='horizon',
         help='a job that is overdue at the end is late (horizon, the default), or only completed '
         'jobs are judged (completions, as in the paper)')
     add('--stop-at-first-miss', action='store_true',
         help='end the run with the first missed deadline')
     add('--trace', metavar='OUT.mcap', type=options.Trace, help='record the run to this file')
-    verdicts.add_fail_on_miss(parser)
     options.add(
-        parser, 'graph', '--workers', '--cpus', '--preemptive', '--execution-times',
-        '--duration', '--utilisation', '--report', '--json', '--overwrite')
+        parser, 'graph', '--policy', '--on-late', '--workers', '--cpus', '--preemptive',
+        '--duration', '--execution-times', '--seed', '--utilisation', '--fail-on-miss',
+        '--report', '--json', '--overwrite')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -97,23 +94,11 @@ def execution_times(
 
 def _lines(result: dict[str, Any]) -> Iterator[str]:
     """Yield the table of a run, and the lines below it."""
-    from mddag_executor.report.tables import never_due_lines, sink_table, verdicts_line
+    from mddag_executor.report.tables import run_lines, sink_table
     yield sink_table(result['dags'])
     jobs = sum(dag['jobs'] for dag in result['dags'].values())
-    yield (f'{result["policy"]}, {counted(result["workers"], "worker")}, '
-           f'{"preemptive" if result["preemptive"] else "not preemptive"}, '
-           f'{format_ns(result["duration_ns"])}, utilisation {result["utilisation"]:.3f}')
-    yield f'{counted(jobs, "job")}, {verdicts_line(result["dags"])}'
-    yield from never_due_lines(result['dags'])
+    yield from run_lines(result, f', {counted(jobs, "job")}')
     if result['ended_ns'] < result['duration_ns']:
         yield f'stopped at the first miss, at {format_ns(result["ended_ns"], 9)}'
-    miss = result['first_miss']
-    if miss is not None:
-        completed = miss['completed_ns']
-        what = 'never completed' if completed is None else (
-            f'completed {format_ns(completed - miss["deadline_ns"])} late')
-        deadline = format_ns(miss['deadline_ns'], 9)
-        yield (f'first miss: {printable(miss["vertex"])} of job {miss["job"]} of '
-               f'{printable(miss["dag"])}, deadline at {deadline}, {what}')
     if result['trace'] is not None:
         yield f'trace: {printable(result["trace"])}'

@@ -41,11 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(parser, '--workers', only='in each process, ',
                 otherwise="as recorded, or the declaration's")
     options.add(parser, '--cpus', otherwise='as recorded, or enough for all')
-    options.add_policy(parser, default='as recorded, or rad')
+    options.add(parser, '--policy', otherwise='as recorded, or rad')
     options.add(parser, '--preemptive', otherwise='as recorded')
-    options.add(parser, '--duration', '--execution-times', '--seed', '--utilisation',
-                only='with GRAPH: ')
-    parser.set_defaults(duration=None)
+    options.add(parser.add_argument_group('with GRAPH'), *(
+        f'--{name.replace("_", "-")}' for name in _ONLY_GRAPH), default=None)
     add('--jobs', type=options.positive_int, metavar='N',
         help='how many processes search (default: one for each processor)')
     add('--fail-under', type=options.positive_float, metavar='FACTOR',

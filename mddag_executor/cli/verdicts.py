@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 import sys
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import common, options
+from mddag_executor.cli import common
 from mddag_executor.cli.text import one_line, printable
 from mddag_executor.core.tally import total
 from mddag_executor.core.tolerances import not_tolerated, NOTHING_DUE
@@ -19,24 +19,6 @@ if TYPE_CHECKING:
 
 _NEVER_DUE = ('give a declaration whose nodes, topics and namespaces are those that ran, and a '
               'run that is longer than its deadlines')
-
-
-def add_fail_on_miss(parser: argparse.ArgumentParser) -> None:
-    """Declare `--fail-on-miss`."""
-    parser.add_argument(
-        '--fail-on-miss', action='store_true',
-        help='exit with status 1 if more deadlines were missed than are tolerated (`tolerate:` in '
-        'the declaration), or no job was due')
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare `--fail-on-miss` and what goes with it."""
-    add = parser.add_argument
-    add_fail_on_miss(parser)
-    add('--github', action='store_true',
-        help='print an annotation for GitHub Actions for each sink that missed more than that')
-    add('--junit', metavar='OUT.xml', type=options.Output,
-        help="write JUnit XML, a test case for each sink ('-': to standard output)")
 
 
 def judge(args: argparse.Namespace, tally: MissTally, result: dict[str, Any]) -> int:

@@ -10,10 +10,10 @@ from typing import Any
 from mddag_executor.core.tally import counts
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.tables import (
-    never_due_lines,
     percent,
+    ratio,
+    run_lines,
     short_names,
-    verdicts_line,
     worst_first,
 )
 from mddag_executor.report.text import Cell, format_ns, printable, table
@@ -145,25 +145,11 @@ def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> st
 
 def summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines below the tables of a replay."""
-    yield verdicts_line(result['dags'])
-    yield from never_due_lines(result['dags'])
     if result['skip_ns']:
         yield f'left out: jobs released in the first {format_ns(result["skip_ns"])}'
-    pool = f'policy {printable(result["policy"])}, ' + counted(result['workers'], 'worker')
-    if 'recorded_callbacks' in result:      # recorded by another executor
-        pool = f'imported: {counted(result["workers"], "thread")} ran callbacks'
-    if result.get('processes'):
-        pool += f' in {counted(len(result["processes"]), "process", "processes")}'
-    yield (pool + (', preemptive' if result['preemptive'] else '')
-           + f', {format_ns(result["duration_ns"])}, utilisation {_share(result["utilisation"])}'
-           + _use(result))
-    miss = result['first_miss']
-    if miss is not None:
-        late = 'never completed' if miss['completed_ns'] is None else \
-            f'{format_ns(miss["completed_ns"] - miss["deadline_ns"])} late'
-        yield f'first miss: {printable(miss["vertex"])}, job {miss["job"]}, {late}'
-        if result.get('misses') is not None:
-            yield from causes_line(result['misses'])
+    yield from run_lines(result, _use(result))
+    if result.get('misses') is not None:
+        yield from causes_line(result['misses'])
     if result['rescheduled']:
         if result['estimated_executions']:
             yield (f'{result["estimated_executions"]} of {result["executions"]} executions did '
@@ -184,8 +170,4 @@ def _use(result: Mapping[str, Any]) -> str:
     use = result['worker_use']['use']
     if result['rescheduled']:
         return '' if use is None else f', workers busy {100 * use:.1f} %'
-    return f' (all callbacks: {_share(use)})'
-
-
-def _share(value: float | None) -> str:
-    return '-' if value is None else f'{value:.3f}'
+    return f' (all callbacks: {ratio(use)})'

@@ -148,7 +148,7 @@ def verdicts_line(dags: Mapping[str, Any]) -> str:
 
 def verdicts_text(every: Counts) -> str:
     """Return verdicts as a text."""
-    return (f'{counted(every.due, "sink job")} due, {every.in_time} in time '
+    return (f'{counted(every.due, "result")} due, {every.in_time} in time '
             f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
             + ''.join(f', {getattr(every, name)} {name}' for name in rare_ends(every)))
 
@@ -158,6 +158,34 @@ def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:
     never = never_due(dags)
     if never:
         yield f'never due, so not judged: {counted(len(never), "sink")}: {listed(never)}'
+
+
+def run_lines(result: Mapping[str, Any], more: str = '') -> Iterator[str]:
+    """
+    Yield the lines about a whole run, below a table of its sinks.
+
+    :param more: after the settings of the run.
+    """
+    yield verdicts_line(result['dags'])
+    yield from never_due_lines(result['dags'])
+    pool = f'policy {printable(result["policy"])}, ' + counted(result['workers'], 'worker')
+    if 'recorded_callbacks' in result:      # recorded by another executor
+        pool = f'imported: {counted(result["workers"], "thread")} ran callbacks'
+    if result.get('processes'):
+        pool += f' in {counted(len(result["processes"]), "process", "processes")}'
+    yield (pool + (', preemptive' if result['preemptive'] else '')
+           + f', {format_ns(result["duration_ns"])}, utilisation {ratio(result["utilisation"])}'
+           + more)
+    miss = result['first_miss']
+    if miss is not None:
+        late = 'never completed' if miss['completed_ns'] is None else \
+            f'{format_ns(miss["completed_ns"] - miss["deadline_ns"])} late'
+        yield f'first miss: {printable(miss["vertex"])}, job {miss["job"]}, {late}'
+
+
+def ratio(value: float | None) -> str:
+    """Return a utilisation as text."""
+    return '-' if value is None else f'{value:.3f}'
 
 
 def drift_lines(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:

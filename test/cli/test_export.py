@@ -58,7 +58,7 @@ def test_a_report_of_each_kind(
             ('Simulation', ['simulate', graph, '--duration', '50ms'])):
         out = tmp_path / 'out.html'
         status, text, err = call(capsys, *arguments, '--report', out)
-        assert (status, err) == (0, '') and 'sink jobs due' in text
+        assert (status, err) == (0, '') and 'results due' in text
         page = out.read_text()
         assert f'<h1>{name}: ' in page and page.endswith('</html>\n')
         assert not list(tmp_path.glob('.*.part'))

@@ -136,7 +136,7 @@ def test_a_part_by_time(
         status, output, _ = call(capsys, 'replay', *given, *part, '--json', '-')
         assert status == 0 and json.loads(output)['dags']['/camera']['jobs'] == due
         status, output, _ = call(capsys, 'explain', *given, *part)
-        assert status == 0 and f'{due} sink jobs due' in output
+        assert status == 0 and f'{due} results due' in output
         jobs = tmp_path / 'jobs.csv'
         assert call(capsys, 'export', *given, *part, '--rows', 'jobs', '-o', str(jobs))[0] == 0
         assert len(jobs.read_text().splitlines()) == 1 + due

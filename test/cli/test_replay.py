@@ -33,7 +33,7 @@ def test_a_given_graph_judges(
     graph.write_text(GRAPH.replace('8ms', '5ms'))
     status, out, err = call(capsys, trace, graph, '--fail-on-miss')
     assert (status, err) == (1, '')
-    assert '3 sink jobs due, 1 in time (33.33 %), 2 late, 0 expired' in out
+    assert '3 results due, 1 in time (33.33 %), 2 late, 0 expired' in out
     graph.write_text(GRAPH.replace('8ms', '10ms'))
     status, out, err = call(capsys, trace, graph, '--fail-on-miss')
     assert (status, err) == (0, '')
@@ -92,7 +92,7 @@ def test_a_truncated_trace_gives_what_is_there(
     cut.write_bytes(data[:-40])
     status, out, err = call(capsys, cut)
     assert status == 0
-    assert '3 sink jobs due' in out
+    assert '3 results due' in out
     assert err.startswith(f'warning: {cut}: the summary at the end is damaged or missing: ')
     assert err.count('\n') == 1
 
@@ -201,7 +201,7 @@ def test_with_a_graph(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     graph, out = drive.with_name('graph.yaml'), drive.with_name('out.json')
     status, text, errors = call(capsys, drive, graph, '--fail-on-miss', '--json', out)
     assert (status, errors) == (1, '')
-    assert '4 sink jobs due, 3 in time (75.00 %), 1 late, 0 expired' in text
+    assert '4 results due, 3 in time (75.00 %), 1 late, 0 expired' in text
     assert 'imported: 2 threads ran callbacks' in text
     rows = [line.split() for line in text.splitlines()]
     assert any(row[:6] == ['seen', '4', 'of', '4', 'all', '3'] for row in rows)

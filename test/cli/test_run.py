@@ -74,7 +74,7 @@ def test_a_synthetic_run_is_counted_measured_and_recorded(graph: Path, mddag: Md
     assert result['measured']['utilisation'] == pytest.approx(18 / 20 / 3)
     assert result['measured']['utilisation_taken'] > 0.99 * 18 / 20 / 3
     assert Path('out.mcap').read_bytes()[:5] == b'\x89MCAP'
-    for text in ('quick:cb', 'slow:cb', '500 ms', 'sink jobs due', 'measured by the nodes, ',
+    for text in ('quick:cb', 'slow:cb', '500 ms', 'results due', 'measured by the nodes, ',
                  '0 dropped', f'trace: {graph.parent / "out.mcap"}'):
         assert text in process.stdout
 
@@ -198,7 +198,7 @@ def test_a_signal_ends_a_synthetic_run(graph: Path, number: int) -> None:
     result = json.loads(Path('result.json').read_text())
     assert result['measured']['window_ns'] > 0
     assert result['dags']['main']['sinks']['/slow:cb']['completed'] >= len(releases()) > 0
-    assert 'sink jobs due' in out
+    assert 'results due' in out
 
 
 def test_a_signal_that_comes_twice_is_one(graph: Path) -> None:
@@ -211,7 +211,7 @@ def test_a_signal_that_comes_twice_is_one(graph: Path) -> None:
             time.sleep(0.02)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 0 and 'Traceback' not in err, err
-    assert 'sink jobs due' in out and 'trace: ' in out
+    assert 'results due' in out and 'trace: ' in out
     assert [event['_name'] for event in read_events('out.mcap')].count('mddag:task_set') == 1
 
 

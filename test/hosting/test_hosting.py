@@ -159,14 +159,14 @@ def test_an_exception_during_the_run_comes_out_behind_the_summary(
     assert message in process.stderr.splitlines()[-1]
     assert f'--node {spec}: its main has raised {message}' in process.stderr
     assert 'its nodes run no more' in process.stderr
-    assert 'sink jobs due' in process.stdout
+    assert 'results due' in process.stdout
 
 
 def test_exceptions_that_no_spin_waits_for_end_the_run(world: Path, mddag: Mddag) -> None:
     process = mddag('run', 'graph.yaml', '--node', 'chat:no_longer_spins', '--duration', '50s')
     assert process.returncode == 70
     assert 'ZeroDivisionError' in process.stderr.splitlines()[-1]
-    assert 'sink jobs due' in process.stdout
+    assert 'results due' in process.stdout
 
 
 @pytest.mark.parametrize(('spec', 'warning'), [
@@ -181,7 +181,7 @@ def test_what_does_not_end_is_left_behind(
         'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '1s')
     assert process.returncode == 0
     assert warning in process.stderr
-    assert 'sink jobs due' in process.stdout
+    assert 'results due' in process.stdout
 
 
 def test_what_nodes_print_stays_out_of_the_json(world: Path, mddag: Mddag) -> None:

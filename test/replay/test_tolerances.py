@@ -213,7 +213,7 @@ def test_a_warm_up_is_left_out(
         arguments = ['replay', str(trace), *mode, '--skip', skip]
         assert program.main([*arguments, '--fail-on-miss']) == (late > 0)
         output = capsys.readouterr()
-        assert output.err == '' and f'{due} sink jobs due, {due - late} in time' in output.out
+        assert output.err == '' and f'{due} results due, {due - late} in time' in output.out
         assert ('left out: jobs released in the first' in output.out) == (skip != '0')
         assert program.main([*arguments, '--json', '-']) == 0
         result = json.loads(capsys.readouterr().out)
@@ -225,7 +225,7 @@ def test_a_warm_up_is_left_out(
             skip, 31 * MS)
     page = tmp_path / 'report.html'
     assert program.main([*arguments, '--report', str(page)]) == 0
-    assert '6 sink jobs due, 6 in time (100.00 %)' in page.read_text()
+    assert '6 results due, 6 in time (100.00 %)' in page.read_text()
 
 
 @pytest.mark.parametrize('mode', [[], ['--reschedule']])
