@@ -40,10 +40,12 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.executor.jobs import (
     Announced,
+    header_stamp,
     NO_ORIGIN,
     Origin,
     Publication,
     PublisherNumbers,
+    steady_time,
 )
 from mddag_executor.executor.other_processes import contested
 from mddag_executor.executor.work import Work
@@ -82,7 +84,6 @@ class Announcements:
         self._jobs = pool.engine.jobs
         self._engine = pool.engine
         self._clock = pool.clock
-        self._give = pool.inbox.announced
         self._topics = sorted({t for c in task_set.callbacks for t in c.publishes})
         self._number = {topic: i for i, topic in enumerate(self._topics)}
         self._contested = contested(task_set)
@@ -171,6 +172,17 @@ class Announcements:
             if origin is not None:
                 self._waiting.remove(entry)
                 self._give(entry[1], origin)
+
+    def _give(self, work: Work, origin: Origin | Announced | None) -> None:
+        """Pass on a message after a possible wait for its announcement."""
+        now = self._pool.now
+        release = stamp = -1
+        if isinstance(origin, Announced):
+            release = origin.release + self._clock.offset_ns
+        elif origin is None and work.entity.remote_publishers:
+            stamp = header_stamp(work.args[0])
+            release = steady_time(stamp, now)
+        self._engine.arrived(work, origin, release, stamp, now)
 
     def _take_in(
         self, whose: int, of: int, sequence: int, begin: int, end: int, home: int, number: int,

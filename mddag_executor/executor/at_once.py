@@ -13,12 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from mddag_executor.executor import compat
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.jobs import Publication
 from mddag_executor.executor.loop import EventLoop, Events
+from mddag_executor.executor.sources import Source
 from mddag_executor.executor.timers import TimerQueue
-from mddag_executor.executor.work import Work
 
 
 class AtOnce:
@@ -26,18 +26,21 @@ class AtOnce:
     The sources handled at once; all methods but ``ring`` belong to the spinning thread.
 
     :param lock: that of the engine.
+    :param executor: runs the callbacks of futures.
     :param fail: receives exceptions of takes.
+    :ivar has_run: whether the last ``handle`` has handled anything.
     """
 
     def __init__(
-        self, engine: Engine, lock: Any, fail: Callable[[BaseException], None]
+        self, engine: Engine, lock: Any, executor: Any, fail: Callable[[BaseException], None]
     ) -> None:
         self.loop = EventLoop(())
         self.timers = TimerQueue(self.loop.wake, lambda: None, fail)
-        self.failed = fail
+        self.executor = executor
+        self.fail = fail
+        self.has_run = False
         self._engine = engine
         self._lock = lock
-        self._has_run = False
 
     def ring(self) -> None:
         """End the current wait, or the next one; from any thread, also in a signal handler."""
@@ -45,7 +48,7 @@ class AtOnce:
 
     def handle(self, events: Events) -> bool:
         """Handle arrivals; return whether there were any."""
-        self._has_run = False
+        self.has_run = False
         sources, _, expired = self.loop.sources(events)
         for source in sources:
             source.collect()
@@ -53,31 +56,51 @@ class AtOnce:
             self.loop.timer.at = 0
             with self._lock:
                 fired = list(self.timers.fire())
-            for _, work, _, _ in fired:
+            for work, *_ in fired:
                 work.function(*work.args)
-                self._ran(work.entity)
+                self.count(work.entity)
         due = self.timers.next_due()
         if due != self.loop.timer.at:
             self.loop.timer.arm(due)
-        return self._has_run
+        return self.has_run
 
-    def message(
-        self, entity: Entity, args: tuple[Any, ...], info: dict[str, Any],
-        publication: Publication | None,
-    ) -> None:
-        """Handle a message of simulated time."""
-        entity.rclpy.callback(*args)
-        self._ran(entity)
-
-    def request(self, work: Work) -> None:
-        """Handle a request: never called, as services are not among these sources."""
-        raise NotImplementedError
-
-    def note_run(self) -> None:
-        """Note that ``handle`` has done something."""
-        self._has_run = True
-
-    def _ran(self, entity: Entity) -> None:
-        self.note_run()
+    def count(self, entity: Entity) -> None:
+        """Count a callback that has run."""
+        self.has_run = True
         with self._lock:
             self._engine.ran_at_once(entity)
+
+
+class ClockSource(Source):
+    """A subscription to simulated time."""
+
+    __slots__ = ('_at_once',)
+
+    def __init__(self, entity: Entity, at_once: AtOnce) -> None:
+        super().__init__(
+            entity, at_once.loop, compat.message_taker(entity.rclpy), at_once.fail)
+        self._at_once = at_once
+
+    def post(self, taken: Any) -> None:
+        """Set the time."""
+        self.entity.rclpy.callback(taken[0])
+        self._at_once.count(self.entity)
+
+
+class ClientSource(Source):
+    """A client: its responses complete futures, whose callbacks run in the executor."""
+
+    __slots__ = ('_at_once',)
+
+    def __init__(self, entity: Entity, at_once: AtOnce) -> None:
+        super().__init__(
+            entity, at_once.loop, compat.response_taker(entity.rclpy), at_once.fail)
+        self._at_once = at_once
+
+    def post(self, taken: Any) -> None:
+        """Complete the future of a response."""
+        header, response = taken
+        compat.complete_request(
+            self.entity.rclpy, header.request_id.sequence_number, response,
+            self._at_once.executor)
+        self._at_once.has_run = True

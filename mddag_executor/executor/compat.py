@@ -57,14 +57,26 @@ def message_taker(subscription: Any) -> Callable[[], tuple[Any, dict[str, Any]] 
     return partial(subscription.handle.take_message, subscription.msg_type, subscription.raw)
 
 
-def request_taker(service: Any) -> Callable[[], tuple[Any, Any]]:
-    """Return a function that takes a request with its header, which is None if there is none."""
-    return partial(service.handle.service_take_request, service.srv_type.Request)
+def request_taker(service: Any) -> Callable[[], tuple[Any, Any] | None]:
+    """Return a function that takes a request with its header, or returns None."""
+    take, kind = service.handle.service_take_request, service.srv_type.Request
+
+    def take_request() -> tuple[Any, Any] | None:
+        taken: tuple[Any, Any] = take(kind)
+        return None if taken[1] is None else taken
+
+    return take_request
 
 
-def response_taker(client: Any) -> Callable[[], tuple[Any, Any]]:
-    """Return a function that takes a response's header and the response; None if there is none."""
-    return partial(client.handle.take_response, client.srv_type.Response)
+def response_taker(client: Any) -> Callable[[], tuple[Any, Any] | None]:
+    """Return a function that takes a response's header and the response, or returns None."""
+    take, kind = client.handle.take_response, client.srv_type.Response
+
+    def take_response() -> tuple[Any, Any] | None:
+        taken: tuple[Any, Any] = take(kind)
+        return None if taken[0] is None else taken
+
+    return take_response
 
 
 callback_type: Callable[[Any], Any] = attrgetter('_callback_type')

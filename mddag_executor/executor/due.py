@@ -58,8 +58,8 @@ class DueTimes:
     def call_at(self, at: int, function: Callable[[], None]) -> None:
         """Call a function at a time, without the lock."""
         self._n_calls += 1
-        self._timers.has_new = True
         heappush(self._calls, (at, self._n_calls, function))
+        self._arm_by(at)
 
     def handle(self, now: int, since: int) -> list[Callable[[], None]]:
         """
@@ -75,14 +75,13 @@ class DueTimes:
             if self._context_ended():
                 pool.context_ended()
         self._timer.at = 0
-        for fired in self._timers.fire():
-            pool.inbox.timer(fired)
+        pool.fire_timers()
         if now > self._engine.deadlines.next:
             self._engine.judge_overdue(now)
         if 0 < self._gil_check.at <= monotonic:
             self._check_gil(monotonic)
         if 0 < pool.muting.until <= now:
-            pool.muting.end(pool.running)
+            pool.muting.end()
         calls = []
         while self._calls and self._calls[0][0] <= monotonic:
             calls.append(heappop(self._calls)[2])
@@ -123,7 +122,10 @@ class DueTimes:
         :param is_late: it is short, but runs longer than expected.
         """
         self._watch_holder(now, is_late)
-        at = self._gil_check.at
+        self._arm_by(self._gil_check.at)
+
+    def _arm_by(self, at: int) -> None:
+        """Set the timerfd to a time, unless that is 0, or it expires sooner."""
         if at and not 0 < self._timer.at <= at:
             self.may_expire_early = True
             self._timer.arm(at)

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from threading import get_native_id
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
@@ -109,6 +109,13 @@ class Engine:
 
     # --- ready work --- --------------------------------------------------------------------------
 
+    def taken(self, entity: Entity, message: Any, source_timestamp: int, now: int) -> None:
+        """Record that a message was taken at ``now``, which is not after it became ready."""
+        assert self.record is not None
+        self.record(
+            'rmw_take', now, get_native_id(), id(entity.rclpy), id(message), source_timestamp,
+            True)
+
     def timer_due(self, work: Work, due: int, now: int) -> None:
         """Handle a timer that became due at ``due``."""
         entity = work.entity
@@ -121,7 +128,7 @@ class Engine:
         elif entity.source >= 0:
             self._start_job(work, max(entity.since, min(due, now)), now)
         else:
-            self._start_undeclared(work, now)
+            self.ready(work, now)
 
     def timer_missed(self, entity: Entity, due: int, period: int, count: int, now: int) -> None:
         """
@@ -165,22 +172,23 @@ class Engine:
         if origin is None or not self._start_successor(work, origin, now):
             if entity.callback is not None:
                 entity.unattributed += 1
-            self._start_undeclared(work, now)
+            self.ready(work, now)
 
-    def ready_message(self, work: Work, now: int) -> None:
-        """Handle a message of a subscription that no DAG declares."""
+    def ready(self, work: Work, now: int) -> None:
+        """Handle undeclared work: a message, request, guard condition, waitable or task."""
         entity = work.entity
         if entity.removed or self._finished:
             return
         if entity.waiting and 0 < entity.depth <= len(entity.waiting):
             self._replace_oldest(work, now)
-        else:
-            self._start_undeclared(work, now)
-
-    def ready(self, work: Work, now: int) -> None:
-        """Handle other undeclared work: requests, guard conditions, waitables, tasks."""
-        if not work.entity.removed and not self._finished:
-            self._start_undeclared(work, now)
+            return
+        self.undeclared += 1
+        x = work.x = self.scheduler.ready_undeclared(
+            entity.ready, entity.group, entity.habit.holds, now)
+        work.ready_ns = now
+        entity.ready += 1
+        entity.waiting[x] = None
+        self._work[x] = work
 
     def ran_at_once(self, entity: Entity) -> None:
         """Count an undeclared callback that was handled at once."""
@@ -277,16 +285,6 @@ class Engine:
         self._start(work, x, now)
         return True
 
-    def _start_undeclared(self, work: Work, now: int) -> None:
-        self.undeclared += 1
-        entity = work.entity
-        x = self.scheduler.ready_undeclared(entity.ready, entity.group, entity.habit.holds, now)
-        work.x = x
-        work.ready_ns = now
-        entity.ready += 1
-        entity.waiting[x] = None
-        self._work[x] = work
-
     def _start(self, work: Work, x: int, now: int) -> None:
         entity, state = work.entity, self._state
         state.x_group[x] = entity.group
@@ -321,7 +319,7 @@ class Engine:
         self._work[first], self._work[second] = heir, oldest
         heir.x, oldest.x = first, second
         self._drop(entity, second, 'qos_depth', now)
-        self._start_undeclared(work, now)
+        self.ready(work, now)
 
     def _drop(self, entity: Entity, x: int, reason: str, now: int) -> None:
         del entity.waiting[x]
@@ -363,9 +361,11 @@ class Engine:
         :param worker: the worker to use if it is idle; else the lowest idle one is used.
         """
         state = self._state
-        if not (state.ready or state.held_back or state.unpolled) or not state.scalars[N_IDLE]:
+        if not (state.ready or state.held_back or state.unpolled):
             return None
         if state.worker_x[worker] >= 0:
+            if not state.scalars[N_IDLE]:
+                return None
             worker = state.worker_x.index(-1)
         if self.holders:
             state.overtaking[1] = self._may_be_overtaken(now)
@@ -502,6 +502,7 @@ class Engine:
         """
         entity = work.entity
         entity.ran += 1
+        entity.busy_ns += end - start
         x, work.x = work.x, -1
         if work in self.holders:
             self.holders.remove(work)
@@ -540,6 +541,7 @@ class Engine:
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Take a running execution off its worker until ``resume``."""
+        work.entity.busy_ns += end - start
         if self.record is not None:
             self._record_run(work, start, end, vtid, worker)
         self._let_go(work)
@@ -565,8 +567,10 @@ class Engine:
         self, work: Work, start: int, end: int, vtid: int, worker: int, ran: bool
     ) -> None:
         """Free the worker of an execution that could not finish because its context has ended."""
-        if self.record is not None and ran:
-            self._record_run(work, start, end, vtid, worker)
+        if ran:
+            work.entity.busy_ns += end - start
+            if self.record is not None:
+                self._record_run(work, start, end, vtid, worker)
         self.lend(work)
         work.x = -1
         work.entity.ran += ran

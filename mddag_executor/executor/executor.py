@@ -44,7 +44,6 @@ from mddag_executor.executor.diagnostics import Diagnostics
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.gil import short_switch_interval
-from mddag_executor.executor.inbox import Inbox
 from mddag_executor.executor.misses import MissLog, MissNotifier
 from mddag_executor.executor.name_check import NameCheck
 from mddag_executor.executor.recorder import Recorder
@@ -186,10 +185,9 @@ class MultiDeadlineExecutor(BareExecutor):
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
             on_late=on_late, record=self._recorder.record if self._recorder else None,
             on_miss=None if self._notifier is None else self._notifier.post, process=process)
-        inbox = Inbox(self._engine, self._trace_clock, self._recorder, self._fail)
         self._pool = WorkerPool(
-            self._engine, self._trace_clock, inbox, self._fail, self._context_ended, prepare)
-        self._at_once = AtOnce(self._engine, self._pool.lock, self._fail)
+            self._engine, self._trace_clock, self._fail, self._context_ended, prepare)
+        self._at_once = AtOnce(self._engine, self._pool.lock, self, self._fail)
         self._at_once.loop.add_own(self._pool.guard)
         self._pool.serve_meanwhile = self._serve_meanwhile
         self._pool.stopped = self._stopped
@@ -222,7 +220,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._engine.other_processes is not None
                 and self._engine.other_processes.announces):
             self._announcements = Announcements(task_set, process, self.context, self._pool)
-            inbox.announcements = self._announcements
+            self._pool.announcements = self._announcements
             self._registry.own = {*self._announcements.subscriptions}
         # Otherwise ready callbacks would run before the spin notices.
         call_at_shutdown(self.context, self._pool.start_no_more)

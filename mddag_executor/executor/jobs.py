@@ -76,10 +76,12 @@ class PublisherNumbers:
         nothing before it was counted.
     """
 
-    __slots__ = ('offset', '_unlike')
+    __slots__ = ('offset', '_found', '_unlike')
 
     def __init__(self) -> None:
         self.offset = 0
+        # the count of the last publication whose message was found
+        self._found = NO_NUMBER
         # another possible offset, and the count of the last message that it would explain
         self._unlike: tuple[int, int] | None = None
 
@@ -87,20 +89,25 @@ class PublisherNumbers:
         """
         Return whether a message is the publication with this count; only its window fits.
 
-        Messages of two consecutive publications that differ from the count by the same number show
-        that the publisher had sent messages before.
+        Messages of two publications in a row that differ from the count by the same number show
+        that the publisher had sent messages before.  A message that differs after that of the
+        publication was found is of another publisher.
         """
         offset = sequence - count
-        if offset == self.offset:
-            self._unlike = None
+        is_explained = self._unlike is not None and (
+            self._unlike[0] == offset and self._unlike[1] != count)
+        if offset == self.offset or count > self._found and is_explained:
+            self.confirm(count, sequence)
             return True
-        if count == NO_NUMBER:
-            return False
-        if self._unlike is not None and self._unlike[0] == offset and self._unlike[1] != count:
-            self.offset, self._unlike = offset, None
-            return True
-        self._unlike = offset, count
+        if count > self._found:
+            self._unlike = offset, count
         return False
+
+    def confirm(self, count: int, sequence: int) -> None:
+        """Note that a message is the publication with this count."""
+        self.offset = sequence - count
+        self._found = max(count, self._found)
+        self._unlike = None
 
 
 class PublisherState:
@@ -260,6 +267,7 @@ class Jobs:
         elif fits and sequence is not None:
             matches = [p for p in fits if p.sequence + p.numbers.offset == sequence]
             if len(matches) == 1:
+                matches[0].numbers.confirm(matches[0].sequence, sequence)
                 return matches[0].origin
         if len(fits) > 1:
             self.doubtful += counted

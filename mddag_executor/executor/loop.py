@@ -23,7 +23,7 @@ Theory of operation
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 import os
 import resource
 import select
@@ -45,6 +45,10 @@ ALWAYS = -1
 _EDGE = select.EPOLLIN | select.EPOLLET
 
 Events = list[tuple[int, int]]
+
+
+def _no_events(timeout: float = -1) -> Events:
+    return []
 
 
 class ChannelSource(Protocol):
@@ -83,6 +87,8 @@ class EventLoop:
 
     def __init__(self, urgencies_ns: tuple[int, ...] = URGENCIES_NS) -> None:
         self._epoll = select.epoll()
+        #: waits for events until the timeout (s; -1: for ever), and returns them
+        self.wait: Callable[..., Events] = self._epoll.poll
         self._urgencies_ns = urgencies_ns
         self._nested = [select.epoll() for _ in urgencies_ns]
         self._nested_fds = {nested.fileno(): nested for nested in self._nested}
@@ -96,7 +102,6 @@ class EventLoop:
         self._channels: dict[int, tuple[ChannelSource, ...]] = {}
         self._shared: dict[str, list[int]] = {}
         self._shared_fds: set[int] = set()
-        self._asking_fds: set[int] = set()
         self._free: list[int] = []
         self._muted = len(urgencies_ns)
         self._budget = fd_budget()
@@ -131,8 +136,6 @@ class EventLoop:
         if most:
             fds.append(source.fd)
             self._shared_fds.add(source.fd)
-        if source.asks_others:
-            self._asking_fds.add(source.fd)
         self._channels[source.fd] = (source,)
         self._epoll.register(source.fd, _EDGE)
 
@@ -151,7 +154,6 @@ class EventLoop:
         del self._channels[fd]
         self._home(source.urgency).unregister(fd)
         self._shared_fds.discard(fd)
-        self._asking_fds.discard(fd)
         for fds in self._shared.values():
             if fd in fds:
                 fds.remove(fd)
@@ -198,10 +200,6 @@ class EventLoop:
 
     # --- waiting ---------------------------------------------------------------------------------
 
-    def wait(self, timeout_s: float = -1) -> Events:
-        """Return events, waiting for one until the timeout; -1: for ever."""
-        return [] if self._epoll.closed else self._epoll.poll(timeout_s)
-
     def sources(
         self, events: Events
     ) -> tuple[list[ChannelSource], list[ChannelSource], bool]:
@@ -215,11 +213,12 @@ class EventLoop:
         expired = False
         channels = self._channels
         for fd, _ in events:
-            if fd in channels:
-                if fd in self._asking_fds:
-                    asking += channels[fd]
+            several = channels.get(fd)
+            if several is not None:
+                if several[0].asks_others:
+                    asking += several
                 else:
-                    found += channels[fd]
+                    found += several
             elif fd == self.timer.fd:
                 expired = True
             elif fd in self._nested_fds:
@@ -276,6 +275,7 @@ class EventLoop:
         fds = [*self._free, self._bell, self._leave, self.timer.fd]
         self._bell = self._leave = self.timer.fd = -1
         self._free.clear()
+        self.wait = _no_events
         for fd in fds:
             if fd >= 0:
                 os.close(fd)

@@ -13,13 +13,14 @@ arrivals are collected when muting ends.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.inbox import Inbox
-from mddag_executor.executor.loop import ALWAYS, EventLoop, urgency_of
+from mddag_executor.executor.loop import ALWAYS, urgency_of
 from mddag_executor.executor.sources import SubscriptionSource
-from mddag_executor.executor.timers import TimerQueue
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.workers import WorkerPool
 
 
 class Muting:
@@ -29,21 +30,19 @@ class Muting:
     :ivar until: when to stop muting, on the trace's clock; 0: nothing is muted.
     """
 
-    def __init__(
-        self, engine: Engine, loop: EventLoop, timers: TimerQueue, inbox: Inbox
-    ) -> None:
+    def __init__(self, pool: WorkerPool) -> None:
         self.until = 0
         #: the entities with sources
         self.entities: Iterable[Entity] = ()
         # whether a callback has ever held the GIL for long: else nothing is worth a nested epoll
         self._has_long = False
         self._bound = 0
-        self._engine = engine
-        self._loop = loop
-        self._timers = timers
-        self._inbox = inbox
+        self._pool = pool
+        self._engine = pool.engine
+        self._loop = pool.loop
+        self._timers = pool.timers
 
-    def update(self, now: int, is_running: bool) -> None:
+    def update(self, now: int) -> None:
         """Mute sources whose callbacks cannot start while the dispatched one holds the GIL."""
         if not self._has_long:
             self._has_long = True
@@ -55,18 +54,17 @@ class Muting:
             self.until, self._bound = until, bound
             self._loop.mute(bound)
         else:
-            self.end(is_running)
+            self.end()
 
-    def end(self, is_running: bool) -> None:
+    def end(self) -> None:
         """End muting, and collect arrivals; timers only if callbacks may start."""
         if not self.until:
             return
         self.until = self._bound = 0
         for source in self._loop.sources(self._loop.unmute())[0]:
             source.collect()
-        if is_running:
-            for fired in self._timers.fire():
-                self._inbox.timer(fired)
+        if self._pool.running:
+            self._pool.fire_timers()
 
     def classify(self, source: SubscriptionSource) -> None:
         """Register a source according to its callback's GIL habit and deadline."""

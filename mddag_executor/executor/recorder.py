@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The executor's trace apart from its hot path: entities, and messages taken."""
+"""The executor's trace apart from its hot path: nodes and entities."""
 
 from __future__ import annotations
 
@@ -113,12 +113,6 @@ class Recorder:
             self._say('add_callback_group', id(self), id(group), kind)
         if group is not None:
             self._say(f'callback_group_add_{entity.kind}', id(group), handle)
-
-    def taken(self, entity: Entity, message: Any, source_timestamp: int, now: int) -> None:
-        """Record that a message was taken at ``now``, which is not after it became ready."""
-        self.record(
-            'rmw_take', now, threading.get_native_id(), id(entity.rclpy), id(message),
-            source_timestamp, True)
 
     def close(self, now: int, end: int | None = None) -> None:
         """

@@ -18,56 +18,48 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 import os
-from typing import Any, ClassVar, Protocol
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.executor import compat
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.jobs import Publication
+from mddag_executor.executor.jobs import header_stamp, Publication, steady_time
 from mddag_executor.executor.listeners import clear_listener, MANY, set_listener
 from mddag_executor.executor.loop import ALWAYS, EventLoop
 from mddag_executor.executor.work import Work
 from rclpy.exceptions import InvalidHandle
 
+if TYPE_CHECKING:
+    from mddag_executor.executor.workers import WorkerPool
+
 SERVICE_DEPTH = 10
 """How many requests wait in Python at most: the depth of rclpy's default profile for services."""
-
-
-class Arrivals(Protocol):
-    """Receives collected messages and requests; all methods are called under the engine's lock."""
-
-    def message(
-        self, entity: Entity, args: tuple[Any, ...], info: dict[str, Any],
-        publication: Publication | None,
-    ) -> None:
-        """Handle a message; ``publication``: the one that has just sent it, if certain."""
-
-    def request(self, work: Work) -> None:
-        """Handle a request."""
-
-    def failed(self, error: BaseException) -> None:
-        """Handle an exception of a take."""
 
 
 class Source:
     """
     An entity at which messages, requests or responses arrive.
 
+    :param take: takes one arrival and returns it; None: there is none.
+    :param fail: receives the exceptions of takes.
     :ivar fd: its descriptor (see ``loop``), -1: none.
     :ivar urgency: the nested epoll in which ``fd`` is registered.
     """
 
-    __slots__ = ('entity', 'handle', 'fd', 'urgency', 'is_counted', '_loop', '_arrivals')
+    __slots__ = ('entity', 'handle', 'fd', 'urgency', 'is_counted', '_loop', '_take', '_fail')
 
-    kind: ClassVar[str]
     asks_others = False
 
-    def __init__(self, entity: Entity, loop: EventLoop, arrivals: Arrivals) -> None:
+    def __init__(
+        self, entity: Entity, loop: EventLoop, take: Callable[[], Any],
+        fail: Callable[[BaseException], None],
+    ) -> None:
         self.entity = entity
         self.handle: Any = entity.rclpy.handle
         self.fd, self.urgency, self.is_counted = -1, ALWAYS, False
         self._loop = loop
-        self._arrivals = arrivals
+        self._take = take
+        self._fail = fail
 
     def listen(self) -> None:
         """
@@ -76,78 +68,111 @@ class Source:
         :raises InvalidHandle: when the entity has been destroyed.
         """
         with self.handle:
-            set_listener(self.kind, self.handle.pointer, self.fd)
+            set_listener(self.entity.kind, self.handle.pointer, self.fd)
 
-    def ignore(self) -> bool:
-        """End ``listen``; return False if the entity is just being destroyed."""
+    def ignore(self) -> None:
+        """End ``listen``."""
         try:
             with self.handle:
-                clear_listener(self.kind, self.handle.pointer)
-            return True
+                clear_listener(self.entity.kind, self.handle.pointer)
         except InvalidHandle:
-            return False
+            pass  # it is just being destroyed
 
-    def collect(self) -> None:
-        """Collect all arrivals announced since the last call."""
-        count = MANY
-        if self.is_counted:
-            try:
-                count = os.eventfd_read(self.fd)
-            except (OSError, ValueError):
-                return  # another thread has collected it, or it was just removed
-        self._collect(count)
+    def collect(self, left: int = 0) -> None:
+        """
+        Collect the arrivals; the rest after ``MOST`` is announced again.
 
-    def collect_all(self) -> None:
-        """Collect all arrivals, announced or not."""
-        self._collect(MANY)
-
-    def _collect(self, left: int) -> None:
-        """Take ``left`` arrivals at most; the rest after ``MOST`` is announced again."""
-        entity = self.entity
-        if entity.removed:
-            return  # another executor may have it now
+        :param left: how many at most; 0: those announced since the last call.
+        """
+        entity, take = self.entity, self._take
         try:
+            if not left:
+                left = os.eventfd_read(self.fd) if self.is_counted else MANY
+            if entity.removed:
+                return  # another executor may have it now
             for _ in range(min(left, MOST)):
                 if 0 < entity.most_waiting <= len(entity.waiting):
-                    entity.collect_more = self.collect_all
+                    entity.collect_more = partial(self.collect, MANY)
                     return
                 left -= 1
-                if not self.take_one():
+                taken = take()
+                if taken is None:
                     return
+                self.post(taken)
         except compat.RCL_ERRORS as error:
             if compat.alive(entity.rclpy):
-                self._arrivals.failed(error)
+                self._fail(error)
             return
+        except BlockingIOError:
+            return  # another thread has collected it
         except Exception as error:
-            self._arrivals.failed(error)
+            if self.fd < 0:
+                return  # it was just removed
+            self._fail(error)
         if left:
             self._loop.announce(self, left)
 
-    def take_one(self) -> bool:
-        """Take one arrival and post it; return whether there was one."""
+    def post(self, taken: Any) -> None:
+        """Handle an arrival."""
         raise NotImplementedError
 
 
 class SubscriptionSource(Source):
     """A subscription."""
 
-    __slots__ = ('_take', '_with_info')
+    __slots__ = ('_pool', '_with_info', '_is_plain')
 
-    kind = 'subscription'
-
-    def __init__(self, entity: Entity, loop: EventLoop, arrivals: Arrivals) -> None:
-        super().__init__(entity, loop, arrivals)
-        self._take = compat.message_taker(entity.rclpy)
+    def __init__(self, entity: Entity, pool: WorkerPool) -> None:
+        super().__init__(entity, pool.loop, compat.message_taker(entity.rclpy), pool.fail)
+        self._pool = pool
         self._with_info = compat.callback_type(entity.rclpy) is compat.WITH_INFO
+        self._is_plain = (
+            pool.engine.record is None and entity.callback is None and not entity.is_own)
 
-    def take_one(self) -> bool:
-        """Take a message and post it; return whether there was one."""
-        taken = self._take()
-        if taken is None:
-            return False
-        self._arrivals.message(
-            self.entity, taken if self._with_info else taken[:1], taken[1], None)
-        return True
+    def post(self, taken: Any, publication: Publication | None = None) -> None:
+        """
+        Report a message to the engine.
+
+        :param publication: the one that has just sent it, if certain.
+        """
+        entity, pool = self.entity, self._pool
+        work = Work(entity, entity.rclpy.callback, taken if self._with_info else taken[:1])
+        if self._is_plain:
+            pool.engine.ready(work, pool.now)
+        else:
+            self._post_known(work, taken[1], publication)
+
+    def _post_known(
+        self, work: Work, info: dict[str, Any], publication: Publication | None
+    ) -> None:
+        """Report a message that is recorded, or may belong to a job, or is the executor's own."""
+        entity, engine = self.entity, self._pool.engine
+        if entity.is_own:
+            work.function(*work.args)
+            return
+        message, stamp = work.args[0], info['source_timestamp']
+        now = self._pool.now
+        if engine.record is not None:
+            now = self._pool.tick()  # it becomes ready right after it was taken
+            engine.taken(entity, message, stamp, now)
+        if entity.callback is None:
+            engine.ready(work, now)
+            return
+        if entity.awaits and publication is None and self._pool.announcements is not None:
+            self._pool.announcements.take(work, info, now)
+            return
+        origin = None
+        release = header = -1
+        if entity.source >= 0:
+            release, header = engine.jobs.release(
+                engine.tables.dag_of[entity.source], message, stamp, now)
+        elif entity.targets:
+            origin = publication.origin if publication is not None else engine.jobs.find(
+                entity.topic, stamp, info.get('publication_sequence_number'))
+            if origin is None and entity.remote_publishers:
+                header = header_stamp(message)
+                release = steady_time(header, now)
+        engine.arrived(work, origin, release, header, now)
 
     def collect_published(self, publication: Publication | None) -> bool:
         """
@@ -162,82 +187,45 @@ class SubscriptionSource(Source):
             announced = os.eventfd_read(self.fd)
         except (OSError, ValueError):  # nothing was announced, or it was just removed
             return False
-        entity = self.entity
-        if announced > 1 or entity.most_waiting:
-            self._collect(announced)
+        if announced > 1 or self.entity.most_waiting:
+            self.collect(announced)
             return True
         try:
             taken = self._take()
         except compat.RCL_ERRORS:
-            self.collect_all()  # finds out the reason
+            self.collect(MANY)  # finds out the reason
             return True
         if taken is None:
             return False
-        info = taken[1]
         if publication is not None:
+            info = taken[1]
             if not publication.holds(info['source_timestamp']):
                 publication = None
             else:
                 sequence = info.get('publication_sequence_number')
                 if sequence is not None:
-                    publication.numbers.offset = sequence - publication.sequence
-        self._arrivals.message(
-            entity, taken if self._with_info else taken[:1], info, publication)
+                    publication.numbers.confirm(publication.sequence, sequence)
+        self.post(taken, publication)
         return True
 
 
 class ServiceSource(Source):
     """A service."""
 
-    __slots__ = ('_take',)
+    __slots__ = ('_pool',)
 
-    kind = 'service'
+    def __init__(self, entity: Entity, pool: WorkerPool) -> None:
+        super().__init__(entity, pool.loop, compat.request_taker(entity.rclpy), pool.fail)
+        self._pool = pool
 
-    def __init__(self, entity: Entity, loop: EventLoop, arrivals: Arrivals) -> None:
-        super().__init__(entity, loop, arrivals)
-        self._take = compat.request_taker(entity.rclpy)
-
-    def take_one(self) -> bool:
-        """Take a request and post it; return whether there was one."""
-        request, header = self._take()
-        if header is None:
-            return False
-        service = self.entity.rclpy
-        self._arrivals.request(Work(
+    def post(self, taken: Any) -> None:
+        """Report a request to the engine."""
+        request, header = taken
+        service, engine, now = self.entity.rclpy, self._pool.engine, self._pool.now
+        work = Work(
             self.entity, service.callback, (request, service.srv_type.Response()),
-            partial(service.send_response, header=header)))
-        return True
-
-
-class ClientSource(Source):
-    """
-    A client: its responses complete futures, whose callbacks run in the executor.
-
-    The spinning thread collects from it, without the engine's lock.
-
-    :param executor: the executor.
-    :param responded: called after each response.
-    """
-
-    __slots__ = ('_take', '_executor', '_responded')
-
-    kind = 'client'
-
-    def __init__(
-        self, entity: Entity, loop: EventLoop, arrivals: Arrivals, executor: Any,
-        responded: Callable[[], None],
-    ) -> None:
-        super().__init__(entity, loop, arrivals)
-        self._take = compat.response_taker(entity.rclpy)
-        self._executor = executor
-        self._responded = responded
-
-    def take_one(self) -> bool:
-        """Take a response and complete its future; return whether there was one."""
-        header, response = self._take()
-        if header is None:
-            return False
-        compat.complete_request(
-            self.entity.rclpy, header.request_id.sequence_number, response, self._executor)
-        self._responded()
-        return True
+            partial(service.send_response, header=header))
+        if self.entity.source >= 0:
+            engine.arrived(work, None, now, -1, now)
+        else:
+            engine.ready(work, now)

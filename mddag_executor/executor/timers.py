@@ -41,8 +41,8 @@ TOLERANCE_NS = 20_000
 ZERO_PERIOD_NS = 1_000_000
 """A timer without a period is always due; it runs this often."""
 
-Fired = tuple['TimerSource', Work, int, int]
-"""A due timer, its execution, nominal due time (monotonic ns), periods missed after it."""
+Fired = tuple[Work, int, int, int]
+"""Execution and nominal due time (monotonic ns) of a timer, the periods missed, the period."""
 
 _now = time.monotonic_ns
 
@@ -87,15 +87,14 @@ class TimerSource:
             set_listener('timer', self.handle.pointer, self.fd)
         self._queue.add(self)
 
-    def ignore(self) -> bool:
-        """End ``listen``; return False if the timer is just being destroyed."""
+    def ignore(self) -> None:
+        """End ``listen``."""
         self._queue.remove(self)
         try:
             with self.handle:
                 clear_listener('timer', self.handle.pointer)
-            return True
         except InvalidHandle:
-            return False
+            pass  # it is just being destroyed
 
     def collect(self) -> None:
         """Ask rcl when it is due, as it was reset."""
@@ -297,10 +296,10 @@ class TimerQueue:
             return None
         if period <= 0:
             self._push(source, now + ZERO_PERIOD_NS)
-            return None if work is None else (source, work, now, 0)
+            return None if work is None else (work, now, 0, 0)
         self._push(source, after)
         missed = max(0, (after - due + period // 2) // period - 1)
-        return None if work is None else (source, work, due, missed)
+        return None if work is None else (work, due, missed, period)
 
     def _fire_simulated(self, source: TimerSource) -> Fired | None:
         if not source.is_due():
@@ -308,7 +307,7 @@ class TimerQueue:
         work = source.call()
         if source.is_due():  # several periods in one jump: rcl has skipped all but the last
             self._push(source, 0)
-        return None if work is None else (source, work, _now(), 0)
+        return None if work is None else (work, _now(), 0, 0)
 
     def _failed(self, source: TimerSource, error: Exception) -> None:
         """Classify an exception of rcl: the timer is destroyed or cancelled, or it is an error."""

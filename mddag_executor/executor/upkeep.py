@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 from mddag_executor.executor import publishing
-from mddag_executor.executor.at_once import AtOnce
+from mddag_executor.executor.at_once import AtOnce, ClientSource, ClockSource
 from mddag_executor.executor.compat import (
     ends_sleep,
     is_builtin,
@@ -34,7 +34,7 @@ from mddag_executor.executor.entity import (
 from mddag_executor.executor.listeners import ListenerError
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry, snapshot
-from mddag_executor.executor.sources import ClientSource, ServiceSource, SubscriptionSource
+from mddag_executor.executor.sources import ServiceSource, Source, SubscriptionSource
 from mddag_executor.executor.timers import TimerSource
 from mddag_executor.executor.waitables import (
     EventsSource,
@@ -46,7 +46,7 @@ from mddag_executor.executor.workers import WorkerPool
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 
-AnySource = SubscriptionSource | ServiceSource | ClientSource | TimerSource
+AnySource = Source | TimerSource
 
 
 class Upkeep:
@@ -154,7 +154,7 @@ class Upkeep:
 
     def _listen(self, entity: Entity) -> None:
         """Make the source of an entity; the caller holds the engine's lock."""
-        pool, loop, inbox = self._pool, self._pool.loop, self._pool.inbox
+        pool, loop = self._pool, self._pool.loop
         source: AnySource
         if entity.kind == TIMER:
             if entity.callback is None and ends_sleep(entity.rclpy.callback):
@@ -168,17 +168,16 @@ class Upkeep:
                 return
             if entity.at_once:
                 loop = self._at_once.loop
-                source = SubscriptionSource(entity, loop, self._at_once)
+                source = ClockSource(entity, self._at_once)
             else:
-                source = SubscriptionSource(entity, loop, inbox)
+                source = SubscriptionSource(entity, pool)
             loop.add(source)
         elif entity.kind == SERVICE:
-            source = ServiceSource(entity, loop, inbox)
+            source = ServiceSource(entity, pool)
             loop.add(source, f'services {entity.node}' if is_builtin(entity.rclpy) else '')
         elif entity.kind == CLIENT:
             loop = self._at_once.loop
-            source = ClientSource(
-                entity, loop, self._at_once, self._executor, self._at_once.note_run)
+            source = ClientSource(entity, self._at_once)
             loop.add(source)
         else:
             return

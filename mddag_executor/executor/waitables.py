@@ -115,7 +115,7 @@ class WaitableSource:
         if self._has_more:
             self.collect()
 
-    def ignore(self) -> bool:
+    def ignore(self) -> None:
         """End ``listen``, and wait until no thread collects from it."""
         self._ignored = True
         with self._lock:
@@ -123,7 +123,6 @@ class WaitableSource:
                 self._set.parts(clear_listener)
             except InvalidHandle:
                 pass  # destroyed ones write no more
-        return True
 
     def collect(self) -> None:
         """Collect arrivals; must be called without the engine's lock."""

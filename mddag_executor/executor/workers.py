@@ -39,7 +39,7 @@ from contextlib import contextmanager
 from functools import partial
 import threading
 from time import monotonic_ns
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core.queues import TURN_NS
@@ -55,15 +55,16 @@ from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.debugging import engine_lock
 from mddag_executor.executor.due import DueTimes, Guard
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.groups import Refused
-from mddag_executor.executor.inbox import Inbox
 from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
 from mddag_executor.executor.muting import Muting
 from mddag_executor.executor.timers import TimerQueue
 from mddag_executor.executor.work import current, Destroyed, QuickCallback, Work
 from mddag_executor.trace.groups import PUBLICATION
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.announcements import Announcements
 
 
 class WorkerThread:
@@ -75,18 +76,18 @@ class WorkerThread:
     :ivar permit: a lock, released to admit the thread to the epoll.
     :ivar has_lent: whether its callback has returned its worker; ``waits``: whether it still
         waits.
-    :ivar is_polling: whether the thread waits in the epoll; ``is_parked``: for its permit.
-    :ivar waits_since: since when it has waited in the epoll, on the trace's clock.
+    :ivar waits_since: since when it has waited in the epoll, on the trace's clock; 0: it does not.
+    :ivar is_parked: whether it waits for its permit.
     :ivar published: when the running callback first published (monotonic ns); 0: not yet.
-    :ivar start: when the execution that has just ended began; ``end``: when it ended (monotonic
-        ns).
+    :ivar start: when the execution that has just ended began; ``end``: when it ended (on the
+        trace's clock).
     :ivar outcome: its exception, or the future that it waits for, if it goes on later; None: it
         has finished.
     """
 
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
-                 'is_polling', 'is_parked', 'has_lent', 'pool', 'engine', 'start', 'end',
-                 'outcome', 'waits_since')
+                 'is_parked', 'has_lent', 'pool', 'engine', 'start', 'end', 'outcome',
+                 'waits_since')
 
     def __init__(self, pool: WorkerPool, thread: threading.Thread | None) -> None:
         self.pool = pool
@@ -97,7 +98,7 @@ class WorkerThread:
         self.permit = threading.Lock()
         self.permit.acquire()
         self.vtid = self.ident = 0
-        self.waits = self.has_lent = self.is_polling = False
+        self.waits = self.has_lent = False
         self.is_parked = True
         self.published = self.start = self.end = self.waits_since = 0
         self.outcome: Any = None
@@ -144,16 +145,16 @@ class WorkerPool:
     :param fail: receives every exception that a callback raises.
     :param context_ended: whether the context has ended, which makes callbacks fail.
     :param prepare_thread: called first in each worker thread (priority, CPU set).
-    :param inbox: receives the collected messages and requests.
     :ivar running: whether executions may start.
     :ivar stopped_at: when ``running`` became false, on the trace's clock; 0: it is true.
     :ivar is_current: whether the registry knows all entities.
+    :ivar now: the time of the last event, on the trace's clock.
+    :ivar announcements: of other processes; None: there are none.
     """
 
     def __init__(
-        self, engine: Engine, clock: TraceClock, inbox: Inbox,
-        fail: Callable[[BaseException], None], context_ended: Callable[[], bool],
-        prepare_thread: Callable[[], None] | None = None,
+        self, engine: Engine, clock: TraceClock, fail: Callable[[BaseException], None],
+        context_ended: Callable[[], bool], prepare_thread: Callable[[], None] | None = None,
     ) -> None:
         self.engine = engine
         self.clock = clock
@@ -162,8 +163,7 @@ class WorkerPool:
         self.lock = engine_lock(engine.validate, engine.size)
         self._deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
-        self.inbox = inbox
-        inbox.tick = self.tick
+        self.announcements: Announcements | None = None
         self.timers = TimerQueue(self.loop.wake, lambda: self.entities_changed(), fail)
         self.running = False
         self.stopped_at = 0
@@ -183,7 +183,7 @@ class WorkerPool:
         self.context_ended: Callable[[], None] = lambda: None
         #: called with begin and end of a time in which no thread of the process ran (monotonic ns)
         self.stopped: Callable[[int, int], None] = lambda begin, end: None
-        self._fail = fail
+        self.fail = fail
         self._context_ended = context_ended
         self._prepare_thread = prepare_thread
         self._threads: list[WorkerThread] = []
@@ -199,13 +199,13 @@ class WorkerPool:
         self._is_stepping = False
         # coroutines that have yielded: they continue in the next step
         self._of_next_step: list[Work] = []
-        self._last = 0
+        self.now = 0
         # the thread that last dispatched a short callback
         self._leader: WorkerThread | None = None
         # what it ran when the guard was set
         self._guarded: Work | None = None
         self._misses = 0
-        self.muting = Muting(engine, self.loop, self.timers, inbox)
+        self.muting = Muting(self)
         self.due = DueTimes(self, context_ended)
         #: wakes a thread when a short callback runs longer than expected
         self.guard = Guard(self._guard_expired)
@@ -214,8 +214,16 @@ class WorkerPool:
 
     def tick(self) -> int:
         """Return the engine's time now; it never decreases.  The caller holds the lock."""
-        now = self._last = self.inbox.now = monotonic_ns() + self._offset
+        now = self.now = monotonic_ns() + self._offset
         return now
+
+    def fire_timers(self) -> None:
+        """Report the due timers to the engine; the caller holds the lock."""
+        for work, due, missed, period in self.timers.fire():
+            due += self._offset
+            self.engine.timer_due(work, due, self.now)
+            if missed:
+                self.engine.timer_missed(work.entity, due, period, missed, self.now)
 
     def report(self, event: Callable[..., None], *args: Any) -> None:
         """
@@ -271,7 +279,6 @@ class WorkerPool:
         """Let a worker thread call a function at a time (monotonic ns), without the lock."""
         with self.lock:
             self.due.call_at(at, function)
-            self.due.arm(monotonic_ns())
 
     def wake_for_more(self) -> None:
         """Wake a thread if an idle worker may start an execution; the caller holds the lock."""
@@ -280,8 +287,8 @@ class WorkerPool:
         running = current.running
         if running is not None and running.pool is self and running.is_short():
             if not self.guard.is_set:
-                self._guard(self._last - self._offset)
-        elif self.engine.may_start_more(self._last):
+                self._guard(self.now - self._offset)
+        elif self.engine.may_start_more(self.now):
             self._wake_one()
         elif self.engine.holders and self.engine.idle_workers and self.engine.has_waiting:
             self.due.check_holder(monotonic_ns())
@@ -351,7 +358,7 @@ class WorkerPool:
         """Start no more executions; running ones finish.  No thread waits in the epoll then."""
         with self.lock:
             self.start_no_more()
-            self.muting.end(self.running)
+            self.muting.end()
             self.due.arm(0)
             if not self.polling or self._leaving:
                 return
@@ -420,23 +427,23 @@ class WorkerPool:
             if self._prepare_thread is not None:
                 self._prepare_thread()
         except Exception as error:
-            self._fail(error)
+            self.fail(error)
         try:
             self._work(me)
         except BaseException as error:
-            self._fail(error)
+            self.fail(error)
         finally:
             with self.lock:
                 self._threads.remove(me)
                 if me in self._parked:
                     self._parked.remove(me)
-                if me.is_polling:  # it has failed
-                    me.is_polling = False
+                if me.waits_since:  # it has failed
+                    me.waits_since = 0
                     self.polling -= 1
 
     def _work(self, me: WorkerThread) -> None:
         """Take turns until the pool is closed."""
-        wait, turn, execute = self.loop.wait, self._turn, self._execute
+        loop, turn, execute = self.loop, self._turn, self._execute
         me.permit.acquire()
         me.is_parked = False
         current.running = me
@@ -445,9 +452,9 @@ class WorkerPool:
             if turn(me, events):
                 execute(me)
                 events = []
-                if not self.polling and self._last - self._polled_at > SHORT_CALLBACK_NS:
-                    events = wait(0)
-                    self._polled_at = self._last
+                if not self.polling and self.now - self._polled_at > SHORT_CALLBACK_NS:
+                    events = loop.wait(0)
+                    self._polled_at = self.now
             elif me.is_parked:
                 if self._closed:
                     return
@@ -455,7 +462,7 @@ class WorkerPool:
                 me.permit.acquire()
                 me.is_parked = False
             else:
-                events = wait()
+                events = loop.wait()
 
     # --- a turn ----------------------------------------------------------------------------------
 
@@ -466,47 +473,45 @@ class WorkerPool:
         :param is_last: run nothing more in this thread.
         :return: False: there is no execution, and the thread is to wait in the epoll or is parked.
         """
-        arrived: Sequence[ChannelSource] = ()
-        expired = False
-        if events:
-            arrived, asking, expired = self.loop.sources(events)
-            if asking:
-                self._collect(asking)
-        if self._deferred:
-            self._do_deferred()
         calls: list[Callable[[], None]] = []
         timed: Sequence[Callable[[], None]] = ()
-        engine = self.engine
+        arrived: Sequence[ChannelSource] = ()
+        is_due = False
+        if events:
+            arrived, asking, is_due = self.loop.sources(events)
+            if asking:
+                self._collect(asking)
+            if self._deferred:
+                self._do_deferred()
         with self.lock:
             # inlined tick: saves a call for each execution
-            now = since = self._last = self.inbox.now = monotonic_ns() + self._offset
-            work = me.work
+            now = self.now = monotonic_ns() + self._offset
+            work, since = me.work, me.waits_since
             if work is not None:
                 self._report_end(me, work, now, calls)
-                if self.muting.until and not engine.holders:
-                    self.muting.end(self.running)
-            elif me.is_polling:
-                since = me.waits_since
-                me.is_polling = False
+            elif since:
+                me.waits_since = 0
                 self.polling -= 1
-                if not self.polling:
+                if self._leaving and not self.polling:
                     self._all_left.set()
             if events:
                 self._bell_rings = False  # the waiting thread may have received it
                 self._collect(arrived)
-            if (expired or self.timers.has_jumped) and self.running:
-                timed = self.due.handle(now, self._waited_since(since))
+                is_due = is_due or self.timers.has_new or self.timers.has_jumped
+                if is_due and self.running:
+                    timed = self.due.handle(now, self._waited_since(since or now))
             found = not is_last and not timed and self._choose(me, now, bool(events))
-            due = self.due
-            if (expired or self.timers.has_new or engine.deadlines.next < due.deadline
-                    or not found and (due.may_expire_early or engine.holders)):
-                due.arm(now - self._offset)
-            if (expired or not found) and self._misses != engine.verdicts.missed:
-                self._misses = engine.verdicts.missed
+            if (is_due or self.engine.deadlines.next < self.due.deadline
+                    or not found and (self.due.may_expire_early or self.engine.holders)):
+                self.due.arm(now - self._offset)
+            if (is_due or not found) and self._misses != self.engine.verdicts.missed:
+                self._misses = self.engine.verdicts.missed
                 calls.append(self.missed)
         if calls or timed:
             self._call([*calls, *timed])
-        return self._turn(me, []) if timed else found
+            if timed:
+                return self._turn(me, [])
+        return found
 
     def _collect(self, sources: Sequence[ChannelSource]) -> None:
         """Collect from sources, or leave what arrived to the next spin."""
@@ -524,7 +529,7 @@ class WorkerPool:
         """
         if not self.polling:
             return mine
-        return min([mine, *(each.waits_since for each in self._threads if each.is_polling)])
+        return min([mine, *(each.waits_since for each in self._threads if each.waits_since)])
 
     def _do_deferred(self) -> None:
         """Call the functions that waited for the lock."""
@@ -541,30 +546,30 @@ class WorkerPool:
             try:
                 function()
             except BaseException as error:
-                self._fail(error)
+                self.fail(error)
 
     def _choose(self, me: WorkerThread, now: int, has_events: bool) -> bool:
         """Set the next execution, or where to wait; return whether there is an execution."""
         engine = self.engine
         work = engine.dispatch(me.worker, now) if self.running else None
         if work is None:
-            self._rest(me, has_events)
+            if me.thread is not None:  # else a visitor: the thread of a spin_once
+                self._rest(me, has_events)
             return False
-        me.worker = work.worker
         me.work = work
+        me.worker = work.worker
         holders = engine.holders
         if holders:
             if holders[0].entity.habit.mean_ns >= TURN_NS or self.muting.until:
-                self.muting.update(now, self.running)
+                self.muting.update(now)
             if engine.has_waiting:
                 self.due.check_holder(now - self._offset)
-        if self._is_stepping:
-            pass
-        elif work.entity.wall_ns <= SHORT_CALLBACK_NS:
+        entity = work.entity
+        if entity.wall_ns <= SHORT_CALLBACK_NS:
             self._leader = me
             if not self.polling and not self.guard.is_set:
                 self._admit()
-            elif not (self.guard.is_set or work.entity.habit.holds) and engine.has_waiting:
+            elif not (self.guard.is_set or entity.habit.holds) and engine.has_waiting:
                 self._guard(now - self._offset)
         elif not self.polling:
             self._admit()
@@ -578,23 +583,20 @@ class WorkerPool:
 
         :param has_events: whether it has just collected arrivals.
         """
-        if me.thread is None:  # a visitor: the thread of a spin_once
-            return
-        leader, n_workers = self._leader, self.engine.n_workers
+        leader = self._leader
         is_left_to_leader = (
             has_events and leader is not me and leader is not None and leader.is_short())
         if self.running and not is_left_to_leader and (
-                len(self._threads) == n_workers
-                or len(self._threads) - self._waiting_calls - len(self._parked) <= n_workers):
-            me.is_polling = True
-            me.waits_since = self._last
+                len(self._threads) - self._waiting_calls - len(self._parked)
+                <= self.engine.n_workers):
+            me.waits_since = self.now
             self.polling += 1
-        else:
-            me.is_parked = True
-            if is_left_to_leader and self.running and not self.polling:
-                self._guard(self._last - self._offset)
-            if not self._closed:
-                self._parked.append(me)
+            return
+        me.is_parked = True
+        if is_left_to_leader and self.running and not self.polling:
+            self._guard(self.now - self._offset)
+        if not self._closed:
+            self._parked.append(me)
 
     def arm(self) -> None:
         """Set the timerfd again for new timers; the caller holds the lock."""
@@ -611,43 +613,43 @@ class WorkerPool:
         """Run the thread's execution until it ends or waits."""
         work: Any = me.work
         entity = work.entity
+        habit, gate = entity.habit, entity.gate
         must_check = entity.may_be_gone or not self.is_current
-        me.published = 0
-        habit = entity.habit
         measurement = None
         if habit.rests < 1 or self.engine.record is not None:
             measurement = Measurement(habit)
+        me.published = 0
         start = monotonic_ns()
         try:
             me.outcome = (
-                work.step(must_check) if entity.gate is None
-                else entity.gate.step(work, must_check))
+                work.step(must_check) if gate is None else gate.step(work, must_check))
         except BaseException as error:
             me.outcome = error
         end = monotonic_ns()
-        me.start, me.end = start, end
-        if measurement is None:
+        me.start, me.end = start + self._offset, end + self._offset
+        if measurement is None and not me.published and end - start <= SHORT_CALLBACK_NS:
             habit.rests -= 1
         else:
-            work.cpu_ns += measurement.end(end - start)
-            if entity.is_nested != habit.computes and entity.classify is not None:
-                with self.lock:
-                    entity.classify()
-        if measurement is not None or me.published or end - start > SHORT_CALLBACK_NS:
-            self._note_times(entity, start, end, me.published)
+            self._note_times(work, measurement, start, end, me.published)
         if self.callback_ended is not None and me.outcome is None:
             self.callback_ended(entity.rclpy, None)
 
-    @staticmethod
-    def _note_times(entity: Entity, start: int, end: int, published: int) -> None:
+    def _note_times(
+        self, work: Work, measurement: Measurement | None, start: int, end: int, published: int
+    ) -> None:
         """Note how long an execution took, and when it published (monotonic ns; 0: it did not)."""
-        wall = end - start
-        if wall > SHORT_CALLBACK_NS:
-            entity.habit.rests = 0  # long callbacks are measured each time
-        if entity.ran:
-            entity.wall_ns += (wall - entity.wall_ns) >> 3
+        entity, wall = work.entity, end - start
+        habit = entity.habit
+        if measurement is None:
+            habit.rests -= 1
         else:
-            entity.wall_ns = wall
+            work.cpu_ns += measurement.end(wall)
+            if entity.is_nested != habit.computes and entity.classify is not None:
+                with self.lock:
+                    entity.classify()
+        if wall > SHORT_CALLBACK_NS:
+            habit.rests = 0  # long callbacks are measured each time
+        entity.wall_ns += (wall - entity.wall_ns) >> 3 if entity.ran else wall - entity.wall_ns
         if published:
             entity.tail_ns += (end - published - entity.tail_ns) >> 3
 
@@ -659,29 +661,25 @@ class WorkerPool:
 
         :param calls: receives the functions to call afterwards without the lock.
         """
-        engine, entity = self.engine, work.entity
+        engine = self.engine
         me.work = None
         if me.outcome is None and not me.has_lent:
-            entity.busy_ns += me.end - me.start
-            offset = self._offset
-            engine.finished(work, me.start + offset, me.end + offset, now, me.vtid, work.worker)
-        elif not self._report_unusual_end(me, work, now, calls):
-            return
-        if engine.to_ask_again:
-            engine.ask_again()
-        if entity.removed:
+            engine.finished(work, me.start, me.end, now, me.vtid, work.worker)
+            if engine.to_ask_again:
+                engine.ask_again()
+        else:
+            self._report_unusual_end(me, work, now, calls)
+        if work.entity.removed:
             self.entities_changed()  # the registry can forget it now
+        if self.muting.until and not engine.holders:
+            self.muting.end()
+            self.due.arm(now - self._offset)  # timers that were muted have new due times
 
     def _report_unusual_end(
         self, me: WorkerThread, work: Work, now: int, calls: list[Callable[[], None]]
-    ) -> bool:
-        """
-        Report an execution that waits, has raised an exception, or has lent its worker.
-
-        :return: whether it ran: its callback group may have refused it.
-        """
-        engine, entity = self.engine, work.entity
-        start, end = me.start + self._offset, me.end + self._offset
+    ) -> None:
+        """Report an execution that was refused, waits, has failed, or has lent its worker."""
+        engine, start, end = self.engine, me.start, me.end
         outcome, worker = me.outcome, work.worker
         me.outcome = None
         if me.has_lent:
@@ -692,9 +690,7 @@ class WorkerPool:
             calls.append(partial(self._settle_end, work, outcome))
         if isinstance(outcome, Refused):
             engine.refused(work, now)
-            return False
-        entity.busy_ns += end - start
-        if outcome is None:
+        elif outcome is None:
             engine.finished(work, start, end, now, me.vtid, worker)
         elif not isinstance(outcome, BaseException):
             engine.suspended(work, start, end, me.vtid, worker)
@@ -705,7 +701,8 @@ class WorkerPool:
             engine.destroyed(work, now)
         else:
             engine.finished(work, start, end, now, me.vtid, worker, True)
-        return True
+        if not isinstance(outcome, Refused):
+            engine.ask_again()
 
     def _settle_end(self, work: Work, outcome: Any) -> None:
         """Resume a suspended execution later, or report an exception; without the lock."""
@@ -716,7 +713,7 @@ class WorkerPool:
         elif isinstance(outcome, BaseException):
             if self.callback_ended is None or not self.callback_ended(
                     work.entity.rclpy, outcome):
-                self._fail(outcome)
+                self.fail(outcome)
         elif outcome is NEXT_TURN or not hasattr(outcome, 'add_done_callback'):
             if self._is_stepping:
                 self._of_next_step.append(work)
@@ -773,7 +770,7 @@ class WorkerPool:
         finally:
             with self.lock:
                 self.running = self._is_stepping = False
-                self.muting.end(False)
+                self.muting.end()
 
     def resume_stepping(self) -> None:
         """Continue as in ``stepping``, after ``start`` and ``pause``."""

@@ -337,7 +337,6 @@ class Loop:
         """End an execution in virtual time, or suspend it."""
         work, engine, worker = execution.work, self.engine, execution.worker
         start, waits_for = execution.start, execution.waits_for
-        work.entity.busy_ns += now - start
         for each in execution.sent:
             each.record(execution.thread)  # before its callback's end
         if waits_for is None:

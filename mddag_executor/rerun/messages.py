@@ -27,7 +27,6 @@ from typing import Any
 from mddag_executor.executor.compat import alive, callback_type, WITH_INFO
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import header_stamp, Origin
-from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.work import Work
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError
@@ -95,14 +94,13 @@ class Messages:
 
     def __init__(
         self, loop: Loop, times: Durations, outputs: Outputs, task_set: TaskSet,
-        recorder: Recorder | None, warn: Callable[[str], None],
+        warn: Callable[[str], None],
     ) -> None:
         self._loop = loop
         self._engine = loop.engine
         self._release_from = [dag.release_from for dag in task_set.dags]
         self._times = times
         self._outputs = outputs
-        self._recorder = recorder
         self._warn = warn
         self._outlets: dict[Any, Outlet] = {}
         self._inlets: dict[str, list[Inlet]] = {}
@@ -285,8 +283,8 @@ class Messages:
             release = now
             if stamp < 0:
                 stamp = now  # a job of its own
-        if self._recorder is not None:
-            self._recorder.taken(entity, message, source_stamp, now)
+        if engine.record is not None:
+            engine.taken(entity, message, source_stamp, now)
         engine.arrived(work, origin, release, stamp, now)
 
     def _release(self, entity: Entity, message: Any, source_stamp: int) -> tuple[int, int]:

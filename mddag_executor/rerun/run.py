@@ -181,7 +181,7 @@ class Rerun:
                 self._engine, settings.cpus, source.times.python, loop.start, loop.ended)
         self._registry = Registry(task_set, self._engine, self._engine.leave_group)
         self._messages = Messages(
-            loop, source.times, self._outputs, task_set, self._recorder, self._warn)
+            loop, source.times, self._outputs, task_set, self._warn)
         self._player = Player(loop, self._messages, source.messages)
         self._services = Services(loop, self._holder, self._warn)
         self._actions = Actions(

@@ -25,12 +25,11 @@ from mddag_executor.executor import compat, executor
 from mddag_executor.executor.compat import BareTask
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, TASK
-from mddag_executor.executor.inbox import Inbox
 from mddag_executor.executor.jobs import Jobs, Origin, Publication, PublisherState, Topic
 from mddag_executor.executor.loop import EventLoop
 from mddag_executor.executor.muting import Muting
 from mddag_executor.executor.sources import Source
-from mddag_executor.executor.timers import TimerSource
+from mddag_executor.executor.timers import TimerQueue, TimerSource
 from mddag_executor.executor.waitables import WaitableSource, WaitSetThread
 from mddag_executor.executor.work import TaskWork, Work
 from mddag_executor.executor.workers import WorkerPool
@@ -83,7 +82,7 @@ def depth_not_kept() -> None:
             message(self, work, *args)
         return broken
     replace(Engine, 'arrived', make)
-    replace(Engine, 'ready_message', make)
+    replace(Engine, 'ready', make)
 
 
 @mutation('Of each kind of entity every twentieth callback does not run, and counts as run.')
@@ -119,8 +118,8 @@ def every_twentieth_response_lost() -> None:
 @mutation('What was left in the middleware since enough waits is never collected.')
 def rest_not_collected() -> None:
     def make(collect: Any) -> Any:
-        def broken(self: Source) -> None:
-            collect(self)
+        def broken(self: Source, left: int = 0) -> None:
+            collect(self, left)
             self.entity.collect_more = None
         return broken
     replace(Source, 'collect', make)
@@ -204,7 +203,7 @@ def exceptions_of_takes_swallowed() -> None:
         def broken(self: Any, *args: Any) -> None:
             init(self, *args[:-1], lambda error: None)
         return broken
-    for kind in (Inbox, WaitableSource, WaitSetThread):
+    for kind in (Source, WaitableSource, WaitSetThread):
         replace(kind, '__init__', make)
 
 
@@ -265,12 +264,12 @@ def shutdown_leaves_wait_set() -> None:
 
 @mutation("A job's release is when its timer was looked at, and not when it was due.")
 def release_is_when_noticed() -> None:
-    def make(timer: Any) -> Any:
-        def broken(self: Inbox, fired: Any) -> None:
-            source, work, _, missed = fired
-            timer(self, (source, work, time.monotonic_ns(), missed))
+    def make(fire: Any) -> Any:
+        def broken(self: TimerQueue) -> Any:
+            for work, _, *missed in fire(self):
+                yield work, time.monotonic_ns(), *missed
         return broken
-    replace(Inbox, 'timer', make)
+    replace(TimerQueue, 'fire', make)
 
 
 @mutation('A message belongs to the oldest open job that still waits for one like it.')
