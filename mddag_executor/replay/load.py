@@ -7,9 +7,10 @@ Theory of operation
 -------------------
 * Jobs are the released jobs, in the order of release.  A source is ready when it was in the
   recording: shortly after a timer's release, possibly long after the header stamp of a message.
-* The executor polls timers in rounds, and dispatches the jobs of a round only after all of it is
-  noticed, because a more urgent one may follow.  A timer that was due when the previous one was
-  noticed belongs to the same round.
+* A worker notices due timers before it chooses its next execution.  A timer that was noticed right
+  after the end of an execution, and was due before, is therefore known at its release: whenever
+  the next execution is chosen, it takes part.  Otherwise it is known when it was noticed.  One
+  worker notices nothing while it runs a callback, so whatever was due meanwhile is known.
 * The execution time of a vertex is the sum of the pieces of its execution.  If it did not complete
   (dropped, expired, open at the end), it is the callback's median, otherwise the declared mean.
 * A job that expired at its release never ran: its timer was noticed after its next period.  This
@@ -19,8 +20,6 @@ Theory of operation
   undeclared DAG, ready when it was in the recording.  Their callback groups are ignored.
 * If CPU times are recorded, execution times are isolated execution times (``isolation``), and the
   load has the CPU time and whether the GIL was held (as recorded or declared).
-* A timer that was due while all workers ran callbacks was noticed late for that reason.  Its
-  latency is that of other timers; how long it waits for a worker is simulated.
 * *Transport* is the time from the end of the publishing execution until the successor is ready;
   negative if it published early.
 * *Dispatch* is the time from when an execution could have started until it started (see
@@ -51,7 +50,7 @@ from mddag_executor.recording import tables as recorded_tables
 from mddag_executor.recording.tables import Ints, Recording, sort_by
 from mddag_executor.replay.deadlines import look_up
 from mddag_executor.replay.dispatches import Dispatches
-from mddag_executor.replay.isolation import ENOUGH, isolated_times, Recorded
+from mddag_executor.replay.isolation import isolated_times, Recorded
 from mddag_executor.replay.noticed import Noticed
 from mddag_executor.replay.usage import ran
 from mddag_executor.simulate import Load
@@ -91,7 +90,8 @@ class RecordedLoad(NamedTuple):
 
 _JOB, _VERTEX, _EDGE = range(3)
 _COLUMNS = {
-    'release': (_JOB, 'i8'), 'noticed': (_JOB, 'i8'), 'round': (_JOB, 'i8'),
+    'release': (_JOB, 'i8'), 'noticed': (_JOB, 'i8'), 'turn': (_JOB, 'i8'),
+    'busy': (_JOB, 'i1'),
     'took': (_VERTEX, 'i8'), 'start': (_VERTEX, 'i8'), 'end': (_VERTEX, 'i8'),
     'cpu': (_VERTEX, 'i8'), 'dispatch': (_VERTEX, 'i4'), 'held': (_VERTEX, 'i2'),
     'arrived': (_EDGE, 'i8'), 'sent': (_EDGE, 'i1')}
@@ -159,7 +159,6 @@ class LoadBuilder:
         for jobs, mine in zip(self._jobs, of_dag):
             jobs.release[:] = mine['release']
             jobs.noticed[:] = np.maximum(mine['release'], mine['noticed'])
-        self._find_rounds(of_dag)
         self._job_ends()
         table = recording.executions
         dag = table['dag'].astype(np.int64)
@@ -172,31 +171,6 @@ class LoadBuilder:
         self._take_completions()
         self._take_publications()
         del self._row
-
-    def _find_rounds(self, of_dag: Sequence[Any]) -> None:
-        """Find which timers were noticed in one round."""
-        timers = [(number, place) for number, mine in enumerate(of_dag) if self._timer[number]
-                  for place in range(len(mine))]
-        columns = [np.concatenate([mine[name] for number, mine in enumerate(of_dag)
-                                   if self._timer[number]] or [np.empty(0, dtype=np.int64)])
-                   for name in ('release', 'noticed', 'order')]
-        process = np.array([self._process[self._tables.source[dag]] for dag, _ in timers],
-                           dtype=np.int64)
-        order = sort_by(process, columns[2])
-        release, noticed, process = columns[0][order], columns[1][order], process[order]
-        begins = np.ones(len(order), dtype=np.bool_)
-        begins[1:] = (process[1:] != process[:-1]) | (release[1:] > noticed[:-1])
-        number = np.cumsum(begins) - 1
-        #: End of each round of timers.
-        self._rounds = noticed[np.r_[np.flatnonzero(begins)[1:] - 1, len(order) - 1]] \
-            if len(order) else noticed
-        rounds = np.empty(len(order), dtype=np.int64)
-        rounds[order] = number
-        at = 0
-        for dag, jobs in enumerate(self._jobs):
-            if self._timer[dag]:
-                jobs.round[:] = rounds[at:at + len(jobs.numbers)]
-                at += len(jobs.numbers)
 
     def _job_ends(self) -> None:
         """Keep failed and skipped executions: they fail or are skipped again."""
@@ -216,14 +190,12 @@ class LoadBuilder:
         piece = table[rows]
         vertex, row = piece['vertex'].astype(np.int64), self._row[rows]
         first, ready = piece['piece'] == 0, piece['ready'].copy()
-        is_source = np.array([not each for each in self._edges_into] + [False])
-        source = np.flatnonzero((row >= 0) & is_source[vertex])
-        for dag, jobs in enumerate(self._jobs):
-            mine = source[piece['dag'][source] == dag]
-            number = jobs.round[row[mine]]
-            known = number >= 0
-            ready[mine[known]] = np.maximum(ready[mine[known]], self._rounds[number[known]])
         process = np.array(self._process, dtype=np.int64)[vertex]
+        self._find_turns(piece, process)
+        for dag, jobs in enumerate(self._jobs):
+            mine = np.flatnonzero((row >= 0) & (vertex == self._tables.source[dag]))
+            turn = jobs.turn[row[mine]]
+            ready[mine] = np.where(turn >= 0, turn, ready[mine])
         self._dispatches = Dispatches(
             n_workers, piece['worker'].astype(np.int64), self._groups(piece['callback'], vertex),
             np.where(first, ready, piece['start']), piece['start'], piece['end'], process)
@@ -242,6 +214,23 @@ class LoadBuilder:
         for dag, jobs in enumerate(self._jobs):
             those = mine[piece['dag'][mine] == dag]
             jobs.dispatch[row[those] * jobs.size + vertex[those] - self._first[dag]] = those
+
+    def _find_turns(self, piece: Any, process: Ints) -> None:
+        """
+        Find the timers that were noticed right after the end of an execution: ``turn``.
+
+        ``busy`` says whether any execution ran at the release.
+        """
+        for dag, jobs in enumerate(self._jobs):
+            here = process == self._process[self._tables.source[dag]]
+            if self._timer[dag] and here.any():
+                start, end = np.sort(piece['start'][here]), piece['end'][here]
+                ended = end[np.maximum(0, np.searchsorted(end, jobs.noticed, 'right') - 1)]
+                begun = np.searchsorted(start, jobs.noticed) - np.searchsorted(start, ended)
+                known = (ended >= jobs.release) & (ended <= jobs.noticed) & (begun == 0)
+                jobs.turn[known] = ended[known]
+                jobs.busy[:] = np.searchsorted(start, jobs.release, 'right') > np.searchsorted(
+                    end, jobs.release, 'right')
 
     def _groups(self, callback: Any, vertex: Ints) -> Ints:
         """Return numbers of the mutually exclusive groups of pieces, or -1."""
@@ -370,8 +359,8 @@ class LoadBuilder:
             'delays': delays, 'delay_stride': [jobs.n_edges for jobs in self._jobs],
             'delay_base': [0, *accumulate(
                 len(jobs.numbers) * jobs.n_edges for jobs in self._jobs[:-1])]}
-        load = self._load(costs, bases, others[:, 0],
-                          overheads and not notices)._replace(
+        load = self._load(costs, bases, others[:, 0], overheads and not notices, workers == 1)
+        load = load._replace(
             fates=self._fates(bases, len(costs)), **columns)
         return RecordedLoad(
             load, [jobs.numbers.tolist() for jobs in self._jobs], demand, executions, estimated,
@@ -487,7 +476,6 @@ class LoadBuilder:
         late = every[number]
         del self._dispatches, number, known
         self._drop('dispatch')
-        self._notice_at_once(start - late)
         ran: Any = (took >= 0) & (start >= 0)
         if ran.all():
             ran = slice(None)   # a slice copies nothing: there may be millions
@@ -512,47 +500,17 @@ class LoadBuilder:
             late[ran] = cost - took[ran]
         return every, usual, late, intakes
 
-    def _notice_at_once(self, could: Any) -> None:
-        """
-        Reduce the latency of timers that were due while all workers ran callbacks.
-
-        How long such a timer waits for a worker is simulated.  Its own latency is at most the
-        median of those that were due while a worker was idle.
-
-        :param could: when executions could have started.
-        """
-        number, noticed, start, end = (
-            self._whole[name] for name in ('round', 'noticed', 'start', 'end'))
-        of = np.flatnonzero(number >= 0)
-        due, ends, home = self._when_due()
-        process = self._by_execution(self._process)
-        for here in np.unique(home):
-            mine = (start >= 0) & (end >= 0) & (process == here)
-            running = (np.searchsorted(np.sort(could[mine]), due, 'right')
-                       - np.searchsorted(np.sort(end[mine]), due, 'right'))
-            blocked = (running >= self._n_workers) & (home == here)
-            idle = (ends - due)[~blocked & (home == here)]
-            usual = int(np.median(idle)) if len(idle) >= ENOUGH else 0
-            ends[blocked] = np.minimum(ends[blocked], due[blocked] + usual)
-        self._rounds = ends
-        noticed[of] = np.minimum(noticed[of], ends[number[of]])
-
-    def _when_due(self) -> tuple[Any, Any, Any]:
-        """Return of each round of timers when it was due, when it ended, and its process."""
-        number, release = self._whole['round'], self._whole['release']
-        of = np.flatnonzero(number >= 0)
-        ends = self._rounds.copy()
-        due, home = np.full(len(ends), NEVER), np.zeros(len(ends), dtype=np.int64)
-        np.minimum.at(due, number[of], release[of])
-        home[number[of]] = np.repeat(
-            [self._process[source] for source in self._tables.source[:-1]],
-            [len(jobs.round) for jobs in self._jobs])[of]
-        return due, ends, home
-
     def _noticed(self) -> Noticed:
         """Return what the intakes noticed in the recording."""
-        due, ends, home = self._when_due()
-        columns = [np.stack((due, ends, home, np.ones_like(due)))]
+        columns = []
+        for dag, jobs in enumerate(self._jobs):
+            if self._timer[dag]:
+                ready, of = np.unique(jobs.noticed, return_inverse=True)
+                due = np.full(len(ready), NEVER)
+                np.minimum.at(due, of, jobs.release)
+                columns.append(np.stack((
+                    due, ready, np.full(len(due), self._process[self._tables.source[dag]]),
+                    np.ones_like(due))))
         to = [[self._process[b] for a, b in edge_numbers(self._tables)
                if self._tables.dag_of[a] == dag.index] for dag in self._task_set.dags]
         for jobs, crosses, places in zip(self._jobs, self._crossings(self._process), to):
@@ -576,15 +534,15 @@ class LoadBuilder:
         return found
 
     def _load(
-        self, costs: Any, bases: list[int], others: Ints, overheads: bool
+        self, costs: Any, bases: list[int], others: Ints, overheads: bool, one_worker: bool
     ) -> Load:
         # ready, DAG, row of the job in its DAG, release
         parts = [np.column_stack((
             others, np.full(len(others), len(self._jobs)), np.arange(len(others)), others))]
-        rounds = np.r_[self._rounds, _UNKNOWN]      # end of a missing round
         for dag, jobs in zip(self._task_set.dags, self._jobs):
             ideal = self._timer[dag.index] and not overheads
-            ready: Any = jobs.release if ideal else np.maximum(jobs.noticed, rounds[jobs.round])
+            ready: Any = jobs.release if ideal else np.where(
+                (jobs.turn >= 0) | one_worker & (jobs.busy > 0), jobs.release, jobs.noticed)
             parts.append(np.column_stack((
                 ready, np.full(len(ready), dag.index), np.arange(len(ready)), jobs.release)))
         columns = np.concatenate(parts).T
