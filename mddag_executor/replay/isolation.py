@@ -15,15 +15,6 @@ which the model, with the recorded starts, gives the recorded ends.
 2. Pauses that the model does not explain remain in the time.  So a schedule like the recorded one
    has the recorded response times.
 3. Long recordings are split into windows; each window uses its own best iteration.
-
-The result is right if as many executions run in parallel as in the recording.  With fewer workers,
-part of the unexplained pauses disappears:
-
-4. The fastest fifth (``LEAST``) of a callback's executions is assumed not to have waited for
-   others.  What an execution waited beyond that, at most the time in which others ran, is time
-   waiting for others.
-5. This time is subtracted in proportion to the time in which more executions ran than the new pool
-   allows.  With one worker all of it is subtracted.
 """
 
 from __future__ import annotations
@@ -31,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from mddag_executor.core import NEVER, Tables
+from mddag_executor.core import Tables
 from mddag_executor.recording.tables import Ints
 from mddag_executor.simulate import END, Load, schedule, Settings
 from mddag_executor.simulate.schedule import prepare
@@ -40,8 +31,6 @@ import numpy.typing as npt
 
 ENOUGH = 5
 """Minimum number of executions for a median."""
-LEAST = 0.2
-"""Quantile of a callback's waiting times that is assumed to be independent of other callbacks."""
 TURNS = 8
 WINDOW = 50_000
 """
@@ -56,8 +45,8 @@ class Recorded(NamedTuple):
     Recorded executions, by columns, ns.
 
     ``could`` is when they could have started, ``took`` the time from then to the end, ``cpu`` the
-    CPU time (-1: unknown), ``locks`` whether they hold the GIL while they compute, ``interpreter``
-    the number of the process's interpreter, from 1, and ``callback`` a number.
+    CPU time (-1: unknown), ``locks`` whether they hold the GIL while they compute, and
+    ``interpreter`` the number of the process's interpreter, from 1.
     """
 
     could: Ints
@@ -65,7 +54,6 @@ class Recorded(NamedTuple):
     cpu: Ints
     locks: Flags
     interpreter: Ints
-    callback: Ints
 
     @property
     def least(self) -> Ints:
@@ -77,7 +65,7 @@ class Recorded(NamedTuple):
         """Return the chosen executions."""
         return Recorded(
             self.could[which], self.took[which], self.cpu[which], self.locks[which],
-            self.interpreter[which], self.callback[which])
+            self.interpreter[which])
 
     def followed_by(self, others: Recorded) -> Recorded:
         """Return these executions, followed by others."""
@@ -85,29 +73,19 @@ class Recorded(NamedTuple):
         return Recorded(*columns)
 
 
-def isolated_times(ran: Recorded, cpus: int = 0, workers: int = NEVER) -> Ints:
+def isolated_times(ran: Recorded, cpus: int = 0) -> Ints:
     """
     Return isolated execution times.
 
     :param cpus: CPUs of the machine; 0: unknown.
-    :param workers: workers of each process, if fewer than in the recording.
     """
     took = ran.took.copy()
-    at_once = workers * int(ran.interpreter.max(initial=1)) if workers < NEVER else NEVER
-    some, more = (np.zeros(len(took) * (workers < NEVER), dtype=np.int64) for _ in range(2))
     for which in _windows(ran):
         window = ran.of(which)
-        ends = window.could + window.took
-        overlap = _overlap(window.could, ends)
-        if workers < NEVER:
-            some[which], more[which] = overlap, _overlap(window.could, ends, at_once)
-        disturbed = which[overlap > 0]
+        disturbed = which[_overlaps(window.could, window.could + window.took)]
         if len(disturbed):
             took[disturbed] = _explained(
                 ran.of(disturbed), cpus, TURNS * len(took) // len(disturbed))
-    if workers < NEVER:
-        took -= np.rint(
-            _waited_for_others(ran, took, some) * more / np.maximum(1, some)).astype(np.int64)
     return took
 
 
@@ -124,15 +102,6 @@ def _windows(ran: Recorded) -> Iterator[Ints]:
             window = WINDOW + int(running[WINDOW:].argmin())
         yield order[:window]
         order = order[window:]
-
-
-def _by_callback(callback: Ints, those: Flags) -> Iterator[Ints]:
-    """Yield the chosen executions of each callback."""
-    places = np.flatnonzero(those)
-    places = places[np.argsort(callback[places], kind='stable')]
-    for which in np.split(places, np.flatnonzero(np.diff(callback[places])) + 1):
-        if len(which):
-            yield which
 
 
 def _explained(ran: Recorded, cpus: int, runs: int) -> Ints:
@@ -191,23 +160,9 @@ def _interpreters(n: int) -> Tables:
         first_sink=[0] * (n + 1), first_successor=[0] * (n + 1))
 
 
-def _waited_for_others(ran: Recorded, took: Ints, overlap: Ints) -> Ints:
-    """Return how long executions waited for others, which ran for ``overlap``."""
-    waited = took - ran.least
-    lost = np.zeros_like(took)
-    for which in _by_callback(ran.callback, ran.cpu >= 0):
-        lost[which] = waited[which] - np.quantile(waited[which], LEAST)
-    found: Ints = np.clip(lost, 0, overlap)
+def _overlaps(begins: Ints, ends: Ints) -> Flags:
+    """Return which intervals overlap others; they are in the order of their begins."""
+    later = np.maximum.accumulate(ends)[:-1] > begins[1:]
+    earlier = begins[1:] < ends[:-1]
+    found: Flags = np.append(False, later) | np.append(earlier, False)
     return found
-
-
-def _overlap(begins: Ints, ends: Ints, others: int = 1) -> Ints:
-    """Return by interval how long at least ``others`` other intervals overlapped it."""
-    times = np.concatenate([begins, ends])
-    order = np.argsort(times, kind='stable')
-    passed = np.diff(times[order])
-    passed[np.cumsum(np.where(order < len(begins), 1, -1))[:-1] <= others] = 0
-    total = np.zeros_like(times)
-    total[order[1:]] = np.cumsum(passed)
-    overlap: Ints = total[len(begins):] - total[:len(begins)]
-    return overlap

@@ -141,7 +141,6 @@ class LoadBuilder:
         self._task_set, self._recording, self._tables = task_set, recording, tables
         self._first = tables.first_vertex
         self._process = [*(processes or [1] * tables.n_vertices), 1]
-        self._callbacks = task_set.places_of_vertices()
         self._cpus, self._n_workers = cpus, n_workers
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
         # by global vertex and leg: the edge (number in its DAG) that its message satisfies
@@ -482,16 +481,18 @@ class LoadBuilder:
         if (cpu[ran] >= 0).any():
             recorded = Recorded(
                 start[ran] - late[ran], took[ran] + late[ran], cpu[ran], locks[ran],
-                self._by_execution(self._process)[ran],
-                self._by_execution(self._callbacks)[ran])
+                self._by_execution(self._process)[ran])
             give_back()
             beyond = recorded
             if notices:
                 noticed = self._noticed()
                 intakes = noticed.costs(recorded)
                 beyond = recorded.followed_by(noticed.executions(intakes))
-            cost = isolated_times(beyond, self._cpus, workers)[:len(recorded.took)]
+            cost = isolated_times(beyond, self._cpus)[:len(recorded.took)]
             del beyond
+            if workers == 1:    # no other thread of the process competes for the GIL
+                alone = recorded.locks
+                cost[alone] = np.minimum(cost, recorded.cpu + late[ran])[alone]
             # the reduction: it began late, or was paused later
             began = recorded.took - cost
             del recorded

@@ -78,5 +78,4 @@ class Noticed(NamedTuple):
         took = np.maximum(takes, self.ready - self.due + more)
         due = self.ready + more - took
         n = len(due)
-        return Recorded(due, took, takes, np.ones(n, dtype=np.bool_), self.interpreter,
-                        np.full(n, -1))
+        return Recorded(due, took, takes, np.ones(n, dtype=np.bool_), self.interpreter)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mddag_executor.core import NEVER
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import EXECUTIONS, Recording, rows
@@ -33,15 +32,13 @@ Ran = tuple[float, float, float, int]
 
 def of(
     *ran: Ran, cpus: int = 0, here: Sequence[int] | None = None,
-    callbacks: Sequence[int] | None = None, workers: int = NEVER,
 ) -> list[float]:
     """Return what executions would have taken alone; all in ms."""
     could, took, cpu, held = (np.array(column) for column in zip(*ran))
     times = [np.rint(each * 1e6).astype(np.int64) for each in (could, took)]
     cpu = np.where(cpu < 0, -1, np.rint(cpu * 1e6)).astype(np.int64)
     interpreter = np.array(here) if here is not None else np.maximum(held, 1)
-    callback = np.arange(len(ran)) if callbacks is None else np.array(callbacks)
-    found = isolated_times(Recorded(*times, cpu, held > 0, interpreter, callback), cpus, workers)
+    found = isolated_times(Recorded(*times, cpu, held > 0, interpreter), cpus)
     return [float(each) for each in np.round(found / 1e6, 1)]
 
 
@@ -76,17 +73,14 @@ def test_cpus_that_were_busy() -> None:
 @settings(deadline=None)
 @given(st.lists(st.tuples(
     st.integers(0, 10), st.integers(0, 10), st.integers(-1, 10), st.integers(0, 2)),
-    min_size=1, max_size=20), st.integers(0, 3), st.integers(1, 5), st.integers(1, 30),
-    st.integers(1, 4))
+    min_size=1, max_size=20), st.integers(0, 3), st.integers(1, 30))
 def test_never_longer_and_alone_never_less_than_it_computed(
-    ran: list[Ran], cpus: int, callbacks: int, window: int, workers: int
+    ran: list[Ran], cpus: int, window: int
 ) -> None:
     """Also where the windows part what runs."""
     with MonkeyPatch.context() as patch:
         patch.setattr(module, 'WINDOW', window)
-        found = of(
-            *ran, cpus=cpus, callbacks=[i % callbacks for i in range(len(ran))],
-            workers=workers)
+        found = of(*ran, cpus=cpus)
     for (_, took, cpu, _), alone_ in zip(ran, found):
         assert min(cpu, took) <= alone_ <= took
 
@@ -178,7 +172,7 @@ def recorded(count: int) -> tuple[Recorded, Noticed]:
         timer += [True, False]
     one = np.ones(count, dtype=np.int64)
     return Recorded(
-        np.array(could), np.array(took), 5 * MS * one, one > 0, one, one), Noticed(
+        np.array(could), np.array(took), 5 * MS * one, one > 0, one), Noticed(
         np.array(due), np.array(ready), np.ones(len(due), dtype=np.int64), np.array(timer))
 
 
