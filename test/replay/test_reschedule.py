@@ -429,14 +429,18 @@ nodes:
 @pytest.mark.parametrize('options', [
     [], ['--workers', '1'], ['--preemptive'], ['--cpus', '1'], ['--overheads', 'none'],
     ['--processes', '2']])
-@pytest.mark.parametrize('computed', [(), (MS, True)])
+@pytest.mark.parametrize('computes', [False, True])
 def test_what_was_not_published_is_not_published_again(
-    options: list[str], computed: tuple[Any, ...], tmp_path: Path,
+    options: list[str], computes: bool, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     # /detect finds an object in every third image; the other jobs expire
     path, jobs = tmp_path / 'run.mcap', 40
     with begin_trace(path, SELDOM, workers=2) as file:
+        def ran(start: int, end: int, dag: int, vertex: int, **more: int) -> None:
+            computed = (end - start, True) if computes else ()
+            add_execution(file, start, end, dag, vertex, job, computed=computed, **more)
+
         for publisher, topic in ((51, '/image'), (52, '/object')):
             file.add('rcl_publisher_init', START_TIME, 1, 1, publisher, 1, publisher, topic, 10)
         for job in range(jobs):
@@ -445,16 +449,13 @@ def test_what_was_not_published_is_not_published_again(
                 file.add('expire', at, 1, 1, 0, job - 11)
             for dag in (0, 1):
                 file.add('job_release', at, 1, 1, dag, job, at)
-            add_execution(file, at, at + 2 * MS, 0, 0, job, address=7, computed=computed)
+            ran(at, at + 2 * MS, 0, 0, address=7)
             file.add('rclcpp_publish', at + MS, 1, 10, 51, 0, 0)
-            add_execution(file, at + 2 * MS, at + 5 * MS, 0, 1, job, address=8,
-                          computed=computed)
+            ran(at + 2 * MS, at + 5 * MS, 0, 1, address=8)
             if job % 3 == 0:
                 file.add('rclcpp_publish', at + 4 * MS, 1, 10, 52, 0, 0)
-                add_execution(file, at + 5 * MS, at + 6 * MS, 0, 2, job, address=9,
-                              computed=computed)
-            add_execution(file, at + 10 * MS, at + 12 * MS, 1, 0, job, ready=at, address=6,
-                          thread=11, worker=1, computed=computed)
+                ran(at + 5 * MS, at + 6 * MS, 0, 2, address=9)
+            ran(at + 10 * MS, at + 12 * MS, 1, 0, ready=at, address=6, thread=11, worker=1)
         end_trace(file, START_TIME + jobs * 100 * MS)
     found = []
     for more in ([], ['--reschedule', *options]):
