@@ -19,54 +19,36 @@ An execution that holds the GIL also waited until the previous one had released 
 
 from __future__ import annotations
 
-from typing import Any
-
-from mddag_executor.recording.tables import Ints
+from mddag_executor.recording.tables import Ints, Mask
 import numpy as np
 
 
-class Dispatches:
+def dispatch_times(
+    n_workers: int, worker: Ints, group: Ints, ready: Ints, start: Ints, end: Ints,
+    process: Ints, holding: Mask,
+) -> Ints:
     """
-    Computes the dispatch times of executions.
+    Return the dispatch times of executions, ns.
 
     All are given by columns, in the order of their ends; times in ns.
 
     :param n_workers: number of workers of each process.
     :param worker: the worker of each execution, -1: unknown.
     :param group: number of its mutually exclusive callback group, or -1.
+    :param holding: whether it holds the GIL.
     """
-
-    def __init__(
-        self, n_workers: int, worker: Ints, group: Ints, ready: Ints, start: Ints, end: Ints,
-        process: Ints,
-    ) -> None:
-        self._n_workers = n_workers
-        self._start, self._end, self._process = start, end, process
-        # when it was free, and when its worker was free, too
-        self._free = np.maximum(ready, _end_before(group, end))
-        self._worker = np.maximum(self._free, _end_before(worker, end))
-
-    def late(self, holding: Any = ()) -> Any:
-        """
-        Return by number the dispatch time, ns, as an array.
-
-        :param holding: the numbers of executions that hold the GIL.
-        """
-        free, start, end, worker = self._free, self._start, self._end, self._worker
-        process = self._process
-        could = worker.copy()
-        for number in np.unique(process).tolist():
-            here = process == number
-            n_free, n_ended = (
-                np.searchsorted(np.sort(times[here]), free, 'right') for times in (free, end))
-            could = np.where(here & (n_free - n_ended <= self._n_workers), free, could)
-        holding = np.array(holding, dtype=np.int64)
-        for number in np.unique(process[holding]).tolist():
-            mine = holding[process[holding] == number]
-            ended = np.sort(end[mine])
-            place = np.searchsorted(ended, start[mine], 'right') - 1
-            could[mine] = np.maximum(could[mine], np.where(place >= 0, ended[place], 0))
-        return np.maximum(0, start - could)
+    free = np.maximum(ready, _end_before(group, end))
+    could = np.maximum(free, _end_before(worker, end))
+    for number in np.unique(process).tolist():
+        here = process == number
+        n_free, n_ended = (
+            np.searchsorted(np.sort(times[here]), free, 'right') for times in (free, end))
+        could = np.where(here & (n_free - n_ended <= n_workers), free, could)
+        mine = np.flatnonzero(here & holding)
+        place = np.searchsorted(end[mine], start[mine], 'right') - 1
+        could[mine] = np.maximum(could[mine], np.where(place >= 0, end[mine][place], 0))
+    late: Ints = np.maximum(0, start - could)
+    return late
 
 
 def _end_before(of: Ints, end: Ints) -> Ints:

@@ -49,7 +49,7 @@ from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded_tables
 from mddag_executor.recording.tables import Ints, Recording, sort_by
 from mddag_executor.replay.deadlines import look_up
-from mddag_executor.replay.dispatches import Dispatches
+from mddag_executor.replay.dispatches import dispatch_times
 from mddag_executor.replay.isolation import isolated_times, Recorded
 from mddag_executor.replay.noticed import Noticed
 from mddag_executor.replay.usage import ran
@@ -195,9 +195,11 @@ class LoadBuilder:
             mine = np.flatnonzero((row >= 0) & (vertex == self._tables.source[dag]))
             turn = jobs.turn[row[mine]]
             ready[mine] = np.where(turn >= 0, turn, ready[mine])
-        self._dispatches = Dispatches(
+        self._late = dispatch_times(
             n_workers, piece['worker'].astype(np.int64), self._groups(piece['callback'], vertex),
-            np.where(first, ready, piece['start']), piece['start'], piece['end'], process)
+            np.where(first, ready, piece['start']), piece['start'], piece['end'], process,
+            piece['holds_gil'] & (piece['cpu'] >= 0) & (
+                piece['completes'] == recorded_tables.VERTEX))
         numbers = np.arange(len(rows))
         others = np.flatnonzero(vertex < 0)
         # ready, duration, dispatch or -1: undeclared callbacks, and legs that completed nothing
@@ -468,12 +470,11 @@ class LoadBuilder:
         number, took, start, cpu, held = (
             self._whole[name] for name in ('dispatch', 'took', 'start', 'cpu', 'held'))
         locks = (held > 0) & (cpu >= 0)
-        every = self._dispatches.late(number[locks & (number >= 0)])
         known = number[number >= 0]
-        usual = quantile(memoryview(np.sort(every[known])), 0.5) if len(known) else None
-        every = np.append(every, usual or 0)     # number -1
+        usual = quantile(memoryview(np.sort(self._late[known])), 0.5) if len(known) else None
+        every = np.append(self._late, usual or 0)     # number -1
         late = every[number]
-        del self._dispatches, number, known
+        del self._late, number, known
         self._drop('dispatch')
         ran: Any = (took >= 0) & (start >= 0)
         if ran.all():

@@ -14,7 +14,7 @@ from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import EXECUTIONS, Recording, rows
 from mddag_executor.replay import isolation as module
 from mddag_executor.replay import replay
-from mddag_executor.replay.dispatches import Dispatches
+from mddag_executor.replay.dispatches import dispatch_times
 from mddag_executor.replay.isolation import isolated_times, Recorded
 from mddag_executor.replay.noticed import Noticed
 from mddag_executor.replay.usage import group_waits, PoolUse
@@ -85,19 +85,19 @@ def test_never_longer_and_alone_never_less_than_it_computed(
         assert min(cpu, took) <= alone_ <= took
 
 
-Executions = list[tuple[int, 'int | None', int, int, int]]
+Execution = tuple[int, 'int | None', int, int, int]
 """Worker, group, when it was ready, its start and its end."""
 
 
-def dispatches(n_workers: int, executions: Executions) -> Dispatches:
+def late(n_workers: int, *executions: Execution, holding: Sequence[int] = ()) -> list[int]:
+    if not executions:
+        return []
     worker, group, ready, start, end = (
         np.array([-1 if each is None else each for each in column], dtype=np.int64)
         for column in zip(*executions))
-    return Dispatches(n_workers, worker, group, ready, start, end, np.ones_like(worker))
-
-
-def late(n_workers: int, *executions: tuple[int, int | None, int, int, int]) -> list[int]:
-    return dispatches(n_workers, [*executions]).late().tolist() if executions else []
+    return dispatch_times(
+        n_workers, worker, group, ready, start, end, np.ones_like(worker),
+        np.isin(np.arange(len(worker)), holding)).tolist()
 
 
 @pytest.mark.parametrize(('workers', 'executions', 'expected'), [
@@ -117,7 +117,7 @@ def late(n_workers: int, *executions: tuple[int, int | None, int, int, int]) -> 
     # an unknown worker is not waited for
     (1, [(-1, None, 0, 0, 400), (-1, None, 100, 430, 500)], [0, 330]),
 ])
-def test_by_hand(workers: int, executions: Executions, expected: list[int]) -> None:
+def test_by_hand(workers: int, executions: list[Execution], expected: list[int]) -> None:
     assert late(workers, *executions) == expected
 
 
@@ -136,15 +136,13 @@ def test_a_schedule_without_overhead_has_none(jobs: list[tuple[int, int]]) -> No
 def test_waiting_for_what_computes_is_not_late() -> None:
     """Three that compute, one after the other; a fourth overtakes; one that only waits."""
     ms = 1_000_000
-    first, overtakes, second, waits, third = range(5)
-    found = dispatches(5, [
-        (0, None, 0, 30, 10 * ms), (3, None, 4 * ms, 5 * ms + 7, 6 * ms),
-        (1, None, 0, 10 * ms + 50, 20 * ms), (4, None, 12 * ms, 13 * ms + 9, 22 * ms),
-        (2, None, 15 * ms, 20 * ms + 60, 30 * ms)])
+    overtakes, first, second, _, third = range(5)
     # who overtakes and who only waits could begin at once; the machine tells why they did not
-    assert found.late([first, second, third, overtakes]).tolist() == [
-        30, ms + 7, 50, ms + 9, 60]
-    assert waits == 3
+    assert late(
+        5, (3, None, 4 * ms, 5 * ms + 7, 6 * ms), (0, None, 0, 30, 10 * ms),
+        (1, None, 0, 10 * ms + 50, 20 * ms), (4, None, 12 * ms, 13 * ms + 9, 22 * ms),
+        (2, None, 15 * ms, 20 * ms + 60, 30 * ms), holding=(overtakes, first, second, third),
+    ) == [ms + 7, 30, 50, ms + 9, 60]
 
 
 TIMER, MESSAGE = 200_000, 400_000
