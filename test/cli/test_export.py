@@ -71,12 +71,8 @@ def test_diff(
     quick.write_text(GRAPH % '1ms')
     after = tmp_path / 'after.mcap'
     call(capsys, 'simulate', quick, '--duration', '100ms', '--workers', 1, '--trace', after)
-    status, out, err = call(capsys, 'diff', trace, after, '--fail-on-worse', '--callbacks')
-    assert (status, err) == (0, '')
-    assert ['n:s', '10', '10', '0.00', '%', '100.00', '%', '6', 'ms', '3', 'ms', '6', 'ms', '3',
-            'ms', '-50.0', '%'] in [
-                line.split() for line in out.splitlines()]
-    assert 'n:t' in out and 'worse in B: 0 sinks' in out
+    status, out, err = call(capsys, 'diff', trace, after, '--fail-on-worse')
+    assert (status, err) == (0, '') and 'worse in B: 0 sinks' in out
     status, out, _ = call(capsys, 'diff', after, trace, '--fail-on-worse')
     assert status == 1 and 'worse in B: 1 sink' in out
     assert call(capsys, 'diff', after, trace)[0] == 0

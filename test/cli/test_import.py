@@ -38,13 +38,6 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_it_writes_a_trace(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = recording.with_name('out.mcap')
-    status, text, errors = call(capsys, 'ctf', recording, '-o', out)
-    assert (status, text, errors) == (0, f'1 event of 1 kind from 1 process: {out}\n', '')
-    assert [event['callback'] for event in read_events(out)] == [3]
-
-
 def test_what_was_there_stays_when_the_import_fails(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

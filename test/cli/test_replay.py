@@ -16,6 +16,7 @@ import pytest
 from ..cli.helpers import caller
 from ..replay.recorded import four_jobs, MS
 from ..report.runs import by_hand, GRAPH, START
+from .test_golden import SEEN
 
 call = caller('replay')
 
@@ -40,22 +41,7 @@ def test_a_given_graph_judges(
     assert 'first miss' not in out
 
 
-def test_reschedule(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Without the recorded waiting and transport the third job is still late: 6 and 3 ms."""
-    status, out, err = call(
-        capsys, trace, '--reschedule', '--workers', 1, '--policy', 'fifo', '--preemptive',
-        '--overheads', 'none')
-    assert (status, err) == (0, '')
-    lines = [line.split() for line in out.splitlines()]
-    assert ['filter:run', '8', 'ms', '3', '66.67', '%', '66.67', '%', '9', 'ms', '10', 'ms', '9',
-            'ms', '10', 'ms'] in lines
-    assert ('policy fifo, 1 worker, preemptive, 40 ms, utilisation 0.450, workers busy 45.0 %'
-            in out.splitlines())
-    assert 'first miss: /filter:run, job 2, 1 ms late' in out
-    result = json.loads(call(capsys, trace, '--reschedule', '--json', '-')[1])
-    assert (result['policy'], result['workers'], result['preemptive']) == ('rad', 2, False)
-    assert result['rescheduled'] is True
-    assert result['recorded']['dags']['/driver']['sinks']['/filter:run']['completed'] == 3
+def test_overheads(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # the second callback was dispatched 1 ms after it was ready, though its worker was free
     for options, longest in (([], 10 * MS), (['--overheads', 'recorded'], 10 * MS),
                              (['--overheads', 'none'], 9 * MS), (['--overheads', '2ms'], 13 * MS)):
@@ -178,46 +164,14 @@ nodes:
         assert (done.returncode, done.stderr) == (2, f'error: --sink: {says}\n')
 
 
-IMPORTED = """\
-mddag: 1
-nodes:
-  - node: /camera
-    callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]
-  - node: /detect
-    callbacks: [{name: detect, subscription: /image, deadline: 8ms}]
-paths:
-  - {name: seen, callbacks: ['/camera:grab', '/detect:detect']}
-"""
-
-
-@pytest.fixture
-def drive(tmp_path: Path) -> Path:
-    """Give a recording of four jobs; the last one is late."""
-    (tmp_path / 'graph.yaml').write_text(IMPORTED)
-    return four_jobs(tmp_path / 'drive.mcap')
-
-
-def test_with_a_graph(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    graph, out = drive.with_name('graph.yaml'), drive.with_name('out.json')
-    status, text, errors = call(capsys, drive, graph, '--fail-on-miss', '--json', out)
-    assert (status, errors) == (1, '')
-    assert '4 results due, 3 in time (75.00 %), 1 late, 0 expired' in text
-    assert 'imported: 2 threads ran callbacks' in text
-    rows = [line.split() for line in text.splitlines()]
-    assert any(row[:6] == ['seen', '4', 'of', '4', 'all', '3'] for row in rows)
-    assert any(row[:2] == ['worst-with-external-latency', '2'] for row in rows)
-    assert 'Callbacks in the recording' not in text
-    result = json.loads(out.read_text())
-    assert result['paths']['seen']['data_age']['max'] == 2 * MS
-    assert result['first_miss']['job'] == 3
-
-
-def test_rescheduled(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_imported_run_is_rescheduled_with_a_graph_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive, graph = four_jobs(tmp_path / 'drive.mcap'), tmp_path / 'graph.yaml'
+    graph.write_text(SEEN)
     status, text, errors = call(
-        capsys, drive, drive.with_name('graph.yaml'), '--reschedule', '--workers', 1,
-        '--policy', 'rad')
-    assert (status, errors) == (0, '')
-    assert 'policy rad, 1 worker' in text
+        capsys, drive, graph, '--reschedule', '--policy', 'rad', '--workers', 1)
+    assert (status, errors) == (0, '') and 'policy rad, 1 worker' in text
     status, _, errors = call(capsys, drive, '--reschedule')
     assert (status, errors.count('\n')) == (2, 1)
     assert errors.startswith(f'error: {drive}: it was imported') and 'GRAPH' in errors

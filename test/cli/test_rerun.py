@@ -6,16 +6,16 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-import re
 import shutil
 import subprocess
 import sys
 
 import pytest
 
+from . import golden
+
 EXAMPLE = Path(__file__).resolve().parents[2] / 'examples' / 'rerun'
 THIRD_PARTY = EXAMPLE.parent / 'third_party'
-GOLDEN = Path(__file__).parent / 'golden' / 'rerun.txt'
 NODES = ('--node', 'robot:Tracker', '--node', 'robot:Brake')
 
 
@@ -52,11 +52,7 @@ def test_a_run_and_its_result(drive: Path) -> None:
     done = mddag(
         drive, 'rerun', 'drive.mcap', 'graph.yaml', *NODES, '-o', 'out.mcap', '--trace',
         'run.mcap', '--json', 'result.json')
-    found = re.sub('sha256:[0-9a-f]{64}', 'DIGEST', re.sub(
-        r'in [0-9.]+ s \([0-9.]+ times', 'in 0 s (0 times', done.stdout))
-    if os.environ.get('UPDATE_GOLDEN'):
-        GOLDEN.write_text(found)
-    assert found == GOLDEN.read_text()
+    golden.compare('rerun', done.stdout)
     result = json.loads((drive / 'result.json').read_text())
     assert result['topics'] == {'/brake': 50, '/parameter_events': 4, '/track': 50}
     assert result['messages'] == 104

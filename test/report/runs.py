@@ -40,9 +40,14 @@ paths:
 
 
 def by_hand(
-    path: Path, hostile: bool = False, finished: bool = True, undeclared: bool = True
+    path: Path, hostile: bool = False, finished: bool = True, undeclared: bool = True,
+    extra_ms: int = 0,
 ) -> Path:
-    """Write a trace of three jobs; the third is 2 ms late; then an undeclared callback runs."""
+    """
+    Write a trace of three jobs; the third is 2 ms late; then an undeclared callback runs.
+
+    :param extra_ms: how much longer the last callback takes.
+    """
     with TraceFile(path, overwrite=True) as file:
         def add(name: str, ms: int, *fields: Any) -> None:
             file.add(name, START + ms * MS, 1, 9, *fields)
@@ -61,8 +66,8 @@ def by_hand(
             at = 10 + 10 * job
             add('job_release', at, 0, job, START + at * MS)
             run(0, job, at, at, at + first)
-            run(1, job, at + first, at + first + 1, at + first + 4)
-        add('deadline', 40, 0, 1, 2, START + 38 * MS, START + 40 * MS)
+            run(1, job, at + first, at + first + 1, at + first + 4 + extra_ms)
+        add('deadline', 40 + extra_ms, 0, 1, 2, START + 38 * MS, START + (40 + extra_ms) * MS)
         if undeclared:
             add('dispatch', 41, 77, -1, -1, -1, -1, START + 41 * MS, 0)
             add('callback_start', 41, 77, False)

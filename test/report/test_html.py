@@ -16,16 +16,8 @@ from hypothesis import strategies as st
 from mddag_executor.replay import replay
 from mddag_executor.report import html
 from mddag_executor.report.diff import callbacks_table, compare, sinks_table
-from mddag_executor.report.html_data import (
-    COLOURS,
-    json_for_html,
-    label,
-    prepare,
-    UNKNOWN,
-)
-from mddag_executor.report.html_tables import (
-    html_table,
-)
+from mddag_executor.report.html_data import COLOURS, json_for_html, label, prepare, UNKNOWN
+from mddag_executor.report.html_tables import html_table
 import msg_graph
 import pytest
 
@@ -85,11 +77,6 @@ def test_what_is_in_the_file_is_what_ran(tmp_path: Path) -> None:
     assert prepared.marks['x'] == pytest.approx([0.030])
 
 
-def ms(text: str) -> float:
-    number, unit = text.split()
-    return float(number) * {'us': 1e-3, 'ms': 1.0, 's': 1e3}[unit]
-
-
 def test_a_page_needs_nothing_but_itself(tmp_path: Path) -> None:
     page = report(runs.by_hand(tmp_path / 'run.mcap'))
     assert any(tag == 'script' for tag, _ in page.elements)
@@ -120,15 +107,6 @@ def test_json_and_cells_hold_any_text(text: str) -> None:
     page = Page(html_table(('a',), [(text,)], 1))
     assert [tag for tag, _ in page.elements] == ['table', 'thead', 'tr', 'th', 'tbody', 'tr', 'td']
     assert len(label(text, 20)) <= 20
-
-
-def test_end_to_end_times_of_declared_paths(tmp_path: Path) -> None:
-    page = report(runs.by_hand(tmp_path / 'run.mcap'))
-    outcome = replay(runs.by_hand(tmp_path / 'run.mcap'))
-    data = html.of_outcome(outcome)
-    assert data.paths == outcome.result()['paths']
-    text = ' '.join(' '.join(page.texts).split())
-    assert ('worst-with-external-latency' in text) is bool(data.paths)
 
 
 def test_a_run_without_anything_has_a_report_too() -> None:

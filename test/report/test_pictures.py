@@ -3,7 +3,7 @@
 """
 Pictures of task sets: what is in them, and that no name can break out of its label.
 
-``test_golden`` has the DOT and Mermaid texts of ``GRAPH``.
+``cli/test_golden.py`` has the DOT and Mermaid texts of ``GRAPH``.
 """
 
 from __future__ import annotations

@@ -1,0 +1,45 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Comparison with the files in golden/, without what is different in each run."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import re
+from typing import Any
+
+from mddag_executor import __version__
+
+FOLDER = Path(__file__).with_name('golden')
+_CHANGING = (
+    (re.compile(r'"(elapsed_s)": [0-9.e-]+'), r'"\1": 0'),
+    (re.compile(r'in \d+\.\d s, \d+\.\d\d ms for'), 'in 0.0 s, 0.00 ms for'),
+    (re.compile('sha256:[0-9a-f]{64}'), 'DIGEST'),
+    (re.compile(r'in [0-9.]+ s \([0-9.]+ times'), 'in 0 s (0 times'),
+    (re.compile(f'"mddag": "{re.escape(__version__)}"'), '"mddag": "VERSION"'))
+
+
+def compare(name: str, found: str) -> None:
+    """Compare a text with a file; with UPDATE_GOLDEN in the environment, write the file."""
+    found = found.replace('\r\n', '\n')
+    for pattern, constant in _CHANGING:
+        found = pattern.sub(constant, found)
+    path = FOLDER / f'{name}.txt'
+    if os.environ.get('UPDATE_GOLDEN'):
+        path.write_bytes(found.encode())
+    assert found == path.read_bytes().decode()
+
+
+def words(text: str) -> str:
+    """Return the text of a live run without its numbers, and without what a busy machine adds."""
+    lines = [re.sub(r'-?\d+(\.\d+)?( (ns|us|ms|s)\b)?', '#', line) for line in text.splitlines()]
+    return ''.join(f'{re.sub(" +", " ", line)}\n' for line in lines if not re.search(
+        'stops?$|stops? [(]|timer releases? skipped|differences? between', line))
+
+
+def shape(value: Any, depth: int = 9) -> Any:
+    """Return a result without its values: the names of all that it has."""
+    if isinstance(value, dict) and depth:
+        return {key: shape(each, depth - 1) for key, each in value.items()}
+    return '...'
