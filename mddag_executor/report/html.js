@@ -136,7 +136,7 @@
   }
 
   function darken(doc) {                // the pictures, where the reader prefers dark pages
-    for (const {model} of Bokeh.index) {
+    for (const model of doc.roots()) {
       model.setv({background_fill_color: '#202022', border_fill_color: '#1b1b1d',
                   outline_line_color: '#555'});
       if (model.title) model.title.text_color = '#ddd';

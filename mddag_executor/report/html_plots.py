@@ -114,8 +114,8 @@ def _overview(data: ReportData, prepared: Prepared, time: Range1d) -> Any:
     plot.yaxis.axis_label = 'busy workers'
     _seconds(plot, 'time (s)')
     tool = RangeTool(x_range=time)
-    tool.overlay.fill_color = '#000000'
-    tool.overlay.fill_alpha = 0.08
+    tool.overlay.fill_color = '#888888'      # on light and dark pages
+    tool.overlay.fill_alpha = 0.2
     plot.add_tools(tool)
     _style(plot)
     return plot

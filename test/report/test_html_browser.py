@@ -158,8 +158,13 @@ def test_the_wheel_zooms_only_with_ctrl(browser: Any, small: Path) -> None:
     assert complaints(browser) == []
 
 
-def test_a_miss_can_be_found(browser: Any, large: Path) -> None:
+@pytest.mark.parametrize('scheme', ['dark', 'light'])
+def test_a_miss_can_be_found(browser: Any, large: Path, scheme: str) -> None:
+    browser.execute_cdp_cmd('Emulation.setEmulatedMedia', {
+        'features': [{'name': 'prefers-color-scheme', 'value': scheme}]})
     opened(browser, large)
+    shown = browser.execute_script('return Bokeh.documents[0].roots()[0].border_fill_color')
+    assert (shown == '#1b1b1d') is (scheme == 'dark')
     first = browser.execute_script('return mddag.missed[0]')
     browser.find_element('id', 'mddag-next').click()
     wait_for(lambda: 'MISSED' in status(browser))
