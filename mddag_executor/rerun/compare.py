@@ -78,97 +78,93 @@ def differences(
         wanted.setdefault(message.topic, []).append(message)
     results = []
     for topic in sorted({*found, *wanted}):
-        one = _Topic(topic, start, tolerance).compare(
-            found.get(topic, []), wanted.get(topic, []))
+        one = _difference(
+            topic, found.get(topic, []), wanted.get(topic, []), start, tolerance)
         if one is not None:
             results.append(one)
     return results
 
 
-class _Topic:
-    """Compares the messages of one topic."""
+def _difference(
+    topic: str, found: Sequence[Output], expected: Sequence[RecordedMessage], start: int,
+    tolerance: float,
+) -> Difference | None:
+    counts = len(found), len(expected)
+    timing: Difference | None = None
+    for number, (one, other) in enumerate(zip(found, expected)):
+        at = one.time - start
+        if other.kind != type_name(one.kind):
+            return Difference(topic, CONTENT, number, at, 'its type', other.kind,
+                              type_name(one.kind), *counts)
+        for path, a, b, is_time in _fields(one, other, tolerance):
+            difference = Difference(
+                topic, TIMING if is_time else CONTENT, number, at, path, _shown(b),
+                _shown(a), *counts)
+            if not is_time:
+                return difference
+            timing = timing or difference
+        if timing is None and one.time != other.time:
+            timing = Difference(
+                topic, TIMING, number, at, '',
+                f'{(other.time - start) / 1e9:.6f} s', f'{at / 1e9:.6f} s', *counts)
+    if len(found) == len(expected):
+        return timing
+    if timing is not None:
+        return timing._replace(kind=MISSING)
+    number = min(counts)
+    time = found[number].time if len(found) > number else expected[number].time
+    sides = ('nothing', 'there') if len(found) > number else ('a message', 'missing')
+    return Difference(
+        topic, MISSING, number, time - start, 'it', *sides, *counts)
 
-    def __init__(self, topic: str, start: int, tolerance: float) -> None:
-        self._topic = topic
-        self._start = start
-        self._tolerance = tolerance
 
-    def compare(
-        self, found: Sequence[Output], expected: Sequence[RecordedMessage]
-    ) -> Difference | None:
-        counts = len(found), len(expected)
-        timing: Difference | None = None
-        for number, (one, other) in enumerate(zip(found, expected)):
-            at = one.time - self._start
-            if other.kind != type_name(one.kind):
-                return Difference(self._topic, CONTENT, number, at, 'its type', other.kind,
-                                  type_name(one.kind), *counts)
-            for path, a, b, is_time in self._fields(one, other):
-                difference = Difference(
-                    self._topic, TIMING if is_time else CONTENT, number, at, path, _shown(b),
-                    _shown(a), *counts)
-                if not is_time:
-                    return difference
-                timing = timing or difference
-            if timing is None and one.time != other.time:
-                timing = Difference(
-                    self._topic, TIMING, number, at, '',
-                    f'{(other.time - self._start) / 1e9:.6f} s', f'{at / 1e9:.6f} s', *counts)
-        if len(found) == len(expected):
-            return timing
-        if timing is not None:
-            return timing._replace(kind=MISSING)
-        number = min(counts)
-        time = found[number].time if len(found) > number else expected[number].time
-        sides = ('nothing', 'there') if len(found) > number else ('a message', 'missing')
-        return Difference(
-            self._topic, MISSING, number, time - self._start, 'it', *sides, *counts)
+def _fields(
+    one: Output, other: RecordedMessage, tolerance: float
+) -> Iterator[tuple[str, Any, Any, bool]]:
+    if one.data == other.data:
+        return
+    try:
+        expected = deserialize_message(other.data, one.kind)
+    except Exception:
+        yield 'its content', 'a message', 'what does not decode', False
+        return
+    yield from _unequal('', deserialize_message(one.data, one.kind), expected, False, tolerance)
 
-    def _fields(
-        self, one: Output, other: RecordedMessage
-    ) -> Iterator[tuple[str, Any, Any, bool]]:
-        if one.data == other.data:
-            return
-        try:
-            expected = deserialize_message(other.data, one.kind)
-        except Exception:
-            yield 'its content', 'a message', 'what does not decode', False
-            return
-        yield from self._unequal('', deserialize_message(one.data, one.kind), expected, False)
 
-    def _unequal(
-        self, path: str, a: Any, b: Any, is_time: bool
-    ) -> Iterator[tuple[str, Any, Any, bool]]:
-        """Yield the fields that differ: path, both values, whether it is of a time."""
-        if hasattr(a, 'get_fields_and_field_types'):
-            kind = type_name(type(a))
-            is_time = is_time or kind == 'builtin_interfaces/msg/Time'
-            for name in a.get_fields_and_field_types():
-                yield from self._unequal(
-                    f'{path}.{name}' if path else name, getattr(a, name), getattr(b, name),
-                    is_time)
-        elif isinstance(a, (str, bytes)) or not hasattr(a, '__len__'):
-            if not self._same(a, b):
-                yield path, a, b, is_time
-        elif len(a) != len(b):
-            yield f'the length of {path}', len(a), len(b), is_time
-        elif not _same_array(a, b):
-            for i, (x, y) in enumerate(zip(a, b)):
-                yield from self._unequal(f'{path}[{i}]', x, y, is_time)
+def _unequal(
+    path: str, a: Any, b: Any, is_time: bool, tolerance: float
+) -> Iterator[tuple[str, Any, Any, bool]]:
+    """Yield the fields that differ: path, both values, whether it is of a time."""
+    if hasattr(a, 'get_fields_and_field_types'):
+        kind = type_name(type(a))
+        is_time = is_time or kind == 'builtin_interfaces/msg/Time'
+        for name in a.get_fields_and_field_types():
+            yield from _unequal(
+                f'{path}.{name}' if path else name, getattr(a, name), getattr(b, name),
+                is_time, tolerance)
+    elif isinstance(a, (str, bytes)) or not hasattr(a, '__len__'):
+        if not _same(a, b, tolerance):
+            yield path, a, b, is_time
+    elif len(a) != len(b):
+        yield f'the length of {path}', len(a), len(b), is_time
+    elif not _same_array(a, b):
+        for i, (x, y) in enumerate(zip(a, b)):
+            yield from _unequal(f'{path}[{i}]', x, y, is_time, tolerance)
 
-    def _same(self, a: Any, b: Any) -> bool:
-        if a == b:
+
+def _same(a: Any, b: Any, tolerance: float) -> bool:
+    if a == b:
+        return True
+    try:
+        if math.isnan(a) and math.isnan(b):
             return True
-        try:
-            if math.isnan(a) and math.isnan(b):
-                return True
-            difference = abs(a - b)
-        except TypeError:
-            return False
-        if not self._tolerance or float(a).is_integer() and isinstance(a, int):
-            return False
-        limit = self._tolerance * max(1.0, abs(a), abs(b))
-        return bool(difference <= limit)
+        difference = abs(a - b)
+    except TypeError:
+        return False
+    if not tolerance or float(a).is_integer() and isinstance(a, int):
+        return False
+    limit = tolerance * max(1.0, abs(a), abs(b))
+    return bool(difference <= limit)
 
 
 def _same_array(a: Any, b: Any) -> bool:

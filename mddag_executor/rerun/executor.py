@@ -25,10 +25,10 @@ class NodeHolder(BareExecutor):
     :ivar task_entity: what the run keeps for tasks.
     """
 
-    def __init__(self, context: Any) -> None:
+    def __init__(self, context: Any, loop: Loop) -> None:
         super().__init__(context=context)
         self.task_entity = Entity(TASK, None, '', None, -1, 0, '')
-        self.loop: Loop | None = None
+        self._loop = loop
         self._unclaimed = Unclaimed(self._fail)
 
     def _fail(self, error: BaseException) -> None:
@@ -40,8 +40,7 @@ class NodeHolder(BareExecutor):
 
     def wake(self) -> None:
         """Take note that entities have come or gone."""
-        if self.loop is not None:
-            self.loop.changed = True
+        self._loop.changed = True
 
     def add_node(self, node: Node) -> bool:
         """Add a node."""
@@ -62,22 +61,15 @@ class NodeHolder(BareExecutor):
             return task
         task, work = make_task(
             self.task_entity, self, self._resume, self._unclaimed, callback, args, kwargs)
-        assert self.loop is not None
-        self.loop.call_in_run(partial(self._ready, work))
+        self._loop.call_in_run(lambda: self._loop.engine.ready(work, self._loop.now))
         return task
 
     def on_callback_ended(self, listener: Callable[[Any, BaseException | None], bool]) -> None:
         """Have a function called after each callback; what one raises ends the run."""
-        assert self.loop is not None
-        self.loop.on_ended = lambda entity: listener(entity, None)
-
-    def _ready(self, work: Work) -> None:
-        assert self.loop is not None
-        self.loop.engine.ready(work, self.loop.now)
+        self._loop.on_ended = lambda entity: listener(entity, None)
 
     def _resume(self, work: Work) -> None:
-        assert self.loop is not None
-        self.loop.call_in_run(partial(self.loop.engine.resume, work))
+        self._loop.call_in_run(partial(self._loop.engine.resume, work))
 
 
 class RerunHost(Host):

@@ -58,20 +58,12 @@ def canonical(data: bytes, kind: Any) -> bytes:
 
 @cache
 def _walk_of(kind: Any) -> Walk:
-    walks = [_walk(slot) for slot in kind.SLOT_TYPES] or [_numbers_of(1, 1)]
+    walks = [_walk(slot) for slot in kind.SLOT_TYPES] or [_numbers(1, 1)]
 
     def walk(data: bytearray, at: int) -> int:
         for each in walks:
             at = each(data, at)
         return at
-
-    return walk
-
-
-def _numbers_of(width: int, count: int) -> Walk:
-    """Return the walk over so many numbers of one width."""
-    def walk(data: bytearray, at: int) -> int:
-        return _align(data, at, width) + width * count
 
     return walk
 
@@ -83,52 +75,40 @@ def _align(data: bytearray, at: int, width: int) -> int:
     return at + gap
 
 
-def _walk(slot: Any) -> Walk:
+def _walk(slot: Any, count: int | None = 1) -> Walk:
+    """Return the walk over so many values of a type; None: their number comes first."""
+    if isinstance(slot, AbstractNestedType):
+        return _walk(slot.value_type, slot.size if isinstance(slot, Array) else None)
     if isinstance(slot, BasicType):
-        return _numbers_of(_WIDTHS[slot.typename], 1)
-    if isinstance(slot, (AbstractString, AbstractWString)):
-        return _string(4 if isinstance(slot, AbstractWString) else 1)
-    if isinstance(slot, NamespacedType):
-        return _walk_of(_class_of(slot))
-    assert isinstance(slot, AbstractNestedType)
-    inner = slot.value_type
-    if isinstance(slot, Array):
-        if isinstance(inner, BasicType):
-            return _numbers_of(_WIDTHS[inner.typename], slot.size)
-        return _repeated(_walk(inner), slot.size)
-    if isinstance(inner, BasicType):
-        return _numbers(_WIDTHS[inner.typename])
-    return _repeated(_walk(inner), None)
+        return _numbers(_WIDTHS[slot.typename], count)
+    one = _walk_of(_class_of(slot)) if isinstance(slot, NamespacedType) else _numbers(
+        4 if isinstance(slot, AbstractWString) else 1, None)
+    return one if count == 1 else _repeated(one, count)
 
 
 def _class_of(slot: Any) -> Any:
     return getattr(import_module('.'.join(slot.namespaces)), slot.name)
 
 
-def _string(width: int) -> Walk:
+def _counted(data: bytearray, at: int, count: int | None) -> tuple[int, int]:
+    """Return where values begin, and how many there are."""
+    if count is not None:
+        return at, count
+    at = _align(data, at, 4)
+    return at + 4, int(_LENGTH.unpack_from(data, at)[0])
+
+
+def _numbers(width: int, count: int | None) -> Walk:
     def walk(data: bytearray, at: int) -> int:
-        at = _align(data, at, 4)
-        return at + 4 + width * int(_LENGTH.unpack_from(data, at)[0])
-
-    return walk
-
-
-def _numbers(width: int) -> Walk:
-    def walk(data: bytearray, at: int) -> int:
-        at = _align(data, at, 4)
-        count = int(_LENGTH.unpack_from(data, at)[0])
-        return _align(data, at + 4, width) + width * count if count else at + 4
+        at, n = _counted(data, at, count)
+        return _align(data, at, width) + width * n if n else at
 
     return walk
 
 
 def _repeated(walk_one: Walk, count: int | None) -> Walk:
     def walk(data: bytearray, at: int) -> int:
-        n = count
-        if n is None:
-            at = _align(data, at, 4)
-            n = int(_LENGTH.unpack_from(data, at)[0])
-            at += 4
+        at, n = _counted(data, at, count)
         for _ in range(n):
             at = walk_one(data, at)
         return at

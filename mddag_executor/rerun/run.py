@@ -158,12 +158,7 @@ class Rerun:
 
     def _make(self, context: Any) -> None:
         settings, source, task_set = self._settings, self._source, self._task_set
-        self._holder = NodeHolder(context)
         writer = None if self._trace is None else VirtualTraceWriter(self._trace)
-        clock = _TraceTime(source.start)
-        self._recorder = None if writer is None else Recorder(
-            writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE_NS,
-            MAX_ACTIVE_JOBS, clock, writer, settings.cpus or 0)
         self._engine = Engine(
             task_set, settings.workers, settings.policy, default_deadline=DEFAULT_DEADLINE_NS,
             max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER_NS,
@@ -174,7 +169,10 @@ class Rerun:
         self._loop = loop = Loop(
             self._engine, source.times, source.start, source.end, source.pauses, self._refresh,
             self._begin, self._over)
-        clock.loop = self._holder.loop = loop
+        self._recorder = None if writer is None else Recorder(
+            writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE_NS,
+            MAX_ACTIVE_JOBS, _TraceTime(loop), writer, settings.cpus or 0)
+        self._holder = NodeHolder(context, loop)
         self._holders = self._held()
         if settings.cpus is not None or self._holders:
             loop.computing = SharedCpus(
@@ -396,13 +394,12 @@ class Rerun:
 class _TraceTime(TraceClock):
     """The clock of a trace: virtual time."""
 
-    def __init__(self, start: int) -> None:
+    def __init__(self, loop: Loop) -> None:
         self.offset_ns = 0
-        self._start = start
-        self.loop: Loop | None = None
+        self._loop = loop
 
     def now(self) -> int:
-        return self._start if self.loop is None else self.loop.now
+        return self._loop.now
 
 
 @contextmanager
@@ -413,7 +410,7 @@ def _context(ros_args: Sequence[str]) -> Iterator[Any]:
         raise RerunError(
             'rclpy: it is initialised already: call rclpy.shutdown before, a rerun has a context '
             'of its own')
-    before = os.environ.get(_NO_DISCOVERY)
+    before = {name: os.environ[name] for name in (_NO_DISCOVERY,) if name in os.environ}
     os.environ[_NO_DISCOVERY] = 'OFF'
     try:
         rclpy.init(
@@ -423,10 +420,8 @@ def _context(ros_args: Sequence[str]) -> Iterator[Any]:
             f'--ros-args {" ".join(ros_args)}: {" ".join(str(error).split())[:200]}: correct it'
         ) from error
     finally:
-        if before is None:
-            del os.environ[_NO_DISCOVERY]
-        else:
-            os.environ[_NO_DISCOVERY] = before
+        del os.environ[_NO_DISCOVERY]
+        os.environ.update(before)
     try:
         yield get_default_context()
     finally:
