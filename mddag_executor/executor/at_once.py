@@ -74,8 +74,6 @@ class AtOnce:
 class ClockSource(Source):
     """A subscription to simulated time."""
 
-    __slots__ = ('_at_once',)
-
     def __init__(self, entity: Entity, at_once: AtOnce) -> None:
         super().__init__(
             entity, at_once.loop, compat.message_taker(entity.rclpy), at_once.fail)
@@ -89,8 +87,6 @@ class ClockSource(Source):
 
 class ClientSource(Source):
     """A client: its responses complete futures, whose callbacks run in the executor."""
-
-    __slots__ = ('_at_once',)
 
     def __init__(self, entity: Entity, at_once: AtOnce) -> None:
         super().__init__(

@@ -1,15 +1,24 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Actions at a due time: timers, deadlines of open jobs, checks, and calls.
+When threads wake up: due times, the guard, and muting.
 
-One timerfd (``EventLoop.timer``) is set to the earliest due time.  While there are executions to
-run, it may expire too early, but not too late.
+Theory of operation
+-------------------
+1.  *Due times* are those of timers, deadlines of open jobs, checks, and calls.  One timerfd
+    (``EventLoop.timer``) is set to the earliest.  While there are executions to run, it may expire
+    too early, but not too late.
+2.  *Muting.*  Waking a thread costs 60 to 140 us while a callback computes.  So while a callback
+    holds the GIL for long, callbacks that cannot start wake no thread.  Those that could start are
+    known beforehand: they do not compute, or their relative deadline is below a bound (see
+    ``Engine.overtaking_bound``).  Short callbacks compute, too: each needs the GIL to start.  The
+    sources of all others are switched off (``loop``), and their timers do not count for the
+    timerfd.  Their arrivals are collected when muting ends.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from heapq import heappop, heappush
 import os
 from time import monotonic_ns, process_time_ns
@@ -17,8 +26,12 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER
 from mddag_executor.executor.bounds import AGAIN_NS, SHORT_CALLBACK_NS, STOP_NS
+from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import CHECK_NS, GilCheck, LAST_CHECK_NS
 from mddag_executor.executor.listeners import TimerFd
+from mddag_executor.executor.loop import ALWAYS, ChannelSource, urgency_of
+from mddag_executor.executor.shutdown import is_over
+from mddag_executor.executor.sources import SubscriptionSource
 
 if TYPE_CHECKING:
     from mddag_executor.executor.workers import WorkerPool
@@ -29,17 +42,14 @@ class DueTimes:
     The times at which a worker pool has to act; all methods need the engine's lock.
 
     Times are monotonic ns, unless noted otherwise.
-
-    :param context_ended: whether the context has ended.
     """
 
-    def __init__(self, pool: WorkerPool, context_ended: Callable[[], bool]) -> None:
+    def __init__(self, pool: WorkerPool) -> None:
         self._pool = pool
         self._engine = pool.engine
         self._timer = pool.loop.timer
         self._timers = pool.timers
         self._offset = pool.clock.offset_ns
-        self._context_ended = context_ended
         self._check_context_at = 0
         self._calls: list[tuple[int, int, Callable[[], None]]] = []
         self._n_calls = 0
@@ -72,8 +82,8 @@ class DueTimes:
         self._notice_stop(monotonic, since - self._offset)
         if monotonic > self._check_context_at:  # a context that was only destroyed is not reported
             self._check_context_at = monotonic + AGAIN_NS
-            if self._context_ended():
-                pool.context_ended()
+            if is_over(pool.executor.context):
+                pool.executor.wake()
         self._timer.at = 0
         pool.fire_timers()
         if now > self._engine.deadlines.next:
@@ -163,10 +173,10 @@ class DueTimes:
         if at:
             late = now - max(at, seen, since) - (cpu - used)
             if late >= STOP_NS:
-                self._pool.stopped(now - late, now)
+                self._engine.verdicts.stopped(now - late + self._offset, now + self._offset)
 
 
-class Guard:
+class Guard(ChannelSource):
     """
     A time at which to wake a thread because a callback runs longer than expected.
 
@@ -179,14 +189,15 @@ class Guard:
     :ivar is_set: whether a time is set.
     """
 
-    urgency = -1
-    is_counted = asks_others = False
-
     def __init__(self, expired: Callable[[], None]) -> None:
         self._timer = TimerFd()
         self.is_set = False
         self.fd = self._timer.fd
-        self.collect = expired
+        self._expired = expired
+
+    def collect(self) -> None:
+        """Handle the expiry."""
+        self._expired()
 
     def set(self, at: int) -> None:
         """Set the time (monotonic ns), unless one is set."""
@@ -207,3 +218,69 @@ class Guard:
     def __del__(self) -> None:
         """Close the descriptor of an executor that was never shut down."""
         self.close()
+
+
+class Muting:
+    """
+    The muted sources; all methods need the engine's lock.
+
+    :ivar until: when to stop muting, on the trace's clock; 0: nothing is muted.
+    """
+
+    def __init__(self, pool: WorkerPool) -> None:
+        self.until = 0
+        #: the entities with sources
+        self.entities: Iterable[Entity] = ()
+        # whether a callback has ever held the GIL for long: else nothing is worth a nested epoll
+        self._has_long = False
+        self._bound = 0
+        self._pool = pool
+        self._engine = pool.engine
+        self._loop = pool.loop
+        self._timers = pool.timers
+
+    def update(self, now: int) -> None:
+        """Mute sources whose callbacks cannot start while the dispatched one holds the GIL."""
+        if not self._has_long:
+            self._has_long = True
+            for entity in list(self.entities):
+                if entity.classify is not None:
+                    entity.classify()
+        bound, until = self._engine.overtaking_bound(now)
+        if bound:
+            self.until, self._bound = until, bound
+            self._loop.mute(bound)
+        else:
+            self.end()
+
+    def end(self) -> None:
+        """End muting, and collect arrivals; timers only if callbacks may start."""
+        if not self.until:
+            return
+        self.until = self._bound = 0
+        for source in self._loop.sources(self._loop.unmute())[0]:
+            source.collect()
+        if self._pool.running:
+            self._pool.fire_timers()
+
+    def classify(self, source: SubscriptionSource) -> None:
+        """Register a source according to its callback's GIL habit and deadline."""
+        entity = source.entity
+        habit = entity.habit
+        if not habit.is_known:
+            return
+        entity.is_nested = habit.computes
+        urgency = ALWAYS
+        if habit.computes and self._has_long:
+            urgency = urgency_of(self._engine.relative_deadline(entity))
+        self._loop.move(source, urgency)
+
+    def next_timer(self) -> int:
+        """Return when the next timer that could start is due (monotonic ns); 0: never."""
+        return self._timers.next_due_of(self._could_start) if self.until else (
+            self._timers.next_due())
+
+    def _could_start(self, entity: Entity) -> bool:
+        habit = entity.habit
+        return (not habit.computes or not habit.is_known
+                or self._engine.relative_deadline(entity) < self._bound)

@@ -477,7 +477,7 @@ class Engine:
             self.scheduler.resume(work.x)
 
     def leave_group(self, work: Work) -> None:
-        """Note that an execution's callback group has let it run (see ``groups``)."""
+        """Note that an execution's callback group has let it run (see ``work``)."""
         self.scheduler.leave_group(work.x)
 
     def ask_again(self) -> None:
@@ -549,7 +549,7 @@ class Engine:
         self._work[work.x] = work
 
     def refused(self, work: Work, now: int) -> None:
-        """Put an execution back that its callback group has refused (see ``groups``)."""
+        """Put an execution back that its callback group has refused (see ``work``)."""
         entity, x = work.entity, work.x
         if entity.removed:
             self.destroyed(work, now)

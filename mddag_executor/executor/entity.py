@@ -14,7 +14,7 @@ from msg_graph import Callback, TaskSet
 from msg_graph.binding import entity_name
 
 if TYPE_CHECKING:
-    from mddag_executor.executor.groups import Gate
+    from mddag_executor.executor.work import Gate
 
 TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
     'timer', 'subscription', 'service', 'client', 'guard', 'waitable', 'task')

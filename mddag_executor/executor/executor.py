@@ -33,7 +33,6 @@ from mddag_executor.executor import publishing, settings
 from mddag_executor.executor.announcements import Announcements
 from mddag_executor.executor.at_once import AtOnce
 from mddag_executor.executor.compat import (
-    adopt_awaited,
     BareExecutor,
     ends_call,
     is_called_by_spin,
@@ -44,14 +43,13 @@ from mddag_executor.executor.diagnostics import Diagnostics
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.gil import short_switch_interval
-from mddag_executor.executor.misses import MissLog, MissNotifier
+from mddag_executor.executor.misses import MissNotifier
 from mddag_executor.executor.name_check import NameCheck
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
 from mddag_executor.executor.settings import Thresholds
 from mddag_executor.executor.shutdown import (
     call_at_shutdown,
-    ContextChecks,
     halt_at_exit,
     is_over,
 )
@@ -186,16 +184,9 @@ class MultiDeadlineExecutor(BareExecutor):
             on_late=on_late, record=self._recorder.record if self._recorder else None,
             on_miss=None if self._notifier is None else self._notifier.post, process=process)
         self._pool = WorkerPool(
-            self._engine, self._trace_clock, self._fail, self._context_ended, prepare)
+            self._engine, self._trace_clock, self, self._fail, prepare)
         self._at_once = AtOnce(self._engine, self._pool.lock, self, self._fail)
         self._at_once.loop.add_own(self._pool.guard)
-        self._pool.serve_meanwhile = self._serve_meanwhile
-        self._pool.stopped = self._stopped
-        self._pool.adopt = lambda future: adopt_awaited(future, self)
-        self._pool.context_ended = self._at_once.ring
-        self._pool.entities_changed = self.wake
-        self._miss_log = MissLog(self._engine.verdicts)
-        self._pool.missed = self._miss_log.write
         self._registry = Registry(task_set, self._engine, self._pool.leave_group)
         self._new_tasks: deque[Work] = deque()
         self._task_entity = Entity(TASK, None, '', None, -1, 0, '')
@@ -203,7 +194,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._recorder.entities((), [self._task_entity])
         self._names = NameCheck(task_set, self._registry, process)
         self._announcements: Announcements | None = None
-        self._checks = ContextChecks()
+        self._check_at: list[float] = []  # when to check again whether the context has ended
         self._stepping: select.epoll | None = None
         super().__init__(context=context)
         self._wait_sets = WaitSetThread(
@@ -230,9 +221,6 @@ class MultiDeadlineExecutor(BareExecutor):
     def _nodes_to_serve(self) -> list[Any]:
         nodes: list[Any] = list(self.get_nodes())
         return nodes if self._announcements is None else [*nodes, self._announcements.node]
-
-    def _context_ended(self) -> bool:
-        return is_over(self.context)
 
     def _context_ends(self) -> None:
         """Note whether a callback of this executor ends the context."""
@@ -281,8 +269,13 @@ class MultiDeadlineExecutor(BareExecutor):
         self._at_once.ring()
 
     def _signalled(self) -> None:
-        """Note that rclpy has received a signal: the context ends soon."""
-        self._checks.begin()
+        """
+        Note that rclpy has received a signal: the context ends soon.
+
+        rclpy first wakes all waiting threads; another thread shuts the contexts down later.
+        """
+        now = time.monotonic()
+        self._check_at = [now + delay for delay in (0.005, 0.025, 0.1, 0.4)]
         self._at_once.ring()
 
     # --- tasks -----------------------------------------------------------------------------------
@@ -405,7 +398,6 @@ class MultiDeadlineExecutor(BareExecutor):
             if self._notifier is not None:
                 self._notifier.start()
             self._pool.start()
-            self._pool.stopped(time.monotonic_ns(), time.monotonic_ns())  # noticed from now on
             while not self.is_ending():
                 self._raise_error()
                 if done():
@@ -441,12 +433,11 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _patience_s(self, deadline: float | None, rest: float | None) -> float | None:
         """Return for how long the spinning thread may wait; None: until a wake-up."""
+        now = time.monotonic()
         times = [rest, self._unclaimed.rest_s(), self._names.rest_s()]
-        if self._checks.at is not None:
-            self._checks.due()
-            times.append(self._checks.seconds())
+        times += [at - now for at in self._check_at if at > now]
         if deadline is not None:
-            times.append(max(0.0, deadline - time.monotonic()))
+            times.append(max(0.0, deadline - now))
         return min((each for each in times if each is not None), default=None)
 
     def _settle(
@@ -496,12 +487,6 @@ class MultiDeadlineExecutor(BareExecutor):
         if is_over(self.context):
             raise ExternalShutdownException()
 
-    def _stopped(self, begin: int, end: int) -> None:
-        """Note that no thread of the process ran from ``begin`` to ``end`` (monotonic ns)."""
-        with self._pool.lock:
-            self._engine.verdicts.stopped(
-                begin + self._trace_clock.offset_ns, end + self._trace_clock.offset_ns)
-
     def _fail(self, error: BaseException) -> None:
         """Store an exception of another thread; the spin raises it."""
         self._errors.append(error)
@@ -516,7 +501,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 raise error
 
     @contextmanager
-    def _serve_meanwhile(self) -> Iterator[None]:
+    def serve_meanwhile(self) -> Iterator[None]:
         """Let other threads do all work while the callback of a ``spin_once`` waits."""
         ended = False
 

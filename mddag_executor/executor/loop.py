@@ -27,7 +27,6 @@ from collections.abc import Callable, Iterable
 import os
 import resource
 import select
-from typing import Protocol
 
 from mddag_executor.executor.listeners import new_eventfd, TimerFd
 
@@ -51,21 +50,24 @@ def _no_events(timeout: float = -1) -> Events:
     return []
 
 
-class ChannelSource(Protocol):
+class ChannelSource:
     """
-    The interface of a source, as the loop uses it.
+    Anything that announces arrivals by a descriptor.
 
+    :ivar fd: the descriptor, -1: none.
+    :ivar urgency: the nested epoll in which it is registered.
     :ivar asks_others: ``collect`` calls foreign code, so the caller must hold no lock.
     :ivar is_counted: the descriptor is not shared, so its count is the number of arrivals.
     """
 
-    fd: int
-    urgency: int
-    is_counted: bool
-    asks_others: bool
+    fd = -1
+    urgency = ALWAYS
+    is_counted = False
+    asks_others = False
 
     def collect(self) -> None:
         """Collect the arrivals."""
+        raise NotImplementedError
 
 
 def fd_budget() -> int:

@@ -136,9 +136,13 @@ class MissLog:
         self._logged = 0
         self._at = 0.0
 
+    def is_behind(self) -> bool:
+        """Return whether there were misses since the last line."""
+        return self._verdicts.missed != self._logged
+
     def write(self) -> None:
         """Log the misses since the last line, if any; from any thread, without a lock."""
-        if self._verdicts.missed == self._logged or not self._lock.acquire(blocking=False):
+        if not self.is_behind() or not self._lock.acquire(blocking=False):
             return
         try:
             now, count = time.monotonic(), self._verdicts.missed - self._logged

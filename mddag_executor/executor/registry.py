@@ -23,9 +23,8 @@ from mddag_executor.executor.entity import (
     TIMER,
     WAITABLE,
 )
-from mddag_executor.executor.groups import decides_itself, Gate
 from mddag_executor.executor.sources import SERVICE_DEPTH
-from mddag_executor.executor.work import Work
+from mddag_executor.executor.work import decides_itself, Gate, Work
 from msg_graph import binding, Callback, TaskSet
 from msg_graph.duration import exact_duration
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -72,7 +71,7 @@ class Registry:
     any time.
 
     :ivar by_id: the ``Entity`` of each rclpy entity, by the ``id`` of the latter.
-    :param passed: called with each execution that a callback group has let run (see ``groups``).
+    :param passed: called with each execution that a callback group has let run (see ``work``).
     """
 
     def __init__(

@@ -18,13 +18,10 @@ import time
 from typing import Any
 import weakref
 
-from mddag_executor.executor.bounds import AGAIN_NS, END_S
+from mddag_executor.executor.bounds import END_S
 from mddag_executor.executor.compat import on_end
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
-
-_now = time.monotonic_ns
-
 
 _Kept = dict[weakref.ref[Any], Any]
 _started: _Kept = {}
@@ -87,9 +84,9 @@ def _stop_all() -> None:
     executors = [executor for executor, _ in _living(_executors)]
     for executor in executors:
         executor.halt()
-    end = _now() + int(END_S * 1e9)
+    end = time.monotonic() + END_S
     for executor in executors:
-        executor.wait_halted(max(0.0, (end - _now()) / 1e9))
+        executor.wait_halted(max(0.0, end - time.monotonic()))
     for thing, _ in _living(_started):
         thing.stop()
 
@@ -126,33 +123,3 @@ def _call_all(reference: weakref.ref[Context], methods: _Kept) -> None:
         _ended.add(context)
     for owner, function in _living(methods):
         function(owner)
-
-
-class ContextChecks:
-    """
-    When to check again whether a context has ended, after a possible signal.
-
-    On a signal rclpy first wakes all waiting threads, and shuts the contexts down later, in
-    another thread.  A thread that checks early finds the context valid, and is not woken again.
-    """
-
-    def __init__(self) -> None:
-        self.at: int | None = None
-        self._step = 0
-
-    def begin(self) -> None:
-        """Check again, at intervals that grow from 5 ms to half a second."""
-        self._step = AGAIN_NS
-        self.at = _now() + self._step
-
-    def due(self) -> bool:
-        """Return whether it is time for a check; if so, the next one is an interval later."""
-        if self.at is None or _now() < self.at:
-            return False
-        self._step *= 4
-        self.at = _now() + self._step if self._step <= 500_000_000 else None
-        return True
-
-    def seconds(self) -> float:
-        """Return the seconds until the next check."""
-        return 0.0 if self.at is None else max(0.0, (self.at - _now()) / 1e9)

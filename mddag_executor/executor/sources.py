@@ -25,7 +25,7 @@ from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import header_stamp, Publication, steady_time
 from mddag_executor.executor.listeners import clear_listener, MANY, set_listener
-from mddag_executor.executor.loop import ALWAYS, EventLoop
+from mddag_executor.executor.loop import ChannelSource, EventLoop
 from mddag_executor.executor.work import Work
 from rclpy.exceptions import InvalidHandle
 
@@ -36,30 +36,12 @@ SERVICE_DEPTH = 10
 """How many requests wait in Python at most: the depth of rclpy's default profile for services."""
 
 
-class Source:
-    """
-    An entity at which messages, requests or responses arrive.
+class EntitySource(ChannelSource):
+    """An entity with a listener."""
 
-    :param take: takes one arrival and returns it; None: there is none.
-    :param fail: receives the exceptions of takes.
-    :ivar fd: its descriptor (see ``loop``), -1: none.
-    :ivar urgency: the nested epoll in which ``fd`` is registered.
-    """
-
-    __slots__ = ('entity', 'handle', 'fd', 'urgency', 'is_counted', '_loop', '_take', '_fail')
-
-    asks_others = False
-
-    def __init__(
-        self, entity: Entity, loop: EventLoop, take: Callable[[], Any],
-        fail: Callable[[BaseException], None],
-    ) -> None:
+    def __init__(self, entity: Entity) -> None:
         self.entity = entity
         self.handle: Any = entity.rclpy.handle
-        self.fd, self.urgency, self.is_counted = -1, ALWAYS, False
-        self._loop = loop
-        self._take = take
-        self._fail = fail
 
     def listen(self) -> None:
         """
@@ -77,6 +59,24 @@ class Source:
                 clear_listener(self.entity.kind, self.handle.pointer)
         except InvalidHandle:
             pass  # it is just being destroyed
+
+
+class Source(EntitySource):
+    """
+    An entity at which messages, requests or responses arrive.
+
+    :param take: takes one arrival and returns it; None: there is none.
+    :param fail: receives the exceptions of takes.
+    """
+
+    def __init__(
+        self, entity: Entity, loop: EventLoop, take: Callable[[], Any],
+        fail: Callable[[BaseException], None],
+    ) -> None:
+        super().__init__(entity)
+        self._loop = loop
+        self._take = take
+        self._fail = fail
 
     def collect(self, left: int = 0) -> None:
         """
@@ -119,8 +119,6 @@ class Source:
 
 class SubscriptionSource(Source):
     """A subscription."""
-
-    __slots__ = ('_pool', '_with_info', '_is_plain')
 
     def __init__(self, entity: Entity, pool: WorkerPool) -> None:
         super().__init__(entity, pool.loop, compat.message_taker(entity.rclpy), pool.fail)
@@ -211,8 +209,6 @@ class SubscriptionSource(Source):
 
 class ServiceSource(Source):
     """A service."""
-
-    __slots__ = ('_pool',)
 
     def __init__(self, entity: Entity, pool: WorkerPool) -> None:
         super().__init__(entity, pool.loop, compat.request_taker(entity.rclpy), pool.fail)

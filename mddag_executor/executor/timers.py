@@ -27,8 +27,8 @@ from typing import Any
 
 from mddag_executor.executor.compat import RCL_ERRORS, timer_functions, with_timer_info
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.listeners import clear_listener, NextCall, set_listener
-from mddag_executor.executor.loop import ALWAYS
+from mddag_executor.executor.listeners import NextCall
+from mddag_executor.executor.sources import EntitySource
 from mddag_executor.executor.work import Work
 from rclpy.clock import Clock, JumpHandle, JumpThreshold
 from rclpy.clock_type import ClockType
@@ -47,31 +47,22 @@ Fired = tuple[Work, int, int, int]
 _now = time.monotonic_ns
 
 
-class TimerSource:
+class TimerSource(EntitySource):
     """
     A timer.
 
-    :ivar fd: becomes readable when it is reset (see ``loop``).
+    Its listener announces that it is reset.
+
     :ivar due: when to ask rcl next (monotonic ns), while ``entry`` is its entry's number, not 0.
     """
 
-    __slots__ = (
-        'entity', 'timer', 'handle', 'fd', 'urgency', 'is_counted', 'due', 'entry', 'simulated',
-        'may_be_simulated', '_queue', '_next_call', '_call', '_until', '_period', '_offset',
-        '_clock', '_is_steady', 'last_period')
-
-    asks_others = False
-
     def __init__(self, entity: Entity, queue: TimerQueue) -> None:
-        timer = entity.rclpy
-        self.entity = entity
+        super().__init__(entity)
+        timer = self.timer = entity.rclpy
         self._queue = queue
-        self.timer = timer
-        self.handle: Any = timer.handle
-        self.fd, self.urgency, self.is_counted = -1, ALWAYS, False
         with self.handle:
             self._next_call = NextCall(self.handle.pointer)
-        self._until, self._call, self._period = timer_functions(timer)
+        self._until, self._call, self.period = timer_functions(timer)
         self._clock: Any = timer.clock
         self._is_steady = timer.clock.clock_type == ClockType.STEADY_TIME
         self.may_be_simulated = timer.clock.clock_type == ClockType.ROS_TIME
@@ -83,18 +74,13 @@ class TimerSource:
 
     def listen(self) -> None:
         """Let rcl announce resets, and begin to ask when it is due."""
-        with self.handle:
-            set_listener('timer', self.handle.pointer, self.fd)
+        super().listen()
         self._queue.add(self)
 
     def ignore(self) -> None:
         """End ``listen``."""
         self._queue.remove(self)
-        try:
-            with self.handle:
-                clear_listener('timer', self.handle.pointer)
-        except InvalidHandle:
-            pass  # it is just being destroyed
+        super().ignore()
 
     def collect(self) -> None:
         """Ask rcl when it is due, as it was reset."""
@@ -128,10 +114,6 @@ class TimerSource:
         if callback is None:
             return None
         return Work(self.entity, with_timer_info(self.timer, callback, info))
-
-    def period(self) -> int:
-        """Return its period, ns."""
-        return self._period()
 
 
 class TimerQueue:

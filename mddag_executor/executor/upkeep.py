@@ -11,6 +11,7 @@ each of them.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 import threading
 import time
 from typing import Any
@@ -46,8 +47,6 @@ from mddag_executor.executor.workers import WorkerPool
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 
-AnySource = Source | TimerSource
-
 
 class Upkeep:
     """
@@ -76,7 +75,7 @@ class Upkeep:
         self._fail = fail
         self._lock = threading.RLock()
         self._refresh_at = 0.0
-        self._sources: dict[Entity, AnySource | WaitableSource] = {}
+        self._sources: dict[Entity, Source | TimerSource | WaitableSource] = {}
         pool.muting.entities = self._sources
         self._deliveries: dict[str, publishing.LocalDelivery] = {}
         self._events: WaitableSource | None = None
@@ -154,44 +153,36 @@ class Upkeep:
 
     def _listen(self, entity: Entity) -> None:
         """Make the source of an entity; the caller holds the engine's lock."""
-        pool, loop = self._pool, self._pool.loop
-        source: AnySource
+        pool, at_once, share = self._pool, self._at_once, ''
+        loop = at_once.loop if entity.kind == CLIENT or entity.at_once else pool.loop
+        source: Source | TimerSource
         if entity.kind == TIMER:
             if entity.callback is None and ends_sleep(entity.rclpy.callback):
-                loop = self._at_once.loop
-                source = TimerSource(entity, self._at_once.timers)
-            else:
-                source = TimerSource(entity, pool.timers)
-            loop.add(source, f'timers {entity.node}')
+                loop = at_once.loop
+            share = f'timers {entity.node}'
+            source = TimerSource(entity, pool.timers if loop is pool.loop else at_once.timers)
         elif entity.kind == SUBSCRIPTION:
             if is_of_wait_for_message(entity.rclpy):
                 return
-            if entity.at_once:
-                loop = self._at_once.loop
-                source = ClockSource(entity, self._at_once)
-            else:
-                source = SubscriptionSource(entity, pool)
-            loop.add(source)
+            source = (ClockSource(entity, at_once) if entity.at_once
+                      else SubscriptionSource(entity, pool))
         elif entity.kind == SERVICE:
+            share = f'services {entity.node}' if is_builtin(entity.rclpy) else ''
             source = ServiceSource(entity, pool)
-            loop.add(source, f'services {entity.node}' if is_builtin(entity.rclpy) else '')
         elif entity.kind == CLIENT:
-            loop = self._at_once.loop
-            source = ClientSource(entity, self._at_once)
-            loop.add(source)
+            source = ClientSource(entity, at_once)
         else:
             return
+        loop.add(source, share)
         self._sources[entity] = source
         try:
             source.listen()
         except ListenerError as error:
             self._fail(error)
-        if loop is not pool.loop:
-            return
         if isinstance(source, SubscriptionSource) and source.is_counted:
             before = self._deliveries.get(entity.label)
             self._deliver(entity.label, (*(before.sources if before else ()), source))
-            entity.classify = lambda: pool.muting.classify(source)
+            entity.classify = partial(pool.muting.classify, source)
 
     def _deliver(self, topic: str, sources: tuple[SubscriptionSource, ...]) -> None:
         """Let publishing threads of this process collect for these subscriptions of a topic."""
@@ -207,9 +198,9 @@ class Upkeep:
         if delivery is not None and source in delivery.sources:
             self._deliver(
                 entity.label, tuple(each for each in delivery.sources if each is not source))
+        if isinstance(source, WaitableSource):
+            self._sources[entity] = source  # later, without the lock
         if source is None or isinstance(source, WaitableSource):
-            if source is not None:
-                self._sources[entity] = source  # later, without the lock
             return
         entity.classify = None
         source.ignore()
@@ -243,7 +234,8 @@ class Upkeep:
             if self._events is not None:
                 dropped, self._events = self._events, None
                 self._drop(dropped)
-            self._events = self._listen_to(events, EventsSource) if events else None
+            self._events = self._listen_to(
+                events, partial(EventsSource, self._registry.note_event)) if events else None
         left = [e for e in self._unlistened if e in present]
         for entity in added:
             if entity.kind == GUARD:
@@ -261,7 +253,7 @@ class Upkeep:
         self._wait_sets.update(left)
 
     def _listen_to(
-        self, entities: list[Entity], kind: type[WaitableSource] = WaitableSource
+        self, entities: list[Entity], make: Callable[..., WaitableSource] = WaitableSource
     ) -> WaitableSource | None:
         """Return the source of waitables; None: there are no listeners for them."""
         pool = self._pool
@@ -273,15 +265,13 @@ class Upkeep:
             except InvalidHandle:
                 pass  # destroyed meanwhile
         try:
-            source = kind(
+            source = make(
                 alive, self._context, self._executor, pool.post, pool.call_at, self._fail)
         except InvalidHandle:
             self.changed = True
             return None
         except ListenerError:
             return None
-        if isinstance(source, EventsSource):
-            source.note = self._registry.note_event
         with pool.lock:
             pool.loop.add(source)
         try:

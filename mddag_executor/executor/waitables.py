@@ -29,7 +29,7 @@ from mddag_executor.executor import compat
 from mddag_executor.executor.bounds import END_S, MOST
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.listeners import clear_listener, ListenerError, NextCall, set_listener
-from mddag_executor.executor.loop import ALWAYS
+from mddag_executor.executor.loop import ChannelSource
 from mddag_executor.executor.shutdown import call_at_shutdown, is_over, join, stop_at_exit
 from mddag_executor.executor.waitsets import FilledSet
 from mddag_executor.executor.work import Work
@@ -63,7 +63,7 @@ def executions_of(entity: Entity, executor: Any) -> list[Work]:
     return found
 
 
-class WaitableSource:
+class WaitableSource(ChannelSource):
     """
     Waitables that share a descriptor.
 
@@ -80,7 +80,6 @@ class WaitableSource:
         self, entities: Iterable[Entity], context: Context, executor: Any, post: Post,
         at: Callable[[int, Callable[[], None]], None], fail: Callable[[BaseException], None],
     ) -> None:
-        self.fd, self.urgency, self.is_counted = -1, ALWAYS, False
         self._by_id = {id(entity.rclpy): entity for entity in entities}
         self._executor = executor
         self._post = post
@@ -186,10 +185,12 @@ class EventsSource(WaitableSource):
     """
     QoS events (rclpy's ``EventHandler``) that share a descriptor.
 
-    :ivar note: called with each event and its status.
+    :param note: called with each event and its status.
     """
 
-    note: Callable[[Any, Any], None]
+    def __init__(self, note: Callable[[Any, Any], None], *others: Any) -> None:
+        super().__init__(*others)
+        self._note = note
 
     def _collect(self) -> None:
         found: list[Work] = []
@@ -203,7 +204,7 @@ class EventsSource(WaitableSource):
             _known[entity] = counts
             if counts != before or any(
                     value for name, value in values.items() if name.endswith('_change')):
-                self.note(event, status)
+                self._note(event, status)
                 found.append(Work(entity, event.execute, (status,)))
 
         self._set.wait(None, take)

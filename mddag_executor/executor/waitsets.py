@@ -10,13 +10,12 @@ Uses of ``_rclpy.WaitSet``: the constructor with the number of each kind, ``poin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, ExitStack
 import ctypes
 from typing import Any
 
 from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.waitable import NumberOfEntities, Waitable
@@ -54,7 +53,7 @@ class FilledSet:
             with handle:
                 self._guards[handle.pointer] = guard
             self._held.append(handle)
-        with _Held(self._held):
+        with _held(self._held):
             for waitable in self.waitables:
                 counts += waitable.get_num_entities()
             self._set = _rclpy.WaitSet(
@@ -68,7 +67,7 @@ class FilledSet:
 
         :raises InvalidHandle: when one of them has been destroyed.
         """
-        return _Held(self._held)
+        return _held(self._held)
 
     def parts(self, call: Callable[[str, int], None]) -> None:
         """
@@ -79,7 +78,7 @@ class FilledSet:
 
         :raises InvalidHandle: when one of them has been destroyed.
         """
-        with _Held(self._held):
+        with _held(self._held):
             self._fill()
             filled = _RclWaitSet.from_address(self._set.pointer)
             for kind in _KINDS:
@@ -110,7 +109,7 @@ class FilledSet:
         :return: the guard conditions that were triggered.
         :raises InvalidHandle: when one of them has been destroyed.
         """
-        with _Held(self._held):
+        with _held(self._held):
             self._fill()
             if timeout_ns is not None:
                 self._set.wait(timeout_ns)
@@ -121,22 +120,10 @@ class FilledSet:
             return [self._guards[address] for address in ready if address in self._guards]
 
 
-class _Held(AbstractContextManager[None]):
-    """Protects several handles from being destroyed while entered."""
-
-    def __init__(self, handles: Iterable[Any]) -> None:
-        self._handles = handles
-        self._entered: list[Any] = []
-
-    def __enter__(self) -> None:
-        try:
-            for handle in self._handles:
-                handle.__enter__()
-                self._entered.append(handle)
-        except InvalidHandle:
-            self.__exit__()
-            raise
-
-    def __exit__(self, *_: object) -> None:
-        while self._entered:
-            self._entered.pop().__exit__(None, None, None)
+@contextmanager
+def _held(handles: Iterable[Any]) -> Iterator[None]:
+    """Protect handles from being destroyed while entered."""
+    with ExitStack() as stack:
+        for handle in handles:
+            stack.enter_context(handle)
+        yield

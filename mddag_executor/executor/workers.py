@@ -20,8 +20,7 @@ Theory of operation
     which is released exactly once for each admission.  A thread that wakes for an execution that
     the thread of a short callback will run is parked again.  So if arrivals are dense, one thread
     does everything, and none waits in the epoll until the guard expires.
-5.  *Time* is in ``due``.  ``muting`` has the arrivals not announced while a callback holds the
-    GIL.
+5.  *Time*, and the arrivals not announced while a callback holds the GIL, are in ``due``.
 6.  *Lending.*  A callback that waits inside ``Client.call`` returns its worker to the core.  If
     fewer threads are left than there are workers, a thread is made.  At most ``MOST`` callbacks
     lend at the same time; further ones keep their workers.
@@ -35,7 +34,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 import threading
 from time import monotonic_ns
@@ -51,20 +50,21 @@ from mddag_executor.executor.bounds import (
     MOST_YIELD_NS,
     SHORT_CALLBACK_NS,
 )
-from mddag_executor.executor.compat import NEXT_TURN
+from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN
 from mddag_executor.executor.debugging import engine_lock
-from mddag_executor.executor.due import DueTimes, Guard
+from mddag_executor.executor.due import DueTimes, Guard, Muting
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.gil import Measurement
-from mddag_executor.executor.groups import Refused
 from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
-from mddag_executor.executor.muting import Muting
+from mddag_executor.executor.misses import MissLog
+from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.timers import TimerQueue
-from mddag_executor.executor.work import current, Destroyed, QuickCallback, Work
+from mddag_executor.executor.work import current, Destroyed, QuickCallback, Refused, Work
 from mddag_executor.trace.groups import PUBLICATION
 
 if TYPE_CHECKING:
     from mddag_executor.executor.announcements import Announcements
+    from mddag_executor.executor.executor import MultiDeadlineExecutor
 
 
 class WorkerThread:
@@ -142,8 +142,8 @@ class WorkerPool:
     """
     The worker threads, with the lock and the clock of the engine.
 
+    :param executor: is woken when entities have changed, or its context has ended.
     :param fail: receives every exception that a callback raises.
-    :param context_ended: whether the context has ended, which makes callbacks fail.
     :param prepare_thread: called first in each worker thread (priority, CPU set).
     :ivar running: whether executions may start.
     :ivar stopped_at: when ``running`` became false, on the trace's clock; 0: it is true.
@@ -153,8 +153,8 @@ class WorkerPool:
     """
 
     def __init__(
-        self, engine: Engine, clock: TraceClock, fail: Callable[[BaseException], None],
-        context_ended: Callable[[], bool], prepare_thread: Callable[[], None] | None = None,
+        self, engine: Engine, clock: TraceClock, executor: MultiDeadlineExecutor,
+        fail: Callable[[BaseException], None], prepare_thread: Callable[[], None] | None = None,
     ) -> None:
         self.engine = engine
         self.clock = clock
@@ -164,27 +164,16 @@ class WorkerPool:
         self._deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
         self.announcements: Announcements | None = None
-        self.timers = TimerQueue(self.loop.wake, lambda: self.entities_changed(), fail)
+        self.timers = TimerQueue(self.loop.wake, executor.wake, fail)
         self.running = False
         self.stopped_at = 0
         self.is_current = False
         self.lent = 0
-        #: called with something to run while a callback of ``spin_once`` waits in ``Client.call``
-        self.serve_meanwhile: Callable[[], Any] | None = None
-        #: called with a future that a coroutine awaits
-        self.adopt: Callable[[Any], None] = lambda future: None
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
         self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
-        #: called when there is an entity that the registry does not know
-        self.entities_changed: Callable[[], None] = lambda: None
-        #: called when deadlines were missed
-        self.missed: Callable[[], None] = lambda: None
-        #: called when the end of the context is noticed
-        self.context_ended: Callable[[], None] = lambda: None
-        #: called with begin and end of a time in which no thread of the process ran (monotonic ns)
-        self.stopped: Callable[[int, int], None] = lambda begin, end: None
+        self.executor = executor
         self.fail = fail
-        self._context_ended = context_ended
+        self._miss_log = MissLog(engine.verdicts)
         self._prepare_thread = prepare_thread
         self._threads: list[WorkerThread] = []
         self._parked: list[WorkerThread] = []
@@ -204,9 +193,8 @@ class WorkerPool:
         self._leader: WorkerThread | None = None
         # what it ran when the guard was set
         self._guarded: Work | None = None
-        self._misses = 0
         self.muting = Muting(self)
-        self.due = DueTimes(self, context_ended)
+        self.due = DueTimes(self)
         #: wakes a thread when a short callback runs longer than expected
         self.guard = Guard(self._guard_expired)
 
@@ -349,6 +337,7 @@ class WorkerPool:
             self._is_stepping = False
             self.stopped_at = 0
             self.due.begin(self.tick() - self._offset)
+            self.engine.verdicts.stopped(self.now, self.now)  # stops are noticed from now on
             while len(self._threads) < self.engine.n_workers:
                 self._new_thread()
             if not self.polling:
@@ -504,9 +493,8 @@ class WorkerPool:
             if (is_due or self.engine.deadlines.next < self.due.deadline
                     or not found and (self.due.may_expire_early or self.engine.holders)):
                 self.due.arm(now - self._offset)
-            if (is_due or not found) and self._misses != self.engine.verdicts.missed:
-                self._misses = self.engine.verdicts.missed
-                calls.append(self.missed)
+            if (is_due or not found) and self._miss_log.is_behind():
+                calls.append(self._miss_log.write)
         if calls or timed:
             self._call([*calls, *timed])
             if timed:
@@ -670,7 +658,7 @@ class WorkerPool:
         else:
             self._report_unusual_end(me, work, now, calls)
         if work.entity.removed:
-            self.entities_changed()  # the registry can forget it now
+            self.executor.wake()  # the registry can forget it now
         if self.muting.until and not engine.holders:
             self.muting.end()
             self.due.arm(now - self._offset)  # timers that were muted have new due times
@@ -694,7 +682,7 @@ class WorkerPool:
             engine.finished(work, start, end, now, me.vtid, worker)
         elif not isinstance(outcome, BaseException):
             engine.suspended(work, start, end, me.vtid, worker)
-        elif self._context_ended():  # this may destroy nodes, too
+        elif is_over(self.executor.context):  # this may destroy nodes, too
             engine.left_open(
                 work, start, end, me.vtid, worker, not isinstance(outcome, Destroyed))
         elif isinstance(outcome, Destroyed):
@@ -723,7 +711,7 @@ class WorkerPool:
             self.call_at(monotonic_ns() + rest, partial(self.resume, work))
         else:
             work.yields = 0
-            self.adopt(outcome)
+            adopt_awaited(outcome, self.executor)
             outcome.add_done_callback(QuickCallback(partial(self.resume, work)))
 
     def _ask_again(self) -> None:
@@ -751,10 +739,7 @@ class WorkerPool:
                     self._admit()
         waits_before, me.waits = me.waits, me.has_lent
         try:
-            if me.thread is None and self.serve_meanwhile is not None:
-                with self.serve_meanwhile():
-                    yield
-            else:
+            with self.executor.serve_meanwhile() if me.thread is None else nullcontext():
                 yield
         finally:
             me.waits = waits_before

@@ -43,9 +43,8 @@ from mddag_executor.core import NEVER
 from mddag_executor.core.state import DONE
 from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.groups import Refused
 from mddag_executor.executor.jobs import Origin
-from mddag_executor.executor.work import Destroyed, QuickCallback, Work
+from mddag_executor.executor.work import Destroyed, QuickCallback, Refused, Work
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.run_threads import RunThreads

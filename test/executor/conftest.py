@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
-import signal
 import subprocess
 import sys
 import threading
@@ -62,20 +61,29 @@ def is_idle(executor: MultiDeadlineExecutor) -> bool:
     return bool(not statistics['queue'] and statistics['idle_workers'] == statistics['workers'])
 
 
-def interrupted(program: str, *arguments: str) -> tuple[int, str, str]:
-    """Run a program that prints ``ready``, then SIGINT it; return exit status, output, errors."""
+def run_program(
+    program: str, *arguments: str, send: int | None = None, after: float = 0.0
+) -> tuple[str, str]:
+    """
+    Run a program in a process of its own; return its output and errors.
+
+    :param send: the signal that it gets ``after`` seconds when it has printed ``ready``.
+    """
     process = subprocess.Popen(
         [sys.executable, '-c', program, *arguments], stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True)
     try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == 'ready\n', process.communicate()[1]
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=10)
+        if send is not None:
+            assert process.stdout is not None
+            assert process.stdout.readline() == 'ready\n', process.communicate()[1]
+            time.sleep(after)
+            process.send_signal(send)
+        out, err = process.communicate(timeout=60)
     finally:
         process.kill()
         process.wait()
-    return process.returncode, out, err
+    assert process.returncode == 0, err
+    return out, err
 
 
 @pytest.fixture

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 from typing import Any
 
@@ -17,17 +15,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import is_idle, Spinning, wait_for
-
-
-def run(program: str, seconds: float = 60.0) -> str:
-    """Run a program in a process of its own; return what it printed."""
-    done = subprocess.run(
-        [sys.executable, '-c', program], capture_output=True, text=True, timeout=seconds,
-        check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
+from .conftest import is_idle, run_program, Spinning, wait_for
 
 # --- descriptors ---------------------------------------------------------------------------------
 
@@ -83,7 +71,7 @@ rclpy.shutdown()
 
 def test_many_subscriptions_share_few_descriptors():
     """300 of them, and no more than 256 files."""
-    assert run(MANY) == "True True ['late']\n"
+    assert run_program(MANY)[0] == "True True ['late']\n"
 
 
 # --- what waits ----------------------------------------------------------------------------------
@@ -271,4 +259,4 @@ rclpy.shutdown()
 @pytest.mark.parametrize('way', ['spin', 'spin_once'])
 def test_nothing_wakes_in_an_idle_executor(way):
     """No thread polls: in a second the whole process, with the middleware, waits seldom."""
-    assert run(IDLE.replace('WAY', repr(way))) == 'True\n'
+    assert run_program(IDLE.replace('WAY', repr(way)))[0] == 'True\n'

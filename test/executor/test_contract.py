@@ -20,7 +20,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import interrupted, is_idle, Spinning, wait_for
+from .conftest import is_idle, run_program, Spinning, wait_for
 
 
 def counting(node: Node, period: float = 0.005) -> list[int]:
@@ -182,8 +182,7 @@ print(sorted(ends))
 
 
 def test_a_signal_ends_the_executors_of_all_contexts():
-    status, out, err = interrupted(CONTEXTS)
-    assert status == 0, err
+    out, err = run_program(CONTEXTS, send=signal.SIGINT)
     assert out in (
         "[('other', 'ExternalShutdownException'), ('own', 'KeyboardInterrupt')]\n",
         "[('other', 'ExternalShutdownException'), ('own', 'ExternalShutdownException')]\n")

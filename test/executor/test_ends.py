@@ -8,7 +8,6 @@ from collections.abc import Callable
 import contextlib
 import itertools
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -27,6 +26,8 @@ from rclpy.executors import (
 )
 from rclpy.node import Node
 from std_msgs.msg import Empty
+
+from .conftest import run_program
 
 ENDS: dict[str, Callable[[Context], Any]] = {
     'shutdown': Context.try_shutdown, 'destroy': Context.destroy,
@@ -178,13 +179,10 @@ STEPS = 'while rclpy.ok(): executor.spin_once(timeout_sec=0.005)'
 
 
 def run(**parts: str) -> None:
-    program = PROGRAM.format(**{'callback': 'sleep', 'end': '', **parts})
-    process = subprocess.run(
-        [sys.executable, '-c', program], capture_output=True, text=True, timeout=30, check=False)
-    assert process.returncode == 0, process.stderr
-    assert process.stdout.splitlines()[-1] == 'end'
+    out, err = run_program(PROGRAM.format(**{'callback': 'sleep', 'end': '', **parts}))
+    assert out.splitlines()[-1] == 'end'
     expected = 'cannot keep its rate', 'use of fork() may lead to deadlocks'
-    noise = [line for line in process.stderr.splitlines()
+    noise = [line for line in err.splitlines()
              if not any(text in line for text in expected)]
     assert noise == []
 
@@ -240,18 +238,7 @@ print([t.name for t in threading.enumerate() if t.name.startswith('mddag')])
 @pytest.mark.parametrize(('number', 'spin'), [
     (signal.SIGTERM, 'executor.spin()'), (signal.SIGINT, 'rclpy.spin(node, executor)')])
 def test_a_signal_ends_spin(number, spin):
-    process = subprocess.Popen(
-        [sys.executable, '-c', PROGRAM_SIGNALS.format(spin=spin)], stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == 'ready\n'
-        time.sleep(0.5)
-        process.send_signal(number)
-        out, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
-    assert process.returncode == 0, err
+    out, err = run_program(PROGRAM_SIGNALS.format(spin=spin), send=number, after=0.5)
     assert out.splitlines()[0] in ('KeyboardInterrupt', 'ExternalShutdownException')
     assert out.splitlines()[1] == '[]'
     assert 'Traceback' not in err
@@ -323,7 +310,4 @@ print(stops, heard.count('stop'))
 @pytest.mark.parametrize('where', ['spin', 'spin_once', 'beside'])
 def test_a_signal_s_handler_may_publish(where):
     """Whatever the main thread does when the signal comes: it holds locks now and then."""
-    done = subprocess.run(
-        [sys.executable, '-c', PUBLISHES, where], capture_output=True, text=True, timeout=60,
-        check=False)
-    assert (done.returncode, done.stdout) == (0, '200 200\n'), done.stderr
+    assert run_program(PUBLISHES, where)[0] == '200 200\n'

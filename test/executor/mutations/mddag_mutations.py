@@ -23,11 +23,11 @@ from mddag_executor.core import policies, tally
 from mddag_executor.core.state import COMPLETED, IDLE, JOB_END, LATE, OPEN
 from mddag_executor.executor import compat, executor
 from mddag_executor.executor.compat import BareTask
+from mddag_executor.executor.due import Muting
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.jobs import Jobs, Origin, Publication, PublisherState, Topic
 from mddag_executor.executor.loop import EventLoop
-from mddag_executor.executor.muting import Muting
 from mddag_executor.executor.sources import Source
 from mddag_executor.executor.timers import TimerQueue, TimerSource
 from mddag_executor.executor.waitables import WaitableSource, WaitSetThread
