@@ -127,7 +127,7 @@ def parse_executors(text: str, policies: str | None = None) -> list[tuple[str, s
             find_policy(policy)
         for each in [policy] if colon else default if name == OURS else ['rad']:
             if (name, each) in found:
-                raise UsageError(f"--executors: '{item.strip()}' stands there twice: name it once")
+                raise UsageError(f"--executors: '{item.strip()}' is listed twice: name it once")
             found.append((name, each))
     if policies is not None and not any(name == OURS for name, _ in found):
         raise UsageError(f'--policies: they are those of this executor: name {OURS}')

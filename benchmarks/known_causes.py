@@ -79,7 +79,7 @@ class Run:
                           for name in ('sensor', 'victim'))
         self._data = sensor.create_publisher(Empty, '/data', 10)
         self._many = sensor.create_publisher(Empty, '/many', 20)
-        # first what stands in the way: its timer is due first
+        # first the blocking callback: its timer is due first
         victim.create_timer(2 * self._period, self._other, callback_group=(
             group if cause == 'group' else ReentrantCallbackGroup()))
         sensor.create_timer(self._period, self._tick)

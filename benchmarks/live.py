@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--load', choices=LOADS, required=True,
         help='autoware and reference-system: the synthetic nodes of these declarations; topics: '
-        'empty callbacks of many topics; entities: one active topic beside idle subscriptions; '
+        'empty callbacks of many topics; entities: one active topic next to idle subscriptions; '
         'robot: the ordinary nodes of examples/robot')
     add('--executors', default=','.join(EXECUTORS), metavar='E[,E…]',
         help=f'some of {", ".join(EXECUTORS)}; the first is this one, also with another policy as '
@@ -97,7 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--seed', type=options.seed, default=arguments.LIVE_SEED, metavar='N',
         help='seed of the drawn execution times and phases, the same for all executors; with the '
         'default (%(default)s) every deadline of the Autoware workload can be kept')
-    arguments.add_repeat(parser, 1, 'measure everything R times in turn, and take the medians')
+    arguments.add_repeat(parser, 1, 'measure everything R times alternately, and take the medians')
     arguments.add_graph(parser)
     options.add(parser, '--json')
 

@@ -224,9 +224,9 @@ def _in_child(name: str, path: str, limit: int, pipe: Any) -> None:
         pipe.send(str(error))
         return
     took, cpu = time.monotonic() - begin, time.process_time() - cpu
-    beside = resource.getrusage(resource.RUSAGE_CHILDREN)
-    pipe.send(Speed(count, took, cpu + beside.ru_utime + beside.ru_stime,
-                    peak_memory_mb() + beside.ru_maxrss / 1024))
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    pipe.send(Speed(count, took, cpu + children.ru_utime + children.ru_stime,
+                    peak_memory_mb() + children.ru_maxrss / 1024))
 
 
 def measure(name: str, path: str, limit: int) -> Speed:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 HELP = 'measure the replayer'
 DESCRIPTION = """\
-Measure the replayer: the speed and memory of reading and linking, beside other readers; with
+Measure the replayer: the speed and memory of reading and linking, next to other readers; with
 --accuracy how well reschedule predicts a live run; with --slack whether the slack that it finds
 holds in live runs."""
 EXAMPLE = """\
@@ -65,7 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--others', type=options.positive_int, default=200_000, metavar='N',
         help="messages after which mcap's and rosbags' readers are stopped (default: %(default)s)")
     arguments.add_repeat(
-        parser, 3, 'measure R times in turn: the best speed counts, and the median response times')
+        parser, 3,
+        'measure R times alternately: the best speed counts, and the median response times')
     add('--accuracy', action='store_true',
         help='record live runs, reschedule them, and compare the response times of each sink')
     add('--slack', action='store_true',

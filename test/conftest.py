@@ -264,7 +264,7 @@ def mddag() -> Callable[..., subprocess.CompletedProcess[str]]:
             try:
                 out, err = process.communicate(given, timeout)
             except subprocess.TimeoutExpired:
-                process.send_signal(signal.SIGABRT)  # has it tell where each thread stands
+                process.send_signal(signal.SIGABRT)  # writes the stack of each thread
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.communicate(timeout=10)
                 process.kill()

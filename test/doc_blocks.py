@@ -11,7 +11,7 @@ sourced workspace.  Its blocks are tried there in the order of the page, so that
 one before it has made.  What is done with a block depends on its language:
 
 * `sh`: run by bash, which must end with status 0; `mddag` and `python` are those of this test.
-* `text` right behind: the output of that command.  `…` in it stands for anything.
+* `text` right behind: the output of that command.  `…` in it matches anything.
 * `python`: run as a program.
 * `yaml`: a declaration, which must load.
 * `json`: must parse.
@@ -199,7 +199,7 @@ class Folder:
             json.loads(block.text)
         else:
             assert block.reason is not None, (
-                f'{block.place}: nobody knows how to try {block.language!r}: mark it')
+                f'{block.place}: {block.language!r} cannot be tried: mark it')
 
     def _run(self, block: Block, command: list[str]) -> None:
         expected, until = int(block.mark('exit') or 0), block.mark('until')

@@ -47,7 +47,7 @@ LEVELS = {
 PASSED_ON = {'mddag_executor.DeadlineMiss': 'mddag_executor.executor',
              'mddag_executor.MultiDeadlineExecutor': 'mddag_executor.executor',
              'mddag_executor.open_recording': 'mddag_executor.replay'}
-# The core takes events with their times and answers with decisions; it asks nobody.
+# The core takes events with their times and answers with decisions; it asks for nothing.
 NOT_IN_CORE = {
     'asyncio', 'concurrent', 'datetime', 'io', 'logging', 'multiprocessing', 'os', 'pathlib',
     'queue', 'random', 'rclpy', 'selectors', 'signal', 'socket', 'subprocess', 'sys', 'threading',

@@ -162,7 +162,7 @@ def _scan(file: int, position: int, size: int, blocks: list[Block]) -> None:
             chunks_seen = True
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
             if chunks_seen and opcode == Opcode.MESSAGE:
-                raise Damage('a message stands outside of the chunks', position)
+                raise Damage('a message is outside of the chunks', position)
             blocks.append(_plain(file, position, size, messages=not chunks_seen))
             end = blocks[-1].end
         elif opcode == Opcode.DATA_END:

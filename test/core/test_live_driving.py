@@ -338,7 +338,7 @@ class LiveDriver(RuleBasedStateMachine):
             for other in self.alive())
 
     def polled(self, runs: list[Run]) -> list[Run]:
-        """Return those that a poll would find: not what stands behind another of its entity."""
+        """Return those that a poll would find: not what waits behind another one of its entity."""
         if not self.scheduler.policy.polling:
             return runs
         waiting = [run for run in self.runs if run.fate == WAITING]

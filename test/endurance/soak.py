@@ -15,14 +15,14 @@ one fault after the other, chosen at random, and after each of them a second to 
 * ``raise``: a callback raises, which ends ``spin``; it is called again;
 * ``stop``: a source stops for a second;
 * ``burst``: a source releases ten times as often for a second;
-* ``clock``: the simulated time, which a node beside the workload follows, jumps to and fro.
+* ``clock``: the simulated time, which an additional node follows, jumps to and fro.
 
 At the end these have to hold: memory in use within 5 % of what it was after the warm-up, without
 what the middleware keeps of nodes made again (see ``soak_memory``); as many threads and file
 handles; every execution that became ready ran, was dropped, or is one of those that wait;
 every job ended or is open; and no deadline is missed by a job that was released in a clean window.
 Sinks whose critical path is longer than their deadline in this draw are left out of that last one,
-and so are windows in which the machine itself stood still: a process beside this one, which does
+and so are windows in which the machine itself stood still: another process, which does
 nothing but sleep, tells when it was woken more than ``STALL_S`` late.
 """
 
@@ -59,7 +59,7 @@ BURST = 10
 DRAIN_S = 3.0
 MEMORY_RATIO = 0.05
 REMADE = 200
-"""So many nodes a process beside this one makes again, to see what the middleware keeps."""
+"""How many nodes another process makes again, to see what the middleware keeps."""
 MATCH_S = 30.0
 MOST_TOLD = 50
 STALL_S = 0.01

@@ -122,7 +122,7 @@ def test_nothing_is_lost_while_publishers_come_and_go(make_executor, make_node):
 
 @pytest.mark.parametrize('depth', [5000, 0])
 def test_several_threads_publish_and_each_ones_order_is_kept(make_executor, make_node, depth):
-    """Also where only a part of a long queue waits in Python: 0 stands for KEEP_ALL."""
+    """Also where only a part of a long queue waits in Python: 0 means KEEP_ALL."""
     qos = QoSProfile(depth=depth) if depth else QoSProfile(history=HistoryPolicy.KEEP_ALL)
     node, got = make_node(), []
     node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), qos)

@@ -307,7 +307,7 @@ print(stops, heard.count('stop'))
 """
 
 
-@pytest.mark.parametrize('where', ['spin', 'spin_once', 'beside'])
+@pytest.mark.parametrize('where', ['spin', 'spin_once', 'other thread'])
 def test_a_signal_s_handler_may_publish(where):
     """Whatever the main thread does when the signal comes: it holds locks now and then."""
     assert run_program(PUBLISHES, where)[0] == '200 200\n'

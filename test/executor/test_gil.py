@@ -288,7 +288,7 @@ def test_an_arrival_with_a_later_deadline_is_collected_after_a_long_callback(com
     """
     Its callback never begins before the long one has ended.
 
-    As nobody is to be woken for it, it may only be taken then; so it must not be overlooked.
+    As no thread is woken for it, it may only be taken then; so it must not be overlooked.
     """
     for _ in range(3):
         assert computing.order('patient') == ['begins', 'ends', 'patient']

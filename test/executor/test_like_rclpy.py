@@ -103,5 +103,5 @@ def test_a_task_awaits_one_future_after_another(make_executor, mine, generates):
         assert wait_for(task.done)
     assert task.result() == 'done' and got == list(range(20))
     assert spinning.error is None
-    # where rclpy's own executors keep tasks that are to go on, which nobody would take out here
+    # where rclpy's own executors keep tasks that are to go on, which nothing would take out here
     assert not getattr(executor, '_ready_tasks', ())

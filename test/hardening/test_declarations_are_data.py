@@ -3,7 +3,7 @@
 """
 Declarations and what else is read as a whole are data: bounded, and nothing in them is obeyed.
 
-What the language refuses, error by error, stands in `test/msg_graph`; here are the files that mean
+What the language refuses, error by error, is in `test/msg_graph`; here are the files that mean
 harm, at every verb that reads one.
 """
 

@@ -178,7 +178,7 @@ def test_what_is_lost_until_processes_have_met_is_of_no_job(world: Path) -> None
     assert run.process.returncode == 0, errors
     live, replayed = (counts(dags['chain']['sinks']['/last:sink']) for dags in (
         result['dags'], replay(['up.mcap', 'down.mcap']).result()['dags']))
-    # beside what waited 0.1 s for its announcement, as on a busy machine
+    # in addition to what waited 0.1 s for its announcement, as on a busy machine
     assert 0 <= replayed.due - live.due <= result['undeclared']
     assert live.due > 0
 

@@ -143,7 +143,7 @@ def test_it_ends_with_who_started_it(tmp_path: Path) -> None:
 
 
 def is_alive(pid: int) -> bool:
-    """Tell whether a process runs; nobody may be there to take note of its end."""
+    """Tell whether a process runs; no process may be there to take note of its end."""
     try:
         os.kill(pid, 0)
         return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'

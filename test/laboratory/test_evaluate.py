@@ -140,12 +140,12 @@ def test_no_policy_exceeds_the_bound(judge: str, change: dict[str, object]) -> N
 
 
 def test_by_hand(small: TaskSet) -> None:
-    """At 16 ms slow does not fit beside two fast ones; nothing else matters for preemptive rad."""
+    """At 16 ms slow does not fit next to two fast ones; only that matters for preemptive rad."""
     outcome = evaluate(Experiment(small, ('rad',), workers=1, duration_ns=10 ** 9), 40)
     lengths = Draws(small, 0).times(0, 40)[:, 1]
     assert set(lengths.tolist()) == {10_000_000, 16_000_000}
     assert outcome.accepted[0].tolist() == (lengths == 10_000_000).tolist()
-    assert outcome.possible.all()       # whoever starves slow is accepted
+    assert outcome.possible.all()       # a policy that starves slow is accepted
     strict = evaluate(Experiment(
         small, ('rad',), workers=1, duration_ns=10 ** 9, judge='horizon'), 40)
     assert strict.possible.tolist() == strict.accepted[0].tolist()

@@ -135,7 +135,7 @@ nodes:
     assert alone == (50 * MS + CALLBACK_NS + costs.timer_ns,
                      MS + CALLBACK_NS + costs.timer_ready_ns)
     assert together[1] == alone[1] + SWITCH_NS
-    # it stands still while others are noticed
+    # it is stopped while others are noticed
     assert together[0] >= alone[0] + 4 * costs.timer_ns
 
 

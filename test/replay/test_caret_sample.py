@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A real CARET recording, with CARET's own results beside it: equal to the nanosecond."""
+"""A real CARET recording, next to CARET's own results: equal to the nanosecond."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ import pytest
 from .cases_by_hand import slow_cases
 from .flows import flows
 
-# not a part of the repository: looked for beside it
+# not a part of the repository: looked for next to it
 BESIDE = Path(__file__).resolve().parents[3] / 'shared' / 'caret'
 CARET = Path(os.environ.get('MDDAG_CARET_SAMPLE', BESIDE))
 SESSION = CARET / 'end_to_end_sample'

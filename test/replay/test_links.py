@@ -222,7 +222,7 @@ def test_what_was_initialised_before_the_recording(tmp_path: Path) -> None:
 
 
 def test_any_lost_event_is_said_or_changes_nothing(recorded: Recorded) -> None:
-    """Leave out each event in turn: no link may be another one, and what is missing is said."""
+    """Leave out each event once: no link may be another one, and what is missing is said."""
     for k in range(3):
         at = (k + 1) * 100 * MS
         recorded.run(CAMERA, 1, at, at + 3 * MS)

@@ -308,7 +308,7 @@ def test_a_folder_says_what_is_in_it(tmp_path: Path) -> None:
         file.add('caret_init', BEGIN, 1, 1, 5, 'jazzy')
     assert not is_ordinary(str(tmp_path / 'run'))
     assert is_ordinary(str(write_bag(tmp_path / 'bag')))
-    # also where the recorder of a bag left its metadata beside it
+    # also where the recorder of a bag left its metadata next to it
     (tmp_path / 'run' / 'metadata.yaml').write_text('{}')
     assert not is_ordinary(str(tmp_path / 'run'))
     # nor is what is left of one a bag, however little it is

@@ -204,7 +204,7 @@ def test_a_trace_cut_anywhere(sound: bytes, whole: dict[str, Any], tmp_path: Pat
 
 
 def test_an_event_at_the_end_of_all_times(tmp_path: Path) -> None:
-    """The run ends before the time that stands for never, so the scheduler's does."""
+    """The run ends before the time that means never, so the scheduler's does."""
     path = tmp_path / 'a.mcap'
     with TraceFile(path) as file:
         file.add('task_set', START_TIME, 1, 1, SMALL, 'g.yaml', 'rad', 2, MS, 3, False)

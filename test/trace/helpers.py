@@ -64,7 +64,7 @@ def sample(event: EventType, number: int) -> tuple[Any, ...]:
 
 
 def mixture(count: int, first: int = 0) -> list[tuple[Any, ...]]:
-    """Return recordings of all events of the table in turn, in the order of time."""
+    """Return recordings of all events of the table, one by one, in the order of time."""
     events = list(EVENTS.values())
     return [sample(events[number % len(events)], number)
             for number in range(first, first + count)]

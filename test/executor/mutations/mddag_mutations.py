@@ -40,7 +40,7 @@ MUTATIONS: dict[str, Callable[[], None]] = {}
 MEANING: dict[str, str] = {}
 
 silent = threading.local()
-"""``silent.on``: what the calling thread does wakes nobody who spins."""
+"""``silent.on``: what the calling thread does wakes no spinning thread."""
 
 
 def mutation(meaning: str) -> Callable[[Callable[[], None]], Callable[[], None]]:
@@ -160,7 +160,7 @@ def nothing_muted() -> None:
     replace(EventLoop, 'mute', lambda mute: lambda self, bound: None)
 
 
-@mutation('While a callback computes, nobody wakes for what holds the GIL, however urgent it is.')
+@mutation('While a callback computes, no thread wakes for what holds the GIL, however urgent.')
 def urgent_ones_muted() -> None:
     replace(EventLoop, 'mute', lambda mute: lambda self, bound: mute(self, 0))
 
@@ -207,7 +207,7 @@ def exceptions_of_takes_swallowed() -> None:
         replace(kind, '__init__', make)
 
 
-@mutation('A task of a spinning executor is there, and nobody notices.')
+@mutation('A task of a spinning executor is there, and no thread notices.')
 def create_task_does_not_wake_workers() -> None:
     def make(report: Any) -> Any:
         def broken(self: WorkerPool, event: Any, *args: Any) -> None:
@@ -225,7 +225,7 @@ def create_task_does_not_wake_spin_once() -> None:
     _wakes_nobody(executor.MultiDeadlineExecutor, 'create_task')
 
 
-@mutation('A node that is added is noted, and whoever spins does not notice.')
+@mutation('A node that is added is noted, and the spinning thread does not notice.')
 def add_node_does_not_wake() -> None:
     _wakes_nobody(executor.MultiDeadlineExecutor, 'add_node')
 
