@@ -534,7 +534,7 @@ CALLBACK_KEYS = {
     'keep': Key(choice('all', 'newest'),
                 'Of a source or sink: newest drops what has not started when the next is ready.'),
     'importance': Key(choice('high', 'normal', 'low', missing='normal'),
-                      'Of a sink. The scheduler does not use it yet.'),
+                      'Of a sink: in an overload the least important is late first.'),
     'tolerate': Key(weakly_hard(), "Of a sink: how many misses are tolerated, as '1 of 100'."),
     'max_active_jobs': Key(whole(1, 1_000_000),
                            'Bound on the open jobs of its DAG, if it is a source.'),

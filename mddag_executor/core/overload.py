@@ -8,6 +8,10 @@ vertex.  That is the latest start with which all its sinks are in time; or the p
 execution of the vertex must be checked, because an older one is demoted or the vertex is refused.
 So work that is in time costs one comparison.  Like ``rules`` this module contains only integer
 arithmetic and list indexing.
+
+Sources: robust EDF (Buttazzo and Stankovic, "RED", 1993), the mode switch of EDF-VD (Baruah et
+al., ECRTS 2012), and the postponed deadlines of the constant bandwidth server (Abeni and Buttazzo,
+RTSS 1998), which keep late callbacks from starving.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def test_a_run_and_its_result(drive: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_each_time_also_beside_busy_processes(drive: Path) -> None:
+def test_the_same_each_time_also_next_to_busy_processes(drive: Path) -> None:
     """Also where seven workers are too few, and with other hashes of strings."""
     text = (drive / 'graph.yaml').read_text()
     (drive / 'overload.yaml').write_text(

@@ -354,7 +354,7 @@ time.sleep(0.7)  # it is over: nothing more is told
 
 
 @pytest.mark.parametrize(('patience', 'takes', 'times'), [(20.0, 0.0, 0), (0.5, 1.5, 1)])
-def test_an_end_that_takes_too_long_tells_where_each_thread_stands(
+def test_an_end_that_takes_too_long_shows_the_stack_of_each_thread(
     patience: float, takes: float, times: int
 ) -> None:
     process = subprocess.run(

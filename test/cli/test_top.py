@@ -166,7 +166,7 @@ def test_live_in_a_terminal_until_the_user_ends_it(running: Any):
     assert 'workers of' in text and 'Traceback' not in text
 
 
-def test_nobody_to_hear(call: Mddag):
+def test_no_process_to_hear(call: Mddag):
     done = call('top', '--once', '--timeout', '300ms')
     assert done.returncode == 2 and done.stdout == ''
     assert done.stderr.startswith('error: /diagnostics: no executor has published its state')

@@ -134,7 +134,7 @@ def test_every_job_is_found_by_its_number(
     assert sum(sink['completed'] for sink in last['sinks'].values()) == 2 * JOBS
 
 
-def test_what_nobody_announces_waits_for_a_while_and_is_counted(
+def test_messages_without_announcement_wait_for_a_while_and_are_counted(
         make_executor: Any, make_node: Any) -> None:
     text = GRAPH + 'processes: {p1: [/one], p2: [/two, /three, /four, /five]}'
     nodes = Nodes(make_node)
@@ -235,7 +235,7 @@ def test_publications_before_the_count_began_are_learnt():
     assert bench.job(150, 1) == 4
 
 
-def test_messages_of_a_stranger_in_the_window_are_nobody_s():
+def test_messages_of_a_stranger_in_the_window_belong_to_no_job():
     """Whatever its numbers are, and however often they differ alike."""
     bench = Bench()
     for job in range(1, 100):

@@ -192,7 +192,7 @@ def test_a_signal_ends_the_executors_of_all_contexts():
 DEPTH = 1000
 
 
-def test_one_of_rclpys_executors_beside_it(make_executor, make_node, ros_context):
+def test_one_of_rclpys_executors_in_the_same_process(make_executor, make_node, ros_context):
     """They pass a number to each other, a thousand times."""
     here, there, done = make_node('here'), make_node('there'), threading.Event()
     to_there = here.create_publisher(Header, '/to_there', DEPTH)
@@ -256,7 +256,7 @@ def raise_in_the_child() -> None:
 
 
 @pytest.mark.filterwarnings('ignore:.*use of fork')
-def test_a_process_that_is_forked_disturbs_nobody_and_ends(make_executor, make_node):
+def test_a_forked_process_disturbs_nothing_and_ends(make_executor, make_node):
     """From a callback and from elsewhere, as ``multiprocessing`` does it."""
     fork = multiprocessing.get_context('fork')
     node, heard, ticks = make_node(), [], []

@@ -108,7 +108,7 @@ def test_the_same_events_give_the_same_answers_as_the_simulator(case: Case) -> N
 
 @examples(150)
 @given(st.lists(st.booleans() | st.integers(0, 2), max_size=120))
-def test_nothing_waits_that_may_run_beside_who_computes(steps: list[bool | int]) -> None:
+def test_nothing_waits_that_may_run_during_a_computing_callback(steps: list[bool | int]) -> None:
     """What computes or does not becomes ready, or a worker ends, as the pool does it."""
     engine = Engine(
         None, 3, 'rad', default_deadline=10 ** 9, max_active_jobs=NEVER, expire_after=NEVER)

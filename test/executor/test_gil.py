@@ -295,7 +295,7 @@ def test_an_arrival_with_a_later_deadline_is_collected_after_a_long_callback(com
     assert computing.executor.statistics()['dropped'] == {}
 
 
-def test_of_two_arrivals_beside_a_long_callback_one_overtakes(computing):
+def test_of_two_arrivals_during_a_long_callback_one_overtakes(computing):
     computing.meanwhile = lambda: 'urgent' in computing.ran
     for names in (('patient', 'urgent'), ('urgent', 'patient')):
         assert computing.order(*names) == ['begins', 'urgent', 'ends', 'patient']

@@ -15,7 +15,7 @@ from rclpy.task import Future
 from .conftest import Spinning, wait_for
 
 
-def test_tasks_created_while_nobody_spins_run_in_rclpys_order(make_executor, ros_context):
+def test_tasks_created_before_spin_run_in_rclpys_order(make_executor, ros_context):
     orders = []
     for executor in make_executor(), SingleThreadedExecutor(context=ros_context):
         order: list[str] = []

@@ -26,7 +26,7 @@ from .test_like_rclpy import (  # noqa: F401
 )
 from .test_spin import (  # noqa: F401
     test_a_coroutine_that_awaits_something_unknown_is_asked_again,
-    test_an_exception_that_somebody_awaits_does_not_end_spin,
+    test_an_awaited_exception_does_not_end_spin,
 )
 from .test_waitables import test_many_goals_at_once  # noqa: F401
 

@@ -74,7 +74,7 @@ def test_what_fails_when_it_is_taken_comes_out_of_spin(make_executor, make_node)
         executor.spin_until_future_complete(Future(), 2.0)
 
 
-def test_an_exception_that_somebody_awaits_does_not_end_spin(make_executor):
+def test_an_awaited_exception_does_not_end_spin(make_executor):
     """See also ``test_asked_for`` (rclpy#1215)."""
     executor = make_executor()
 

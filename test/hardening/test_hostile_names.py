@@ -165,7 +165,7 @@ def test_a_bag_names_only_its_own_files(call: Mddag, tmp_path: Path, names: obje
     harmless(done.stderr)
 
 
-def test_whoever_floods_the_diagnostics_fills_no_memory() -> None:
+def test_a_flood_of_diagnostics_fills_no_memory() -> None:
     board = Board()
 
     def say(process: str) -> None:

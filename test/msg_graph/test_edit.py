@@ -127,7 +127,7 @@ def test_a_process_has_a_node() -> None:
 
 @pytest.mark.parametrize('before', ['', 'processes: {old: [/a]}\n', 'processes:\n  old: [/b]\n'])
 @pytest.mark.parametrize('after', ['', 'workers: 3\n'])
-def test_processes_are_written_anew(before: str, after: str) -> None:
+def test_processes_are_written_again(before: str, after: str) -> None:
     tasks = loads(HEAD + before + after)
     placed = with_processes(tasks, (Process('x', ('/c', '/b')), Process('1', ('/a',))))
     assert placed.text == HEAD + after + "processes:\n  x: [/b, /c]\n  '1': [/a]\n"

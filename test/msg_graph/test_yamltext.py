@@ -114,7 +114,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         load('nul\x00byte')
 
 
-def test_scalars_are_what_stands_there() -> None:
+def test_scalars_are_as_written() -> None:
     """Words that YAML 1.1 takes for truth values, dates or numbers are names like any other."""
     tasks = loads("""\
 mddag: 1

@@ -175,7 +175,7 @@ def test_policy_workers_and_preemption_are_those_asked_for(tmp_path: Path) -> No
     assert fifo['utilisation'] == pytest.approx(16 / 20)
 
 
-def test_another_declaration_schedules_anew(tmp_path: Path) -> None:
+def test_another_declaration_schedules_again(tmp_path: Path) -> None:
     """Deadlines, order of DAGs and callback groups are those of the declaration given."""
     path = tmp_path / 'a.mcap'
     write_two(path)

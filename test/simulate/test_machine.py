@@ -346,7 +346,7 @@ def test_what_comes_is_noticed_by_a_thread_that_takes_no_worker(compiled: bool) 
     assert [(d[2], d[5]) for d in ran.decisions if d[2] >= 0] == [(1, arrived + MS)]
 
 
-def test_what_computes_stands_still_while_a_timer_is_noticed() -> None:
+def test_a_computing_callback_is_stopped_while_a_timer_is_noticed() -> None:
     ran = responses_of(loads(BOTH), [[80 * MS], [MS]])
     ends = {(int(e[4]), int(e[5])): int(e[0]) for e in ran.log if e[1] == END}
     # a switch interval until the intake gets the lock; then the urgent one waits for it as long

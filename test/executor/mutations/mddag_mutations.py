@@ -222,15 +222,15 @@ def create_task_does_not_wake_workers() -> None:
 
 @mutation('A task does not end the wait of a spin_once.')
 def create_task_does_not_wake_spin_once() -> None:
-    _wakes_nobody(executor.MultiDeadlineExecutor, 'create_task')
+    _wakes_no_thread(executor.MultiDeadlineExecutor, 'create_task')
 
 
 @mutation('A node that is added is noted, and the spinning thread does not notice.')
 def add_node_does_not_wake() -> None:
-    _wakes_nobody(executor.MultiDeadlineExecutor, 'add_node')
+    _wakes_no_thread(executor.MultiDeadlineExecutor, 'add_node')
 
 
-def _wakes_nobody(owner: Any, name: str) -> None:
+def _wakes_no_thread(owner: Any, name: str) -> None:
     def make_deaf(wake: Any) -> Any:
         return lambda self: None if getattr(silent, 'on', False) else wake(self)
 
