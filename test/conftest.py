@@ -75,6 +75,8 @@ def pytest_configure(config: pytest.Config) -> None:
         # The same examples on every run of continuous integration; new ones at home.
         derandomize=CI)
     hypothesis.settings.load_profile('mddag')
+    if getattr(config.option, 'maxworkerrestart', '') is None:
+        config.option.maxworkerrestart = '0'  # a new worker would wait for ever for its tests
     if CI:  # what is not there is an error
         pytest.importorskip = lambda name, *_, **__: importlib.import_module(name)
 
