@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mddag_executor.replay.run import open_recording
 
 __all__ = ['DeadlineMiss', 'MultiDeadlineExecutor', 'open_recording', '__version__']
-__version__ = '1.0.0'
+__version__ = '2.0.0'
 
 __getattr__, __dir__ = on_first_use(__name__, {
     'DeadlineMiss': 'mddag_executor.executor',

@@ -76,6 +76,7 @@ def test_ruff() -> None:
 
 # What it finds depends on the Python, and on the types that numpy has for it.
 @pytest.mark.skipif(sys.version_info[:2] != (3, 12), reason='mypy runs with Python 3.12 only')
+@pytest.mark.slow
 @pytest.mark.timeout(900)  # minutes on a busy machine, without what earlier runs have found
 def test_mypy() -> None:
     run('mypy')

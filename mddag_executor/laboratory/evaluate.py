@@ -139,7 +139,7 @@ def _collect(
             if progress is not None:
                 progress(outcome.runs)
     except KeyboardInterrupt:
-        for future in [each for each in pending if not each.cancel()]:
+        for future in [each for each in reversed(pending) if not each.cancel()]:
             outcome.add(future.result())
         raise
     finally:

@@ -86,9 +86,9 @@ def test_what_is_asked_for_is_done(
 
 def test_a_disk_that_gets_full_leaves_nothing_and_promises_nothing(graph: Path) -> None:
     done = subprocess.run(
-        [sys.executable, '-m', 'mddag_executor', 'simulate', str(graph), '--duration', '10min',
+        [sys.executable, '-m', 'mddag_executor', 'simulate', str(graph), '--duration', '20s',
          '--trace', 'out.mcap'], cwd=graph.parent, text=True, capture_output=True, check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000)))
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000)))
     assert done.returncode == 2
     assert done.stderr == (
         f'error: out.mcap: writing failed ({os.strerror(errno.EFBIG)}): free space, then try '

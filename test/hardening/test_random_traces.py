@@ -26,8 +26,8 @@ from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.schema import EVENTS
 import pytest
 
-EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '64'))
-BATCHES = 4
+EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '32'))
+BATCHES = 2
 BAG = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
 TEXTS = ['', 'rad', 'ros2', '/n', '/n:tick', '0,1', '-1', '9' * 30, ',,,', '\x1b[2J', '../..',
          'x' * 999, 'mddag: 1', '{}', '<b>', '/trace/../x', 'timer', 'on_tick@dag']

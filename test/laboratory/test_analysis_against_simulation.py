@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import random
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS, Verdict
 from mddag_executor.simulate import Load, periodic_load, Settings, simulate
 import msg_graph
 from msg_graph import TaskSet
+
+from ..core.task_sets import examples
 
 MS = 1_000_000
 HORIZON = 240 * MS
@@ -102,7 +104,7 @@ def check_holds(task_set: TaskSet, verdict: Verdict, workers: int, rng: random.R
             assert not missed(task_set, times, policy, preemptive, workers, offsets)
 
 
-@settings(max_examples=150)
+@examples(60)
 @given(seed=st.integers(0, 2 ** 32), one=st.booleans(), dags=st.integers(1, 4),
        workers=st.integers(1, 5), part=st.floats(0.05, 1.1))
 def check_random_set(seed: int, one: bool, dags: int, workers: int, part: float) -> None:
@@ -133,7 +135,7 @@ def at_the_border(seed: int, one: bool, dags: int, workers: int, name: str
     return found
 
 
-@settings(max_examples=150)
+@examples(60)
 @given(seed=st.integers(0, 2 ** 32), dags=st.integers(1, 4), workers=st.integers(1, 4),
        name=st.sampled_from(NAMES), one=st.booleans())
 def check_border(seed: int, dags: int, workers: int, name: str, one: bool) -> None:

@@ -216,5 +216,4 @@ def test_compiled_code_is_kept_until_a_source_changes(tmp_path: Path) -> None:
             NUMBA_CACHE_DIR=str(tmp_path))
 
     assert [hits_and_misses() for _ in range(2)] == ['0 1', '1 0']
-    changed = 'compiling._hash_of = lambda *modules: "another"'
-    assert [hits_and_misses(changed) for _ in range(2)] == ['0 1', '1 0']
+    assert hits_and_misses('compiling._hash_of = lambda *modules: "another"') == '0 1'
