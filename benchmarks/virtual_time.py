@@ -116,7 +116,7 @@ def time_core(
     :param seed: of the execution times.
     :return: for JSON: counts, and us of CPU time for each event and vertex job.
     :raises mddag_executor.core.PolicyError: if there is no such policy.
-    :raises SimulationError: if a callback declares no execution time.
+    :raises InputError: if a callback declares no execution time.
     """
     settings = Settings(policy, workers, duration_ns, preemptive=None)
     tables = Tables.build(task_set)

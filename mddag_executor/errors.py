@@ -56,4 +56,4 @@ class UserCodeError(MddagError):
 
 
 class UsageError(MddagError):
-    """A command line that asks for something impossible."""
+    """Settings, or a command line, that ask for something impossible."""

@@ -21,9 +21,10 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
+from mddag_executor.errors import UsageError
 from mddag_executor.laboratory import necessary, sufficient
 from mddag_executor.laboratory.sufficient import Bound
-from mddag_executor.laboratory.tasks import AnalysisError, Task, tasks_of
+from mddag_executor.laboratory.tasks import Task, tasks_of
 from mddag_executor.text import counted
 from msg_graph import format_duration, TaskSet
 
@@ -91,7 +92,7 @@ def analyse(
     :param progress: gets how many tests are done.
     """
     if workers < 1:
-        raise AnalysisError(f'workers: {workers} is too few: give at least 1')
+        raise UsageError(f'workers: {workers} is too few: give at least 1')
     tasks = tasks_of(task_set, budget)
     found = [_longest_path(tasks), _utilisation(tasks, workers), _demand(tasks, workers)]
     impossible = any(verdict.verdict == FAILS for verdict in found)

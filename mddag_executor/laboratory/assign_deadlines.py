@@ -27,7 +27,7 @@ from dataclasses import replace
 import math
 from typing import Any, NamedTuple
 
-from mddag_executor.errors import MddagError
+from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.acceptance import wilson, Z_95
 from mddag_executor.laboratory.evaluate import compiling_pays, evaluate
 from mddag_executor.laboratory.experiment import Experiment
@@ -44,9 +44,6 @@ _USUAL_SCALES = 11
 Deadlines = dict[str, int]
 """Relative deadlines of sinks, ns, by their callbacks' keys."""
 
-
-class AssignError(MddagError):
-    """Deadlines that cannot be found as asked."""
 
 
 class Measured(NamedTuple):
@@ -93,7 +90,7 @@ def proportional(task_set: TaskSet, budget: str) -> Deadlines:
     The sink of a DAG with the longest critical path gets the period, the others less.  A callback
     that is several sinks gets the shortest of theirs.
 
-    :raises mddag_executor.laboratory.tasks.AnalysisError: an execution time is not declared.
+    :raises mddag_executor.errors.UsageError: an execution time is not declared.
     """
     deadlines: Deadlines = {}
     for task in tasks_of(task_set, budget):
@@ -109,7 +106,7 @@ def scaled(task_set: TaskSet, budget: str, scale: float) -> Deadlines:
     """
     Return critical paths times a scale; a callback that is several sinks gets the longest.
 
-    :raises mddag_executor.laboratory.tasks.AnalysisError: an execution time is not declared.
+    :raises mddag_executor.errors.UsageError: an execution time is not declared.
     """
     deadlines: Deadlines = {}
     for task in tasks_of(task_set, budget):
@@ -156,13 +153,13 @@ def search(
     :param experiment: with one policy; its task set's deadlines are ignored.
     :param runs: with each scale.
     :param progress: gets the scale, and how many of its runs are done.
-    :raises AssignError: no deadlines reach the target, or so many runs cannot show it.
+    :raises UsageError: no deadlines reach the target, or so many runs cannot show it.
     """
     if not 0.0 < target < 1.0:
-        raise AssignError(
+        raise UsageError(
             f'--target {target:g}: it is out of range: give a ratio above 0 and below 1')
     if runs < least_runs(target):
-        raise AssignError(f'--target {target:g}: {runs} runs cannot show it: give --runs '
+        raise UsageError(f'--target {target:g}: {runs} runs cannot show it: give --runs '
                           f'{least_runs(target)} or more')
     compiled = compiling_pays((experiment,), runs * _USUAL_SCALES, jobs)
     tried: list[tuple[float, Measured]] = []
@@ -171,7 +168,7 @@ def search(
         deadlines = scaled(experiment.task_set, budget, scale)
         if max(deadlines.values()) > experiment.duration_ns // 2:
             best = max((measured.ratio for _, measured in tried), default=0.0)
-            raise AssignError(
+            raise UsageError(
                 f'--target {target:g}: no scale with deadlines up to half of a run reaches it '
                 f'(the best accepted {100 * best:.1f} %): give a lower target, more --workers, '
                 'or a longer --duration')
@@ -180,7 +177,7 @@ def search(
 
     def is_good(scale: float) -> bool:
         if scale < _LEAST_SCALE:
-            raise AssignError(
+            raise UsageError(
                 '--target: every deadline is good enough: is there anything to execute?')
         tried.append((scale, acceptance(scale, experiment.seed)))
         return tried[-1][1].interval[0] >= target

@@ -33,10 +33,9 @@ import time
 from typing import Any
 
 from mddag_executor import __version__
-from mddag_executor.errors import MddagError
+from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.laboratory.acceptance import Evaluation
 from mddag_executor.laboratory.experiment import Chunk, Evaluator, Experiment, STRIDE
-from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.schedule import SOON_S
 
 Submit = Callable[[int, int], 'Future[Chunk]']
@@ -69,7 +68,7 @@ def evaluate(
     :param compiled: whether to use the compiled core; None: if that is faster.
     :param progress: gets now and then how many runs are done.
     :return: the outcome; after a KeyboardInterrupt that of the runs that are done.
-    :raises SimulationError: on settings that make no sense, or a cluster that cannot be used.
+    :raises UsageError: on settings that make no sense, or a cluster that cannot be used.
     :raises mddag_executor.core.PolicyError: when there is no such policy.
     :raises InputError: when a callback declares no execution time.
     """
@@ -97,17 +96,17 @@ def evaluate(
 
 def _check(experiments: Sequence[Experiment], runs: int, first_run: int, jobs: int) -> None:
     if not experiments:
-        raise SimulationError('graphs: there is none: name at least one declaration')
+        raise UsageError('graphs: there is none: name at least one declaration')
     if runs < 1:
-        raise SimulationError(f'runs: {runs} is too few: give at least 1')
+        raise UsageError(f'runs: {runs} is too few: give at least 1')
     if runs * len(experiments) > MOST_RUNS:
-        raise SimulationError(f'runs: {runs * len(experiments)} is too many: give at most '
+        raise UsageError(f'runs: {runs * len(experiments)} is too many: give at most '
                               f'{MOST_RUNS}, and evaluate more in ranges (--first-run)')
     if not 0 <= first_run < STRIDE - MOST_RUNS:
-        raise SimulationError(
+        raise UsageError(
             f'first run: {first_run} is out of range: give 0 to {STRIDE - MOST_RUNS - 1}')
     if jobs < 1:
-        raise SimulationError(f'jobs: {jobs} is too few: give at least 1')
+        raise UsageError(f'jobs: {jobs} is too few: give at least 1')
 
 
 def compiling_pays(experiments: Sequence[Experiment], runs: int, jobs: int) -> bool:
@@ -161,7 +160,7 @@ def _local(jobs: int, evaluator: Evaluator) -> Iterator[Submit]:
         with pool:
             yield lambda first, count: pool.submit(evaluator, first, count)
     except BrokenProcessPool:
-        raise SimulationError('jobs: a worker process was killed: free some memory, or give fewer '
+        raise UsageError('jobs: a worker process was killed: free some memory, or give fewer '
                               '--jobs') from None
 
 
@@ -179,7 +178,7 @@ def _dask(address: str, evaluator: Evaluator) -> Iterator[Submit]:
         raise
     except (Exception, CancelledError) as error:    # whatever the cluster or its network raises
         said = ' '.join(f'{type(error).__name__}: {error}'.split())[:160]
-        raise SimulationError(
+        raise UsageError(
             f'--dask {address}: {said}: check the address, and that the scheduler and workers '
             f'with mddag_executor {__version__} run there') from None
 
@@ -187,7 +186,7 @@ def _dask(address: str, evaluator: Evaluator) -> Iterator[Submit]:
 def _on_worker(evaluator: Any, version: str, first: int, count: int) -> Chunk:
     """Evaluate a chunk on a worker of a cluster."""
     if version != __version__:
-        raise SimulationError(f'--dask: a worker has mddag_executor {__version__}, and this is '
+        raise UsageError(f'--dask: a worker has mddag_executor {__version__}, and this is '
                               f'{version}: install the same version there')
     chunk: Chunk = evaluator(first, count)
     return chunk

@@ -19,7 +19,8 @@ from collections.abc import Iterator
 from dataclasses import fields
 from typing import NamedTuple
 
-from mddag_executor.laboratory.generate_options import GenerateError, LEAST_NS, Options
+from mddag_executor.errors import UsageError
+from mddag_executor.laboratory.generate_options import LEAST_NS, Options
 from mddag_executor.laboratory.shapes import draw_shape, Shape
 from mddag_executor.laboratory.shares import deal, Dice
 from msg_graph.duration import exact_duration, whole_us
@@ -67,7 +68,7 @@ def _utilisations(dice: Dice, options: Options, least: list[float]) -> list[floa
     total = options.utilisation * options.workers
     room = [options.most_per_dag - low for low in least]
     if total < sum(least) or min(room) < 0:
-        raise GenerateError(
+        raise UsageError(
             f'--utilisation {options.utilisation:g}: it leaves a callback less than 1 us: give '
             'more utilisation, longer --periods, or fewer --dags or --vertices')
     shares = deal(dice, total - sum(least), room)

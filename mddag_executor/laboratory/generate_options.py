@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from mddag_executor.errors import MddagError
+from mddag_executor.errors import UsageError
 from mddag_executor.text import counted
 from msg_graph.duration import DAY
 from msg_graph.model import MOST_WORKERS
@@ -29,9 +29,6 @@ _RANGES: dict[str, tuple[str, float, float]] = {
     'tightness': ('--tightness', _LEAST_ABOVE_0, 1_000),
 }
 
-
-class GenerateError(MddagError):
-    """Options that no task set can have."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +63,7 @@ class Options:
         """
         Check that there can be such a task set.
 
-        :raises GenerateError: there cannot.
+        :raises UsageError: there cannot.
         """
         for name, (option, least, most) in _RANGES.items():
             value = getattr(self, name)
@@ -74,19 +71,19 @@ class Options:
             for one in values:
                 if not (math.isfinite(one) and least <= one <= most):
                     lower = 'above 0' if least == _LEAST_ABOVE_0 else f'{least:g}'
-                    raise GenerateError(
+                    raise UsageError(
                         f'{option} {one:g}: it is out of range: give {lower} to {most:g}')
             if name != 'periods_ns' and values[0] > values[-1]:
-                raise GenerateError(f'{option} {values[0]:g}:{values[-1]:g}: the first is larger: '
+                raise UsageError(f'{option} {values[0]:g}:{values[-1]:g}: the first is larger: '
                                     'write the smaller one first')
         vertices, dags = self.vertices[0], self.dags[0]
         if self.sinks[0] > max(1, vertices - 1):
-            raise GenerateError(
+            raise UsageError(
                 f'--sinks {self.sinks[0]}: a DAG of {counted(vertices, "vertex", "vertices")} has '
                 f'at most {max(1, vertices - 1)}: give fewer, or more --vertices')
         load = self.utilisation * self.workers
         if load > dags * self.most_per_dag * (1 + 1e-12):
-            raise GenerateError(
+            raise UsageError(
                 f'--utilisation {self.utilisation:g}: a load of {load:g} does not fit into '
                 f'{counted(dags, "DAG")} of at most {self.most_per_dag:g}: give more --dags, or a '
                 'larger --max-dag-load')

@@ -22,7 +22,7 @@ import math
 import random
 from typing import TypeVar
 
-from mddag_executor.laboratory.generate_options import GenerateError
+from mddag_executor.errors import UsageError
 
 T = TypeVar('T')
 
@@ -59,10 +59,10 @@ def deal(dice: Dice, total: float, most: Sequence[float]) -> list[float]:
     """
     Return shares that sum up to a total, each with its upper bound.
 
-    :raises GenerateError: the bounds are too low.
+    :raises UsageError: the bounds are too low.
     """
     if total > sum(most) * (1 + 1e-9):
-        raise GenerateError(
+        raise UsageError(
             f'--utilisation: a load of {total:g} does not fit into DAGs of {sum(most):g} in all: '
             'give more --dags, or a larger --max-dag-load')
     return dirichlet_rescale(dice, total, most)
@@ -100,6 +100,6 @@ def _stretched(dice: Dice, total: float, most: Sequence[float]) -> list[float]:
                 break  # nothing but rounding is left to stretch
             lower = [limit if is_over else 0.0 for limit, is_over in zip(most, over)]
             shares = [(share - less) * total / rest for share, less in zip(shares, lower)]
-    raise GenerateError(
+    raise UsageError(
         f'--utilisation: {_MOST_TRIES} draws did not fit: give more --dags, or a larger '
         '--max-dag-load')

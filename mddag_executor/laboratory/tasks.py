@@ -8,14 +8,10 @@ from dataclasses import dataclass
 
 from mddag_executor import defaults
 from mddag_executor.core import Tables
-from mddag_executor.errors import MddagError
+from mddag_executor.errors import InputError, UsageError
 from mddag_executor.text import counted
 from msg_graph import Dag, ExecutionTime, TaskSet
 from msg_graph.model import path_lengths, topological_order
-
-
-class AnalysisError(MddagError):
-    """A declaration that cannot be analysed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +79,12 @@ def _costs(task_set: TaskSet, dag: Dag, budget: str) -> list[int]:
     return costs
 
 
-def _unknown(task_set: TaskSet) -> AnalysisError:
+def _unknown(task_set: TaskSet) -> InputError:
     missing = [callback for callback in task_set.callbacks if callback.execution_time is None]
     first, others = missing[0], len(missing) - 1
     also = f' (and {counted(others, "more callback")})' if others else ''
-    place = f'{first.file or task_set.file}:{first.line}'
-    return AnalysisError(f'{place}: {first.key}{also} declares no execution_time: add one')
+    return InputError(first.file or task_set.file,
+                      f'{first.key}{also} declares no execution_time', 'add one', first.line)
 
 
 def _budget(time: ExecutionTime, budget: str) -> int:
@@ -98,7 +94,7 @@ def _budget(time: ExecutionTime, budget: str) -> int:
         return time.draw(0.99)
     if budget == 'mean':
         return time.mean_ns
-    raise AnalysisError(
+    raise UsageError(
         f"budget '{budget}': there is no such budget: choose one of {', '.join(defaults.BUDGETS)}")
 
 

@@ -26,10 +26,11 @@ from typing import NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core import policy as find_policy
+from mddag_executor.errors import InputError
 from mddag_executor.replay.bags import Bag, BagError, UNKNOWN
 from mddag_executor.replay.load import RecordedLoad
 from mddag_executor.replay.reschedule import Reschedule
-from mddag_executor.simulate import Load, Settings, SimulationError
+from mddag_executor.simulate import Load, Settings
 from mddag_executor.simulate.workload import declared_holds
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.times import credible
@@ -197,9 +198,8 @@ def reschedule_bag(
     if times is None:
         missing = [c for c in (v.callback for v in task_set.vertices) if c.execution_time is None]
         if missing:
-            raise SimulationError(
-                f'{task_set.file}:{missing[0].line}: {missing[0].key} declares no execution_time: '
-                'add one, or give --execution-times FILE')
+            raise InputError(task_set.file, f'{missing[0].key} declares no execution_time',
+                             'add one, or give --execution-times FILE', missing[0].line)
     sources = (dag.vertices[dag.source].callback for dag in task_set.dags)
     topics = {topic for source in sources if source.kind != 'timer' for topic in source.topics}
     bag = Bag(path, topics, name)

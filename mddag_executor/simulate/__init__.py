@@ -3,7 +3,6 @@
 """Simulation in virtual time: the core with given releases and execution times."""
 
 from mddag_executor.simulate.engine import END, LogEntry, PREEMPT, START
-from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.run import JUDGES, simulate, SimulatedRun
 from mddag_executor.simulate.schedule import schedule, Scheduled, Settings
@@ -17,6 +16,6 @@ from mddag_executor.simulate.workload import (
 
 __all__ = [
     'END', 'JUDGES', 'Load', 'LogEntry', 'PREEMPT', 'START', 'Scheduled', 'Settings',
-    'SimulatedRun', 'SimulationError', 'draw_execution_times', 'periodic_load',
+    'SimulatedRun', 'draw_execution_times', 'periodic_load',
     'read_execution_times', 'scale_execution_times', 'schedule', 'simulate', 'utilisation',
 ]

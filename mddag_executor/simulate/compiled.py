@@ -18,10 +18,10 @@ from mddag_executor import progress
 from mddag_executor.core.policies import POLICIES
 from mddag_executor.core.state import Decision, State
 from mddag_executor.core.tables import Tables
+from mddag_executor.errors import UsageError
 from mddag_executor.simulate.compiling import available, entry_points
 from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import LogEntry, Orders
-from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.machine import Machine
 import numpy as np
@@ -33,7 +33,7 @@ _COMPILE_S = 25.0   # approximate compile time
 def check_available() -> None:
     """Check that there is a compiler."""
     if not available():
-        raise SimulationError("numba, which compiles the core, is not installed: install "
+        raise UsageError("numba, which compiles the core, is not installed: install "
                               "'mddag_executor[batch]' with pip")
 
 

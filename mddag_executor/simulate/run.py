@@ -10,8 +10,8 @@ from typing import Any
 
 from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core.state import Decision
+from mddag_executor.errors import UsageError
 from mddag_executor.simulate.engine import LogEntry
-from mddag_executor.simulate.errors import SimulationError
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.schedule import schedule, Settings
 from msg_graph import TaskSet
@@ -62,7 +62,7 @@ def simulate(
     :param max_active_jobs: maximum number of open jobs of a DAG that does not declare it.
     :param log: keep the log of every worker.
     :param progress: receives the virtual time (ns) regularly.
-    :raises SimulationError: for invalid settings.
+    :raises UsageError: for invalid settings.
     :raises mddag_executor.core.PolicyError: if there is no such policy.
     """
     check(settings)
@@ -81,14 +81,14 @@ def simulate(
 def check(settings: Settings) -> None:
     """Check settings."""
     if not 1 <= settings.workers <= MOST_WORKERS:
-        raise SimulationError(
+        raise UsageError(
             f'workers: {settings.workers} is out of range: give 1 to {MOST_WORKERS}')
     if settings.duration_ns < 1:
-        raise SimulationError(f'duration: {settings.duration_ns} ns is too short: give at least 1')
+        raise UsageError(f'duration: {settings.duration_ns} ns is too short: give at least 1')
     if settings.cpus is not None and settings.cpus < 1:
-        raise SimulationError(f'cpus: {settings.cpus} is too few: give at least 1')
+        raise UsageError(f'cpus: {settings.cpus} is too few: give at least 1')
     if settings.judge not in JUDGES:
-        raise SimulationError(
+        raise UsageError(
             f"judge '{settings.judge}': there is no such way: choose one of {', '.join(JUDGES)}")
     if settings.dispatch_overhead_ns < 0 or settings.switch_overhead_ns < 0:
-        raise SimulationError('overhead: it is negative: give 0 or more')
+        raise UsageError('overhead: it is negative: give 0 or more')

@@ -17,7 +17,7 @@ import random
 from typing import Any
 
 from mddag_executor.core import processes_of
-from mddag_executor.simulate.errors import SimulationError
+from mddag_executor.errors import InputError, UsageError
 from mddag_executor.simulate.load import Load
 from msg_graph import Dag, ExecutionTime, TaskSet
 from msg_graph.duration import DAY, MICROSECOND
@@ -35,7 +35,7 @@ def draw_execution_times(
     :param undeclared: execution time of callbacks that declare none, ns; None: each must declare
         one.
     :return: one list for each DAG, by local vertex index; the same seed gives the same draw.
-    :raises SimulationError: if a callback declares no execution time.
+    :raises InputError: if a callback declares no execution time.
     """
     generator = random.Random(seed)
     times = []
@@ -50,9 +50,9 @@ def draw_execution_times(
                 row.append(undeclared)
                 continue
             if times_of_callback is None:
-                raise SimulationError(
-                    f'{task_set.file}:{vertex.callback.line}: {vertex.callback.key} declares no '
-                    'execution_time: add one, or give --execution-times FILE')
+                raise InputError(
+                    task_set.file, f'{vertex.callback.key} declares no execution_time',
+                    'add one, or give --execution-times FILE', vertex.callback.line)
             row.append(times_of_callback.draw(share))
         times.append(row)
     return times
@@ -63,23 +63,21 @@ def read_execution_times(task_set: TaskSet, text: str, name: str) -> list[list[i
     Read fixed execution times: JSON ``{"DAG": {"/node:callback": microseconds, …}, …}``.
 
     :return: ns, one list for each DAG, by local vertex index.
-    :raises SimulationError: for any other contents, or a vertex without a time.
+    :raises InputError: for any other contents, or a vertex without a time.
     """
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
-        raise SimulationError(
-            f'{name}:{error.lineno}: not JSON ({error.msg}): {_FORMAT}') from None
+        raise InputError(name, f'not JSON ({error.msg})', _FORMAT, error.lineno) from None
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
-        raise SimulationError(f'{name}: not usable JSON ({error}): {_FORMAT}') from None
+        raise InputError(name, f'not usable JSON ({error})', _FORMAT) from None
     if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
-        raise SimulationError(f'{name}: not an object of objects: {_FORMAT}')
+        raise InputError(name, 'not an object of objects', _FORMAT)
     known = {dag.name for dag in task_set.dags}
     for dag_name in data:
         if dag_name not in known:
-            raise SimulationError(
-                f"{name}: DAG '{dag_name}' is not in {task_set.file}: "
-                f"its DAGs are {', '.join(sorted(known))}")
+            raise InputError(name, f"DAG '{dag_name}' is not in {task_set.file}",
+                             f"its DAGs are {', '.join(sorted(known))}")
     return [_dag_times(dag, data.get(dag.name, {}), name) for dag in task_set.dags]
 
 
@@ -90,18 +88,18 @@ def _dag_times(dag: Dag, times: Mapping[str, Any], name: str) -> list[int]:
         names.update((vertex.name, vertex.callback.key))
         value = times.get(vertex.name, times.get(vertex.callback.key))
         if value is None:
-            raise SimulationError(
-                f'{name}: no execution time for {vertex.callback.key} of DAG {dag.name}: add it')
+            raise InputError(
+                name, f'no execution time for {vertex.callback.key} of DAG {dag.name}', 'add it')
         if isinstance(value, bool) or not isinstance(value, (int, float)) \
                 or not 0 < value < _LONGEST_US:
-            raise SimulationError(
-                f'{name}: execution time of {vertex.callback.key} of DAG {dag.name} is '
-                f'{_shown(value)}: give microseconds, above 0 and below one day')
+            raise InputError(
+                name, f'execution time of {vertex.callback.key} of DAG {dag.name} is '
+                f'{_shown(value)}', 'give microseconds, above 0 and below one day')
         row.append(max(1, round(value * 1000)))
     for key in times:
         if key not in names:
-            raise SimulationError(
-                f"{name}: '{key}' is not a vertex of DAG {dag.name}: take it out or correct it")
+            raise InputError(name, f"'{key}' is not a vertex of DAG {dag.name}",
+                             'take it out or correct it')
     return row
 
 
@@ -122,14 +120,14 @@ def scale_execution_times(
     """
     Return the execution times scaled by one factor to a normalised utilisation, ns.
 
-    :raises SimulationError: if the target is not a positive number, or there is nothing to scale.
+    :raises UsageError: if the target is not a positive number, or there is nothing to scale.
     """
     now = utilisation(task_set, times, workers)
     if not (target > 0 and math.isfinite(target)):
-        raise SimulationError(
+        raise UsageError(
             f'utilisation {target}: it is not a number above zero: give one, as 0.6')
     if now == 0:
-        raise SimulationError('utilisation: all execution times are 0: give times to scale')
+        raise UsageError('utilisation: all execution times are 0: give times to scale')
     factor = target / now
     return [[round(time * factor) for time in row] for row in times]
 

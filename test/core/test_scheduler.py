@@ -26,7 +26,8 @@ from mddag_executor.core.state import (
     WAITING,
 )
 from mddag_executor.core.tables import NEVER
-from mddag_executor.simulate import Settings, simulate, SimulationError
+from mddag_executor.errors import UsageError
+from mddag_executor.simulate import Settings, simulate
 from msg_graph import TaskSet
 import pytest
 
@@ -240,7 +241,7 @@ def test_no_preemption() -> None:
         simulate(task_set, of.load(10), settings)
     assert not simulate(
         task_set, of.load(10), Settings(policy='ros2', preemptive=None)).settings.preempts
-    with pytest.raises(SimulationError, match='workers'):
+    with pytest.raises(UsageError, match='workers'):
         simulate(task_set, of.load(10), Settings(policy='ros2', workers=0))
 
 

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.acceptance import wilson
 from mddag_executor.laboratory.assign_deadlines import (
-    AssignError,
     least_runs,
     measure,
     PRECISION,
@@ -92,7 +92,7 @@ nodes:
 
 def test_overload_reaches_nothing() -> None:
     busy = loads(GRAPH.replace('timer: 10ms', 'timer: 1ms'))
-    with pytest.raises(AssignError, match='no scale with deadlines up to half of a run '):
+    with pytest.raises(UsageError, match='no scale with deadlines up to half of a run '):
         search(experiment(task_set=busy), 0.9, runs=50)
 
 
@@ -104,8 +104,8 @@ def test_least_runs(target: float) -> None:
 
 
 def test_targets_that_cannot_be_shown() -> None:
-    with pytest.raises(AssignError, match='0.99: 50 runs cannot show it: give --runs 381'):
+    with pytest.raises(UsageError, match='0.99: 50 runs cannot show it: give --runs 381'):
         search(experiment(), 0.99, runs=50)
     for target in (0.0, 1.0, 1.5, float('nan')):
-        with pytest.raises(AssignError, match='it is out of range'):
+        with pytest.raises(UsageError, match='it is out of range'):
             search(experiment(), target)

@@ -19,6 +19,7 @@ from pathlib import Path
 import signal
 from typing import Any
 
+from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.acceptance import Evaluation, WIDE_BINS
 from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.evaluate import evaluate
@@ -30,7 +31,6 @@ from mddag_executor.simulate import (
     periodic_load,
     Settings,
     simulate,
-    SimulationError,
 )
 from msg_graph import load, loads, TaskSet
 import numpy as np
@@ -214,7 +214,7 @@ def test_interrupted(small: TaskSet) -> None:
 def test_bad_input(
     small: TaskSet, runs: int, options: dict[str, int], problem: str
 ) -> None:
-    with pytest.raises(SimulationError) as caught:
+    with pytest.raises(UsageError) as caught:
         evaluate(Experiment(small), runs, **options)  # type: ignore[arg-type]
     assert str(caught.value).startswith(problem)
 
@@ -276,7 +276,7 @@ def test_the_outcome_is_that_of_this_machine(cluster: Any) -> None:
 
 def test_an_address_without_a_scheduler() -> None:
     for address in ('tcp://127.0.0.1:1', 'nonsense'):
-        with pytest.raises(SimulationError) as caught:
+        with pytest.raises(UsageError) as caught:
             evaluate(EXPERIMENT, 2, dask=address)
         assert str(caught.value).startswith(f'--dask {address}: ')
         assert ': check the address, and that the scheduler and workers with ' in str(caught.value)

@@ -8,9 +8,10 @@ from dataclasses import replace
 
 from hypothesis import given, settings
 import hypothesis.strategies as st
+from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.assign_deadlines import proportional
 from mddag_executor.laboratory.generate import generate
-from mddag_executor.laboratory.generate_options import GenerateError, Options
+from mddag_executor.laboratory.generate_options import Options
 from mddag_executor.laboratory.shapes import draw_shape, MOST_COPIES
 from mddag_executor.laboratory.shares import Dice
 from msg_graph import loads, TaskSet
@@ -48,7 +49,7 @@ def made(options: Options) -> tuple[str, TaskSet] | None:
     """Return a task set; None if there is none, as the error says."""
     try:
         text = generate(options, 3)
-    except GenerateError as error:
+    except UsageError as error:
         assert 'less than 1 us' in str(error)
         return None
     return text, loads(text, 'random.yaml')
@@ -115,7 +116,7 @@ def test_shapes(count: int, part: float, edges: float, ors: float, seed: int) ->
     ({'workers': 0}, '--workers 0: it is out of range: '),
 ])
 def test_impossible(change: dict[str, object], problem: str) -> None:
-    with pytest.raises(GenerateError) as caught:
+    with pytest.raises(UsageError) as caught:
         generate(replace(Options(), **change))  # type: ignore[arg-type]
     assert str(caught.value).startswith(problem)
 

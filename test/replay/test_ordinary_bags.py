@@ -12,10 +12,11 @@ import sqlite3
 from typing import Any
 
 from mddag_executor.cli import main as program
+from mddag_executor.errors import InputError
 from mddag_executor.replay import bags, Reschedule
 from mddag_executor.replay.bags import Bag, BagError, is_ordinary
 from mddag_executor.replay.bags_reschedule import reschedule_bag
-from mddag_executor.simulate import SimulationError, START
+from mddag_executor.simulate import START
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
 import pytest
@@ -143,7 +144,7 @@ nodes:
 """
     with pytest.raises(BagError, match='none of the sources of g.yaml is in it: it has /chatter'):
         reschedule_bag(path, loads(nothing, 'g.yaml'))
-    with pytest.raises(SimulationError, match='g.yaml:4: /camera:in declares no execution_time'):
+    with pytest.raises(InputError, match='g.yaml:4: /camera:in declares no execution_time'):
         reschedule_bag(path, loads(nothing.replace(', execution_time: 1ms', ''), 'g.yaml'))
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import queues, Tables
+from mddag_executor.errors import UsageError
 from mddag_executor.simulate import (
     END,
     engine,
@@ -20,7 +21,6 @@ from mddag_executor.simulate import (
     schedule,
     Settings,
     simulate,
-    SimulationError,
     START,
 )
 from mddag_executor.simulate.intakes import Costs, Intakes
@@ -129,7 +129,7 @@ def test_declared_holders_in_the_simulator() -> None:
                       for name in 'ab'])
         assert result.get('cpus') == cpus
     assert worst == [[6, 6], [6, 12], [9, 12]]
-    with pytest.raises(SimulationError, match='cpus: 0 is too few'):
+    with pytest.raises(UsageError, match='cpus: 0 is too few'):
         simulate(task_set, load, Settings(workers=2, duration_ns=40 * MS, cpus=0))
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from mddag_executor.errors import UsageError
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import (
@@ -24,7 +25,6 @@ from mddag_executor.simulate import (
     Settings,
     simulate,
     SimulatedRun,
-    SimulationError,
     utilisation,
 )
 from msg_graph import loads, TaskSet
@@ -117,9 +117,9 @@ def test_utilisation_and_its_scaling() -> None:
     assert scaled == [[1_000, 1_500], [500, 500]]
     assert times == [[2_000, 3_000], [1_000, 1_000]]
     for target in (0.0, -1.0, float('nan'), float('inf')):
-        with pytest.raises(SimulationError, match='utilisation'):
+        with pytest.raises(UsageError, match='utilisation'):
             scale_execution_times(two_dags(), times, 2, target)
-    with pytest.raises(SimulationError, match='nothing|0'):
+    with pytest.raises(UsageError, match='nothing|0'):
         scale_execution_times(two_dags(), [[0, 0], [0, 0]], 2, 0.5)
 
 
