@@ -166,7 +166,7 @@ class Judged:
         completed[done] = self._recording.executions['end'][jobs.done[:, local][done]]
         late = done & (completed > deadline)
         dropped, dropped_at = self._dropped(jobs, sinks)
-        dropped &= here & ~done & ((reason < 0)[:, None] | (dropped_at < when[:, None]))
+        dropped &= here & ~done & ((reason < 0)[:, None] | (dropped_at <= when[:, None]))
         # position at which the last sink completed
         closed = np.where(here & ~dropped, np.where(done, order, NEVER), -1).max(
             axis=1, initial=-1)
