@@ -132,6 +132,8 @@ class DueTimes:
         :param is_late: it is short, but runs longer than expected.
         """
         self._watch_holder(now, is_late)
+        if is_late:
+            self._check_gil(now)  # the first reading, with which the next one is compared
         self._arm_by(self._gil_check.at)
 
     def _arm_by(self, at: int) -> None:

@@ -305,12 +305,13 @@ class WorkerPool:
                     and self.engine.waits_since(now) > now - GUARD_NS):
                 self._leader = leader
                 self._guard(now - self._offset)
-            elif not self.polling:
-                self._admit()
             elif self.engine.may_start_more(now):
                 self._wake_one()
-            elif self.engine.holders and self.engine.has_waiting:
-                self.due.check_holder(now - self._offset, is_late=True)
+            else:
+                if not self.polling:
+                    self._admit()
+                if self.engine.holders and self.engine.has_waiting:
+                    self.due.check_holder(now - self._offset, is_late=True)
 
     def _wake_one(self) -> None:
         if self.polling or self._is_stepping:
