@@ -158,7 +158,7 @@ class Announcements:
             name = others.name_of(origin)
             if name is None:  # it was released here, and may come back
                 name = (self._token, origin.job)
-                others.name(name, origin)
+                others.note(name, origin)
         return name, release - self._clock.offset_ns
 
     def _hear(self, message: UInt8MultiArray) -> None:

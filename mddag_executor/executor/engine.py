@@ -166,7 +166,8 @@ class Engine:
                 self.other_processes.note(stamp, work.origin)
             return
         if isinstance(origin, Announced):
-            origin = self._enter_announced(origin, min(release, now), now)
+            origin = self._entering(
+                origin.dag, origin.name, origin.vertex, min(release, now), now)
         elif origin is None and stamp >= 0:
             origin = self._enter(entity, stamp, min(release, now), now)
         if origin is None or not self._start_successor(work, origin, now):
@@ -204,30 +205,27 @@ class Engine:
 
     def _enter(self, entity: Entity, stamp: int, release: int, now: int) -> Origin | None:
         """Find or start the job of a message from another process (see ``other_processes``)."""
-        if self.other_processes is None or not entity.remote_publishers:
+        if not entity.remote_publishers:
             return None
-        dag = self.tables.dag_of[entity.remote_publishers[0]]
-        job = self.other_processes.find(dag, stamp)
+        first = entity.remote_publishers[0]
+        job = self._entering(self.tables.dag_of[first], stamp, first, release, now)
+        # For a sync: the first of its legs that has no message yet.
+        return None if job is None else job._replace(vertex=next(
+            (v for v in entity.remote_publishers if self._is_idle(job, *entity.targets[v])),
+            first))
+
+    def _entering(
+        self, dag: int, name: int | tuple[int, int], vertex: int, release: int, now: int
+    ) -> Origin | None:
+        """Find or start the job of a stamp or an announced name."""
+        if self.other_processes is None or dag < 0:
+            return None
+        job = self.other_processes.find(dag, name)
         if job is None:
             slot = self._release(dag, release, now)
-            job = Origin(slot, dag, self._state.job_index[slot], entity.remote_publishers[0])
-            self.other_processes.note(stamp, job)
-        # For a sync: the first of its legs that has no message yet.
-        return job._replace(vertex=next(
-            (v for v in entity.remote_publishers if self._is_idle(job, *entity.targets[v])),
-            entity.remote_publishers[0]))
-
-    def _enter_announced(self, announced: Announced, release: int, now: int) -> Origin | None:
-        """Find or start the job that another process announces (see ``announcements``)."""
-        if self.other_processes is None or announced.dag < 0:
-            return None
-        job = self.other_processes.named(announced.dag, announced.name)
-        if job is None:
-            slot = self._release(announced.dag, release, now)
-            job = Origin(
-                slot, announced.dag, self._state.job_index[slot], announced.vertex)
-            self.other_processes.name(announced.name, job)
-        return job._replace(vertex=announced.vertex)
+            job = Origin(slot, dag, self._state.job_index[slot], vertex)
+            self.other_processes.note(name, job)
+        return job._replace(vertex=vertex)
 
     def reference_deadline(self, work: Work) -> int | None:
         """Return the reference absolute deadline of an open job's execution; None for others."""

@@ -40,7 +40,7 @@ Two executors in one process that share a graph are treated as two processes.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Hashable, Iterable, Sequence, Set
+from collections.abc import Iterable, Sequence, Set
 import threading
 from typing import Any
 
@@ -80,8 +80,8 @@ class OtherProcesses:
         # the topics on which messages go to other processes
         self._leaving: set[str] = set()
         # by DAG and stamp, or DAG and name; the names of jobs that have entered
-        self._jobs: dict[tuple[int, Hashable], Origin] = {}
-        self._kept: deque[tuple[int, Hashable]] = deque()
+        self._jobs: dict[tuple[int, int | tuple[int, int]], Origin] = {}
+        self._kept: deque[tuple[int, int | tuple[int, int]]] = deque()
         self._names: dict[tuple[int, int], tuple[int, int]] = {}
 
     @staticmethod
@@ -176,12 +176,12 @@ class OtherProcesses:
         return {v.callback.key for dag in self._dags for v in dag.vertices
                 if not self._here.get(dag.index, [0] * len(dag.vertices))[v.index]}
 
-    def note(self, stamp: int, origin: Origin) -> None:
-        """Note the job of a stamp (rule 4)."""
-        if stamp >= 0 and origin.dag in self._crossing:
-            self._keep(stamp, origin)
-
-    def _keep(self, name: Hashable, origin: Origin) -> None:
+    def note(self, name: int | tuple[int, int], origin: Origin) -> None:
+        """Note the job of a stamp, or of a name that is announced (rule 4)."""
+        if isinstance(name, tuple):
+            self._names[origin.dag, origin.job] = name
+        elif name < 0 or origin.dag not in self._crossing:
+            return
         key = (origin.dag, name)
         if key not in self._jobs:
             self._kept.append(key)
@@ -191,18 +191,9 @@ class OtherProcesses:
                     self._names.pop((gone.dag, gone.job), None)
         self._jobs[key] = origin
 
-    def find(self, dag: int, stamp: int) -> Origin | None:
-        """Return the job of a stamp, also one that has ended; None for a new one."""
-        return self._jobs.get((dag, stamp))
-
-    def named(self, dag: int, name: tuple[int, int]) -> Origin | None:
-        """Return the job of an announced name, also one that has ended; None for a new one."""
+    def find(self, dag: int, name: int | tuple[int, int]) -> Origin | None:
+        """Return the job of a stamp or name, also one that has ended; None for a new one."""
         return self._jobs.get((dag, name))
-
-    def name(self, name: tuple[int, int], origin: Origin) -> None:
-        """Note the name of a job that enters, or is announced (rule 4)."""
-        self._names[origin.dag, origin.job] = name
-        self._keep(name, origin)
 
     def name_of(self, origin: Origin) -> tuple[int, int] | None:
         """Return the name of a job, None if it has none yet."""

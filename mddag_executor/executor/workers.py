@@ -237,31 +237,19 @@ class WorkerPool:
 
     def post(self, several: list[Work]) -> None:
         """Make undeclared executions ready."""
-        if self.is_inside():
-            self._defer(partial(self.post, several))
-            return
-        with self.lock:
-            now = self.tick()
-            for work in several:
-                self.engine.ready(work, now)
-            self.wake_for_more()
+        self.report(self._post, several)
+
+    def _post(self, several: list[Work], now: int) -> None:
+        for work in several:
+            self.engine.ready(work, now)
 
     def resume(self, work: Work) -> None:
         """Make a suspended execution ready to go on."""
-        if self.is_inside():
-            self._defer(partial(self.resume, work))
-            return
-        with self.lock:
-            self.tick()
-            self.engine.resume(work)
-            self.wake_for_more()
+        self.report(lambda now: self.engine.resume(work))
 
     def leave_group(self, work: Work) -> None:
         """Note that the callback group of an execution has let it run."""
-        with self.lock:
-            self.tick()
-            self.engine.leave_group(work)
-            self.wake_for_more()
+        self.report(lambda now: self.engine.leave_group(work))
 
     def call_at(self, at: int, function: Callable[[], None]) -> None:
         """Let a worker thread call a function at a time (monotonic ns), without the lock."""
@@ -696,7 +684,8 @@ class WorkerPool:
     def _settle_end(self, work: Work, outcome: Any) -> None:
         """Resume a suspended execution later, or report an exception; without the lock."""
         if isinstance(outcome, Refused):
-            self.call_at(monotonic_ns() + AGAIN_NS, self._ask_again)
+            self.call_at(monotonic_ns() + AGAIN_NS, partial(
+                self.report, lambda now: self.engine.ask_again()))
         elif isinstance(outcome, Destroyed):
             pass
         elif isinstance(outcome, BaseException):
@@ -714,12 +703,6 @@ class WorkerPool:
             work.yields = 0
             adopt_awaited(outcome, self.executor)
             outcome.add_done_callback(QuickCallback(partial(self.resume, work)))
-
-    def _ask_again(self) -> None:
-        with self.lock:
-            self.tick()
-            self.engine.ask_again()
-            self.wake_for_more()
 
     @contextmanager
     def lend(self, me: WorkerThread) -> Iterator[None]:

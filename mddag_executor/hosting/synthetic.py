@@ -41,6 +41,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.executor.jobs import header_stamp
 from mddag_executor.hosting.bodies import (
     Emulate,
     native,
@@ -103,12 +104,6 @@ def stamped(release: int, sender: str = '') -> Header:
     message = Header(frame_id=sender)
     message.stamp.sec, message.stamp.nanosec = divmod(release, 1_000_000_000)
     return message
-
-
-def release_of(message: Header) -> int:
-    """Return the release that a message carries, ns since the epoch."""
-    stamp = message.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 class Role:
@@ -214,7 +209,7 @@ def callback_of(
         role = by_sender.get(message.frame_id)
         if role is None:
             return  # published from outside of the declaration
-        release = release_of(message)
+        release = header_stamp(message)
         if is_sync and not role.is_whole(release, message.frame_id):
             return
         if current_job is not no_job:
