@@ -475,6 +475,7 @@ class WorkerPool:
             if events:
                 self._bell_rings = False  # the waiting thread may have received it
                 self._collect(arrived)
+                now = self.now      # a recorded message is later than the turn began
                 is_due = is_due or self.timers.has_new or self.timers.has_jumped
                 if is_due and self.running:
                     timed = self.due.handle(now, self._waited_since(since or now))

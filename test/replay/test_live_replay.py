@@ -171,6 +171,42 @@ def test_replay_counts_what_the_executor_counted(ros_context: Any, tmp_path: Pat
         assert dag['jobs'] == live['dags'][name]['jobs']
 
 
+def test_what_is_late_when_it_arrives_is_aborted_after_its_release(
+    ros_context: Any, tmp_path: Path
+) -> None:
+    from mddag_executor import MultiDeadlineExecutor
+    from rclpy.node import Node
+    from std_msgs.msg import Header
+    graph = """\
+mddag: 1
+workers: 1
+nodes:
+  - node: /late
+    callbacks:
+      - {name: cb, subscription: /old, period: 10ms, release_from: header_stamp, on_late: abort,
+         deadline: 5ms}
+"""
+    path = tmp_path / 'late.mcap'
+    executor = MultiDeadlineExecutor(
+        loads(graph, 'g.yaml'), context=ros_context, trace=str(path))
+    node = Node('late', context=ros_context, start_parameter_services=False, enable_rosout=False)
+    publisher = node.create_publisher(Header, '/old', 10)
+    node.create_subscription(Header, '/old', lambda message: None, 10)
+    executor.add_node(node)
+    with spinning(executor):
+        for _ in range(20):
+            second, rest = divmod(time.time_ns() - 1_000_000_000, 1_000_000_000)
+            message = Header()
+            message.stamp.sec, message.stamp.nanosec = second, rest
+            publisher.publish(message)
+            time.sleep(0.01)
+    node.destroy_node()
+    outcome = replay(path)
+    assert outcome.warnings == []
+    sink = outcome.result()['dags']['/late']['sinks']['/late:cb']
+    assert sink['aborted'] == executor.statistics()['dags']['/late']['sinks']['/late:cb']['aborted'] > 10
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize('cause', ['waited', 'group', 'machine', 'lost'])
 def test_the_cause_of_most_misses(cause: str, tmp_path: Path) -> None:
