@@ -102,7 +102,7 @@ class _Jobs:
     """
     The jobs of one DAG.
 
-    Each of ``_COLUMNS`` is an attribute, a flat array.
+    Each of ``_COLUMNS`` is an attribute, a view of its part of the column of all DAGs.
     """
 
     def __init__(self, dag: Dag, n_edges: int, numbers: Ints) -> None:
@@ -110,18 +110,18 @@ class _Jobs:
         self.n_edges = n_edges
         self.publishers = [v.index for v in dag.vertices for _ in v.successors]     # by edge
         self.numbers = numbers
-        widths = {_JOB: 1, _VERTEX: self.size, _EDGE: n_edges}
-        for name, (by, kind) in _COLUMNS.items():
-            setattr(self, name, np.full(len(numbers) * widths[by], _UNKNOWN, dtype=kind))
 
     if TYPE_CHECKING:
         def __getattr__(self, name: str) -> Any:
             """Declare the columns for type checkers."""
 
+    def width(self, name: str) -> int:
+        """Return how many values a column has for each job."""
+        return (1, self.size, self.n_edges)[_COLUMNS[name][0]]
+
     def rows(self, name: str) -> Any:
         """Return a column as an array with a row for each job."""
-        return getattr(self, name).reshape(
-            len(self.numbers), self.n_edges if _COLUMNS[name][0] == _EDGE else self.size)
+        return getattr(self, name).reshape(len(self.numbers), self.width(name))
 
 
 class LoadBuilder:
@@ -155,6 +155,12 @@ class LoadBuilder:
         of_dag = [releases[releases['dag'] == dag.index] for dag in task_set.dags]
         self._jobs = [_Jobs(dag, n, mine['job'].copy()) for dag, n, mine in zip(
             task_set.dags, edges_of(tables), of_dag)]
+        self._whole: dict[str, Any] = {}
+        for name, (_, kind) in _COLUMNS.items():
+            ends = np.cumsum([len(jobs.numbers) * jobs.width(name) for jobs in self._jobs])
+            self._whole[name] = np.full(ends[-1] if len(ends) else 0, _UNKNOWN, dtype=kind)
+            for jobs, part in zip(self._jobs, np.split(self._whole[name], ends)):
+                setattr(jobs, name, part)
         for jobs, mine in zip(self._jobs, of_dag):
             jobs.release[:] = mine['release']
             jobs.noticed[:] = np.maximum(mine['release'], mine['noticed'])
@@ -329,7 +335,6 @@ class LoadBuilder:
         :param notices: whether intakes notice timers and messages, instead of the recorded times;
             this needs CPU times, which say how long others computed.
         """
-        self._close()
         process = process or self._process
         notices = notices and bool((self._whole['cpu'] >= 0).any())
         every, usual, late, intakes = self._isolate(workers, notices)
@@ -366,15 +371,6 @@ class LoadBuilder:
         return RecordedLoad(
             load, [jobs.numbers.tolist() for jobs in self._jobs], demand, executions, estimated,
             unknown, usual, transport, late if overheads else late[:0], intakes)
-
-    def _close(self) -> None:
-        """Join the columns of all DAGs' jobs; each DAG keeps a view of its part."""
-        self._whole: dict[str, Any] = {}
-        for name in _COLUMNS:
-            parts = [getattr(jobs, name) for jobs in self._jobs]
-            whole = self._whole[name] = np.concatenate(parts)
-            for jobs, part in zip(self._jobs, np.split(whole, np.cumsum([*map(len, parts)]))):
-                setattr(jobs, name, part)
 
     def _drop(self, *columns: str) -> None:
         """Free columns, which are large for long runs."""
