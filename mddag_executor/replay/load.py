@@ -41,7 +41,6 @@ the recorded indices.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
@@ -107,7 +106,7 @@ class _Jobs:
 
     def __init__(self, dag: Dag, n_edges: int, numbers: Ints) -> None:
         self.size = len(dag.vertices)
-        self.n_edges = n_edges
+        self.widths = 1, self.size, n_edges
         self.publishers = [v.index for v in dag.vertices for _ in v.successors]     # by edge
         self.numbers = numbers
 
@@ -115,13 +114,10 @@ class _Jobs:
         def __getattr__(self, name: str) -> Any:
             """Declare the columns for type checkers."""
 
-    def width(self, name: str) -> int:
-        """Return how many values a column has for each job."""
-        return (1, self.size, self.n_edges)[_COLUMNS[name][0]]
-
     def rows(self, name: str) -> Any:
         """Return a column as an array with a row for each job."""
-        return getattr(self, name).reshape(len(self.numbers), self.width(name))
+        return getattr(self, name).reshape(
+            len(self.numbers), self.widths[_COLUMNS[name][0]])
 
 
 class LoadBuilder:
@@ -155,11 +151,15 @@ class LoadBuilder:
         of_dag = [releases[releases['dag'] == dag.index] for dag in task_set.dags]
         self._jobs = [_Jobs(dag, n, mine['job'].copy()) for dag, n, mine in zip(
             task_set.dags, edges_of(tables), of_dag)]
+        # by kind of column and DAG: the values of each job, and where they begin
+        self._widths = np.array(
+            [jobs.widths for jobs in self._jobs], dtype=np.int64).reshape(-1, 3).T
+        counts = np.array([len(jobs.numbers) for jobs in self._jobs], dtype=np.int64)
+        self._begins = np.cumsum(np.pad(self._widths * counts, ((0, 0), (1, 0))), axis=1)
         self._whole: dict[str, Any] = {}
-        for name, (_, kind) in _COLUMNS.items():
-            ends = np.cumsum([len(jobs.numbers) * jobs.width(name) for jobs in self._jobs])
-            self._whole[name] = np.full(ends[-1] if len(ends) else 0, _UNKNOWN, dtype=kind)
-            for jobs, part in zip(self._jobs, np.split(self._whole[name], ends)):
+        for name, (by, kind) in _COLUMNS.items():
+            self._whole[name] = np.full(self._begins[by, -1], _UNKNOWN, dtype=kind)
+            for jobs, part in zip(self._jobs, np.split(self._whole[name], self._begins[by, 1:])):
                 setattr(jobs, name, part)
         for jobs, mine in zip(self._jobs, of_dag):
             jobs.release[:] = mine['release']
@@ -176,6 +176,12 @@ class LoadBuilder:
         self._take_completions()
         self._take_publications()
         del self._row
+
+    def _places(self, by: int, row: Any, vertex: Any) -> Ints:
+        """Return the places of vertices of jobs in a kind of column (``_EDGE``: of edge 0)."""
+        dag = np.array(self._tables.dag_of)[vertex]
+        place: Ints = self._begins[by][dag] + row * self._widths[by][dag]
+        return place if by != _VERTEX else place + vertex - np.array(self._first)[dag]
 
     def _job_ends(self) -> None:
         """Keep failed and skipped executions: they fail or are skipped again."""
@@ -197,10 +203,9 @@ class LoadBuilder:
         first, ready = piece['piece'] == 0, piece['ready'].copy()
         process = np.array(self._process, dtype=np.int64)[vertex]
         self._find_turns(piece, process)
-        for dag, jobs in enumerate(self._jobs):
-            mine = np.flatnonzero((row >= 0) & (vertex == self._tables.source[dag]))
-            turn = jobs.turn[row[mine]]
-            ready[mine] = np.where(turn >= 0, turn, ready[mine])
+        source = np.flatnonzero((row >= 0) & np.isin(vertex, self._tables.source[:-1]))
+        turn = self._whole['turn'][self._places(_JOB, row[source], vertex[source])]
+        ready[source] = np.where(turn >= 0, turn, ready[source])
         self._late = dispatch_times(
             n_workers, piece['worker'].astype(np.int64), self._groups(piece['callback'], vertex),
             np.where(first, ready, piece['start']), piece['start'], piece['end'], process,
@@ -218,9 +223,7 @@ class LoadBuilder:
         self.callback_of: dict[int, int] = dict(zip(
             some.tolist(), piece['callback'][declared[at]].tolist()))
         mine = np.flatnonzero(first & (row >= 0) & (vertex >= 0))
-        for dag, jobs in enumerate(self._jobs):
-            those = mine[piece['dag'][mine] == dag]
-            jobs.dispatch[row[those] * jobs.size + vertex[those] - self._first[dag]] = those
+        self._whole['dispatch'][self._places(_VERTEX, row[mine], vertex[mine])] = mine
 
     def _find_turns(self, piece: Any, process: Ints) -> None:
         """
@@ -261,29 +264,29 @@ class LoadBuilder:
         width = int(n_legs.max(initial=1))
         edges = np.array([[*each, *[-1] * (width - len(each))] for each in self._edges_into]
                          or [[-1]])
-        for dag, jobs in enumerate(self._jobs):
-            done = table[rows[table['dag'][rows] == dag]]
-            row = self._row[rows[table['dag'][rows] == dag]]
-            vertex = done['vertex'].astype(np.int64)
-            leg = np.where(done['leg'] < 0, n_legs[vertex] - 1, done['leg'])
-            edge = np.where(leg < width, edges[vertex, np.minimum(leg, width - 1)], -1)
-            known = edge >= 0
-            jobs.arrived[row[known] * jobs.n_edges + edge[known]] = done['ready'][known]
-            whole = done['completes'] == recorded_tables.VERTEX
-            if not whole.all():
-                part = done[~whole]
-                self._others = np.concatenate([self._others, np.column_stack((
-                    part['ready'], part['busy'], np.full(len(part), _UNKNOWN)))])
-            place = row[whole] * jobs.size + vertex[whole] - self._first[dag]
-            for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
-                                 ('start', 'began'), ('end', 'end')):
-                getattr(jobs, name)[place] = done[column][whole]
-            at_once = whole & (done['leg'] == recorded_tables.ALL_LEGS) & (n_legs[vertex] > 1)
-            for v in np.unique(vertex[at_once]).tolist():
-                self._all_at_once(jobs, row[at_once & (vertex == v)], self._edges_into[v])
-            source = whole & ~known
-            source[source] = done['ready'][source] >= jobs.release[row[source]]
-            jobs.noticed[row[source]] = done['ready'][source]
+        done, row, whole = table[rows], self._row[rows], self._whole
+        vertex = done['vertex'].astype(np.int64)
+        leg = np.where(done['leg'] < 0, n_legs[vertex] - 1, done['leg'])
+        edge = np.where(leg < width, edges[vertex, np.minimum(leg, width - 1)], -1)
+        known = edge >= 0
+        whole['arrived'][self._places(_EDGE, row[known], vertex[known]) + edge[known]] = done[
+            'ready'][known]
+        ended = done['completes'] == recorded_tables.VERTEX
+        part = done[~ended]
+        self._others = np.concatenate([self._others, np.column_stack((
+            part['ready'], part['busy'], np.full(len(part), _UNKNOWN)))])
+        place = self._places(_VERTEX, row[ended], vertex[ended])
+        for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
+                             ('start', 'began'), ('end', 'end')):
+            whole[name][place] = done[column][ended]
+        at_once = ended & (done['leg'] == recorded_tables.ALL_LEGS) & (n_legs[vertex] > 1)
+        for v in np.unique(vertex[at_once]).tolist():
+            self._all_at_once(self._jobs[self._tables.dag_of[v]], row[at_once & (vertex == v)],
+                              self._edges_into[v])
+        source = np.flatnonzero(ended & ~known)
+        place = self._places(_JOB, row[source], vertex[source])
+        later = done['ready'][source] >= whole['release'][place]
+        whole['noticed'][place[later]] = done['ready'][source[later]]
 
     def _all_at_once(self, jobs: _Jobs, rows: Ints, edges: list[int]) -> None:
         """If one execution completes all legs, only the last message's time is known."""
@@ -313,9 +316,9 @@ class LoadBuilder:
             found = self._recording.who.every_publisher.get(number)
             mine = publisher == number
             for v in np.unique(vertex_of[mine]).tolist() if found is not None else ():
-                jobs = self._jobs[self._tables.dag_of[v]]
+                place = self._places(_EDGE, row[mine & (vertex_of == v)], v)
                 for edge in edges_from.get((v, found.topic), ()) if found is not None else ():
-                    jobs.rows('sent')[row[mine & (vertex_of == v)], edge] = 1
+                    self._whole['sent'][place + edge] = 1
 
     def times(self) -> list[list[int]]:
         """Return by DAG and vertex the execution time, 0 if unknown."""
@@ -358,16 +361,15 @@ class LoadBuilder:
         number = others[:, 2]
         costs = np.concatenate([took, np.maximum(0, others[:, 1]) + np.where(
             number >= 0, every[number], 0)])
-        bases = [0, *accumulate(len(jobs.numbers) * jobs.size for jobs in self._jobs)]
+        bases = self._begins[_VERTEX].tolist()
         columns: dict[str, Any] = {
             'holds': np.concatenate([held, more]) if held.any() else [],
             'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
-            'delays': delays, 'delay_stride': [jobs.n_edges for jobs in self._jobs],
-            'delay_base': [0, *accumulate(
-                len(jobs.numbers) * jobs.n_edges for jobs in self._jobs[:-1])]}
+            'delays': delays, 'delay_stride': self._widths[_EDGE].tolist(),
+            'delay_base': self._begins[_EDGE, :-1].tolist()}
         load = self._load(costs, bases, others[:, 0], overheads and not notices, workers == 1)
         load = load._replace(
-            fates=self._fates(bases, len(costs)), **columns)
+            fates=self._fates(len(costs)), **columns)
         return RecordedLoad(
             load, [jobs.numbers.tolist() for jobs in self._jobs], demand, executions, estimated,
             unknown, usual, transport, late if overheads else late[:0], intakes)
@@ -434,15 +436,13 @@ class LoadBuilder:
                 held[:, v] *= process[self._first[dag.index] + v]
         return estimated, list(unknown)
 
-    def _fates(self, bases: list[int], executions: int) -> list[int]:
+    def _fates(self, executions: int) -> list[int]:
         """Return which executions failed or were skipped; empty: none."""
         fates = [RUNS] * executions if self._failed or self._skipped else []
         for vertex, row in self._failed:
-            dag = self._tables.dag_of[vertex]
-            fates[bases[dag] + row * self._jobs[dag].size + vertex - self._first[dag]] = FAILS
+            fates[int(self._places(_VERTEX, row, vertex))] = FAILS
         for dag, row in self._skipped:
-            source = self._tables.source[dag] - self._first[dag]
-            fates[bases[dag] + row * self._jobs[dag].size + source] = SKIPPED
+            fates[int(self._places(_VERTEX, row, self._tables.source[dag]))] = SKIPPED
         return fates
 
     def _by_execution(self, by_vertex: Sequence[int]) -> Any:
