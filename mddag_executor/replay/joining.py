@@ -472,15 +472,15 @@ class Joined:
         stamped = dag.release_from == 'header_stamp'
         best = None
         for known in reversed(self._releases[dag.index]):
+            away = release - known[0]
+            if away > max(dag.period_ns, SAME_RELEASE):
+                break
             if place in known[2]:
                 continue
-            away = release - known[0]
             if abs(away) <= SAME_RELEASE:
                 return known
             if stamped and best is None and 0 < away < dag.period_ns:
                 best = known
-            if away > dag.period_ns:
-                break
         return best
 
     def _check_run(self) -> None:
