@@ -16,6 +16,7 @@ CPU time, and maximum memory.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 import multiprocessing
 import os
 import resource
@@ -177,6 +178,14 @@ def _reschedule(path: str, limit: int) -> int:
     return TraceReader(path).message_count or 0
 
 
+def _exported(form: str, path: str, limit: int) -> int:
+    from mddag_executor.replay import replay
+    from mddag_executor.report.export import write
+    with open(os.devnull, 'wb') as file:
+        write(form, file, replay(path), 'executions')
+    return TraceReader(path).message_count or 0
+
+
 def _mcap(path: str, limit: int) -> int:
     from mcap.reader import make_reader
     count = 0
@@ -209,6 +218,8 @@ READERS: dict[str, Callable[[str, int], int]] = {
     'read and linked': _link,
     'replayed as recorded': _replay,
     'rescheduled': _reschedule,
+    'exported to Parquet': partial(_exported, 'parquet'),
+    'exported to Perfetto': partial(_exported, 'pftrace'),
     'mcap, undecoded': _mcap,
     'rosbags, undecoded': _rosbags,
 }
