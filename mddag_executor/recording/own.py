@@ -43,6 +43,7 @@ from mddag_executor.recording.tables import (
     Growing,
     Ints,
     JOB_ENDS,
+    last_of,
     LEG,
     Mask,
     MISSES,
@@ -382,10 +383,10 @@ class _Source:
             return rows(EXECUTIONS), none, none
         line = _Line([each for each, _ in found], [at for _, at in found])
         is_dispatch, is_end = line.kind == 0, line.kind == 2
-        before = line.before(is_dispatch | is_end)
+        before = last_of(is_dispatch | is_end, line.thread, before=True)
         runs = (before >= 0) & is_dispatch[before]
         same = runs & (line.callback == line.callback[before])
-        started = line.latest((line.kind == 1) & same)
+        started = last_of((line.kind == 1) & same, line.thread)
         ended = np.flatnonzero(is_end & same)
         self._left_out(_END, 'of an execution that was not dispatched', is_end & ~same)
         by = before[ended]
@@ -415,12 +416,10 @@ class _Source:
         thread = np.r_[table['thread'][ended], complete['vtid'].astype(np.int64)]
         place = np.r_[dispatch_at[ended], at]
         order = sort_by(thread, place)
-        which = np.where(order < len(ended), order, -1)
-        last = np.maximum.accumulate(np.where(which >= 0, np.arange(len(order)), -1))
-        of = np.full(len(complete), -1)
         is_complete = order >= len(ended)
+        last = last_of(~is_complete, thread[order])
         same = (last >= 0) & is_complete
-        same[same] = thread[order[last[same]]] == thread[order[same]]
+        of = np.full(len(complete), -1)
         of[order[same] - len(ended)] = ended[order[last[same]]]
         dag, vertex = self._numbering.of(complete['dag'], complete['vertex'])
         good = (of >= 0) & (dag >= 0)
@@ -698,19 +697,6 @@ class _Line:
         self.row = np.concatenate([np.arange(len(table)) for _, table, _ in parts])[order]
         self.time = np.concatenate([table['timestamp'] for _, table, _ in parts])[order]
         self.callback = np.concatenate([table['callback'] for _, table, _ in parts])[order]
-        self._numbers = np.arange(len(order))
-        begins = np.r_[True, self.thread[1:] != self.thread[:-1]]
-        self._begin = np.maximum.accumulate(np.where(begins, self._numbers, 0))
-
-    def latest(self, which: Mask) -> Ints:
-        """Return by event the last event of its thread, up to itself, in ``which``; -1: none."""
-        found = np.maximum.accumulate(np.where(which, self._numbers, -1))
-        return np.where(found >= self._begin, found, -1)
-
-    def before(self, which: Mask) -> Ints:
-        """Return by event the last earlier event of its thread in ``which``; -1: none."""
-        found = np.r_[-1, np.maximum.accumulate(np.where(which, self._numbers, -1))[:-1]]
-        return np.where(found >= self._begin, found, -1)
 
 
 def _pieces(table: Table, end_at: Ints) -> None:

@@ -336,6 +336,19 @@ def sort_by(*columns: Any) -> Ints:
     return order
 
 
+def last_of(which: Mask, group: Any, before: bool = False) -> Ints:
+    """
+    Return by row the last chosen row of its group up to it, or ``before`` it; -1: none.
+
+    :param group: a sorted column.
+    """
+    last = np.maximum.accumulate(np.where(which, np.arange(len(which)), -1))
+    if before:
+        last = np.append(-1, last)[:len(which)]
+    found: Ints = np.where((last >= 0) & (group[last] == group), last, -1)
+    return found
+
+
 def groups(values: Any) -> tuple[Ints, Ints]:
     """Return the begin and end of each run of equal values in a sorted column."""
     if not len(values):

@@ -49,7 +49,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from mddag_executor.recording.entities import Addresses, Callback, Entities
-from mddag_executor.recording.tables import Ints, Mask, sort_by, Table
+from mddag_executor.recording.tables import Ints, last_of, Mask, sort_by, Table
 from mddag_executor.replay.imported_events import (
     ADDRESSES,
     BECAME,
@@ -227,12 +227,10 @@ class Links:
 
         The result is in the order of the events.
         """
-        order, thread = self._order, self.events['thread'][self._order]
-        place = np.where(of[order], np.arange(len(order)), -1)
-        latest = np.r_[-1, np.maximum.accumulate(place)[:-1]] if len(place) else place
+        order = self._order
+        latest = last_of(of[order], self.events['thread'][order], before=True)
         found = np.full(len(order), -1)
-        known = (latest >= 0) & (thread[np.maximum(latest, 0)] == thread)
-        found[order[known]] = order[latest[known]]
+        found[order] = np.where(latest >= 0, order[latest], -1)
         return found[before]
 
     # --- executions ------------------------------------------------------------------------------

@@ -316,9 +316,9 @@ class LoadBuilder:
             found = self._recording.who.every_publisher.get(number)
             mine = publisher == number
             for v in np.unique(vertex_of[mine]).tolist() if found is not None else ():
-                place = self._places(_EDGE, row[mine & (vertex_of == v)], v)
+                places = self._places(_EDGE, row[mine & (vertex_of == v)], v)
                 for edge in edges_from.get((v, found.topic), ()) if found is not None else ():
-                    self._whole['sent'][place + edge] = 1
+                    self._whole['sent'][places + edge] = 1
 
     def times(self) -> list[list[int]]:
         """Return by DAG and vertex the execution time, 0 if unknown."""

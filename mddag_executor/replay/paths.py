@@ -54,7 +54,16 @@ from __future__ import annotations
 
 from typing import Any, Literal, NamedTuple
 
-from mddag_executor.recording.tables import EXECUTIONS, Ints, Mask, Recording, rows, sort_by, Table
+from mddag_executor.recording.tables import (
+    EXECUTIONS,
+    Ints,
+    last_of,
+    Mask,
+    Recording,
+    rows,
+    sort_by,
+    Table,
+)
 from mddag_executor.replay.spread import spread
 from msg_graph import Callback, Path, TaskSet
 import numpy as np
@@ -494,11 +503,9 @@ def _as_of_each(messages: Ints, wanted: Any, times: Ints) -> Ints:
     number = np.r_[messages[:, 0], wanted]
     is_asked = np.r_[np.zeros(n, dtype=np.int64), np.ones(len(wanted), dtype=np.int64)]
     order = sort_by(number, np.r_[messages[:, 1], times], is_asked)
-    places = np.arange(len(order))
     is_message: Mask = order < n
-    last = np.maximum.accumulate(np.where(is_message, places, NONE))
+    last = last_of(is_message, number[order])
     good = ~is_message & (last >= 0)
-    good[good] = number[order[last[good]]] == number[order[good]]
     found = np.full(len(wanted), NONE)
     found[order[good] - n] = messages[order[last[good]], 2]
     return found
