@@ -186,9 +186,9 @@ def _rescheduled_bag(
     with Progress('replaying'):
         return reschedule_bag(
             path, task_set, policy=args.policy, workers=args.workers,
-            preemptive=bool(args.preemptive), on_late=args.on_late or 'continue', times=times,
-            seed=args.seed or 0,
-            dispatch_overhead=args.overheads or 0, name=name, skip=args.skip, cpus=args.cpus)
+            preemptive=args.preemptive, on_late=args.on_late or 'continue', times=times,
+            seed=args.seed or 0, dispatch_overhead=args.overheads or 0, name=name,
+            skip=args.skip, cpus=args.cpus)
 
 
 def _processes(

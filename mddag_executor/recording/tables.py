@@ -177,7 +177,8 @@ class Recording:
     :ivar callback_vertex: by callback a vertex of its declared callback, for executions without
         job.
     :ivar unjudged: by DAG the number of withdrawn jobs; None: unknown.
-    :ivar warnings: missing or doubtful data, one line each.
+    :ivar messages: number of messages of an ordinary bag; None: it is a trace.
+    :ivar notes: assumptions, one line each; ``warnings``: missing or doubtful data.
     """
 
     name: str
@@ -216,6 +217,8 @@ class Recording:
     links: bool = False
     callback_vertex: dict[int, int] = field(default_factory=dict)
     unjudged: dict[int, int] | None = None
+    messages: int | None = None
+    notes: Sequence[str] = ()
     warnings: list[str] = field(default_factory=list)
     _keys: dict[int, str] | None = field(default=None, init=False, repr=False)
     _callbacks: tuple[Ints, Ints] | None = field(default=None, init=False, repr=False)

@@ -134,7 +134,9 @@ def recording_result(run: Recording) -> dict[str, Any]:
     """Return the part of a result that describes the trace."""
     return {
         'trace': run.name, 'declaration': run.head.file, 'start_ns': run.start,
-        'end_ns': run.end, 'shut_down': run.shut_down, 'lost': run.lost}
+        'end_ns': run.end, **(
+            {'shut_down': run.shut_down, 'lost': run.lost} if run.messages is None
+            else {'messages': run.messages})}
 
 
 def replay(

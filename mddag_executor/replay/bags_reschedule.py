@@ -5,10 +5,10 @@ Ordinary bags rescheduled: recorded sensor messages as releases, declared execut
 
 Theory of operation
 -------------------
-* A DAG whose source is a subscription has a job for each message of its topic in the bag, ready at
-  its arrival.  Its release is as declared by `release_from`: the arrival, the header stamp, or the
-  publication if the recorder stored it.  If a message has no such stamp, or a stamp after its
-  arrival, it is released at its arrival.
+* A bag is a recording without executions.  A DAG whose source is a subscription has a job for each
+  message of its topic, ready at its arrival.  Its release is as declared by `release_from`: the
+  arrival, the header stamp, or the publication if the recorder stored it.  If a message has no
+  such stamp, or a stamp after its arrival, it is released at its arrival.
 * A DAG whose source is a timer has jobs at k * T from the bag's first message on, while messages
   arrive (see ``trace.times``): a bag does not have the real times of timers.
 * Execution times are drawn for each execution from the declared quantiles (seeded), or come from a
@@ -22,19 +22,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 import os
 import random
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from mddag_executor.core import NEVER, Tables
-from mddag_executor.core import policy as find_policy
+from mddag_executor.core import DEFAULT_DEADLINE_NS
 from mddag_executor.errors import InputError
+from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.head import Head
+from mddag_executor.recording.tables import Recording, RELEASES, rows, sort_by
 from mddag_executor.replay.bags import Bag, BagError, UNKNOWN
-from mddag_executor.replay.load import RecordedLoad
-from mddag_executor.replay.reschedule import Reschedule
-from mddag_executor.simulate import Load, Settings
-from mddag_executor.simulate.workload import declared_holds
+from mddag_executor.replay.reschedule import Reschedule, reschedule
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
+import numpy as np
 
 DEFAULT_WORKERS = 7
 _MOST_JOBS = 20_000_000
@@ -49,51 +49,36 @@ class Source(NamedTuple):
     note: str
 
 
-class _Builder:
-    """
-    Makes a load from the messages of a bag.
-
-    :ivar notes: assumptions, one line each; ``warnings``: missing or doubtful data.
-    """
+class _Releases:
+    """Makes the releases of a recording from the messages of a bag."""
 
     def __init__(self, bag: Bag, task_set: TaskSet) -> None:
         self._bag, self._task_set = bag, task_set
         self._start = bag.start or 0
         self.warnings = bag.warnings
+        #: Assumptions, one line each.
         self.notes: list[str] = []
 
-    def build(self, times: Sequence[Sequence[int]] | None, seed: int) -> RecordedLoad:
-        """Return the load; ``times`` and ``seed``: see ``reschedule_bag``."""
-        generator = random.Random(seed)
-        releases: list[tuple[int, int, int, int]] = []
-        costs: list[int] = []
-        holds: list[int] = []
-        bases: list[int] = []
-        jobs: list[Sequence[int]] = []
-        declared = declared_holds(self._task_set)
+    def table(self) -> Any:
+        """Return the releases, in the order of time."""
+        parts = [rows(RELEASES)]
         for dag in self._task_set.dags:
             source = self._source(dag)
             self.notes.append(f'{dag.name}: {source.note}')
-            bases.append(len(costs))
-            jobs.append(range(len(source.jobs)))
-            if len(releases) + len(source.jobs) > _MOST_JOBS:
+            ready, release = np.array(source.jobs, dtype=np.int64).reshape(-1, 2).T
+            parts.append(rows(RELEASES, len(ready), dag=dag.index, job=np.arange(len(ready)),
+                              release=release, noticed=ready))
+            if sum(map(len, parts)) > _MOST_JOBS:
                 raise self._too_many()
-            for job, (ready, release) in enumerate(source.jobs):
-                releases.append((ready, dag.index, job, release))
-                costs.extend(_costs(dag, times, generator))
-                holds += declared[dag.index] if declared else []
-        bases.append(len(costs))
-        if not releases:
+        found = np.concatenate(parts)
+        if not len(found):
             raise BagError(
                 self._bag.name, f'none of the sources of {self._task_set.file} is in it: it has '
                 + (listed(sorted(self._bag.topics)) or 'no topics'),
                 'give the graph of the nodes that were recorded')
-        releases.sort()
-        load = Load(
-            [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases], costs,
-            bases, [*(len(dag.vertices) for dag in self._task_set.dags), 1],
-            [r[3] for r in releases], holds)
-        return RecordedLoad(load, jobs, sum(costs), len(costs), 0, [])
+        found = found[sort_by(*(found[name] for name in ('noticed', 'dag', 'job')))]
+        found['order'] = np.arange(len(found))
+        return found
 
     def _source(self, dag: Dag) -> Source:
         callback = dag.vertices[dag.source].callback
@@ -153,6 +138,57 @@ class _Builder:
             self._bag.name, f'there are more than {_MOST_JOBS} jobs in it', 'give a shorter bag')
 
 
+def read_bag(
+    path: str | os.PathLike[str], task_set: TaskSet, name: str | None = None
+) -> Recording:
+    """
+    Return the recording of an ordinary bag: the releases of its sources.
+
+    :param path: a bag's folder, or one of its files.
+    """
+    sources = (dag.vertices[dag.source].callback for dag in task_set.dags)
+    topics = {topic for source in sources if source.kind != 'timer' for topic in source.topics}
+    bag = Bag(path, topics, name)
+    if bag.start is None:
+        what = '; '.join(bag.warnings) or 'there are no messages in it'
+        raise BagError(bag.name, what.removeprefix(f'{bag.name}: '), 'record one again')
+    releases = _Releases(bag, task_set)
+    workers = task_set.workers or DEFAULT_WORKERS
+    end = (bag.end or 0) + 1
+    return Recording(
+        bag.name, Head(bag.start, '', task_set.file, 'rad', workers, DEFAULT_DEADLINE_NS, 0,
+                       False),
+        task_set, task_set, Entities(), declared=False, imported=True,
+        releases=releases.table(), start=bag.start, end=end, judged_until=end,
+        workers_each=workers, messages=bag.count, notes=releases.notes,
+        warnings=releases.warnings)
+
+
+def reschedule_bag(
+    path: str | os.PathLike[str], task_set: TaskSet, *,
+    times: Sequence[Sequence[int]] | None = None, seed: int = 0, name: str | None = None,
+    **options: Any,
+) -> Reschedule:
+    """
+    Run the core with the messages of an ordinary bag.
+
+    :param path: a bag's folder, or one of its files.
+    :param times: execution times by DAG and vertex, ns; None: drawn from the declared ones.
+    :param options: as for ``reschedule``; a bag has no overheads.
+    """
+    if times is None:
+        missing = [c for c in (v.callback for v in task_set.vertices) if c.execution_time is None]
+        if missing:
+            raise InputError(task_set.file, f'{missing[0].key} declares no execution_time',
+                             'add one, or give --execution-times FILE', missing[0].line)
+    run = read_bag(path, task_set, name)
+    counts = np.bincount(run.releases['dag'], minlength=len(task_set.dags)).tolist()
+    generator = random.Random(seed)
+    return reschedule(run, times=[
+        np.array([_costs(dag, times, generator) for _ in range(count)], dtype=np.int64)
+        for dag, count in zip(task_set.dags, counts)], overheads=False, **options)
+
+
 def _costs(
     dag: Dag, times: Sequence[Sequence[int]] | None, generator: random.Random
 ) -> Sequence[int]:
@@ -164,57 +200,3 @@ def _costs(
         assert declared is not None     # checked before
         row.append(declared.draw(generator.random()))
     return row
-
-
-def reschedule_bag(
-    path: str | os.PathLike[str],
-    task_set: TaskSet,
-    *,
-    policy: str | None = None,
-    workers: int | None = None,
-    preemptive: bool = False,
-    on_late: str = 'continue',
-    times: Sequence[Sequence[int]] | None = None,
-    seed: int = 0,
-    dispatch_overhead: int = 0,
-    skip: int = 0,
-    name: str | None = None,
-    cpus: int | None = None,
-) -> Reschedule:
-    """
-    Run the core with the messages of an ordinary bag.
-
-    :param path: a bag's folder, or one of its files.
-    :param policy: a row of ``mddag_executor.core.POLICIES``; None: `rad`.
-    :param workers: size of the pool; None: as declared, otherwise 7.
-    :param times: execution times by DAG and vertex, ns; None: drawn from the declared ones.
-    :param dispatch_overhead: added to each execution, ns.
-    :param skip: warm-up time after the bag's first message; jobs released in it are not judged,
-        ns.
-    :param cpus: shared by executions that compute; None: enough for all.
-    """
-    policy = policy or 'rad'
-    find_policy(policy).mode(preemptive)
-    if times is None:
-        missing = [c for c in (v.callback for v in task_set.vertices) if c.execution_time is None]
-        if missing:
-            raise InputError(task_set.file, f'{missing[0].key} declares no execution_time',
-                             'add one, or give --execution-times FILE', missing[0].line)
-    sources = (dag.vertices[dag.source].callback for dag in task_set.dags)
-    topics = {topic for source in sources if source.kind != 'timer' for topic in source.topics}
-    bag = Bag(path, topics, name)
-    if bag.start is None:
-        what = '; '.join(bag.warnings) or 'there are no messages in it'
-        raise BagError(bag.name, what.removeprefix(f'{bag.name}: '), 'record one again')
-    builder = _Builder(bag, task_set)
-    work = builder.build(times, seed)
-    end = (bag.end or 0) + 1
-    settings = Settings(
-        policy, workers or task_set.workers or DEFAULT_WORKERS, end, preemptive,
-        dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
-        judge_from=bag.start + skip if skip else -NEVER, on_late=on_late)
-    return Reschedule(
-        task_set, work, Tables.build(task_set, max_active_jobs=NEVER, on_late=on_late), settings,
-        bag.start,
-        {'trace': bag.name, 'declaration': task_set.file, 'start_ns': bag.start, 'end_ns': end,
-         'messages': bag.count}, builder.warnings, skip=skip, notes=builder.notes)

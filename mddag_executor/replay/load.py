@@ -127,17 +127,19 @@ class LoadBuilder:
     :param n_workers: number of workers of each recorded process.
     :param cpus: number of CPUs; 0: unknown.
     :param processes: by vertex the recorded process, from 1; None: one process.
+    :param times: by DAG the execution times of its jobs and vertices, for a recording without
+        executions; None: missing ones are estimated.
     """
 
     def __init__(
         self, recording: Recording, tables: Tables, n_workers: int, cpus: int = 0,
-        processes: Sequence[int] | None = None,
+        processes: Sequence[int] | None = None, times: Sequence[Any] | None = None,
     ) -> None:
         task_set = recording.task_set
         self._task_set, self._recording, self._tables = task_set, recording, tables
         self._first = tables.first_vertex
         self._process = [*(processes or [1] * tables.n_vertices), 1]
-        self._cpus, self._n_workers = cpus, n_workers
+        self._cpus, self._times = cpus, times
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
         # by global vertex and leg: the edge (number in its DAG) that its message satisfies
         numbers = edge_numbers(tables)
@@ -363,10 +365,12 @@ class LoadBuilder:
             number >= 0, every[number], 0)])
         bases = self._begins[_VERTEX].tolist()
         columns: dict[str, Any] = {
-            'holds': np.concatenate([held, more]) if held.any() else [],
-            'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
-            'delays': delays, 'delay_stride': self._widths[_EDGE].tolist(),
-            'delay_base': self._begins[_EDGE, :-1].tolist()}
+            'holds': np.concatenate([held, more]) if held.any() else []}
+        if len(self._recording.executions):
+            columns |= {
+                'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
+                'delays': delays, 'delay_stride': self._widths[_EDGE].tolist(),
+                'delay_base': self._begins[_EDGE, :-1].tolist()}
         load = self._load(costs, bases, others[:, 0], overheads and not notices, workers == 1)
         load = load._replace(
             fates=self._fates(len(costs)), **columns)
@@ -415,6 +419,8 @@ class LoadBuilder:
             took, cpu, held = map(jobs.rows, ('took', 'cpu', 'held'))
             took[[row for of, row in self._skipped if of == dag.index]] = 0
             took[(took < 0) & self._never_ready(dag, edges)] = 0
+            if self._times is not None:
+                took[took < 0] = self._times[dag.index].reshape(took.shape)[took < 0]
             missing = took < 0
             estimated += int(missing.sum())
             held[held < 0] = 0

@@ -33,7 +33,7 @@ from mddag_executor.simulate.intakes import Intakes
 from mddag_executor.simulate.load import edge_numbers
 from mddag_executor.simulate.workload import with_execution_times
 from mddag_executor.text import counted, listed
-from msg_graph import Process, TaskSet
+from msg_graph import NO_GRAPH, Process, TaskSet
 from msg_graph.derive import no_garbage
 from msg_graph.model import MOST_WORKERS
 import numpy as np
@@ -43,11 +43,8 @@ class Reschedule:
     """
     The schedule of a recorded load.
 
-    :param work: the load, made from a run or from a bag.
-    :param start: when the recording began, ns.
-    :param about: the result's part about the recording.
+    :param run: the recording; ``work``: its load.
     :param recorded: the replay as recorded; None: it was a bag.
-    :param notes: assumptions, one line each.
     :ivar processes: nodes of each process; empty: one process.
     :ivar workers: of all processes.
     :ivar decisions: decisions of the core; ``busy``: by worker its busy time, ns.
@@ -55,17 +52,17 @@ class Reschedule:
     """
 
     def __init__(
-        self, task_set: TaskSet, work: RecordedLoad, tables: Tables, settings: Settings,
-        start: int, about: dict[str, Any], warnings: list[str], *, skip: int = 0,
-        overheads: bool = False, processes: Sequence[Process] = (),
-        recorded: Replay | None = None, notes: Sequence[str] = (),
+        self, run: Recording, work: RecordedLoad, tables: Tables, settings: Settings,
+        warnings: list[str], skip: int, overheads: bool, processes: Sequence[Process],
+        recorded: Replay | None,
     ) -> None:
-        self.task_set, self.work, self.tables, self.settings = task_set, work, tables, settings
-        self.recorded, self.processes, self.notes = recorded, processes, notes
+        task_set = self.task_set = run.task_set
+        self.work, self.tables, self.settings = work, tables, settings
+        self.recorded, self.processes, self.notes = recorded, processes, run.notes
         self.workers = settings.workers * settings.processes
         self.warnings = warnings
-        self._skip, self._overheads, self._about = skip, overheads, about
-        self._start = start
+        self._skip, self._overheads, self._about = skip, overheads, recording_result(run)
+        self._start = run.end if run.start is None else run.start
         self.tally = MissTally(task_set, tables)
         load, end = work.load, settings.duration_ns
         self._run = partial(schedule, tables) if work.intakes is None else Intakes(
@@ -144,7 +141,7 @@ class Reschedule:
 
 
 def reschedule(
-    path: Given,
+    path: Given | Recording,
     task_set: TaskSet | None = None,
     *,
     policy: str | None = None,
@@ -158,11 +155,12 @@ def reschedule(
     skip: int = 0,
     cpus: int | None = None,
     processes: Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None = None,
+    times: Sequence[Any] | None = None,
 ) -> Reschedule:
     """
     Run the core with the releases and execution times of a trace.
 
-    :param path: a trace of this executor.
+    :param path: a trace of this executor, or a recording.
     :param task_set: the declaration to schedule by; None: the one in the trace.
     :param policy: a row of ``mddag_executor.core.POLICIES``; None: as recorded.
     :param workers: size of the pool of each process; None: as recorded.
@@ -177,6 +175,8 @@ def reschedule(
     :param cpus: shared by executions that compute; None: as recorded, enough for all if unknown.
     :param processes: returns the nodes of each process, from the task set and the time of each
         vertex; None: as recorded, or as in ``task_set``.
+    :param times: by DAG the execution times of its jobs and vertices, ns, for a recording without
+        executions.
     :raises mddag_executor.trace.TraceError: if the file is not a trace.
     :raises mddag_executor.replay.ReplayError: if the trace has nothing to replay, none of the
         declaration's callbacks, or an execution time that is neither recorded nor declared.
@@ -186,8 +186,9 @@ def reschedule(
         find_policy(policy).mode(bool(preemptive))
     if workers is not None and not 1 <= workers <= MOST_WORKERS:
         raise UsageError(f'workers: {workers} is out of range: give 1 to {MOST_WORKERS}')
-    run = open_recording(path, task_set, name, progress)
-    if not run.declared and task_set is None:
+    run = path if isinstance(path, Recording) else open_recording(
+        path, task_set, name, progress)
+    if run.task_set is NO_GRAPH:
         raise undeclared(run.name)
     head = run.head
     each, ran = run.workers_each, run.placed
@@ -200,9 +201,10 @@ def reschedule(
         Tables.build, default_deadline=head.default_deadline, max_active_jobs=bound,
         expire_after=EXPIRE_AFTER_NS, on_late=on_late)
     tables = tables_of(run.task_set)
-    recorded = Replay(run, skip)
+    recorded = Replay(run, skip) if run.messages is None else None
     with no_garbage():
-        builder = LoadBuilder(run, tables, each, max(0, head.cpus), _processes(run, ran))
+        builder = LoadBuilder(
+            run, tables, each, max(0, head.cpus), _processes(run, ran), times)
     give_back()
     placed = _placed(run, ran, builder) if processes is None else processes(
         run.task_set, builder.times())
@@ -226,20 +228,20 @@ def reschedule(
         tables, builder.callback_of, run.who.groups, declared_first=not run.same)
     del builder     # the load has copies of its data
     give_back()
-    warnings = recorded.warnings
+    start = run.end if run.start is None else run.start
+    warnings, judge_from = run.warnings, start + skip if skip else -NEVER
+    if recorded is not None:
+        warnings, judge_from = recorded.warnings, recorded.judged.judge_from
     if cpus is not None and run.declared and len(work.load.computed) == 0:
         warnings.append(
             f'{run.name}: CPU times are not recorded in it, so with --cpus each '
             'execution computes all the time')
     settings = Settings(
         policy, workers, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
-        judge_from=recorded.judged.judge_from, processes=max(1, len(placed)),
-        on_late=on_late)
-    start = run.end if run.start is None else run.start
+        judge_from=judge_from, processes=max(1, len(placed)), on_late=on_late)
     with no_garbage():
         return Reschedule(
-            run.task_set, work, tables, settings, start, recording_result(run), warnings,
-            skip=skip, overheads=overheads, processes=placed, recorded=recorded)
+            run, work, tables, settings, warnings, skip, overheads, placed, recorded)
 
 
 def _processes(run: Recording, placed: Sequence[Process]) -> list[int]:
