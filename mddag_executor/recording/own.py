@@ -36,6 +36,7 @@ from mddag_executor.recording.tables import (
     ALL_LEGS,
     DEMOTIONS,
     DROPS,
+    earliest,
     EXECUTIONS,
     EXPIRED,
     FAILED,
@@ -338,9 +339,8 @@ class _Source:
         self._put_in_order(found, [
             (found.releases, found.releases['noticed'], released_at),
             (found.job_ends, found.job_ends['time'], ends_at)], seen, complete_at)
-        begun = [found.releases['release'], executions['ready'][
-            (executions['end'] >= 0) & (executions['start'] >= 0)]]
-        found.start = min((int(each.min()) for each in begun if len(each)), default=None)
+        found.start = earliest(found.releases['release'], executions['ready'][
+            (executions['end'] >= 0) & (executions['start'] >= 0)])
         return found
 
     def _entities(self) -> None:

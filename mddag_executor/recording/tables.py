@@ -339,6 +339,11 @@ def sort_by(*columns: Any) -> Ints:
     return order
 
 
+def earliest(*columns: Ints) -> int | None:
+    """Return the earliest time in columns; None if all are empty."""
+    return min((int(each.min()) for each in columns if len(each)), default=None)
+
+
 def last_of(which: Mask, group: Any, before: bool = False) -> Ints:
     """
     Return by row the last chosen row of its group up to it, or ``before`` it; -1: none.

@@ -155,8 +155,7 @@ class _Player:
             end=schedule.end, judged=schedule.judged, judged_until=schedule.end,
             workers_each=workers,
             judge_from=() if schedule.judge_from == -NEVER else [(-1, schedule.judge_from)])
-        begun = [found.releases['release'], found.executions['ready']]
-        found.start = min((int(each.min()) for each in begun if len(each)), default=None)
+        found.start = tables.earliest(found.releases['release'], found.executions['ready'])
         return found
 
     def _drops(self) -> tables.Table:

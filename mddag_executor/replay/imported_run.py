@@ -40,6 +40,7 @@ from mddag_executor.recording.entities import Callback, Entities, INIT_EVENTS
 from mddag_executor.recording.head import Head, named_errors, no_run
 from mddag_executor.recording.mapping import Matching, Target
 from mddag_executor.recording.tables import (
+    earliest,
     EXECUTIONS,
     EXPIRED,
     JOB_ENDS,
@@ -67,7 +68,6 @@ from msg_graph import Dag, TaskSet
 import numpy as np
 
 _SLACK_NS = 1_000_000
-_KEEP_LEGS = 65_536
 _OWN = ('mddag:job_release', 'mddag:dispatch')
 
 
@@ -114,11 +114,8 @@ class ImportedRun:
         #: The declaration to judge by; none is recorded.
         self.task_set = self._matching.task_set
         self._targets = self._matching.target
-        #: The first release, or when the first execution became ready, ns.
-        self._start: int | None = None
         #: The last event's time, ns.
         self.end = max(min(max(0, self.head.time), NEVER - 1), int(table['time'].max(initial=0)))
-        self.jobs = 0
         self._order = 0
         self._doubts = Doubts(self.task_set.dags)
         self.links = self.links_type(self._events, self.who)
@@ -209,11 +206,12 @@ class ImportedRun:
         for dag, jobs in enumerate(self._open):
             for release, job in jobs:
                 self._close(dag, job, release)
+        releases, executions = self._releases.table(), self._all_executions()
         return Recording(
             self.name, self.head, self.task_set, self.task_set, self.who, declared=False,
-            imported=self._imported, same=False, releases=self._releases.table(),
-            executions=self._all_executions(), publications=self._publications(),
-            job_ends=self._ends.table(), takes=self._takes(), start=self._start, end=self.end,
+            imported=self._imported, same=False, releases=releases, executions=executions,
+            publications=self._publications(), job_ends=self._ends.table(), takes=self._takes(),
+            start=earliest(executions['ready'], releases['release']), end=self.end,
             judged_until=self._judged_until(), lost=links.discarded,
             workers_each=self.head.workers, links=True, callback_vertex=self._vertex,
             unjudged=self._doubts.withdrawn, warnings=self.warnings)
@@ -272,13 +270,10 @@ class ImportedRun:
     def _began(self, run: int) -> None:
         """Find the job of an execution."""
         callback = self.links.callbacks[self._runs[run][0]]
-        ready = self._ready_of[run] = self._ready(run, callback)
+        self._ready_of[run] = self._ready(run, callback)
         target = self._targets.get(callback.number)
         if target is not None:
             self._assign(run, callback, target)
-            ready = self._ready_of[run]
-        if self._start is None or ready < self._start:
-            self._start = ready
         of = self._of[run]
         if of is not None:
             self._active[of[0], of[2]] += 1
@@ -305,11 +300,8 @@ class ImportedRun:
                 self._ready_of[run] = max(self._ready_of[run], min(release, start))
             self._of[run] = dag, vertex, job
             self._expire(start)
-            self.jobs += 1
             self._doubts.opened(dag, job)
             self._open[dag].append((release, job))
-            if self._start is None or release < self._start:
-                self._start = release
             self._releases.add(dag, job, release, start, self._next_order())
             return
         sender = UNKNOWN if message < 0 else self._messages[message][0]
@@ -364,8 +356,6 @@ class ImportedRun:
         done = self._legs.setdefault((vertex, job), set())
         done.add(leg)
         if len(done) < self._sizes[vertex]:
-            if len(self._legs) > _KEEP_LEGS:
-                del self._legs[next(iter(self._legs))]
             return False
         del self._legs[(vertex, job)]
         return True
@@ -439,7 +429,7 @@ class ImportedRun:
                 'stamp, because the declared one is not recorded or '
                 'years away: '
                 f'{listed(list(self._fallbacks))}')
-        if self._dags and self.jobs == 0:
+        if self._dags and not len(self._releases):
             lines.append(f'{name}: no job was released in it')
         return lines
 

@@ -48,6 +48,7 @@ from mddag_executor.recording.head import (
 from mddag_executor.recording.own import end_lines, read_process
 from mddag_executor.recording.tables import (
     ALL_LEGS,
+    earliest,
     groups,
     Ints,
     JobNumbers,
@@ -402,9 +403,8 @@ class Joined:
             (part.recording.notices_stops for part in self._parts
              if part.recording.notices_stops is not None), default=None)
         table = found.executions
-        begun = [found.releases['release'], table['ready'][
-            (table['end'] >= 0) & (table['start'] >= 0)]]
-        found.start = min((int(each.min()) for each in begun if len(each)), default=None)
+        found.start = earliest(found.releases['release'], table['ready'][
+            (table['end'] >= 0) & (table['start'] >= 0)])
 
     # --- jobs ------------------------------------------------------------------------------------
 
