@@ -345,7 +345,7 @@ def write_report(path: str, data: Callable[[], ReportData]) -> None:
 
 def write_result(args: argparse.Namespace, result: Any) -> bool:
     """
-    Write a result where `--json` says; return whether tables are to be shown as well.
+    Write a result to the file of `--json`; return whether tables are to be shown as well.
 
     :param result: gets the version of the program and of the results' format
     """
@@ -359,7 +359,7 @@ def show(
     args: argparse.Namespace, result: Any, lines: Iterable[str], aside: bool = False
 ) -> None:
     """
-    Write a result where `--json` says, and print its lines for people if those are wanted.
+    Write a result to the file of `--json`, and print its lines if people read the output.
 
     :param aside: print them on standard error if the output of `--output` is on standard output.
     """

@@ -94,7 +94,7 @@ def _results(
 
 def _has_declaration(trace: Trace) -> bool:
     from mddag_executor.replay.run import has_declaration
-    path, name = trace      # several traces can be joined only where each has a declaration
+    path, name = trace      # several traces can be joined only if each has a declaration
     return not isinstance(path, str) or (not recorded.is_bag(path) and has_declaration(path, name))
 
 

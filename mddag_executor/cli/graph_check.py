@@ -27,7 +27,7 @@ mddag graph check config/autoware.yaml --json -
 """
 DESCRIPTION = """\
 Validate a declaration and show the DAG tasks that it gives: period, number of vertices, sinks with
-deadlines, critical path and load in cores, the last two with the mean execution times (- where one
+deadlines, critical path and load in cores, the last two with the mean execution times (- if one
 is not declared). The utilisation is the load of all DAGs divided by the workers. A path that takes
 longer than its deadline, and a load that the workers or CPUs cannot do, are warned of."""
 

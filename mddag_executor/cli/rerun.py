@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--trace', metavar='RUN.mcap', type=options.Trace,
         help='record the run to this file, for mddag replay')
     add('--expect', metavar='OUT.mcap', type=options.Input,
-        help='compare what the nodes publish with this bag, and exit with status 1 where it '
+        help='compare what the nodes publish with this bag, and exit with status 1 if it '
         'differs')
     add('--tolerance', type=options.not_negative, default=0.0, metavar='X',
         help='with --expect: floating-point numbers may differ by this much, or by this share of '

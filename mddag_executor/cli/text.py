@@ -136,7 +136,7 @@ def run_program(
     """
     Run a program, with progress on a terminal meanwhile.
 
-    :param seconds: how long it will take, where that is known.
+    :param seconds: how long it will take, if that is known.
     :param given: its standard input.
     """
     import subprocess

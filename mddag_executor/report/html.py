@@ -29,6 +29,7 @@ from mddag_executor.report.html_data import (
 from mddag_executor.report.html_tables import (
     callbacks_html,
     misses_html,
+    page_head,
     paths_html,
     sinks_html,
     worst_html,
@@ -42,7 +43,6 @@ from mddag_executor.text import counted
 from msg_graph import TaskSet
 
 _SCRIPT = Path(__file__).with_name('html.js')
-_STYLE = Path(__file__).with_name('html.css')
 _LEGEND = (
     'deadline missed', 'slack below 10 % of the deadline', 'below 25 %', 'below 50 %',
     '50 % and more', 'no deadline, or no verdict')
@@ -130,10 +130,7 @@ def _page(
     plots = [f'<div class="mddag-plot">{division}</div>' for division in divisions]
     title = escape(printable(
         f'{data.title}: {PurePath(data.task_set.file or data.facts[0][1]).name}'))
-    yield (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n<title>{title}</title>'
-           '\n<meta name="viewport" content="width=device-width">\n'
-           '<link rel="icon" href="data:,">\n'
-           f'<style>{_STYLE.read_text(encoding="utf-8")}</style>\n')
+    yield page_head(title)
     yield library
     yield f'</head><body>\n<h1>{title}</h1>\n'
     yield from _head(data)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Sequence
 from html import escape
-from typing import NamedTuple
+from pathlib import Path
 
 from mddag_executor.core.tally import counts, total
 from mddag_executor.replay.chains import Breakdown
@@ -34,6 +34,7 @@ from mddag_executor.report.tables import (
 from mddag_executor.report.text import Cell, format_ns, printable
 from mddag_executor.text import counted
 
+_STYLE = Path(__file__).with_name('html.css')
 MOST_ROWS = 50
 """Number of sinks in the page itself; a script adds the others."""
 _COLOURS = {
@@ -47,6 +48,15 @@ class Html(str):
     """Text that is already markup."""
 
     __slots__ = ()
+
+
+def page_head(title: str) -> str:
+    """Return the begin of a page, up to the end of its style."""
+    return (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
+            f'<title>{title}</title>'
+            '\n<meta name="viewport" content="width=device-width">\n'
+            '<link rel="icon" href="data:,">\n'
+            f'<style>{_STYLE.read_text(encoding="utf-8")}</style>\n')
 
 
 def html_table(
@@ -79,50 +89,37 @@ def _text(is_text: bool) -> str:
     return ' class="text"' if is_text else ''
 
 
-class RankedSink(NamedTuple):
-    """
-    A sink, to be sorted from the worst to the best.
+def _reached(sink: Sink) -> float:
+    """Return the longest response time as a share of the deadline; 0 if it never completed."""
+    response = sink.result['response_ns']
+    return 0.0 if response is None else float(
+        response['max'] / max(1, sink.result['relative_deadline_ns']))
 
-    :ivar missed: the share of its due deadlines that it missed.
-    :ivar reached: its longest response time, as a share of the deadline; 0 if it never completed.
-    """
 
-    missed: float
-    reached: float
-    sink: Sink
-
-    @classmethod
-    def every(cls, data: ReportData) -> list[RankedSink]:
-        """Return all sinks, the worst ones first."""
-        found = []
-        for sink in each_sink(data.tally.result()['dags']):
-            response, deadline = (
-                sink.result[key] for key in ('response_ns', 'relative_deadline_ns'))
-            found.append(cls(
-                missed_share(counts(sink.result)),
-                0.0 if response is None else response['max'] / max(1, deadline), sink))
-        return sorted(found, key=lambda each: (-each.missed, -each.reached))
+def _ranked(data: ReportData) -> list[Sink]:
+    """Return the sinks: the largest share of misses first, then the nearest to its deadline."""
+    return sorted(each_sink(data.tally.result()['dags']), key=lambda sink: (
+        -missed_share(counts(sink.result)), -_reached(sink)))
 
 
 def worst_line(data: ReportData) -> str | None:
     """Return which sink was worst, and why; None: no job was due."""
-    ranked = [each for each in RankedSink.every(data) if counts(each.sink.result).due]
-    if not ranked:
+    worst = next((sink for sink in _ranked(data) if counts(sink.result).due), None)
+    if worst is None:
         return None
-    worst = ranked[0]
-    verdicts, response = counts(worst.sink.result), worst.sink.result['response_ns']
-    text = f'worst sink: {worst.sink.name}: '
+    verdicts, response = counts(worst.result), worst.result['response_ns']
+    text = f'worst sink: {worst.name}: '
     if verdicts.missed:
         text += f'{verdicts.missed} of {counted(verdicts.due, "deadline")} missed'
-        causes = {} if data.misses is None else data.misses['sinks'].get(worst.sink.name, {})
+        causes = {} if data.misses is None else data.misses['sinks'].get(worst.name, {})
         if any(causes.values()):
             text += f', most often because of: {max(causes, key=lambda cause: causes[cause])}'
         text += '; '
     if response is None:
         return text + 'it never completed'
     return text + (
-        f'longest response time {format_ns(response["max"], 3)}, {100 * worst.reached:.0f} % of '
-        f'the deadline of {format_ns(worst.sink.result["relative_deadline_ns"])}')
+        f'longest response time {format_ns(response["max"], 3)}, {100 * _reached(worst):.0f} % of '
+        f'the deadline of {format_ns(worst.result["relative_deadline_ns"])}')
 
 
 def sinks_html(data: ReportData) -> str:
@@ -136,14 +133,14 @@ def sinks_html(data: ReportData) -> str:
     rare, tolerate = rare_ends(total(dags)), tolerate_columns(dags)
     header = ['DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', *rare, *RESPONSES,
               *tolerate]
-    ranked = RankedSink.every(data)
-    full = [(*_sink_cells(each.sink, rare), *(tolerate and tolerate_cells(each.sink.result)),
-             _reached(each.reached)) for each in ranked]
+    ranked = _ranked(data)
+    full = [(*_sink_cells(sink, rare), *(tolerate and tolerate_cells(sink.result)),
+             _reached_bar(_reached(sink))) for sink in ranked]
     bad = range(header.index('late'), header.index('median'))
     shown = html_table([*header, 'max of deadline'], full[:MOST_ROWS], 2, bad,
-                       attributes=(f'data-reached="{each.reached:.4f}"' for each in ranked))
-    rest = [[*('-' if cell is None else printable(str(cell)) for cell in row[:-1]), each.reached]
-            for row, each in zip(full[MOST_ROWS:], ranked[MOST_ROWS:])]
+                       attributes=(f'data-reached="{_reached(sink):.4f}"' for sink in ranked))
+    rest = [[*('-' if cell is None else printable(str(cell)) for cell in row[:-1]), _reached(sink)]
+            for row, sink in zip(full[MOST_ROWS:], ranked[MOST_ROWS:])]
     more = (f'<button id="mddag-all-sinks">show all {len(full)}</button>' if rest else '')
     return ('<p class="search"><input id="mddag-search" type="search" placeholder="search sinks" '
             f'aria-label="search sinks"> {more} <span class="note">The worst ones come first; '
@@ -162,7 +159,7 @@ def _sink_cells(sink: Sink, rare: Sequence[str]) -> list[Cell]:
         format_ns(sink.result['relative_deadline_ns'])]
 
 
-def _reached(share: float) -> Html:
+def _reached_bar(share: float) -> Html:
     """Return a bar from 0 to the deadline, red beyond it."""
     colour = '#d7191c' if share > 1 else '#fd8d3c' if share > 0.9 else '#3182bd'
     return Html(f'<span class="reached"><i style="width:{100 * min(1.0, share):.1f}%;'

@@ -7,15 +7,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from html import escape
 import math
-from pathlib import Path
 from typing import Any
 
-from mddag_executor.report.html_tables import Html, html_table
+from mddag_executor.report.html_tables import Html, html_table, page_head
 from mddag_executor.report.tables import percent, short_names
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 
-_STYLE = Path(__file__).with_name('html.css')
 _BAR_PX = 240
 _COLOURS = ((1.1, '#d7191c'), (1.5, '#fd8d3c'), (2.0, '#fec44f'), (5.0, '#9ecae1'))
 _BEST = '#3182bd'
@@ -97,11 +95,7 @@ def _load_lines(result: Mapping[str, Any]) -> Iterator[str]:
 def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
     """Yield the parts of an HTML page."""
     heading = escape(printable(f'Slack: {title}'))
-    yield (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{heading}'
-           '</title>\n<meta name="viewport" content="width=device-width">'
-           '<link rel="icon" href="data:,">\n'
-           f'<style>{_STYLE.read_text(encoding="utf-8")}</style></head><body>\n'
-           f'<h1>{heading}</h1>\n')
+    yield f'{page_head(heading)}</head><body>\n<h1>{heading}</h1>\n'
     for line in (*_load_lines(result), *_summary(result)):
         yield f'<p class="note">{escape(line)}</p>\n'
     short = _short(result)

@@ -62,7 +62,7 @@ def rerun(
     :param recording: a bag, or a trace of this executor.
     :param graph: the declaration: a file, or a task set.
     :param nodes: as for ``mddag run --node``; or classes of nodes, or functions that return nodes.
-    :param times: ``recorded``, ``declared``, or a file (see ``sources.open_input``).
+    :param times: ``recorded``, ``declared``, or a file (see ``inputs.open_input``).
     :param output: a file that gets the outputs as a bag; ``trace``: one that gets the run.
     :param overwrite: whether ``output`` and ``trace`` may replace files that are there.
     :param patience_s: a callback or thread that waits for this long, and not in virtual time, ends
@@ -83,10 +83,11 @@ def rerun(
         tuple(ros_args))
     source = open_input(
         os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)
-    where = None if trace is None else os.fspath(trace)
     with ExitStack() as files:
-        file = None if output is None else files.enter_context(open(output, 'wb'))
-        run = Rerun(source, task_set, settings, file, where)
+        run = Rerun(
+            source, task_set, settings,
+            None if output is None else files.enter_context(open(output, 'wb')),
+            None if trace is None else os.fspath(trace))
         return run.run(lambda: programs(nodes, ros_args))
 
 
@@ -120,7 +121,7 @@ def assert_same(
     """
     Check that the outputs of a run are those in a bag.
 
-    :raises AssertionError: where they are not; it says where each topic differs first.
+    :raises AssertionError: if they are not; it says where each topic differs first.
     """
     found = compare(result, expected, tolerance)
     if found:

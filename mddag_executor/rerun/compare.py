@@ -9,8 +9,8 @@ The messages of a topic are compared one by one, in their order. What is reporte
 where it differs first, and whether only in *timing*: the same messages, but at other times, or
 with other stamps in them (fields of type ``builtin_interfaces/Time``).
 
-Numbers with a point are equal within a tolerance ``x``: where their difference is at most ``x``,
-or ``x`` times the larger one. What is not a number equals itself.
+Floating-point numbers are equal within a tolerance ``x`` if their difference is at most ``x``, or
+``x`` times the larger one. NaN equals itself.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ class MessageBag:
     :ivar pauses: from when to when none came (see ``trace.times``).
     :ivar topics: every topic in it.
     :ivar kinds: the type of each topic, as far as it has been loaded.
-    :raises mddag_executor.replay.bags.BagError: where there is no bag.
+    :raises mddag_executor.replay.bags.BagError: if there is no bag.
     """
 
     def __init__(self, path: str, name: str | None = None) -> None:
@@ -114,7 +114,7 @@ class RerunInput(NamedTuple):
     """
     What a run takes from recordings.
 
-    :ivar messages: the bag, where there is one.
+    :ivar messages: the bag, if there is one.
     :ivar times: how long callbacks and messages take.
     """
 
@@ -143,9 +143,9 @@ def open_input(
 
     :param path: a bag, or a trace of this executor.
     :param times: ``recorded`` (as in that trace), ``declared`` (drawn with the seed), or a file: a
-        trace, or JSON with execution times; None: recorded where a trace is given.
-    :param name: what messages call the recording, where that is not its path.
-    :raises mddag_executor.errors.MddagError: where anything of it cannot be used.
+        trace, or JSON with execution times; None: recorded if a trace is given.
+    :param name: what messages call the recording, if not by its path.
+    :raises mddag_executor.errors.MddagError: if anything of it cannot be used.
     """
     name = name or path
     bag = is_ordinary(path)
@@ -179,7 +179,7 @@ def _fixed(task_set: TaskSet, times: list[list[int]]) -> Durations:
 
 
 def _messages(path: str, name: str) -> MessageBag | None:
-    """Return the messages of nodes that a recording has; None where it is a mere trace."""
+    """Return the messages of nodes that a recording has; None if it is only a trace."""
     recording = MessageBag(path, name)
     if all(topic.startswith('/trace/') for topic in recording.topics):
         recording.close()

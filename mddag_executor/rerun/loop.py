@@ -110,7 +110,7 @@ class Loop:
         end, before the run threads end that still wait.
     :ivar now: the virtual time.
     :ivar callbacks: how many callbacks have run.
-    :ivar computing: shares CPUs and the interpreter, where these are few.
+    :ivar computing: shares CPUs and the interpreter, if they are limited.
     :ivar changed: whether there may be new entities, or some are gone.
     :ivar on_ended: called with rclpy's entity when its callback has ended.
     """

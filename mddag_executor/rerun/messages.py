@@ -13,7 +13,7 @@ A recorded message goes to the subscriptions of its topic at its recorded time, 
 the run publishes on the topic: then the node's messages count.
 
 Which job does a message belong to?  That of the execution that has sent it. A recorded one starts
-a job where it is its DAG's source. Elsewhere its publisher is not here, and it enters the job
+a job if its subscription is its DAG's source. Otherwise it enters the job
 that its header's stamp names, or one of its own (see ``executor.other_processes``).
 """
 

@@ -37,7 +37,7 @@ class Outputs:
     """
     Collects what is published.
 
-    :param file: gets it as a bag, as rosbag2 writes it, where one is wanted.
+    :param file: gets it as a bag, as rosbag2 writes it; None: no bag.
     :param keep: which topics' messages to keep; None: those of all.
     :ivar messages: what was kept.
     :ivar counts: how many messages were published, by topic.

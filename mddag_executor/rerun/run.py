@@ -291,7 +291,7 @@ class Rerun:
         self._loop.at(self._loop.start, ENDED, self._started)
 
     def _started(self) -> None:
-        """Begin to deliver, when each program has come to where it waits for something."""
+        """Begin to deliver, when each program waits for something."""
         self._started_s = time.monotonic() - self._begun
         gc.freeze()  # else each full collection visits all objects of the nodes
         if all(guest.is_complete for guest in self._host.guests) and not self._hosted:
@@ -356,7 +356,7 @@ class Rerun:
         at = (self._loop.now - self._loop.start) / 1e9
         return RerunError(
             f'{self._loop.here()}: {stuck}, at {at:.6f} s of the run: let it wait with rclpy or '
-            'threading, give --all-clocks where it sleeps, or correct it')
+            'threading, give --all-clocks if it sleeps, or correct it')
 
     def _check_programs(self) -> None:
         for guest in self._failed:

@@ -252,7 +252,7 @@ class RunThreads:
         :param patience_s: a run thread that waits for this long is stuck.
         :param progress: what it returns changes as long as the run goes on.
         :param tick: called now and then.
-        :raises Stalled: where one is; its thread is left behind.
+        :raises Stalled: if a run thread has stalled; its thread is left behind.
         :raises BaseException: what ended the run.
         """
         self._pass_on()

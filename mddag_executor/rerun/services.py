@@ -83,7 +83,7 @@ class Services:
     def call(
         self, client: Client, request: Any, timeout_sec: float | None = None
     ) -> Any:
-        """Send a request and wait for its response; None where it does not come in time."""
+        """Send a request and wait for its response; None if it does not come in time."""
         future = self.call_async(client, request)
         if not self._loop.wait(
                 future.done, self._loop.deadline_after(timeout_sec),

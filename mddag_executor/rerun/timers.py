@@ -138,7 +138,7 @@ class Timers:
             known.due = -1
 
     def until_next(self, timer: Timer) -> int | None:
-        """Return how long it is until a timer is due; None where it is cancelled."""
+        """Return how long it is until a timer is due; None if it is cancelled."""
         if timer.is_canceled():
             return None
         known = self._known.get(id(timer))
