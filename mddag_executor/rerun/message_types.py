@@ -16,16 +16,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
+import re
 import struct
 from typing import Any
 
 from rosidl_parser.definition import (
     AbstractNestedType,
-    AbstractString,
     AbstractWString,
     Array,
     BasicType,
-    BoundedSequence,
     NamespacedType,
 )
 
@@ -35,6 +34,7 @@ _WIDTHS = {
     'boolean': 1, 'octet': 1, 'char': 1, 'int8': 1, 'uint8': 1, 'int16': 2, 'uint16': 2,
     'int32': 4, 'uint32': 4, 'float': 4, 'wchar': 4, 'int64': 8, 'uint64': 8, 'double': 8}
 _NAMES = {'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64'}
+_VALUES = re.compile(r'sequence<(.+?)(?:, (\d+))?>|(.+)\[(\d+)\]')
 _LENGTH = struct.Struct('<I')
 
 Walk = Callable[[bytearray, int], int]
@@ -135,8 +135,8 @@ def definition(kind: Any) -> str:
 
 
 def _own_definition(kind: Any) -> str:
-    names = kind.get_fields_and_field_types()
-    return ''.join(f'{_text(slot)} {name}\n' for name, slot in zip(names, kind.SLOT_TYPES))
+    fields = kind.get_fields_and_field_types()
+    return ''.join(f'{_text(described)} {name}\n' for name, described in fields.items())
 
 
 def _inner(kind: Any) -> list[Any]:
@@ -144,19 +144,10 @@ def _inner(kind: Any) -> list[Any]:
     return [_class_of(slot) for slot in slots if isinstance(slot, NamespacedType)]
 
 
-def _text(slot: Any) -> str:
-    """Return a field's type as a definition has it."""
-    if isinstance(slot, BasicType):
-        name: str = slot.typename
-        return _NAMES.get(name, name)
-    if isinstance(slot, (AbstractString, AbstractWString)):
-        bound = slot.maximum_size if slot.has_maximum_size() else None
-        name = 'wstring' if isinstance(slot, AbstractWString) else 'string'
-        return name if bound is None else f'{name}<={bound}'
-    if isinstance(slot, NamespacedType):
-        return f'{slot.namespaces[0]}/{slot.name}'
-    inner = _text(slot.value_type)
-    if isinstance(slot, Array):
-        return f'{inner}[{slot.size}]'
-    bound = f'<={slot.maximum_size}' if isinstance(slot, BoundedSequence) else ''
-    return f'{inner}[{bound}]'
+def _text(described: str) -> str:
+    """Return a field's type as a definition has it: ``double[<=3]`` of ``sequence<double, 3>``."""
+    values = _VALUES.fullmatch(described)
+    if values is None:
+        return _NAMES.get(described, described.replace('string<', 'string<=').rstrip('>'))
+    sequence, bound, array, size = values.groups()
+    return f'{_text(sequence or array)}[{size or (f"<={bound}" if bound else "")}]'
