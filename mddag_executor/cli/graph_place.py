@@ -11,7 +11,6 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Cell, one_line, Progress, table
-from mddag_executor.errors import UsageError
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
@@ -61,10 +60,9 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.laboratory.prediction import cost_of, improve, Predictor, PUBLISH_NS
     from msg_graph import Process
     from msg_graph.edit import with_processes
-    for option in ('utilisation', 'execution_times'):
-        if args.trace and getattr(args, option) is not None:
-            raise UsageError(f'--{option.replace("_", "-")}: execution times are those of '
-                             '--trace: leave one of them out')
+    if args.trace:
+        options.refuse(args, ('utilisation', 'execution_times'),
+                       'execution times are those of --trace: leave one of them out')
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)
     times, judged = _recorded(args.trace, task_set) if args.trace else (

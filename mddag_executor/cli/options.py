@@ -10,7 +10,7 @@ same. Like the verbs' modules this one imports nothing heavy.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 import math
 from typing import Any, TypeVar
 
@@ -253,6 +253,13 @@ def add(
             default, kept['default'] = otherwise, None
         kept['help'] = only + kept['help'] + ('' if default is None else f' (default: {default})')
         parser.add_argument(*(('-o', name) if name == '--output' else (name,)), **kept)
+
+
+def refuse(args: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Refuse options that are given."""
+    for name in names:
+        if getattr(args, name) is not None:
+            raise UsageError(f'--{name.replace("_", "-")}: {why}')
 
 
 def add_recording(parser: argparse.ArgumentParser, what: str) -> None:

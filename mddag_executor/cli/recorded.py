@@ -75,11 +75,8 @@ def check(args: argparse.Namespace) -> None:
             raise UsageError(
                 '--callbacks: it shows what was recorded: leave it or --reschedule out')
         return
-    for option in _ONLY_RESCHEDULED:
-        if getattr(args, option) is not None:
-            raise UsageError(
-                f'--{option.replace("_", "-")}: a run is replayed as it was recorded: add '
-                '--reschedule')
+    options.refuse(args, _ONLY_RESCHEDULED,
+                   'a run is replayed as it was recorded: add --reschedule')
 
 
 @contextmanager
@@ -152,10 +149,8 @@ def _rescheduled(
     """Run the scheduler over a recording of any kind."""
     if is_bag(path):
         return _rescheduled_bag(args, path, name, task_set)
-    for option, has in (('execution-times', 'a trace has its own'),
-                        ('seed', 'a trace has its own execution times, so nothing is drawn')):
-        if getattr(args, option.replace('-', '_')) is not None:
-            raise UsageError(f'--{option}: {has}: leave the option out')
+    options.refuse(args, ('execution_times', 'seed'),
+                   'a trace has its own execution times: leave the option out')
     from mddag_executor.replay import reschedule
     recorded = args.overheads in (None, _RECORDED)
     with Progress('replaying') as line:

@@ -84,10 +84,7 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
     """Return the problem that a recording is."""
     from mddag_executor.replay import reschedule
     from mddag_executor.replay.slack import Problem
-    for option in _ONLY_GRAPH:
-        if getattr(args, option) is not None:
-            raise UsageError(f'--{option.replace("_", "-")}: a recording has its own: leave the '
-                             'option out')
+    options.refuse(args, _ONLY_GRAPH, 'a recording has its own: leave the option out')
     with recorded.opened(args) as (path, name, task_set), Progress('replaying') as line:
         if recorded.is_bag(path):
             raise UsageError(

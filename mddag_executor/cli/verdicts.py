@@ -30,11 +30,11 @@ def judge(args: argparse.Namespace, tally: MissTally, result: dict[str, Any]) ->
     tally.add_bursts(result['dags'])
     broken = not_tolerated(result['dags'])
     if args.junit is not None:
-        from mddag_executor.report.junit import junit
+        from mddag_executor.report.ci import junit
         with common.output_file(args.junit) as file:
             file.write(junit(result, broken, str(args.trace)))
     if args.github:
-        from mddag_executor.report.github import annotation_lines
+        from mddag_executor.report.ci import annotation_lines
         graph = None if args.graph in (None, '-') else str(args.graph)
         for line in annotation_lines(result['dags'], broken, graph):
             print(line, file=sys.stdout if common.wants_tables(args) else sys.stderr)

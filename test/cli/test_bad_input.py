@@ -145,7 +145,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('replay run.mcap other.yaml',
      'run.mcap: none of the callbacks of other.yaml is in it: it has /n:t, /n:x, /m:t: '),
     ('replay run.mcap --workers 2', '--workers: a run is replayed as it was recorded: add --resc'),
-    ('replay run.mcap --reschedule --seed 1', '--seed: a trace has its own execution times, so '),
+    ('replay run.mcap --reschedule --seed 1', '--seed: a trace has its own execution times: lea'),
     ('replay run.mcap --reschedule --callbacks', '--callbacks: it shows what was recorded: leave'),
     ('replay run.mcap --from 2s --to 1s', '--to: the part ends before it begins: give a time af'),
     ('replay run.mcap --to 1s --skip 1s', '--skip: the part begins with --from: leave one of the'),

@@ -26,8 +26,7 @@ from mddag_executor.core.state import (
 from mddag_executor.core.tally import counts
 from mddag_executor.core.tolerances import not_tolerated
 from mddag_executor.replay.miss_tally import longest_run, MissTally
-from mddag_executor.report.github import annotation_lines
-from mddag_executor.report.junit import junit
+from mddag_executor.report.ci import annotation_lines, junit
 from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
