@@ -132,9 +132,7 @@ def main(args: argparse.Namespace) -> int:
 
 def status(args: argparse.Namespace, result: dict[str, Any]) -> int:
     """Return the exit status of a run in which nothing failed."""
-    if not args.fail_on_miss:
-        return 0
-    return verdicts.exit_status(result['dags'], result['file'] or 'mddag run')
+    return verdicts.exit_status(args, result['dags'], result['file'] or 'mddag run')
 
 
 def part(args: argparse.Namespace) -> int:

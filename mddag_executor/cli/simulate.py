@@ -68,9 +68,7 @@ def main(args: argparse.Namespace) -> int:
         'seed': args.seed if args.execution_times is None else None, 'ended_ns': run.ended_ns,
         'trace': args.trace}
     common.show(args, result, _lines(result))
-    if not args.fail_on_miss:
-        return 0
-    return verdicts.exit_status(result['dags'], task_set.file, 'simulate for longer')
+    return verdicts.exit_status(args, result['dags'], task_set.file, 'simulate for longer')
 
 
 def execution_times(

@@ -38,17 +38,19 @@ def judge(args: argparse.Namespace, tally: MissTally, result: dict[str, Any]) ->
         graph = None if args.graph in (None, '-') else str(args.graph)
         for line in annotation_lines(result['dags'], broken, graph):
             print(line, file=sys.stdout if common.wants_tables(args) else sys.stderr)
-    if not args.fail_on_miss:
-        return 0
-    return exit_status(result['dags'], str(args.trace))
+    return exit_status(args, result['dags'], str(args.trace))
 
 
-def exit_status(dags: Mapping[str, Any], place: str, remedy: str = _NEVER_DUE) -> int:
+def exit_status(
+    args: argparse.Namespace, dags: Mapping[str, Any], place: str, remedy: str = _NEVER_DUE
+) -> int:
     """
-    Return the exit status of `--fail-on-miss`.
+    Return the exit status that `--fail-on-miss` asks for.
 
     If no job was due, nothing has shown that deadlines hold: that is a failure, and is reported.
     """
+    if not args.fail_on_miss:
+        return 0
     if total(dags).due:
         return int(bool(not_tolerated(dags)))
     return unproven(place, NOTHING_DUE, remedy)
