@@ -33,13 +33,15 @@ def compare(name: str, found: str) -> None:
 
 def words(text: str) -> str:
     """Return the text of a live run without its numbers, and without what a busy machine adds."""
-    lines = [re.sub(r'-?\d+(\.\d+)?( (ns|us|ms|s)\b)?', '#', line) for line in text.splitlines()]
-    return ''.join(f'{re.sub(" +", " ", line)}\n' for line in lines if not re.search(
-        'stops?$|stops? [(]|timer releases? skipped|differences? between', line))
+    text = re.sub(r'-?\d+(\.\d+)?( (ns|us|ms|s)\b)?', '#', re.sub(' +', ' ', text))
+    text = re.sub('(, #)? (expired|demoted)', '', text)     # counts that are shown if not 0
+    return ''.join(f'{re.sub("# (#( %)? )*", "# ", line)}\n' for line in text.splitlines() if not
+                   re.search('due to # stops?|timer releases? skipped|differences? between', line))
 
 
-def shape(value: Any, depth: int = 9) -> Any:
-    """Return a result without its values: the names of all that it has."""
-    if isinstance(value, dict) and depth:
-        return {key: shape(each, depth - 1) for key, each in value.items()}
+def shape(value: Any) -> Any:
+    """Return a result without its values: the names of all that it has whatever happens."""
+    if isinstance(value, dict):
+        return {key: '...' if key == 'dropped' else shape(each)
+                for key, each in sorted(value.items()) if key != 'demoted'}
     return '...'
