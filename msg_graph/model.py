@@ -278,27 +278,15 @@ class TaskSet:
                     self.processes[0].name if self.processes else None)
 
     def vertex(self, name: str) -> Vertex:
-        """
-        Return the vertex with this name.
-
-        :raises KeyError: there is none.
-        """
+        """Return the vertex with this name; raise ``KeyError`` if there is none."""
         return self._vertex[name]
 
     def dag(self, name: str) -> Dag:
-        """
-        Return the DAG with this name.
-
-        :raises KeyError: there is none.
-        """
+        """Return the DAG with this name; raise ``KeyError`` if there is none."""
         return self._dag[name]
 
     def callback(self, key: str) -> Callback:
-        """
-        Return the callback ``node:name``.
-
-        :raises KeyError: there is none.
-        """
+        """Return the callback ``node:name``; raise ``KeyError`` if there is none."""
         return self._callback[key]
 
     def with_callbacks(self, change: Mapping[str, Mapping[str, Any]]) -> TaskSet:

@@ -19,7 +19,7 @@ Theory of operation
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import accumulate, islice
 
@@ -128,25 +128,21 @@ def improve(
     """
     best, tried = cost(placing.processes(place)), 1
     seen = {tuple(sorted(place.items()))}
-    while tried < most:
-        for other in _next(placing, place, seen):
-            seen.add(tuple(sorted(other.items())))
-            tried += 1
-            report(tried)
-            found = cost(placing.processes(other))
-            if found < best:
-                place, best = other, found
-                break
-            if tried >= most:
-                break
-        else:
-            break
+    candidates = _next(placing, place, seen)
+    while tried < most and (other := next(candidates, None)) is not None:
+        seen.add(tuple(sorted(other.items())))
+        tried += 1
+        report(tried)
+        found = cost(placing.processes(other))
+        if found < best:
+            place, best = other, found
+            candidates = _next(placing, place, seen)
     return place, tried
 
 
 def _next(
     placing: Placing, place: dict[int, int], seen: set[tuple[tuple[int, int], ...]]
-) -> Iterable[dict[int, int]]:
+) -> Iterator[dict[int, int]]:
     """Return the placements to try next, those of the least load first."""
     candidates = [each for each in placing.neighbours(place)
                   if tuple(sorted(each.items())) not in seen]

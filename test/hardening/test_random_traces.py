@@ -11,8 +11,6 @@ others of a small simulated one. `HARDENING_EXAMPLES=10000` tries that many.
 
 from __future__ import annotations
 
-import contextlib
-import io
 import os
 from pathlib import Path
 import random
@@ -20,11 +18,12 @@ import tempfile
 from typing import Any
 
 from mddag_executor.cli import main as program
-from mddag_executor.cli.text import printable
 from mddag_executor.trace import read_events, TraceFile
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.schema import EVENTS
 import pytest
+
+from .verbs import run
 
 EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '32'))
 BATCHES = 2
@@ -137,19 +136,7 @@ def give(rows: list[Row], seed: int) -> int:
         for name, time, pid, tid, values in rows:
             file.add(name, time, pid, tid, *values)
     for verb in VERBS:
-        out, err = (io.TextIOWrapper(io.BytesIO(), 'utf-8', newline='\n') for _ in range(2))
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            status = program.main(verb)
-        for stream in (out, err):
-            stream.seek(0)
-        printed, said = out.read(), err.read()
-        assert status in (0, 1, 2), f'seed {seed}: {verb}: {said}'
-        used += status != 2
-        assert 'Traceback' not in said
-        for line in (printed + said).split('\n'):
-            assert line == printable(line), f'seed {seed}: {verb}'
-        if status == 2:
-            assert printed == '' and said.splitlines()[-1].startswith('error: '), said
+        used += run(*verb, about=f'seed {seed}')[0] != 2
     return used
 
 
