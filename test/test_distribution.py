@@ -17,6 +17,7 @@ import sys
 import tarfile
 import zipfile
 
+from mddag_executor import __version__
 import pytest
 
 TOP = Path(__file__).resolve().parent.parent
@@ -214,6 +215,7 @@ def test_the_distributions_hold_what_they_should(built: Path) -> None:
         info = next(n.split('/')[0] for n in names if n.endswith('.dist-info/RECORD'))
         entries = ConfigParser()
         entries.read_string(archive.read(f'{info}/entry_points.txt').decode())
+    assert info == f'{NAME}-{__version__}.dist-info'
     assert dict(entries['console_scripts']) == {'mddag': f'{NAME}.cli.main:main'}
     data = f'{info.removesuffix(".dist-info")}.data/data/'
     assert {n for n in names if not n.startswith((info, data))} == files_in(

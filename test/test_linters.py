@@ -98,6 +98,8 @@ def test_names_and_versions_agree() -> None:
     root = package_xml()
     name = root.findtext('name')
     assert (name, root.findtext('version')) == ('mddag_executor', __version__)
+    newest = re.search(r'^## (\S+) - 20', (TOP / 'CHANGELOG.md').read_text(encoding='utf-8'), re.M)
+    assert newest is not None and newest[1] == __version__
     assert root.findtext('export/build_type') == 'ament_python'
     assert (TOP / 'resource' / name).is_file()
 

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -21,32 +20,11 @@ import pytest
 AUTOWARE = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
 DURATION_NS = 3_000_000_000
 WORKERS = 7
-DRAWS = 40
 
 
 @cache
 def autoware() -> TaskSet:
     return load(AUTOWARE)
-
-
-def test_acceptance_over_some_draws() -> None:
-    """
-    Of 40 draws rad meets the most deadlines, then rm, then wc; the same ones every time.
-
-    For comparison: the paper's program, with 5,000 draws from the measured times, has 88.0 %,
-    77.6 % and 45.6 %.
-    """
-    task_set = autoware()
-    accepted = Counter[str]()
-    for seed in range(DRAWS):
-        times = draw_execution_times(task_set, seed)
-        load_of_draw = periodic_load(task_set, times, DURATION_NS)
-        for policy in ('rad', 'rm', 'wc'):
-            settings = Settings(
-                policy=policy, workers=WORKERS, duration_ns=DURATION_NS, preemptive=None,
-                judge='completions', stop_at_first_miss=True)
-            accepted[policy] += not simulate(task_set, load_of_draw, settings).tally.missed
-    assert accepted == {'rad': 36, 'rm': 29, 'wc': 21}
 
 
 # What the paper's own program (github.com/atsushi421/2024_RTSS_WiP_Evaluation) gave on 2026-11-22
