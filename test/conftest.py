@@ -140,12 +140,15 @@ ROS = (
     'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph_systems.py',
     'replay/test_live_replay.py', 'test_docs.py')
 
+# One process compiles the core, which takes half a minute the first time.
+COMPILE = ('simulate/test_compiled.py', 'laboratory/test_evaluate.py')
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if 'PYTEST_XDIST_WORKER' in os.environ:
         # The longest first, so that no process has to wait for the other at the end.
         items.sort(key=lambda item: (
-            not _runs_ros(item.nodeid), item.get_closest_marker('slow') is None))
+            not _is_in(item.nodeid, ROS), item.get_closest_marker('slow') is None))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -155,15 +158,17 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     class Scheduling(LoadScopeScheduling):
 
         def _split_scope(self, nodeid: str) -> str:
-            return nodeid.partition('::')[0] if _runs_ros(nodeid) else nodeid
+            if _is_in(nodeid, COMPILE):
+                return 'compile'
+            return nodeid.partition('::')[0] if _is_in(nodeid, ROS) else nodeid
 
     config.option.loadscopereorder = False  # they are in order
     return Scheduling(config, log)
 
 
-def _runs_ros(nodeid: str) -> bool:
+def _is_in(nodeid: str, places: tuple[str, ...]) -> bool:
     file = PurePosixPath(nodeid.partition('::')[0])
-    return any(file.is_relative_to(PurePosixPath(HERE.name, each)) for each in ROS)
+    return any(file.is_relative_to(PurePosixPath(HERE.name, each)) for each in places)
 
 
 # --- leftovers -----------------------------------------------------------------------------------
