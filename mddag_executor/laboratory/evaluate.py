@@ -101,7 +101,7 @@ def _check(experiments: Sequence[Experiment], runs: int, first_run: int, jobs: i
         raise UsageError(f'runs: {runs} is too few: give at least 1')
     if runs * len(experiments) > MOST_RUNS:
         raise UsageError(f'runs: {runs * len(experiments)} is too many: give at most '
-                              f'{MOST_RUNS}, and evaluate more in ranges (--first-run)')
+                         f'{MOST_RUNS}, and evaluate more in ranges (--first-run)')
     if not 0 <= first_run < STRIDE - MOST_RUNS:
         raise UsageError(
             f'first run: {first_run} is out of range: give 0 to {STRIDE - MOST_RUNS - 1}')
@@ -161,7 +161,7 @@ def _local(jobs: int, evaluator: Evaluator) -> Iterator[Submit]:
             yield lambda first, count: pool.submit(evaluator, first, count)
     except BrokenProcessPool:
         raise UsageError('jobs: a worker process was killed: free some memory, or give fewer '
-                              '--jobs') from None
+                         '--jobs') from None
 
 
 @contextmanager
@@ -187,6 +187,6 @@ def _on_worker(evaluator: Any, version: str, first: int, count: int) -> Chunk:
     """Evaluate a chunk on a worker of a cluster."""
     if version != __version__:
         raise UsageError(f'--dask: a worker has mddag_executor {__version__}, and this is '
-                              f'{version}: install the same version there')
+                         f'{version}: install the same version there')
     chunk: Chunk = evaluator(first, count)
     return chunk

@@ -75,7 +75,7 @@ class Options:
                         f'{option} {one:g}: it is out of range: give {lower} to {most:g}')
             if name != 'periods_ns' and values[0] > values[-1]:
                 raise UsageError(f'{option} {values[0]:g}:{values[-1]:g}: the first is larger: '
-                                    'write the smaller one first')
+                                 'write the smaller one first')
         vertices, dags = self.vertices[0], self.dags[0]
         if self.sinks[0] > max(1, vertices - 1):
             raise UsageError(

@@ -34,7 +34,7 @@ def check_available() -> None:
     """Check that there is a compiler."""
     if not available():
         raise UsageError("numba, which compiles the core, is not installed: install "
-                              "'mddag_executor[batch]' with pip")
+                         "'mddag_executor[batch]' with pip")
 
 
 def pays(plain_s: float) -> bool:
