@@ -58,7 +58,7 @@ def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, list[
     """
     Return the task set of a declaration whose sinks may lack deadlines.
 
-    :return: the task set, and the keys of the callbacks without a deadline; theirs is set to 1 s.
+    :return: the task set, and the keys of the callbacks without a deadline, which get 1 s.
     """
     missing: list[str] = []
     task_set = loads(text, name, without_deadline=missing)

@@ -38,7 +38,7 @@ def whole_number(name: str, value: Any, most: int, unit: str = '') -> int:
     except TypeError:
         number = None
     if number is None or isinstance(value, bool):
-        raise UsageError(f'{name}: {value!r} is no whole number: give 1{unit} or more')
+        raise UsageError(f'{name}: {value!r} must be an integer: give 1{unit} or more')
     if number < 1:
         raise UsageError(f'{name}: {number}{unit} is too {"short" if unit else "few"}: '
                          'give at least 1')

@@ -168,7 +168,7 @@ def _nodes(node: Node, found: Probe) -> None:
             continue
         if count > 1:
             found.warn(
-                f'{full}: {count} nodes have this name; they are taken for one: rename them')
+                f'{full}: {count} nodes have this name; they are treated as one: rename them')
         namespace, _, name = full.rpartition('/')
         endpoints = found.nodes.setdefault(full, Endpoints())
         for get, target, kind in (

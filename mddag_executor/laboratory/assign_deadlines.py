@@ -88,7 +88,7 @@ def proportional(task_set: TaskSet, budget: str) -> Deadlines:
     Return deadlines in proportion to the critical paths.
 
     The sink of a DAG with the longest critical path gets the period, the others less.  A callback
-    that is several sinks gets the shortest of theirs.
+    that is several sinks gets the shortest one.
 
     :raises mddag_executor.errors.UsageError: an execution time is not declared.
     """

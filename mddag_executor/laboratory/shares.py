@@ -43,7 +43,7 @@ class Dice:
         return low + (high - low) * self._random()
 
     def whole(self, low: int, high: int) -> int:
-        """Return a whole number from one to another, both included."""
+        """Return an integer from one to another, both included."""
         return low + int(self._random() * (high - low + 1))
 
     def chance(self, probability: float) -> bool:

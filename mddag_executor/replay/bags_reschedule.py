@@ -87,7 +87,7 @@ class _Releases:
             pauses = len(self._bag.stretches) - 1
             return Source(
                 jobs, f'{counted(len(jobs), "job")} at the nominal period of its timer, from the '
-                'first message on: a bag does not tell when timers ran'
+                'first message on: a bag does not show when timers ran'
                 + (f'; none in {counted(pauses, "pause")} of over a minute without any message'
                    if pauses else ''))
         if not callback.topics:

@@ -146,8 +146,8 @@ def said(offset: Offset | None, there: int | None, name: str) -> str:
     if offset is None:
         early = '' if there is None or there >= 0 else (
             f', though messages come there {-there / 1e6:.3f} ms before they are sent')
-        return (f'no messages went both ways, so its clock is taken as synchronised{early}: give '
-                f'--offset {name}=TIME if it was not')
+        return (f'no messages went both ways, so its clock is assumed to be synchronised{early}: '
+                f'give --offset {name}=TIME if it was not')
     ahead = 'behind' if offset.ahead < 0 else 'ahead'
     return (f'its clock is taken to be {abs(offset.ahead) / 1e6:.3f} ms {ahead}, within '
             f'{offset.uncertainty / 1e6:.3f} ms, by the messages both ways')

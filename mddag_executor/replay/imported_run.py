@@ -420,7 +420,7 @@ class ImportedRun:
         if self._doubts.withdrawn:
             dags = [f'{self._dags[dag].name} ({n})' for dag, n in self._doubts.withdrawn.items()]
             lines.append(
-                f'{name}: not judged, because what is missing may be theirs: '
+                f'{name}: not judged, because their events may be missing: '
                 f'{counted(sum(self._doubts.withdrawn.values()), "job")}: {listed(dags)}')
         lines.extend(f'{name}: {text}' for text in self._timers.odd.lines())
         if self._fallbacks:

@@ -158,7 +158,7 @@ def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(
 
 def test_clocks_are_taken_as_they_are_where_messages_go_one_way(tmp_path: Path) -> None:
     warning, = replay(two_machines(tmp_path, 0, back=False)).warnings
-    assert 'is taken as synchronised: give --offset down=TIME' in warning
+    assert 'is assumed to be synchronised: give --offset down=TIME' in warning
     warning, = replay(two_machines(tmp_path, 5 * MS, back=False)).warnings
     assert 'come there 4.600 ms before they are sent: give --offset down=TIME' in warning
 
