@@ -45,13 +45,10 @@ class Sink(NamedTuple):
     """
     A sink in a table.
 
-    :ivar dag: the name of its DAG, and the table's text: in the DAG's first row only.
-    :ivar name: its name, and the table's text.
-    :ivar result: its result.
+    :ivar shown_name: its name in the table.
     """
 
     dag: str
-    shown_dag: str
     name: str
     shown_name: str
     result: Mapping[str, Any]
@@ -61,10 +58,8 @@ def each_sink(dags: Mapping[str, Any]) -> Iterator[Sink]:
     """Yield the sinks of all DAGs, in the order of a table's rows."""
     short = short_names(name for dag in dags.values() for name in dag['sinks'])
     for dag_name, dag in dags.items():
-        shown = dag_name
         for name, result in dag['sinks'].items():
-            yield Sink(dag_name, shown, name, short[name], result)
-            shown = ''
+            yield Sink(dag_name, name, short[name], result)
 
 
 def sink_table(dags: Mapping[str, Any]) -> str:
