@@ -65,6 +65,7 @@ from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.events import Batch, Column, Event, FIELDS, rows_at, with_fields
+from mddag_executor.trace.schema import EVENTS, PREAMBLE
 from msg_graph import TaskSet
 import numpy as np
 
@@ -138,7 +139,8 @@ def end_lines(found: Recording) -> list[str]:
 class _Kind:
     """The rows of one kind of event, and their positions in the file."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self._name = name
         self.rows: list[Table] = []
         self.places: list[Ints] = []
 
@@ -146,10 +148,10 @@ class _Kind:
         self.rows.append(found)
         self.places.append(places)
 
-    def joined(self) -> tuple[Table | None, Ints]:
-        """Return the rows as one table with the type of the first part; None: no rows."""
+    def joined(self) -> tuple[Table, Ints]:
+        """Return the rows as one table with the type of the first part."""
         if not self.rows:
-            return None, np.empty(0, dtype=np.int64)
+            return _blank(self._name, 0), np.empty(0, dtype=np.int64)
         names = self.rows[0].dtype.names
         assert names is not None
         kind = np.dtype([(each, np.result_type(*(part.dtype[each] for part in self.rows)))
@@ -231,7 +233,7 @@ class _Source:
             self._kind(kind[0]).add(found, places)
 
     def _kind(self, name: str) -> _Kind:
-        return self._kinds.setdefault(name, _Kind())
+        return self._kinds.setdefault(name, _Kind(name))
 
     def _adjacent(self, batch: Batch, columns: dict[str, Column]) -> None:
         """Remove adjacent events of executions (rule 2)."""
@@ -329,12 +331,9 @@ class _Source:
         found.misses = self._misses()
         found.demotions = self._demotions()
         stops, _ = self._kind(_STOP).joined()
-        if stops is not None:
-            found.stops = rows(
-                STOPS, len(stops), start=stops['begin'], end=stops['end'])
-            found.notices_stops = int(stops['end'].min())
-        lost, _ = self._kind(_LOST).joined()
-        found.lost = 0 if lost is None else int(sum(lost['count'].tolist()))
+        found.stops = rows(STOPS, len(stops), start=stops['begin'], end=stops['end'])
+        found.notices_stops = earliest(stops['end'])
+        found.lost = sum(self._kind(_LOST).joined()[0]['count'].tolist())
         self._set_end(found)
         self._put_in_order(found, [
             (found.releases, found.releases['noticed'], released_at),
@@ -376,11 +375,6 @@ class _Source:
         """Return executions of events that are not adjacent, and positions of begins and ends."""
         found = [self._kind(kind).joined() for kind in (_DISPATCH, _START, _END)]
         dispatch = found[0][0]
-        if dispatch is None:
-            self._left_out(_END, 'of an execution that was not dispatched',
-                           np.ones(len(found[2][1]), dtype=np.bool_))
-            none = np.empty(0, dtype=np.int64)
-            return rows(EXECUTIONS), none, none
         line = _Line([each for each, _ in found], [at for _, at in found])
         is_dispatch, is_end = line.kind == 0, line.kind == 2
         before = last_of(is_dispatch | is_end, line.thread, before=True)
@@ -409,7 +403,7 @@ class _Source:
     ) -> tuple[Table, Ints, Ints]:
         """Assign the other completions to executions; return those without execution."""
         complete, at = self._kind(_COMPLETE).joined()
-        if complete is None:
+        if not len(complete):
             return rows(EXECUTIONS), at, at
         ended = np.flatnonzero((table['end'] >= 0) & (complete_at < 0))
         # the last dispatched execution in the thread
@@ -459,22 +453,17 @@ class _Source:
 
     def _publications(self, executions: Table) -> Table:
         published, _ = self._kind(_PUBLISH).joined()
-        if published is None:
-            return rows(PUBLICATIONS)
         time = published['timestamp'].astype(np.int64)
         if (time[1:] < time[:-1]).any():
             order = np.argsort(time, kind='stable')
             published, time = published[order], time[order]
         by = running_at(executions, published['vtid'].astype(np.int64), time)
         return rows(
-            PUBLICATIONS, len(published), publisher=published['publisher_handle'].view(np.int64)
-            if published['publisher_handle'].dtype == np.uint64 else published['publisher_handle'],
+            PUBLICATIONS, len(published), publisher=published['publisher_handle'],
             execution=by, time=time, source_timestamp=UNKNOWN,
             vertex=np.where(by >= 0, executions['vertex'][by], UNKNOWN))
 
-    def _releases(self, released: Table | None, at: Ints) -> tuple[Table, Ints]:
-        if released is None:
-            return rows(RELEASES), at
+    def _releases(self, released: Table, at: Ints) -> tuple[Table, Ints]:
         order = sort_by(released['timestamp'], at)
         released, at = released[order], at[order]
         good = (released['dag'] >= 0) & (released['dag'] < len(self._task_set.dags))
@@ -503,8 +492,6 @@ class _Source:
         tables, places = [rows(JOB_ENDS)], [np.empty(0, dtype=np.int64)]
         for kind, reason in _JOB_ENDS.items():
             found, at = self._kind(kind).joined()
-            if found is None:
-                continue
             good = (found['dag'] >= 0) & (found['dag'] < len(self._task_set.dags))
             self._left_out(kind, 'of a DAG that is not declared', ~good)
             vertex = np.full(len(found), UNKNOWN)
@@ -518,32 +505,21 @@ class _Source:
         return np.concatenate(tables), np.concatenate(places)
 
     def _misses(self) -> Table:
-        found, at = self._kind(_DEADLINE).joined()
-        if found is None:
-            return rows(MISSES)
+        found, _ = self._kind(_DEADLINE).joined()
         dag, vertex = self._numbering.of(found['dag'], found['vertex'])
         return rows(MISSES, len(found), dag=dag, vertex=vertex, job=found['job'],
                     deadline=found['deadline'], completed=found['completed'])
 
     def _demotions(self) -> Table:
         found, _ = self._kind(_DEMOTE).joined()
-        if found is None:
-            return rows(DEMOTIONS)
         dag, vertex = self._numbering.of(found['dag'], found['vertex'])
         return rows(DEMOTIONS, len(found), dag=dag, vertex=vertex, job=found['job'],
                     time=found['timestamp'])
 
     def _set_end(self, found: Recording) -> None:
         """Find the end of the run, and process events that are not in tables."""
-        last = 0
-        for kind in _CORE:
-            each, _ = self._kind(kind).joined() if kind != _COMPLETE else (None, None)
-            if each is not None and len(each):
-                last = max(last, int(each['timestamp'].max()))
-        last = max(last, self._last_seen)
-        left, _ = self._kind(_COMPLETE).joined()
-        if left is not None:
-            last = max(last, int(left['timestamp'].max()))
+        last = max([0, self._last_seen, *(
+            int(part['timestamp'].max()) for kind in _CORE for part in self._kind(kind).rows)])
         drops, reasons, hosted = [], dict[str, int](), []
         for place, event in self._others:
             if event[0] == _DROP:
@@ -561,20 +537,19 @@ class _Source:
         found.drop_reasons = tuple(reasons)
         judging, judging_at = self._kind(_JUDGE_FROM).joined()
         changes = []
-        if judging is not None:
-            last = max(last, int(judging['timestamp'].max()))
-            for now, release, place in zip(*(each.tolist() for each in (
-                    judging['timestamp'], judging['release'], judging_at))):
-                if 0 <= release <= NEVER:
-                    changes.append((now, place, release))
-                else:
-                    self._strange[f'{_JUDGE_FROM} an impossible time'] += 1
+        for now, release, place in zip(*(each.tolist() for each in (
+                judging['timestamp'], judging['release'], judging_at))):
+            last = max(last, now)
+            if 0 <= release <= NEVER:
+                changes.append((now, place, release))
+            else:
+                self._strange[f'{_JUDGE_FROM} an impossible time'] += 1
         self._changes, self._hosting = sorted(changes), sorted(hosted, key=lambda h: h[:2])
         last = min(last, NEVER - 1)     # a run without end cannot be rescheduled
         found.end = found.judged_until = last
         self._shutdown_at: tuple[int, int] | None = None
         shutdown, shutdown_at = self._kind(_SHUTDOWN).joined()
-        if shutdown is not None:
+        if len(shutdown):
             now, judged = int(shutdown['timestamp'][0]), int(shutdown['end'][0])
             if last <= now < NEVER and 0 <= judged <= now:
                 found.end, found.judged_until, found.shut_down = now, judged, True
@@ -685,9 +660,8 @@ class _Numbering:
 class _Line:
     """Events by thread, each thread in the order of the file."""
 
-    def __init__(self, tables: list[Table | None], places: list[Ints]) -> None:
-        parts = [(number, table, at) for number, (table, at) in enumerate(zip(tables, places))
-                 if table is not None]
+    def __init__(self, tables: list[Table], places: list[Ints]) -> None:
+        parts = [(number, table, at) for number, (table, at) in enumerate(zip(tables, places))]
         thread = np.concatenate([table['vtid'].astype(np.int64) for _, table, _ in parts])
         place = np.concatenate([at for *_, at in parts])
         order = sort_by(thread, place)
@@ -770,10 +744,15 @@ def running_at(executions: Table, thread: Ints, time: Ints) -> Ints:
     return found
 
 
+def _blank(name: str, length: int) -> Table:
+    """Return rows of a kind of event that has only numbers."""
+    return np.zeros(length, dtype=[
+        (field, 'u8' if kind == 'uint64' else 'i8')
+        for field, kind in (*PREAMBLE, *EVENTS[name].fields)])
+
+
 def _one_row(event: Event) -> Table:
-    from mddag_executor.trace.schema import EVENTS, PREAMBLE
-    names = [name for name, _ in PREAMBLE] + [name for name, _ in EVENTS[event[0]].fields]
-    table = np.empty(1, dtype=[(name, 'i8') for name in names])
-    for name, value in zip(names, event[1:]):
-        table[name] = value - 2 ** 64 if value >= 2 ** 63 else value
+    table = _blank(event[0], 1)
+    for name, value in zip(table.dtype.names or (), event[1:]):
+        table[name] = value
     return table
