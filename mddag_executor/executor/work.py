@@ -101,14 +101,9 @@ class Work:
     :ivar yields: how many times in a row its coroutine has yielded without awaiting a future.
     """
 
-    then: Callable[[Any], Any] | None = None
-    x = -1
-    coroutine: Any = None
-    origin: Origin | None = None
-    worker = -1
-    ready_ns = 0
-    cpu_ns = 0
-    yields = 0
+    __slots__ = (
+        'entity', 'function', 'args', 'then', 'x', 'coroutine', 'origin', 'worker',
+        'ready_ns', 'cpu_ns', 'yields')
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -117,8 +112,11 @@ class Work:
         self.entity = entity
         self.function = function
         self.args = args
-        if then is not None:
-            self.then = then
+        self.then = then
+        self.coroutine: Any = None
+        self.origin: Origin | None = None
+        self.x = self.worker = -1
+        self.ready_ns = self.cpu_ns = self.yields = 0
 
     def step(self, must_check: bool = True) -> Any:
         """
@@ -164,6 +162,8 @@ def _nothing() -> None:
 
 class TaskWork(Work):
     """An execution of an rclpy ``Task``; exceptions are the task's."""
+
+    __slots__ = ()
 
     def step(self, must_check: bool = True) -> Any:
         """Run the task once; return None when it is done."""
