@@ -69,6 +69,15 @@ _QOS = QoSProfile(
 _ENTRY = struct.Struct('<QQQqqQQqiiI')
 
 
+def own_node(name: str, context: Context) -> Node:
+    """Make a node of the executor itself, without the services and topics of other nodes."""
+    # Its own arguments precede those of the process, which name the process' nodes.
+    return Node(
+        name, context=context, enable_rosout=False, start_parameter_services=False,
+        cli_args=['--ros-args', '-r', f'__node:={name}'],
+        parameter_overrides=[Parameter('start_type_description_service', value=False)])
+
+
 class Announcements:
     """
     Announces publications to the other processes, and receives their announcements.
@@ -95,12 +104,7 @@ class Announcements:
         digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
         names = [each.name for each in task_set.processes]
         own = names.index(process)
-        # Its own arguments precede those of the process, which name the process' nodes.
-        name = f'mddag_jobs_{os.getpid()}_{own}'
-        self.node = Node(
-            name, context=context, enable_rosout=False, start_parameter_services=False,
-            cli_args=['--ros-args', '-r', f'__node:={name}'],
-            parameter_overrides=[Parameter('start_type_description_service', value=False)])
+        self.node = own_node(f'mddag_jobs_{os.getpid()}_{own}', context)
         self._n_others = len(names) - 1
         self._publisher: Publisher | None = self.node.create_publisher(
             UInt8MultiArray, f'/mddag/jobs_{digest}/p{own}', _QOS)

@@ -32,6 +32,7 @@ from typing import NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import quantile
 from mddag_executor.core.tally import Counts, counts, Tally
+from mddag_executor.executor.announcements import own_node
 from mddag_executor.executor.bounds import END_S
 from mddag_executor.executor.settings import Thresholds
 from mddag_executor.executor.shutdown import is_over, join, stop_at_exit
@@ -297,14 +298,9 @@ class Diagnostics:
 
     def _publish(self) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
-        from rclpy.node import Node
-        from rclpy.parameter import Parameter
-        # No executor runs the node, since it has no callbacks. Its own arguments precede those of
-        # the process, which name the process' nodes.
-        node = Node(
-            NODE_NAME, context=self._context, enable_rosout=False, start_parameter_services=False,
-            cli_args=['--ros-args', '-r', f'__node:={NODE_NAME}_{os.getpid()}'],
-            parameter_overrides=[Parameter('start_type_description_service', value=False)])
+
+        # no executor runs the node, since it has no callbacks
+        node = own_node(f'{NODE_NAME}_{os.getpid()}', self._context)
         try:
             publisher = node.create_publisher(DiagnosticArray, TOPIC, 10)
             due = time.monotonic_ns() + self._period_ns
