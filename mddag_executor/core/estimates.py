@@ -10,7 +10,7 @@ executions cost one comparison.
 
 from __future__ import annotations
 
-from mddag_executor.core.overload import admit
+from mddag_executor.core.overload import admit, set_start
 from mddag_executor.core.state import State
 from mddag_executor.core.tables import Tables
 
@@ -51,4 +51,5 @@ class MeanTimes:
                 for each in after:
                     start = min(start, starts.get((each, sink), start))
                 s.reach_by[i] = starts[vertex, sink] = start - self._mean[vertex]
+            set_start(t, s, vertex)
         admit(t, s)

@@ -7,20 +7,25 @@ An execution is checked (``demote``) when it comes first in a queue after ``Stat
 vertex.  That is the latest start with which all its sinks are in time; or the past if every
 execution of the vertex must be checked, because an older one is demoted or the vertex is refused.
 So work that is in time costs one comparison.  Like ``rules`` this module contains only integer
-arithmetic and list indexing.
+arithmetic, list indexing and ``heapq``.
 
 Sources: robust EDF (Buttazzo and Stankovic, "RED", 1993), the mode switch of EDF-VD (Baruah et
-al., ECRTS 2012), and the postponed deadlines of the constant bandwidth server (Abeni and Buttazzo,
-RTSS 1998), which keep late callbacks from starving.
+al., ECRTS 2012), weakly hard (m,k) systems (Bernat et al., 2001), the postponed deadlines of the
+constant bandwidth server (Abeni and Buttazzo, RTSS 1998), which keep late callbacks from starving,
+and priority inheritance (Sha et al., 1990) for late messages before newer ones.
 """
 
 from __future__ import annotations
 
+from heapq import heappop, heappush
+
 from mddag_executor.core.jobs import demotes, judge
+from mddag_executor.core.queues import add_stale
 from mddag_executor.core.state import (
     DEADLINE_KEYS,
     ELSEWHERE,
     OPEN,
+    QueueEntry,
     SINK_DEMOTED,
     START_KEYS,
     State,
@@ -41,51 +46,48 @@ PPM = 1_000_000
 
 def demote(t: Tables, s: State, x: int, now: int) -> bool:
     """
-    Demote a waiting execution if rule 7 or 14 demands it; return whether its key changed.
+    Change the key of the execution that comes first in a queue, or of an older one (rules 7, 14).
 
-    The caller removes its entry from the queue.
+    :return: whether a key changed; the old entry is then stale.
     """
-    old = s.x_key[x]
+    key = s.x_key[x]
     vertex = s.x_vertex[x]
-    last = s.last_demoted[vertex]
-    if last >= 0 and s.x_state[last] != WAITING:
-        last = -1
-        s.last_demoted[vertex] = -1
-        set_start(t, s, vertex)
-    if last == x:
-        last = -1
-    if last >= 0 and s.x_started[x] < 0 and _is_behind(t, s, x, last):
-        priority = s.x_key[last][0]
-        for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
-            _announce_demoted(t, s, s.x_slot[x], t.reach_sink[i], now)
-    else:
-        priority = _demoted_priority(t, s, x, now)
-    if priority <= old[0]:
+    demoted = s.demoted[vertex]
+    while demoted and _is_over(s, demoted[0]):
+        heappop(demoted)
+        if len(demoted) == 0:
+            set_start(t, s, vertex)
+    if s.urged[vertex] == key[3]:
+        return False  # a newer one goes by this key
+    fresh = s.x_started[x] < 0
+    first = -1
+    if fresh and demoted and demoted[0][0] < key[3]:
+        first = demoted[0][4]
+    priority = _late_priority(t, s, x, first, now)
+    if priority > key[0]:
+        if fresh:
+            heappush(demoted, (key[3], 0, 0, 0, x))
+            s.start_by[vertex] = -NEVER
+        _change_key(s, x, priority)
+        return True
+    if first < 0 or s.x_key[first][0] <= key[0]:
         return False
-    s.x_key[x] = (priority, old[1], old[2], old[3], x)
-    if last < 0 or s.x_started[last] >= 0 or old[3] < s.first_demoted[vertex]:
-        s.first_demoted[vertex] = old[3]
-    if last < 0 or s.x_key[x] > s.x_key[last]:
-        s.last_demoted[vertex] = x
-        s.start_by[vertex] = -NEVER
+    s.urged[vertex] = s.x_key[first][3]
+    _change_key(s, first, key[0])
     return True
 
 
-def _is_behind(t: Tables, s: State, x: int, last: int) -> bool:
-    """
-    Return whether an execution became ready later than a demoted one, which it must not overtake.
+def _is_over(s: State, entry: QueueEntry) -> bool:
+    """Return whether a demoted execution has started or was dropped."""
+    x = entry[4]
+    return s.x_state[x] != WAITING or s.x_key[x][3] != entry[0]
 
-    That may not be the last one: messages of a sync's topics may alternate, and those of one topic
-    be of older jobs.
-    """
-    order = s.x_key[x][3]
-    if s.x_key[last][3] < order:
-        return True
-    vertex = s.x_vertex[x]
-    own = _priority(
-        t, s, x, s.job_release[s.x_slot[x]], t.rad_offset[vertex], t.latest_start[vertex])
-    return (s.x_started[last] < 0 and s.first_demoted[vertex] < order  # else it was preempted
-            and s.x_key[x][0] == own)
+
+def _change_key(s: State, x: int, priority: int) -> None:
+    key = s.x_key[x]
+    s.x_key[x] = (priority, key[1], key[2], key[3], x)
+    heappush(s.ready, s.x_key[x])
+    add_stale(s)
 
 
 def _priority(t: Tables, s: State, x: int, release: int, deadline: int, start: int) -> int:
@@ -97,14 +99,20 @@ def _priority(t: Tables, s: State, x: int, release: int, deadline: int, start: i
     return release + t.dag_deadline[s.job_dag[s.x_slot[x]]]
 
 
-def _demoted_priority(t: Tables, s: State, x: int, now: int) -> int:
-    """Return the priority of an execution by the sinks that can be in time, if any."""
+def _late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
+    """
+    Return the priority of an execution by the sinks that can be in time, if any.
+
+    :param first: the oldest demoted execution of its vertex if that is older, or -1.
+    """
     slot = s.x_slot[x]
     vertex = s.x_vertex[x]
     dag = s.job_dag[slot]
     begin = now
-    if s.x_started[x] >= 0:  # it was preempted
-        begin = now - (s.x_cost[x] - s.x_left[x])
+    if first >= 0:
+        begin += len(s.demoted[vertex]) * s.mean[vertex]
+    elif s.x_started[x] >= 0:  # it was preempted
+        begin -= s.x_cost[x] - s.x_left[x]
     refused = is_refused(t, s, vertex)
     process = _process(t, s, vertex)
     if refused and now > s.refused_until[process] and s.refused_late[process] > 0:
@@ -124,24 +132,24 @@ def _demoted_priority(t: Tables, s: State, x: int, now: int) -> int:
         else:
             deadline = min(deadline, t.reach_deadline[i])
             start = min(start, t.reach_start[i])
-    release = s.job_release[slot]
-    if deadline == NEVER:
-        if refused:
-            if s.job_refused[slot] < 0:
-                s.job_refused[slot] = now + REFUSED_PATIENCE * t.dag_deadline[dag]
-            release = s.job_refused[slot]
-        else:
-            if s.job_demoted[slot] < 0:
-                s.job_demoted[slot] = now + patience * t.dag_deadline[dag]
-            release = s.job_demoted[slot]
-        deadline = t.rad_offset[vertex]
-        start = t.latest_start[vertex]
-    return _priority(t, s, x, release, deadline, start)
+    if deadline < NEVER:
+        return _priority(t, s, x, s.job_release[slot], deadline, start)
+    if first >= 0:
+        return s.x_key[first][0]
+    if refused:
+        if s.job_refused[slot] < 0:
+            s.job_refused[slot] = now + REFUSED_PATIENCE * t.dag_deadline[dag]
+        release = s.job_refused[slot]
+    else:
+        if s.job_demoted[slot] < 0:
+            s.job_demoted[slot] = now + patience * t.dag_deadline[dag]
+        release = s.job_demoted[slot]
+    return _priority(t, s, x, release, t.rad_offset[vertex], t.latest_start[vertex])
 
 
 def set_start(t: Tables, s: State, vertex: int) -> None:
     """Set from when on an execution of a vertex that comes first is checked."""
-    if s.last_demoted[vertex] >= 0 or is_refused(t, s, vertex):
+    if s.demoted[vertex] or is_refused(t, s, vertex):
         s.start_by[vertex] = -NEVER
         return
     s.start_by[vertex] = NEVER
@@ -157,21 +165,25 @@ def admit(t: Tables, s: State) -> None:
 
     A driver calls this at the begin and when the execution times have changed.
     """
+    changed = False
     for process in range(1, len(s.overtaking)):
         workers = len(s.worker_x)
         if len(s.pool) > 0:
             workers = 0
             for worker in range(len(s.pool)):
                 workers += int(s.pool[worker] == process)
-        s.refused_below[process] = s.refused_late[process]
+        refused = s.refused_late[process]
         for importance in range(IMPORTANT + 1):
             demand, held = _demand(t, s, process, importance)
-            if demand > 0 and importance > s.refused_below[process]:
-                s.refused_below[process] = importance
+            if demand > 0 and importance > refused:
+                refused = importance
             if demand <= workers * PPM and held <= PPM:
                 break
-    for vertex in range(t.n_vertices):
-        set_start(t, s, vertex)
+        changed = changed or refused != s.refused_below[process]
+        s.refused_below[process] = refused
+    if changed:
+        for vertex in range(t.n_vertices):
+            set_start(t, s, vertex)
 
 
 def _demand(t: Tables, s: State, process: int, importance: int) -> tuple[int, int]:

@@ -48,10 +48,11 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     time plus the mean execution times on the longest path to the sink is past its deadline.  From
     then on its job counts as released ``LATE_PATIENCE`` relative deadlines later (one, if a sink
     has used up the misses that it tolerates).  So demoted jobs age, and each callback gets some
-    time.  Executions of one vertex keep their order: one that became ready later than a demoted
-    one goes behind it.  An execution with sinks of both kinds has as RAD the earliest deadline of
-    those that can be in time.  Running executions keep their keys.  Only policies whose keys are
-    times demote.
+    time.  An execution with sinks of both kinds has as RAD the earliest deadline of those that can
+    be in time.  Executions of one vertex keep their order: one that comes first while older ones
+    are demoted has to wait for these.  If it can be in time even so, the oldest inherits its
+    priority, so a backlog is worked off as soon as that helps; if not, it is demoted behind the
+    oldest.  Running executions keep their keys.  Only policies whose keys are times demote.
 8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
     when an execution of it fails (its callback raises): each incomplete sink is missed.
     Executions that have not started are dropped after an abort.  After an expiry or a failure they
@@ -268,8 +269,6 @@ def peek(t: Tables, s: State, now: int) -> int:
                 continue
             if (now > s.job_hope[slot] + s.start_by[s.x_vertex[x]]
                     and demote(t, s, x, now)):
-                heappop(queue)
-                heappush(s.ready, s.x_key[x])
                 if group >= 0 and s.group_owner[group] == -1:
                     _release_group(s, group)  # others of the group may go first
                 queue = next_queue(t, s, False)

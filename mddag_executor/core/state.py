@@ -85,13 +85,13 @@ class State(NamedTuple):
     partial: list[int]
     expected: list[int]
     # by vertex: from when on its executions are checked (see ``overload``); with ``keep: newest``,
-    # the execution that became ready last; the demoted execution whose key is the largest, or -1,
-    # and the order of the demoted one that became ready first; the known mean execution time, and
-    # whether it holds the interpreter
+    # the execution that became ready last; a heap of the demoted executions that wait, by order;
+    # the order of the one that a newer one made urgent last, or -1; the known mean execution time,
+    # and whether it holds the interpreter
     start_by: list[int]
     newest_ready: list[int]
-    last_demoted: list[int]
-    first_demoted: list[int]
+    demoted: list[list[QueueEntry]]
+    urged: list[int]
     mean: list[int]
     holder: list[int]
     # of a sink that tolerates misses: its last ones, from ``Tables.first_miss`` on, as a ring, and
@@ -203,8 +203,8 @@ def fill_state(
     for v in range(t.n_vertices + 1):
         s.start_by.append(t.latest_start[v])
         s.newest_ready.append(-1)
-        s.last_demoted.append(-1)
-        s.first_demoted.append(-1)
+        add_queue(s.demoted)
+        s.urged.append(-1)
         s.mean.append(t.mean_time[v])
         s.holder.append(0)
         s.next_miss.append(0)

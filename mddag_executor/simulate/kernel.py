@@ -54,6 +54,8 @@ def free_run(state: int, deliveries: int, machine: int, busy: int, log: int) -> 
         free(s.group_heap[group])
     for entity in range(len(s.entity_queue)):
         free(s.entity_queue[entity])
+    for vertex in range(len(s.demoted)):
+        free(s.demoted[vertex])
     queues = as_machine(machine).lock_queue
     for process in range(len(queues)):
         free(queues[process])

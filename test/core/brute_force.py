@@ -21,7 +21,9 @@ Its reading of the documents:
   deadline that it leads to any more, if every vertex on the longest way takes its mean time, goes
   from then on as if its job were released ten relative deadlines later. As long as only some
   deadlines are out of reach, ``rad`` and ``llf`` go by those within reach. One that became ready
-  later at the same vertex does not go before it.
+  later at the same vertex does not go before it: it is late, too, if the mean time of each
+  execution that was demoted there leaves it no deadline within reach, and then goes directly
+  behind the oldest. If it is not late, the oldest goes as early as it.
 * ``keep: newest`` at a source or sink: one of an earlier job that waits there and has never run
   vanishes when the next one is ready.
 * ``ros2`` goes by rounds. When a worker is free and the round has nothing left that it could take,
@@ -105,8 +107,9 @@ class BruteForce:
         self.switch_overhead = switch_overhead
         self.running: list[Execution | None] = [None] * workers
         self.waiting: list[Execution] = []
-        self.last_demoted: dict[tuple[int, int], Execution] = {}
-        self.first_demoted: dict[tuple[int, int], int] = {}
+        # by DAG and vertex: the demoted executions by arrival, and the arrival of the urged one
+        self.demoted: dict[tuple[int, int], list[tuple[int, Execution]]] = {}
+        self.urged: dict[tuple[int, int], int] = {}
         self.round: list[Execution] = []
         self.jobs: list[Job] = []
         self.events: list[Event] = []
@@ -163,40 +166,52 @@ class BruteForce:
             execution, {*self.laxity[execution.job.dag.index, execution.vertex.index]})
 
     def _demote(self, execution: Execution) -> bool:
-        """Lower the priority of an execution if it is late; return whether it is another."""
+        """Change a priority if the next execution is late or behind one; return whether it did."""
         job, vertex = execution.job, execution.vertex
         if ((job.dag.on_late or self.on_late) != 'demote'
                 or self.policy not in ('rad', 'gedf', 'llf')):
             return False
         key = job.dag.index, vertex.index
-        last = self.last_demoted.get(key)
-        if last not in self.waiting or last is execution:
-            last = None
-        if last is not None and not execution.has_run and (
-                last.arrival < execution.arrival or not last.has_run
-                and self.first_demoted[key] < execution.arrival and execution.lowered is None):
-            lowest = self.priority(last)
-        else:
-            lowest = self._demoted_priority(execution)
-        if lowest <= self.priority(execution):
+        demoted = self.demoted.setdefault(key, [])
+        while demoted and (demoted[0][1] not in self.waiting
+                           or demoted[0][1].arrival != demoted[0][0]):
+            del demoted[0]
+        if self.urged.get(key) == execution.arrival:
             return False
-        execution.lowered = lowest
-        if last is None or last.has_run or execution.arrival < self.first_demoted[key]:
-            self.first_demoted[key] = execution.arrival
-        if last is None or (lowest, execution.arrival) > (self.priority(last), last.arrival):
-            self.last_demoted[key] = execution
+        older = None
+        if not execution.has_run and demoted and demoted[0][0] < execution.arrival:
+            older = demoted[0][1]
+        lowest = self._demoted_priority(execution, older, len(demoted))
+        if lowest > self.priority(execution):
+            execution.lowered = lowest
+            if not execution.has_run:
+                demoted.append((execution.arrival, execution))
+                demoted.sort(key=lambda each: each[0])
+            return True
+        if older is None or self.priority(older) <= self.priority(execution):
+            return False
+        older.lowered = self.priority(execution)
+        self.urged[key] = older.arrival
         return True
 
-    def _demoted_priority(self, execution: Execution) -> int:
+    def _demoted_priority(
+        self, execution: Execution, older: Execution | None, ahead: int
+    ) -> int:
         """Return the priority by the deadlines within reach, or later if there is none."""
         job, vertex = execution.job, execution.vertex
         unit = 1 if self.policy == 'llf' else self.tick
         done = (self.ticks[job.dag.index][vertex.index] - execution.left) * self.tick
         starts = self.laxity[job.dag.index, vertex.index]
         now = (self.now - job.release) * self.tick
-        within = {sink for sink, start in starts.items()
-                  if now - (done if execution.has_run else 0) <= start}
+        if execution.has_run:
+            now -= done
+        if older is not None:
+            declared = vertex.callback.execution_time
+            now += ahead * (0 if declared is None else declared.mean_ns)
+        within = {sink for sink, start in starts.items() if now <= start}
         lowest = self._priority(execution, within or {*starts})
+        if not within and older is not None:
+            return self.priority(older)
         if not within:
             if job.demoted is None:
                 deadline = max(job.dag.vertices[s].deadline_ns or 0 for s in job.dag.sinks)

@@ -10,9 +10,11 @@ from typing import Any
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from mddag_executor.core.state import SINK_LATE, SINK_MISSED
 from mddag_executor.core.tally import counts
 from mddag_executor.simulate import Settings, simulate
 from msg_graph import ExecutionTime
+import pytest
 
 from .live_helpers import J, live, start_job, US
 from .task_sets import Case, cases, declaration, examples, TICK
@@ -211,6 +213,35 @@ def test_a_backlog_of_a_heavy_callback_leaves_the_others_in_time() -> None:
             workers=7, duration_ns=1_000_000 * TICK))
         publisher = run.result()['dags']['publisher']['sinks']['/n:publisher']
         assert (counts(publisher).in_time >= 0.96 * 500) == (on_late == 'demote')
+
+
+@pytest.mark.parametrize('extra', [3, 6, 10, 20])
+def test_a_burst_is_worked_off(extra: int) -> None:
+    """No more is late than with ``continue``, and nothing once there is room for the backlog."""
+    periods = {'burst': (20, 40), 'other': (10, 10), 'slow': (60, 60)}
+    ticks = (8, 4, 3)
+    case = Case(declaration([
+        single(name, *times, execution_time=f'{each}us')
+        for (name, times), each in zip(periods.items(), ticks)]),
+        tuple((each,) for each in ticks), 1, 'rad', False)
+    load = case.load(2000)
+    releases = sorted([*zip(load.times, load.dags),
+                       *((500 * TICK + 7 * each, 0) for each in range(extra))])
+    times: dict[int, list[int]] = {0: [], 1: [], 2: []}
+    jobs = []
+    for time, dag in releases:
+        jobs.append(len(times[dag]))
+        times[dag].append(time)
+    load = load._replace(
+        times=[time for time, _ in releases], dags=[dag for _, dag in releases], jobs=jobs)
+    missed = {}
+    for on_late in ('continue', 'demote'):
+        run = simulate(case.task_set, load, Settings(
+            workers=1, duration_ns=2000 * TICK, on_late=on_late))
+        missed[on_late] = [times[dag][job] for kind, dag, _, job, _, _ in run.decisions
+                           if kind in (SINK_LATE, SINK_MISSED)]
+    assert 0 < len(missed['demote']) <= len(missed['continue'])
+    assert max(missed['demote']) < (500 + extra * 8 / (1 - demand(case))) * TICK
 
 
 def test_only_the_newest_is_kept() -> None:
