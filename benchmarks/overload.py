@@ -12,7 +12,7 @@ share if the other DAGs are never released, which no scheduling of the others ca
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 import random
 from typing import Any, BinaryIO, NamedTuple
@@ -20,8 +20,8 @@ from typing import Any, BinaryIO, NamedTuple
 from benchmarks import arguments
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, table
-from mddag_executor.core import Tables, Tally
-from mddag_executor.core.tally import Counts, counts
+from mddag_executor.core import Tables
+from mddag_executor.core.state import SINK_DROPPED, SINK_IN_TIME
 from mddag_executor.laboratory.generate import generate
 from mddag_executor.laboratory.generate_options import Options
 from mddag_executor.simulate import (
@@ -34,6 +34,7 @@ from mddag_executor.simulate import (
 from mddag_executor.simulate.schedule import prepare, schedule
 from mddag_executor.simulate.workload import with_execution_times
 from msg_graph import loads, TaskSet
+import numpy as np
 
 HELP = 'measure the share of results in time in an overload'
 DESCRIPTION = 'Measure the share of results in time around and above the capacity, simulated.'
@@ -122,9 +123,11 @@ class _Case:
 
     def add_to(self, shares: dict[str, list[float]]) -> None:
         """Add the share of results in time of each way."""
+        every = range(len(self._task_set.dags))
         for on_late in ('continue', 'demote', 'abort'):
-            shares[on_late].append(self._share('rad', on_late, self._task_set, self._load))
-        shares['fifo'].append(self._share('fifo', 'continue', self._task_set, self._load))
+            shares[on_late].append(
+                self._share('rad', on_late, self._task_set, self._load, every))
+        shares['fifo'].append(self._share('fifo', 'continue', self._task_set, self._load, every))
         marked = replace(self._task_set, dags=tuple(
             replace(dag, vertices=tuple(
                 replace(vertex, callback=replace(vertex.callback, importance='high'))
@@ -141,19 +144,18 @@ class _Case:
 
     def _share(
         self, policy: str, on_late: str, task_set: TaskSet, load: Load,
-        dags: set[int] | None = None,
+        dags: Collection[int],
     ) -> float:
+        """Return the share of the results of some DAGs that are in time."""
         settings = Settings(
             policy=policy, workers=self._args.workers, duration_ns=self._args.duration,
             preemptive=self._mode.preemptive and policy != 'fifo', on_late=on_late)
         tables = Tables.build(task_set, on_late=on_late)
-        tally = Tally(task_set, tables)
         compiled = prepare(tables, load, settings, 24 * len(WAYS) * (self._args.sets or 1))
-        tally.add(schedule(tables, load, settings, compiled=compiled).decisions)
-        every = Counts.total(
-            counts(vars(sink)) for v, sink in tally.sinks.items()
-            if dags is None or tables.dag_of[v] in dags)
-        return every.in_time / max(1, every.due)
+        decisions = np.array(schedule(tables, load, settings, compiled=compiled).decisions)
+        kinds, of = decisions.reshape(-1, 6)[:, :2].T
+        kinds = kinds[np.isin(of, [*dags]) & (kinds <= SINK_DROPPED)]  # the verdicts
+        return np.count_nonzero(kinds == SINK_IN_TIME) / max(1, len(kinds))
 
 
 def draw(rows: list[dict[str, Any]], file: BinaryIO) -> None:
