@@ -13,7 +13,6 @@ from mddag_executor.core.state import (
     ABORTED,
     ELSEWHERE,
     EXPIRED,
-    FAILED,
     FREE,
     HERE,
     IDLE,
@@ -26,8 +25,6 @@ from mddag_executor.core.state import (
     OUTDATED,
     SINK_ABORTED,
     SINK_DROPPED,
-    SINK_EXPIRED,
-    SINK_FAILED,
     SINK_IN_TIME,
     SINK_MISSED,
     SINK_OVERDUE,
@@ -47,7 +44,7 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     """
     expire_idle(t, s, dag, now)
     if s.n_open[dag] >= t.max_active_jobs[dag]:
-        expire_job(t, s, s.oldest[dag], now)
+        give_up(t, s, s.oldest[dag], EXPIRED, now)
     slot = s.free_slot[dag]
     if slot < 0:
         return -1
@@ -63,7 +60,6 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     if demotes(t, s, dag):
         s.job_hope[slot] = release
         s.job_demoted[slot] = -1
-        s.job_refused[slot] = -1
     s.job_active[slot] = 0
     _link_newest(s, dag, slot)
     base = s.job_base[slot]
@@ -188,32 +184,23 @@ def expire_idle(t: Tables, s: State, dag: int, now: int) -> None:
     while slot >= 0:  # all of them: releases from messages may be out of order
         after = s.job_next[slot]
         if s.job_active[slot] == 0 and now - s.job_release[slot] > patience:
-            expire_job(t, s, slot, now)
+            give_up(t, s, slot, EXPIRED, now)
         slot = after
 
 
-def expire_job(t: Tables, s: State, slot: int, now: int) -> None:
-    """Expire an open job: each sink that has not completed is missed and expired."""
-    _give_up_sinks(t, s, slot, SINK_EXPIRED)
-    close_job(s, slot, EXPIRED, now)
+def give_up(t: Tables, s: State, slot: int, end: int, now: int) -> None:
+    """
+    End an open job early: each sink that has not completed is missed.
 
-
-def abort_job(t: Tables, s: State, slot: int, now: int) -> None:
-    """Abort an open job (rule 7): each sink that has not completed is missed and aborted."""
-    _give_up_sinks(t, s, slot, SINK_ABORTED)
-    close_job(s, slot, ABORTED, now)
-
-
-def fail_job(t: Tables, s: State, slot: int, now: int) -> None:
-    """Fail an open job (rule 8): each sink that has not completed is missed and failed."""
-    _give_up_sinks(t, s, slot, SINK_FAILED)
-    close_job(s, slot, FAILED, now)
-
-
-def outdate_job(t: Tables, s: State, slot: int, now: int) -> None:
-    """Drop a job whose source has not started when the next one's is ready (rule 13)."""
-    _give_up_sinks(t, s, slot, SINK_DROPPED)
-    close_job(s, slot, OUTDATED, now)
+    :param end: ABORTED (rule 7), EXPIRED (rules 1 and 8), FAILED (rule 8), or OUTDATED (rule 13).
+    """
+    dag = s.job_dag[slot]
+    for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
+        vertex = t.sinks[i]
+        if s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0:
+            deadline = s.job_release[slot] + t.sink_deadline[vertex]
+            judge(s, slot, SINK_ABORTED + end - ABORTED, vertex, deadline, -1)
+    close_job(s, slot, end, now)
 
 
 def outdate_sink(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
@@ -227,26 +214,6 @@ def outdate_sink(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
     s.job_sinks_left[slot] -= 1
     if s.job_sinks_left[slot] == 0:
         close_job(s, slot, OUTDATED, now)
-
-
-def _give_up_sinks(t: Tables, s: State, slot: int, kind: int) -> None:
-    dag = s.job_dag[slot]
-    for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
-        vertex = t.sinks[i]
-        if s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0:
-            deadline = s.job_release[slot] + t.sink_deadline[vertex]
-            judge(s, slot, kind, vertex, deadline, -1)
-
-
-def overdue(t: Tables, s: State, slot: int, now: int) -> bool:
-    """Return whether a sink that has not completed is past its absolute deadline."""
-    dag = s.job_dag[slot]
-    for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
-        vertex = t.sinks[i]
-        if (now > s.job_release[slot] + t.sink_deadline[vertex]
-                and s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0):
-            return True
-    return False
 
 
 def next_deadline(t: Tables, s: State, slot: int, after: int) -> int:

@@ -107,7 +107,6 @@ def _late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
     """
     slot = s.x_slot[x]
     vertex = s.x_vertex[x]
-    dag = s.job_dag[slot]
     begin = now
     if first >= 0:
         begin += len(s.demoted[vertex]) * s.mean[vertex]
@@ -119,13 +118,13 @@ def _late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
         s.refused_late[process] = 0
         admit(t, s)
         refused = is_refused(t, s, vertex)
-    patience = LATE_PATIENCE
+    patience = REFUSED_PATIENCE if refused else LATE_PATIENCE
     deadline = NEVER
     start = NEVER
     for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
         sink = t.reach_sink[i]
         if refused or begin > s.job_hope[slot] + s.reach_by[i]:
-            if _is_used_up(t, s, sink, s.job_index[slot]):
+            if not refused and _is_used_up(t, s, sink, s.job_index[slot]):
                 patience = USED_UP_PATIENCE
             note_miss(t, s, slot, sink, now)
             _announce_demoted(t, s, slot, sink, now)
@@ -136,15 +135,10 @@ def _late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
         return _priority(t, s, x, s.job_release[slot], deadline, start)
     if first >= 0:
         return s.x_key[first][0]
-    if refused:
-        if s.job_refused[slot] < 0:
-            s.job_refused[slot] = now + REFUSED_PATIENCE * t.dag_deadline[dag]
-        release = s.job_refused[slot]
-    else:
-        if s.job_demoted[slot] < 0:
-            s.job_demoted[slot] = now + patience * t.dag_deadline[dag]
-        release = s.job_demoted[slot]
-    return _priority(t, s, x, release, t.rad_offset[vertex], t.latest_start[vertex])
+    if s.job_demoted[slot] < 0:
+        s.job_demoted[slot] = now + patience * t.dag_deadline[s.job_dag[slot]]
+    return _priority(
+        t, s, x, s.job_demoted[slot], t.rad_offset[vertex], t.latest_start[vertex])
 
 
 def set_start(t: Tables, s: State, vertex: int) -> None:

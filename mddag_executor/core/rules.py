@@ -95,14 +95,12 @@ from __future__ import annotations
 from heapq import heappop, heappush
 
 from mddag_executor.core.jobs import (
-    abort_job,
     close_job,
     deactivate,
-    fail_job,
+    give_up,
     judge,
-    outdate_job,
+    next_deadline,
     outdate_sink,
-    overdue,
 )
 from mddag_executor.core.overload import demote, note_miss
 from mddag_executor.core.policies import Key, KeyFunction
@@ -123,6 +121,7 @@ from mddag_executor.core.state import (
     DONE,
     DROP,
     DROPPED,
+    FAILED,
     LATE,
     LEADS_OUT,
     N_HOLDING,
@@ -130,6 +129,7 @@ from mddag_executor.core.state import (
     N_STALE,
     OPEN,
     ORDER,
+    OUTDATED,
     POLLING,
     PREEMPTIVE,
     PROPAGATE,
@@ -141,7 +141,7 @@ from mddag_executor.core.state import (
     SWITCH_OVERHEAD,
     WAITING,
 )
-from mddag_executor.core.tables import ABORT, Tables
+from mddag_executor.core.tables import ABORT, NEVER, Tables
 
 
 def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
@@ -171,7 +171,7 @@ def _keep_newest(t: Tables, s: State, x: int, now: int) -> None:
         return  # another message of a sync of the same job
     if s.job_state[slot] == OPEN:
         if t.n_predecessors[vertex] == 0:
-            outdate_job(t, s, slot, now)
+            give_up(t, s, slot, OUTDATED, now)
         else:
             outdate_sink(t, s, slot, vertex, now)
     drop(s, older, now)
@@ -284,9 +284,10 @@ def peek(t: Tables, s: State, now: int) -> int:
             if s.x_vertex[x] == t.n_vertices:
                 return x
             if s.job_state[slot] == OPEN:
-                if t.on_late[s.job_dag[slot]] != ABORT or not overdue(t, s, slot, now):
+                if (t.on_late[s.job_dag[slot]] != ABORT
+                        or next_deadline(t, s, slot, -NEVER) >= now):
                     return x
-                abort_job(t, s, slot, now)
+                give_up(t, s, slot, ABORTED, now)
             if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
                 return x
             drop(s, x, now)
@@ -474,7 +475,7 @@ def fail(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     """End a running execution that failed, and with it its job (rule 8); see ``complete``."""
     slot = s.x_slot[x]
     if s.job_state[slot] == OPEN and s.job_dag[slot] < t.n_dags:
-        fail_job(t, s, slot, now)
+        give_up(t, s, slot, FAILED, now)
     return complete(t, s, key, x, now)
 
 
@@ -503,7 +504,7 @@ def _complete_vertex(
         if s.job_sinks_left[slot] == 0:
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
         elif late and t.on_late[dag] == ABORT:
-            abort_job(t, s, slot, now)
+            give_up(t, s, slot, ABORTED, now)
     elif s.expected[vertex] == LEADS_OUT:
         s.job_sinks_left[slot] -= 1
         if s.job_sinks_left[slot] == 0:

@@ -47,7 +47,7 @@ class Scheduler:
         did not complete its vertex.
     :ivar fail: ``fail(x, now)`` ends a failed execution; see ``complete``.
 
-    Functions without own logic here (``drop``, ``lend``, ``expire``, …) are bound unchanged: see
+    Functions without own logic here (``drop``, ``lend``, ``resume``, …) are bound unchanged: see
     ``core.rules`` and ``core.jobs``.
     """
 
@@ -85,8 +85,6 @@ class Scheduler:
             partial(function, self.state) for function in (
                 rules.lend, rules.stop_holding, rules.suspend, rules.refuse, rules.leave_group,
                 rules.resume))
-        self.expire: Callable[[int, int], None] = partial(jobs.expire_job, *rule)
-        self.abort: Callable[[int, int], None] = partial(jobs.abort_job, *rule)
         self.finish: Callable[[int], None] = partial(jobs.finish, *rule)
 
     def release(self, dag: int, job: int, release: int, now: int) -> int:
@@ -116,15 +114,10 @@ class Scheduler:
         heapify(self.state.ready)
         rules.start_on(self.state, x, worker, now)
 
-    def fail_open(self, slot: int, now: int) -> None:
-        """Fail the job in a slot unless it has ended already."""
+    def give_up(self, slot: int, end: int, now: int) -> None:
+        """End the job in a slot early unless it has ended already; see ``core.jobs.give_up``."""
         if self.state.job_state[slot] == OPEN:
-            jobs.fail_job(self.tables, self.state, slot, now)
-
-    def expire_open(self, slot: int, now: int) -> None:
-        """Expire the job in a slot unless it has ended already."""
-        if self.state.job_state[slot] == OPEN:
-            self.expire(slot, now)
+            jobs.give_up(self.tables, self.state, slot, end, now)
 
     def withdraw(self, slot: int) -> None:
         """Close the open job in a slot without any decision: its end is not known."""

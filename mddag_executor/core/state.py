@@ -110,9 +110,8 @@ class State(NamedTuple):
     job_late: list[int]
     # base of its latest starts: its release; NEVER: it continues when it is late
     job_hope: list[int]
-    # the release that counts for its order since it was late, and since it was refused, or -1
+    # the release that counts for its order since it was late or refused, or -1
     job_demoted: list[int]
-    job_refused: list[int]
     job_active: list[int]
     job_next: list[int]
     job_previous: list[int]
@@ -248,7 +247,6 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
     s.job_late.append(0)
     s.job_hope.append(NEVER)
     s.job_demoted.append(-1)
-    s.job_refused.append(-1)
     s.job_active.append(0)
     s.job_next.append(-1)
     s.job_previous.append(-1)

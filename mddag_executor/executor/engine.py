@@ -37,6 +37,7 @@ from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE, TURN_NS
 from mddag_executor.core.state import (
+    EXPIRED,
     IDLE,
     JUDGE_FROM,
     N_IDLE,
@@ -247,7 +248,7 @@ class Engine:
     def _skip_job(self, entity: Entity, release: int, now: int) -> None:
         """Account for a release whose source does not run: the job expires at once."""
         slot = self._release(self.tables.dag_of[entity.source], release, now)
-        self.scheduler.expire(slot, now)
+        self.scheduler.give_up(slot, EXPIRED, now)
         self._decided(now)
 
     def _release(self, dag: int, release: int, now: int) -> int:
@@ -579,7 +580,7 @@ class Engine:
         x, work.x = work.x, -1
         self._let_go(work)
         if work.origin is not None:
-            self.scheduler.expire_open(work.origin.slot, now)
+            self.scheduler.give_up(work.origin.slot, EXPIRED, now)
         self.scheduler.complete(x, now)
         self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'destroyed', now)
         self._decided(now)

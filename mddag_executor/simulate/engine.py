@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 from mddag_executor.core import jobs, overload, rules
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import add_slot, divide, fill_state, JUDGE_FROM, State
+from mddag_executor.core.state import add_slot, divide, EXPIRED, fill_state, JUDGE_FROM, State
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.simulate.deliveries import (
     arrive_due,
@@ -190,7 +190,7 @@ def release_load(
     source = t.region_offset[t.source[dag]]
     if len(load.fates) > 0:
         if load.fates[cost + source] == SKIPPED:
-            jobs.expire_job(t, s, slot, now)
+            jobs.give_up(t, s, slot, EXPIRED, now)
             return
     for place in range(t.n_region[dag]):
         s.x_cost[base + place] = load.costs[cost + place]

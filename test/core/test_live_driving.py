@@ -271,9 +271,10 @@ class LiveDriver(RuleBasedStateMachine):
     @rule(data=st.data(), abort=st.booleans())
     def end_job(self, data: st.DataObject, abort: bool) -> None:
         job = data.draw(st.sampled_from(self.open_jobs()))
-        (self.scheduler.abort if abort else self.scheduler.expire)(job.slot, self.now)
+        end = ABORTED if abort else EXPIRED
+        self.scheduler.give_up(job.slot, end, self.now)
         self.settle()
-        assert job.end == (ABORTED if abort else EXPIRED)
+        assert job.end == end
 
     # --- decisions -------------------------------------------------------------------------------
 
@@ -415,7 +416,7 @@ class LiveDriver(RuleBasedStateMachine):
         assert self.alive() == []
         assert {run.fate for run in self.runs} <= {DONE, DROPPED}
         for job in self.open_jobs():
-            self.scheduler.expire(job.slot, self.now)
+            self.scheduler.give_up(job.slot, EXPIRED, self.now)
         self.settle()
         assert self.open_jobs() == []
         assert all(state == FREE or dag == self.tables.n_dags

@@ -15,6 +15,7 @@ from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.queues import SWEEP_AT
 from mddag_executor.core.state import (
     DROP,
+    EXPIRED,
     FAILED,
     FREE,
     JOB_END,
@@ -172,7 +173,7 @@ def test_each_overdue_sink_is_found_once_and_in_time(steps, gaps) -> None:
             if state.job_state[slot] != OPEN or state.job_index[slot] != index:
                 continue
             if what == 'expire':
-                scheduler.expire(slot, now)
+                scheduler.give_up(slot, EXPIRED, now)
                 open_sinks = {key: d for key, d in open_sinks.items() if key[:2] != (dag, index)}
             elif (dag, index, vertex) in open_sinks:
                 run_one(scheduler, scheduler.execution(slot, vertex), now)

@@ -23,6 +23,7 @@ from mddag_executor.core.state import (
     ABORTED,
     DROP,
     EXPIRED,
+    FAILED,
     IDLE,
     JOB_END,
     OPEN,
@@ -282,7 +283,7 @@ class VirtualRun:
             self.tally.released(dag)
             self.record('job_release', now, 2, dag, job, release)
             if self.random.random() < self.chances.skipped:
-                self.scheduler.expire(slot, now)
+                self.scheduler.give_up(slot, EXPIRED, now)
                 self.decided(now)
                 return
             self._ready(slot, dag, job, self.tables.source[dag], 0, now)
@@ -368,7 +369,7 @@ class VirtualRun:
             self._at(now + self.random.randrange(MS), lambda later: self._resume(work))
             return
         if declared and self.random.random() < self.chances.failed:
-            self.scheduler.fail_open(work.slot, end)
+            self.scheduler.give_up(work.slot, FAILED, end)
             self.record('fail', now, vtid, work.dag, vertex, work.job)
         whole = self.scheduler.complete(work.x, end)
         if declared:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core import state as core
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.rules import record
 from mddag_executor.core.state import Decision, IDLE, JOB_END, OPEN, SKIP
@@ -12,6 +13,7 @@ from mddag_executor.core.tables import CONTINUE
 from mddag_executor.recording.tables import ABORTED, ALL_LEGS, EXPIRED, FAILED, Recording
 from mddag_executor.replay.miss_tally import MissTally
 
+ENDS = {EXPIRED: core.EXPIRED, ABORTED: core.ABORTED, FAILED: core.FAILED}
 _KINDS = ('released', 'completed', 'ended', 'judge_from', 'hosted', 'finished')
 
 
@@ -70,12 +72,8 @@ class Oracle:
         slot = self.slots.get((dag, job))
         if slot is None:
             return
-        if reason == EXPIRED:
-            self.scheduler.expire(slot, time)
-        elif reason == ABORTED:
-            self.scheduler.abort(slot, time)
-        elif reason == FAILED:
-            self.scheduler.fail_open(slot, time)
+        if reason in ENDS:
+            self.scheduler.give_up(slot, ENDS[reason], time)
         else:
             self.scheduler.withdraw(slot)
             del self.slots[dag, job]
