@@ -19,7 +19,8 @@ Theory of operation
   store their message, load the workers like undeclared callbacks: each piece is a job of the
   undeclared DAG, ready when it was in the recording.  Their callback groups are ignored.
 * If CPU times are recorded, execution times are isolated execution times (``isolation``), and the
-  load has the CPU time and whether the GIL was held (as recorded or declared).
+  load has the CPU time and whether the GIL was held (as recorded or declared).  With one worker,
+  an execution that holds the GIL takes its CPU time: no other thread competes for the GIL.
 * *Transport* is the time from the end of the publishing execution until the successor is ready;
   negative if it published early.
 * *Dispatch* is the time from when an execution could have started until it started (see
