@@ -16,6 +16,9 @@ import pytest
 
 from ..replay.recorded import four_jobs, MS
 from ..replay.test_ordinary_bags import write_bag
+from .helpers import caller
+
+call = caller()
 
 GRAPH = """\
 mddag: 1
@@ -42,12 +45,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     write_bag(found['bag'])
     found['imported.mcap'] = four_jobs(folder / 'imported.mcap')
     return {name: str(path) for name, path in found.items()}
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    status = program.main([*arguments])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 def sink(result: Any) -> Any:
