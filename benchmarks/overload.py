@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Collection, Iterator
-from dataclasses import replace
 import random
 from typing import Any, BinaryIO, NamedTuple
 
@@ -22,6 +21,7 @@ from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, table
 from mddag_executor.core import Tables
 from mddag_executor.core.state import SINK_DROPPED, SINK_IN_TIME
+from mddag_executor.core.tables import IMPORTANT, ON_LATE
 from mddag_executor.laboratory.generate import generate
 from mddag_executor.laboratory.generate_options import Options
 from mddag_executor.simulate import (
@@ -113,44 +113,39 @@ class _Case:
         times = scale_execution_times(
             task_set, draw_execution_times(task_set, seed),
             1 if mode.interpreter else args.workers, load)
-        dags = task_set.dags
-        self._important = {*random.Random(seed).sample(range(len(dags)), -(-len(dags) // 3))}
-        self._task_set = with_execution_times(task_set, times)
-        load_ = periodic_load(self._task_set, times, args.duration)
+        n_dags = len(task_set.dags)
+        self._important = {*random.Random(seed).sample(range(n_dags), -(-n_dags // 3))}
+        self._tables = Tables.build(with_execution_times(task_set, times))
+        load_ = periodic_load(task_set, times, args.duration)
         if mode.interpreter:
             load_ = load_._replace(holds=[1] * len(load_.costs))
         self._load = load_
 
     def add_to(self, shares: dict[str, list[float]]) -> None:
         """Add the share of results in time of each way."""
-        every = range(len(self._task_set.dags))
+        tables, load = self._tables, self._load
+        every = range(tables.n_dags)
         for on_late in ('continue', 'demote', 'abort'):
-            shares[on_late].append(
-                self._share('rad', on_late, self._task_set, self._load, every))
-        shares['fifo'].append(self._share('fifo', 'continue', self._task_set, self._load, every))
-        marked = replace(self._task_set, dags=tuple(
-            replace(dag, vertices=tuple(
-                replace(vertex, callback=replace(vertex.callback, importance='high'))
-                if index in dag.sinks else vertex for index, vertex in enumerate(dag.vertices)))
-            if dag.index in self._important else dag for dag in self._task_set.dags))
+            shares[on_late].append(self._share('rad', on_late, tables, load, every))
+        shares['fifo'].append(self._share('fifo', 'continue', tables, load, every))
+        marked = tables._replace(importance=[
+            IMPORTANT if dag in self._important else importance
+            for dag, importance in zip(tables.dag_of, tables.importance)])
         shares['important'].append(
-            self._share('rad', 'demote', marked, self._load, self._important))
-        mine = [i for i, dag in enumerate(self._load.dags) if dag in self._important]
-        alone = self._load._replace(**{
-            name: [getattr(self._load, name)[i] for i in mine]
-            for name in ('times', 'dags', 'jobs')})
-        shares['alone'].append(
-            self._share('rad', 'demote', self._task_set, alone, self._important))
+            self._share('rad', 'demote', marked, load, self._important))
+        mine = [i for i, dag in enumerate(load.dags) if dag in self._important]
+        alone = load._replace(**{
+            name: [getattr(load, name)[i] for i in mine] for name in ('times', 'dags', 'jobs')})
+        shares['alone'].append(self._share('rad', 'demote', tables, alone, self._important))
 
     def _share(
-        self, policy: str, on_late: str, task_set: TaskSet, load: Load,
-        dags: Collection[int],
+        self, policy: str, on_late: str, tables: Tables, load: Load, dags: Collection[int]
     ) -> float:
         """Return the share of the results of some DAGs that are in time."""
         settings = Settings(
             policy=policy, workers=self._args.workers, duration_ns=self._args.duration,
-            preemptive=self._mode.preemptive and policy != 'fifo', on_late=on_late)
-        tables = Tables.build(task_set, on_late=on_late)
+            preemptive=self._mode.preemptive and policy != 'fifo')
+        tables = tables._replace(on_late=[ON_LATE[on_late]] * len(tables.on_late))
         compiled = prepare(tables, load, settings, 24 * len(WAYS) * (self._args.sets or 1))
         decisions = np.array(schedule(tables, load, settings, compiled=compiled).decisions)
         kinds, of = decisions.reshape(-1, 6)[:, :2].T
