@@ -58,7 +58,7 @@ def demote(t: Tables, s: State, x: int, now: int) -> bool:
         if len(demoted) == 0:
             set_start(t, s, vertex)
     if s.urged[vertex] == key[3]:
-        return False  # a newer one goes by this key
+        return False  # it has the key of a newer one
     fresh = s.x_started[x] < 0
     first = -1
     if fresh and demoted and demoted[0][0] < key[3]:
