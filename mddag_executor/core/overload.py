@@ -9,10 +9,7 @@ execution of the vertex must be checked, because an older one is demoted or the 
 So work that is in time costs one comparison.  Like ``rules`` this module contains only integer
 arithmetic, list indexing and ``heapq``.
 
-Sources: robust EDF (Buttazzo and Stankovic, "RED", 1993), the mode switch of EDF-VD (Baruah et
-al., ECRTS 2012), weakly hard (m,k) systems (Bernat et al., 2001), the postponed deadlines of the
-constant bandwidth server (Abeni and Buttazzo, RTSS 1998), which keep late callbacks from starving,
-and priority inheritance (Sha et al., 1990) for late messages before newer ones.
+docs/run.md names the sources.
 """
 
 from __future__ import annotations

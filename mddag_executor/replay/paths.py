@@ -245,7 +245,7 @@ class Paths:
             parent = np.full(len(ran.runs), NONE)
             if hop is not None and before is not None:
                 if hop.kind == 'trigger':
-                    for message in self._messages_for(path.callbacks[position - 1], key, ran):
+                    for message in self._messages_for(path.callbacks[position - 1], ran):
                         found = _as_of_each(messages, message, ran.start)
                         parent = np.where(found != NONE, found, parent)
                 else:
@@ -267,7 +267,7 @@ class Paths:
                 before = before[0], sent
         return steps.table()
 
-    def _messages_for(self, before: str, key: str, ran: Executions) -> list[Ints]:
+    def _messages_for(self, before: str, ran: Executions) -> list[Ints]:
         """Return the messages that may have started executions; later entries have priority."""
         table = self._table
         if self._recording.links:
