@@ -12,8 +12,8 @@ along its critical chain (see ``chains``):
 * before the source is ready: *waited* while all workers were busy, so that none could notice the
   timer or message; else *released late*;
 * ready callback: *group* while another callback of its group ran; else *waited* while all workers
-  were busy; else, with an idle worker, *interpreter* while any callback ran, *machine* while none
-  ran;
+  were busy; else, with an idle worker, *interpreter* while any callback ran that may have held the
+  GIL (undeclared callbacks: unknown), *machine* while none ran;
 * what a job *waited*, or waited for the *interpreter*, after it was demoted is *overload*;
 * running callback: *ran* up to the usual time (its median or, if less, the declared maximum) and
   *ran long* beyond.  If its CPU time is recorded, shows computing and is not unusual, the excess

@@ -107,7 +107,9 @@ class Explanation:
         table, rows = self._recording.executions, self._rows
         on_workers = rows[table['worker'][rows] >= 0]
         start, end = table['start'][on_workers], table['end'][on_workers]
-        holding = rows[table['holds_gil'][rows] & (table['completes'][rows] > 0)]
+        # undeclared callbacks may hold the GIL, too: a trace does not say
+        holding = rows[(table['holds_gil'][rows] & (table['completes'][rows] > 0))
+                       | (table['vertex'][rows] < 0)]
         since, until = table['began'][holding], table['end'][holding]
         first = int(min(table['start'][rows].min(initial=_NO_END),
                         missed['release'].min(initial=_NO_END)))

@@ -332,6 +332,29 @@ def test_a_callback_that_has_lent_its_worker_keeps_none_busy(
         assert job['parts'][0]['behind'] == behind
 
 
+def test_an_undeclared_callback_may_hold_the_interpreter(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # one of two workers runs it: the other worker's callback cannot begin before it ends
+    path = tmp_path / 'run.mcap'
+    with begin_trace(path, LENT.replace('50ms', '15ms'), workers=2) as file:
+        for job in range(5):
+            release = START_TIME + job * 1_000 * MS
+            start = release + 50 * MS
+            file.add('dispatch', release, 1, 10, 5, -1, -1, -1, 0, release, 0)
+            file.add('callback_start', release, 1, 10, 5, False)
+            file.add('callback_end', start, 1, 10, 5)
+            file.add('job_release', release, 1, 1, 1, job, release)
+            add_execution(file, start, start + MS, 1, 0, job, 1, ready=release, thread=11,
+                          address=8, computed=(MS, True))
+        end_trace(file, START_TIME + 5_000 * MS)
+    result = explain(capsys, str(path))
+    assert result['causes']['interpreter'] == result['missed'] == 5
+    for job in result['jobs']:
+        (behind,) = job['parts'][0]['behind']
+        assert behind['ns'] == 50 * MS
+
+
 def test_only_misses_in_stops_are_said_to_be_in_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
