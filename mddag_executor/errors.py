@@ -51,7 +51,6 @@ class UserCodeError(MddagError):
 
     The command line shows the traceback of the cause and exits with status 70: the line alone,
     and the status of bad input, would take the node's `FileNotFoundError` for one of this program.
-    Without a text the traceback says it all.
     """
 
 

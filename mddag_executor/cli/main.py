@@ -176,7 +176,7 @@ def main(
             traceback.print_exception(raised)
         if line is None:
             return EXIT_DEFECT
-        for each in filter(None, _user_lines(error, line)):
+        for each in _user_lines(error, line):
             print(f'{label("error", sys.stderr)}: {each}', file=sys.stderr)
         return EXIT_BAD_INPUT if raised is error else EXIT_DEFECT
 

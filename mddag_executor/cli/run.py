@@ -41,7 +41,7 @@ from msg_graph import loads, NO_GRAPH
 
 if TYPE_CHECKING:
     from mddag_executor.executor.executor import MultiDeadlineExecutor
-    from mddag_executor.hosting.host import Host
+    from mddag_executor.hosting.host import Guest, Host
     from mddag_executor.hosting.loading import Program
     from mddag_executor.hosting.measure import ExecutionPlan, Ledger
     from mddag_executor.hosting.processes import Supervisor
@@ -206,8 +206,6 @@ def _end(error: BaseException | None, status: int = 0) -> int:
 
     The process ends here if a node's thread would keep the interpreter from ending.
     """
-    if isinstance(error, Exception):
-        raise UserCodeError from error
     if error is not None:
         raise error
     left = [t.name for t in threading.enumerate()
@@ -328,7 +326,22 @@ def _run(
         warn('a callback has not ended in time; it is left behind')
     if args.part is not None:
         result.update(observed=asdict(watch.observed(counts)), ledger=ledger and vars(ledger))
-    return result, session.error
+    return result, _with_place(session.error, result, [] if host is None else host.guests)
+
+
+def _with_place(
+    error: BaseException | None, result: dict[str, Any], guests: Sequence[Guest],
+) -> BaseException | None:
+    """Return what a node raised, with the callbacks or the program that raised it."""
+    if not isinstance(error, Exception):
+        return error
+    from mddag_executor.hosting.loading import describe
+    places = [name for name, each in result['callbacks'].items() if each['failed']] or [
+        f'--node {guest.program.spec}' for guest in guests if guest.error is error]
+    failed = UserCodeError(f'{listed(places) or "mddag run"}: it raised {describe(error)}: '
+                           'correct it, or see its traceback')
+    failed.__cause__ = error
+    return failed
 
 
 def _run_synthetic(

@@ -330,7 +330,8 @@ def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(
     assert 'Traceback (most recent call last):' in lines
     assert any('bad' in line and "open('/calibration/lidar.yaml')" in after
                for line, after in zip(lines, lines[1:]))
-    assert 'FileNotFoundError' in lines[-1]
+    place = '/n:tick: it raised' if spec == 'bad:Calibrated' else f'--node {spec}:'
+    assert lines[-1].startswith(f'error: {place} ') and 'FileNotFoundError' in lines[-1]
 
 
 PROGRAM = """
