@@ -70,7 +70,7 @@ _ENTRY = struct.Struct('<QQQqqQQqiiI')
 
 
 def own_node(name: str, context: Context) -> Node:
-    """Make a node of the executor itself, without the services and topics of other nodes."""
+    """Make a hidden node of the executor itself, without the services and topics of others."""
     # Its own arguments precede those of the process, which name the process' nodes.
     return Node(
         name, context=context, enable_rosout=False, start_parameter_services=False,
@@ -104,7 +104,7 @@ class Announcements:
         digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
         names = [each.name for each in task_set.processes]
         own = names.index(process)
-        self.node = own_node(f'mddag_jobs_{os.getpid()}_{own}', context)
+        self.node = own_node(f'_mddag_jobs_{os.getpid()}_{own}', context)
         self._n_others = len(names) - 1
         self._publisher: Publisher | None = self.node.create_publisher(
             UInt8MultiArray, f'/mddag/jobs_{digest}/p{own}', _QOS)

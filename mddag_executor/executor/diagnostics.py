@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 TOPIC = '/diagnostics'
 WORKERS = 'workers'
-NODE_NAME = 'mddag_diagnostics'
+NODE_NAME = '_mddag_diagnostics'
 OK, WARN, ERROR, STALE = range(4)
 
 

@@ -8,12 +8,16 @@ from collections.abc import Callable, Iterator
 import re
 import threading
 
+from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.hosting.graph_probe import draft_of, probe, Seen
 from msg_graph import loads
 from msg_graph.draft import declaration_of, MARK
 import pytest
+from rclpy.context import Context
 from rclpy.node import Node
 from std_msgs.msg import Empty, String
+
+from ..executor.conftest import Spinning, wait_for
 
 MS = 1_000_000
 
@@ -48,10 +52,16 @@ def system(make_node: Callable[..., Node]) -> Iterator[None]:
         thread.join()
 
 
-def test_a_real_system(system: None) -> None:
+def test_a_real_system(
+        system: None, make_node: Callable[..., Node], ros_context: Context) -> None:
     ticks: list[float] = []
-    found = probe(2.5, ticks.append)
+    watcher = make_node('watcher')
+    with Spinning(MultiDeadlineExecutor(diagnostics_period='100ms', context=ros_context)):
+        assert wait_for(lambda: [
+            name for name in watcher.get_node_names() if 'mddag_diagnostics' in name])
+        found = probe(2.5, ticks.append)
     assert set(found.nodes) >= {'/camera', '/deep/worker'}
+    assert not [name for name in found.nodes if 'mddag' in name]
     assert not [warning for warning in found.warnings if 'rate' in warning]
     assert found.nodes['/camera'].publishes == {'/image': 'std_msgs/msg/String'}
     interval = found.seen['/image'].interval_ns()
