@@ -164,7 +164,7 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
                  default=0)
     if observed.duration_ns < 2 * slowest + latest:
         return None
-    text = f'{callback.key} never ran in {format_duration(observed.duration_ns)}'
+    text = f'{callback.key} never ran in {observed.duration_ns / 1e9:.3f} s'
     question = meant(callback, observed.undeclared)
     return Drift('never ran', callback.key, None, None, 0,
                  printable(text if question is None else f'{text}: {question}'))

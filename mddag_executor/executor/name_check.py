@@ -86,12 +86,12 @@ class NameCheck:
         for callback in missing:
             question = meant(callback, others)
             names.append(callback.key if question is None else f'{callback.key} ({question})')
-        text = (f'{self._task_set.file}: no node here has '
-                f'{counted(len(missing), "declared callback")}: {listed(names)}')
+        found = counted(len(missing), 'declared callback was', 'declared callbacks were')
+        text = f'{self._task_set.file}: {found} found in no node: {listed(names)}'
         ran = sorted({entity.name for entity in self._registry.by_id.values()
                       if entity.callback is None and entity.ran and not entity.is_own
                       and entity.kind in (TIMER, SUBSCRIPTION, SERVICE)
                       and not is_background(entity.label, entity.node)})
         if ran:
             text += f'; undeclared callbacks that ran: {listed(ran)}'
-        return f'{text}: use the same names here and there, or remap the nodes'
+        return f'{text}: use the same names in the declaration and the nodes, or remap the nodes'
