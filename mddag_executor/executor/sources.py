@@ -100,9 +100,9 @@ class Source(EntitySource):
                     return
                 self.post(taken)
         except compat.RCL_ERRORS as error:
-            if compat.alive(entity.rclpy):
-                self._fail(error)
-            return
+            if not compat.alive(entity.rclpy):
+                return
+            self._fail(error)
         except BlockingIOError:
             return  # another thread has collected it
         except Exception as error:
@@ -217,7 +217,9 @@ class ServiceSource(Source):
     def post(self, taken: Any) -> None:
         """Report a request to the engine."""
         request, header = taken
-        service, engine, now = self.entity.rclpy, self._pool.engine, self._pool.now
+        service, engine = self.entity.rclpy, self._pool.engine
+        # a recording tells requests apart by the time at which they became ready
+        now = self._pool.now if engine.record is None else self._pool.tick()
         work = Work(
             self.entity, service.callback, (request, service.srv_type.Response()),
             partial(service.send_response, header=header))

@@ -242,6 +242,7 @@ class WorkerPool:
     def _post(self, several: list[Work], now: int) -> None:
         for work in several:
             self.engine.ready(work, now)
+            now = self.tick()  # a recording tells them apart by it
 
     def resume(self, work: Work) -> None:
         """Make a suspended execution ready to go on."""
@@ -311,7 +312,7 @@ class WorkerPool:
 
     def _admit(self) -> None:
         """Let one more thread wait in the epoll; the caller holds the lock."""
-        if self._parked and (self.running or self._closed) and not self._is_stepping:
+        if self._parked and self.running and not self._is_stepping:
             self._parked.pop().permit.release()
 
     # --- threads ---------------------------------------------------------------------------------
@@ -364,7 +365,7 @@ class WorkerPool:
         with self.lock:
             self._closed = True
             while self._parked:
-                self._admit()
+                self._parked.pop().permit.release()
             threads = list(self._threads)
         deadline = None if timeout is None else monotonic_ns() + int(timeout * 1e9)
         done = True

@@ -11,8 +11,10 @@ import time
 from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.executor import compat
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.exceptions import InvalidHandle
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
 from std_msgs.msg import Header
 
@@ -50,6 +52,36 @@ def test_the_publishing_thread_takes(make_executor, make_node):
     assert queues == [1, 2, 3]
     publisher.publish(Header(frame_id='after'))
     assert got == ['before', '0', '1', '2']
+
+
+def test_messages_after_a_failed_take_run_in_the_next_spin(
+    make_executor, make_node, monkeypatch
+):
+    """They arrived together, and no later message announces them."""
+    node, got, errors = make_node(), [], [InvalidHandle('once')]
+    take_with = compat.message_taker
+
+    def message_taker(subscription):
+        take = take_with(subscription)
+
+        def fail_once():
+            if errors:
+                raise errors.pop()
+            return take()
+        return fail_once
+    monkeypatch.setattr(compat, 'message_taker', message_taker)
+    publisher = node.create_publisher(Header, '/a', 10)
+    node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 10)
+    assert sees_all(publisher)
+    for number in range(3):
+        publisher.publish(Header(frame_id=str(number)))
+    executor = make_executor(num_workers=1, nodes=[node])
+    with pytest.raises(InvalidHandle, match='once'):
+        for _ in range(10):
+            executor.spin_once(0.2)
+    for _ in range(10):
+        executor.spin_once(0.2)
+    assert got == ['0', '1', '2']
 
 
 FOREIGN = """

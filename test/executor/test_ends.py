@@ -22,6 +22,7 @@ from rclpy.context import Context
 from rclpy.executors import (
     ExternalShutdownException,
     MultiThreadedExecutor,
+    ShutdownException,
     SingleThreadedExecutor,
 )
 from rclpy.node import Node
@@ -311,3 +312,50 @@ print(stops, heard.count('stop'))
 def test_a_signal_s_handler_may_publish(where):
     """Whatever the main thread does when the signal comes: it holds locks now and then."""
     assert run_program(PUBLISHES, where)[0] == '200 200\n'
+
+
+def test_a_callback_of_spin_once_may_shut_down(make_executor, make_node):
+    """After a spin, threads are parked; the shutdown ends them though a step is running."""
+    node, future, done = make_node(), rclpy.Future(), []
+    executor = make_executor(num_workers=2, nodes=[node])
+
+    def callback() -> None:
+        if future.done():
+            done.append(executor.shutdown(5.0))
+        else:
+            future.set_result(None)
+    node.create_timer(0.01, callback)
+    executor.spin_until_future_complete(future, 10.0)
+    with contextlib.suppress(ExternalShutdownException, ShutdownException):
+        for _ in range(100):
+            executor.spin_once(0.1)
+            if done:
+                break
+    assert done == [True]
+
+
+STEPS = """
+import threading, time
+import rclpy
+from mddag_executor import MultiDeadlineExecutor
+
+rclpy.init()
+node = rclpy.create_node('node')
+executor = MultiDeadlineExecutor(num_workers=2)
+executor.add_node(node)
+future = rclpy.Future()
+node.create_timer(0.02, lambda: future.done() or future.set_result(None))
+executor.spin_until_future_complete(future)
+
+def step():
+    while True:
+        executor.spin_once(0.3)
+
+threading.Thread(target=step, daemon=True).start()
+time.sleep(0.3)
+print('ends')
+"""
+
+
+def test_a_program_ends_while_a_daemon_thread_steps():
+    assert run_program(STEPS)[0] == 'ends\n'

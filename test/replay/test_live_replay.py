@@ -208,6 +208,47 @@ nodes:
         '/late:cb']['aborted']
 
 
+def test_requests_that_arrive_together_are_recorded_one_by_one(
+    ros_context: Any, tmp_path: Path
+) -> None:
+    from mddag_executor import MultiDeadlineExecutor, open_recording
+    from rclpy.node import Node
+    from rclpy.task import Future
+    from std_srvs.srv import Empty
+    path = tmp_path / 'requests.mcap'
+    executor = MultiDeadlineExecutor(
+        loads(GRAPH, 'g.yaml'), num_workers=1, context=ros_context, trace=str(path))
+    node = Node('node', context=ros_context, start_parameter_services=False, enable_rosout=False)
+    ran, done = [], Future()
+
+    def serve(request: Any, response: Any) -> Any:
+        ran.append(request)
+        if len(ran) == 5:
+            done.set_result(None)
+        return response
+
+    node.create_service(Empty, '/serve', serve)
+    client = node.create_client(Empty, '/serve')
+    assert client.wait_for_service(5.0)
+
+    def call() -> None:
+        timer.cancel()
+        for _ in range(5):
+            client.call_async(Empty.Request())
+        time.sleep(0.05)  # so all of them have arrived when the worker is free
+
+    timer = node.create_timer(0.01, call)
+    executor.add_node(node)
+    executor.spin_until_future_complete(done, 10.0)
+    executor.shutdown(5.0)
+    node.destroy_node()
+    recording = open_recording(path)
+    served = [row for row in recording.executions
+              if '/serve' in recording.callback_name(int(row['callback']))]
+    assert len(served) == len({int(row['ready']) for row in served}) == 5
+    assert all(row['piece'] == 0 and row['began'] == row['start'] for row in served)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize('cause', ['waited', 'group', 'machine', 'lost'])
 def test_the_cause_of_most_misses(cause: str, tmp_path: Path) -> None:
