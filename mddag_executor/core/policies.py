@@ -137,7 +137,7 @@ POLICIES: dict[str, Policy] = {p.name: p for p in (
 
 
 class PolicyError(MddagError):
-    """A policy name that the table does not have."""
+    """An unknown policy, or one that cannot run with or without preemption as asked."""
 
 
 def policy(name: str) -> Policy:

@@ -27,7 +27,7 @@ time, if each vertex takes its mean execution time (0 if none is declared) and n
 least difference of these sinks' deadlines and the longest paths to them (least laxity first).
 * ``reach_deadline``, ``reach_start``: the same two of each sink that the vertex leads to
 (``reach_sink``), from ``first_reach`` of the vertex on.  ``mean_time`` is the declared mean
-execution time, ``height`` the number of vertices on the longest path to a sink.
+execution time, ``height`` the number of edges on the longest path to a sink.
 * ``importance``: the highest of the sinks that it leads to.  ``tolerated``, ``tolerated_of``: of a
 sink with ``tolerate: m of k``, else 0; ``first_miss``: the number of misses that the sinks before
 it tolerate.

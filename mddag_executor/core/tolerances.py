@@ -6,9 +6,9 @@ How many missed deadlines are tolerated, and whether a run meets that.
 A sink with a declared `tolerate: m of k` is judged by that: of any k of its jobs in a row at most
 m miss (`mddag_executor/core/weakly_hard.py`).  Of the others no miss is tolerated.
 
-A job was due at a sink when it completed there, expired, was aborted, or was past its deadline at
-the end of the run.  A sink without a due job is within every tolerance, unless no sink has a due
-job: then deadlines were never tested, and all sinks fail.
+A job was due at a sink when it completed there, expired, failed, was aborted or dropped, or was
+past its deadline at the end of the run.  A sink without a due job is within every tolerance,
+unless no sink has a due job: then deadlines were never tested, and all sinks fail.
 """
 
 from __future__ import annotations

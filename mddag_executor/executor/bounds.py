@@ -46,11 +46,11 @@ END_S = 1.0
 
 MOST = 64
 """
-The bound of numbers that are usually less than ten.
+One bound for several quantities that are usually below ten.
 
-These are the messages taken from one entity before the next entity, the messages of a keep-all
-profile that wait in Python, the publications of a topic, and the callbacks that wait in
-``Client.call``, and the ready executions that are checked for one that may start.
+They are: messages taken from one entity before the next entity, waiting messages of a keep-all
+profile, remembered publications of a topic, callbacks that wait in ``Client.call``, and ready
+executions that are checked for one that may start.
 """
 
 REMEMBERED = 4096

@@ -7,8 +7,8 @@ Theory of operation
 -------------------
 Once a period a separate thread reads the executor's counters and publishes one
 ``DiagnosticArray``: a status for each DAG that has a callback in this process, and one for the
-pool.  The thread takes no lock, so it never delays a worker.  It reads counters while they change;
-a change that it misses shows one period later.
+pool.  The thread does not take the engine's lock.  It reads counters while they change; a change
+that it misses shows one period later.
 
 A DAG's status is about its recent results (jobs of its sinks).  STALE: no job has been released
 for a while.  ERROR, WARN: see ``Thresholds``.  The pool's status is WARN when data was lost:

@@ -7,8 +7,8 @@ Theory of operation
 -------------------
 The engine receives events with their times, and decides what to run.  It has no thread, lock or
 clock and does not use rclpy; ``workers`` has all of these, and calls the engine under its lock, so
-that times never decrease.  Only the engine and its parts (``jobs``, ``other_processes``) change
-the core's state.
+that times never decrease.  The engine and ``other_processes`` change the core's state, and
+``registry`` adds and removes groups; nothing else does.
 
 1.  *Ready work* (``timer_due``, ``arrived``, ``ready``) belongs to a job of a declared DAG, or to
     none.  Messages of known publications go to the job of these (``jobs``), others may enter from

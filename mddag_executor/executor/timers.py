@@ -95,7 +95,8 @@ class TimerSource(EntitySource):
             return at
         offset = time.time_ns() - _now()
         if abs(offset - self._offset) > TOLERANCE_NS:
-            self._offset = offset
+            # a pause between two readings makes the offset smaller, never larger
+            self._offset = max(offset, time.time_ns() - _now())
         return at - self._offset
 
     def is_simulated(self) -> bool:

@@ -5,8 +5,9 @@ A recording: tables with named columns, and the nodes and callbacks that they re
 
 Theory of operation
 -------------------
-1. Every recording has the same numpy structured arrays.  A reader (``own``, ``collected``, …)
-   builds them once; an analysis is a function of them and does not depend on the reader.
+1. Every recording has the same numpy structured arrays.  A reader (``own``,
+   ``replay.imported_run``, …) builds them once; an analysis is a function of them and does
+   not depend on the reader.
 2. Times are int64 nanoseconds on the clock of the recording.  ``UNKNOWN`` (-1) is a time or number
    that is not recorded.
 3. DAGs and vertices are those of ``Recording.task_set``.  Vertices are numbered over all DAGs; -1

@@ -53,7 +53,6 @@ from mddag_executor.recording import tables as recorded
 from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by, Table
 from mddag_executor.replay.miss_tally import MissTally
 from mddag_executor.text import counted
-from msg_graph import TaskSet
 import numpy as np
 
 VERDICTS = np.dtype([
@@ -488,8 +487,3 @@ def judge(recording: Recording, skip: int = 0) -> Judged:
     :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
     """
     return Judged(recording, skip)
-
-
-def names_of(task_set: TaskSet) -> list[str]:
-    """Return the names of all vertices."""
-    return [vertex.name for vertex in task_set.vertices]
