@@ -68,8 +68,10 @@ class NameCheck:
         if periods and now - self._begin < 2e-9 * min(periods):
             return
         self._done = True
-        if missing:
-            get_logger('mddag_executor').warning(printable(self._text(missing)))
+        if missing and self._task_set is not None:
+            text = unbound_text(self._task_set, missing, self._registry)
+            get_logger('mddag_executor').warning(
+                f'{text}: use the same names in the declaration and the nodes, or remap the nodes')
 
     def _missing(self) -> list[Callback]:
         assert self._task_set is not None
@@ -79,19 +81,20 @@ class NameCheck:
                 if callback.key not in elsewhere and not may_run_elsewhere(
                     callback, self._dags.get(callback.key, ()), nodes, self._task_set)]
 
-    def _text(self, missing: list[Callback]) -> str:
-        assert self._task_set is not None
-        others = self._registry.undeclared()
-        names = []
-        for callback in missing:
-            question = meant(callback, others)
-            names.append(callback.key if question is None else f'{callback.key} ({question})')
-        found = counted(len(missing), 'declared callback was', 'declared callbacks were')
-        text = f'{self._task_set.file}: {found} found in no node: {listed(names)}'
-        ran = sorted({entity.name for entity in self._registry.by_id.values()
-                      if entity.callback is None and entity.ran and not entity.is_own
-                      and entity.kind in (TIMER, SUBSCRIPTION, SERVICE)
-                      and not is_background(entity.label, entity.node)})
-        if ran:
-            text += f'; undeclared callbacks that ran: {listed(ran)}'
-        return f'{text}: use the same names in the declaration and the nodes, or remap the nodes'
+
+def unbound_text(task_set: TaskSet, missing: list[Callback], registry: Registry) -> str:
+    """Return one line about declared callbacks without an entity: which ones may be meant."""
+    others = registry.undeclared()
+    names = []
+    for callback in missing:
+        question = meant(callback, others)
+        names.append(callback.key if question is None else f'{callback.key} ({question})')
+    found = counted(len(missing), 'declared callback was', 'declared callbacks were')
+    text = f'{task_set.file}: {found} found in no node: {listed(names)}'
+    ran = sorted({entity.name for entity in registry.by_id.values()
+                  if entity.callback is None and entity.ran and not entity.is_own
+                  and entity.kind in (TIMER, SUBSCRIPTION, SERVICE)
+                  and not is_background(entity.label, entity.node)})
+    if ran:
+        text += f'; undeclared callbacks that ran: {listed(ran)}'
+    return printable(text)

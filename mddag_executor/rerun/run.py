@@ -27,6 +27,7 @@ from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE
 from mddag_executor.executor import publishing
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import WAITABLE
+from mddag_executor.executor.name_check import unbound_text
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry, snapshot
@@ -304,8 +305,8 @@ class Rerun:
         self._player.begin()
 
     def _none_hosted(self) -> str:
-        return (f'{self._task_set.file}: none of its callbacks is in the nodes that run: give the '
-                'nodes that it declares')
+        text = unbound_text(self._task_set, self._registry.unbound(), self._registry)
+        return f'{text}: give the nodes that it declares, with the same names'
 
     def _check_topics(self) -> None:
         known = {*self._source.topics, *self._messages.offered, CLOCK}

@@ -65,6 +65,13 @@ def test_a_run_and_its_result(drive: Path) -> None:
     assert 'the same as out.mcap' in same.stdout
 
 
+def test_a_wrong_name_of_a_topic_is_guessed(drive: Path) -> None:
+    text = (drive / 'robot.py').read_text()
+    (drive / 'typo.py').write_text(text.replace('/track', '/trak'))
+    done = mddag(drive, 'rerun', 'drive.mcap', 'graph.yaml', '--node', 'typo:Brake', status=2)
+    assert "/brake:decide (did you mean the topic '/trak'?)" in done.stderr.splitlines()[-1]
+
+
 @pytest.mark.slow
 def test_the_same_each_time_also_next_to_busy_processes(drive: Path) -> None:
     """Also where seven workers are too few, and with other hashes of strings."""
