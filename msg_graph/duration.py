@@ -66,7 +66,7 @@ def parse_duration(
     if not unit:
         raise DurationError(
             f'{shown(text)} has no unit',
-            f"add one, as '{match['number']}ms' (ns, us, ms, s, min)")
+            f"add one, as '{match['number']}ms' or '{match['number']}s' (ns, us, ms, s, min)")
     if unit not in UNITS:
         raise DurationError(
             f'{shown(text)} has the unknown unit {shown(unit)}', 'use ns, us, ms, s or min')

@@ -17,7 +17,7 @@ from typing import Any
 from mddag_executor.core.tables import ON_LATE
 from mddag_executor.defaults import workers
 from mddag_executor.errors import UsageError
-from msg_graph import load, parse_duration, TaskSet
+from msg_graph import DurationError, load, parse_duration, TaskSet
 from msg_graph.duration import DAY
 from msg_graph.errors import did_you_mean, listed, shown
 from msg_graph.model import MOST_WORKERS
@@ -113,10 +113,13 @@ class Thresholds:
             whole_number(field, getattr(self, field), MOST_JOBS)
 
 
-def _nanoseconds(time: Any) -> Any:
+def _nanoseconds(name: str, time: Any) -> Any:
     """Return the ns of a text like ``1s`` or of rclpy's ``Duration``; other values unchanged."""
     if isinstance(time, str):
-        return parse_duration(time)
+        try:
+            return parse_duration(time)
+        except DurationError as error:
+            raise DurationError(f'{name}: {error.problem}', error.remedy) from None
     return time.nanoseconds if isinstance(time, Duration) else time
 
 
@@ -126,7 +129,7 @@ def diagnostics_period_ns(period: int | str | Duration | None) -> int | None:
 
     :param period: ns, text such as ``1s``, or a ``Duration``; None or 0: no diagnostics.
     """
-    period = _nanoseconds(period)
+    period = _nanoseconds('diagnostics_period', period)
     if period is None or period == 0:
         return None
     period = whole_number('diagnostics_period', period, DAY, ' ns')
@@ -160,7 +163,7 @@ def resolve(
         num_workers = workers(None, task_set)
     num_workers = whole_number('num_workers', num_workers, MOST_WORKERS)
     default_deadline = whole_number(
-        'default_deadline', _nanoseconds(default_deadline), DAY, ' ns')
+        'default_deadline', _nanoseconds('default_deadline', default_deadline), DAY, ' ns')
     return task_set, num_workers, default_deadline
 
 

@@ -202,8 +202,8 @@ nodes:
         f"g.yaml:{place}): correct the value and take the '# ' away" for place in (
             '6: timer: is a blank to fill in (what starts it?',
             '13: deadline: is a blank to fill in (a sink')] + [
-        "g.yaml:8: callback '/a:wrong': 'timer': '5' has no unit: add one, as '5ms' (ns, us, ms, "
-        's, min)']
+        "g.yaml:8: callback '/a:wrong': 'timer': '5' has no unit: add one, as '5ms' or '5s' (ns, "
+        'us, ms, s, min)']
     # what is filled in is no blank, and one that does no harm is no error
     filled = text.replace('# timer', 'timer').replace('# deadline', 'deadline').replace(
         'timer: 5,', 'timer: 5ms, dag: wrong,') + '        # paths: []  # FILL IN: a path\n'

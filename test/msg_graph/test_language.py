@@ -178,7 +178,7 @@ def test_node_names(entry: str, says: list[str]) -> None:
     (['name: t', f'service: /x/ {MARK}'], ['not a valid service name']),
     # times
     (['name: t', f'timer: 100 {MARK}'],
-     ["callback '/a:t': 'timer': '100' has no unit: add one, as '100ms'"]),
+     ["callback '/a:t': 'timer': '100' has no unit: add one, as '100ms' or '100s'"]),
     (['name: t', f'timer: often {MARK}'], ['not a time']),
     (['name: t', f'timer: [1ms] {MARK}'], ["'timer' is a list"]),
     (['name: t', f'timer: {MARK}'], ["'timer' has no value"]),
