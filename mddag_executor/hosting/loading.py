@@ -147,9 +147,10 @@ def _import(spec: str, module_name: str) -> ModuleType:
             raise LoadingError(
                 spec, f"there is no module '{missing}'",
                 'check its name, or add its folder to PYTHONPATH') from None
+        package = missing.partition('.')[0].replace('_', '-')
         raise LoadingError(
             spec, f"'{module_name}' needs the module '{missing}', which is not installed",
-            'install it') from error
+            f'install it (if it is of ROS: apt install ros-DISTRO-{package})') from error
     except Exception as error:
         raise _failure(error)(
             spec, f"'{module_name}' cannot be imported ({describe(error)})",
