@@ -42,6 +42,8 @@ def arrow_table(recording: Recording, name: str) -> Any:
     :param name: one of ``TABLES``.
     :raises KeyError: for another name.
     """
+    if name not in TABLES:
+        raise KeyError(f'there is no table {name!r}: the tables are {", ".join(TABLES)}')
     import pyarrow
     kind, rows = TABLES[name], getattr(recording, name)
     arrays, fields = [], []

@@ -331,8 +331,9 @@ class _Source:
         found.misses = self._misses()
         found.demotions = self._demotions()
         stops, _ = self._kind(_STOP).joined()
-        found.stops = rows(STOPS, len(stops), start=stops['begin'], end=stops['end'])
         found.notices_stops = earliest(stops['end'])
+        stops = stops[stops['begin'] < stops['end']]    # the first one is empty: stops are noticed
+        found.stops = rows(STOPS, len(stops), start=stops['begin'], end=stops['end'])
         found.lost = sum(self._kind(_LOST).joined()[0]['count'].tolist())
         self._set_end(found)
         self._put_in_order(found, [

@@ -224,6 +224,12 @@ class Recording:
     _keys: dict[int, str] | None = field(default=None, init=False, repr=False)
     _callbacks: tuple[Ints, Ints] | None = field(default=None, init=False, repr=False)
 
+    def __repr__(self) -> str:
+        """Return one line: the name, and how much is recorded."""
+        length = 0 if self.start is None else self.end - self.start
+        return (f'<Recording {self.name}: {length / 1e9:.3f} s, {len(self.releases)} jobs, '
+                f'{len(self.executions)} executions>')
+
     @property
     def dropped(self) -> Counter[str]:
         """Return the number of dropped executions by reason."""

@@ -13,7 +13,7 @@ from mddag_executor.recording.mapping import judged_by
 from mddag_executor.recording.own import read_own
 from mddag_executor.recording.tables import Recording
 from mddag_executor.trace import TraceReader
-from msg_graph import TaskSet
+from msg_graph import load, TaskSet
 
 Progress = Callable[[int], None]
 
@@ -42,19 +42,21 @@ Given = str | os.PathLike[str] | Sequence[str] | Traces | TraceReader
 
 
 def open_recording(
-    path: Given, task_set: TaskSet | None = None, name: str | None = None,
-    progress: Progress | None = None,
+    path: Given, task_set: TaskSet | str | os.PathLike[str] | None = None,
+    name: str | None = None, progress: Progress | None = None,
 ) -> Recording:
     """
     Read a trace of this executor, an imported trace, or the traces of one run.
 
-    :param task_set: the declaration to judge by; None: the one in the trace, if any.
+    :param task_set: the declaration to judge by, or its path; None: the one in the trace, if any.
     :param name: the recording's name in messages, if not its path.
     :param progress: called regularly with the number of events read.
     :raises mddag_executor.trace.TraceError: if a file is not a trace.
     :raises mddag_executor.replay.ReplayError: if the recording has nothing to replay or none of
         the declaration's callbacks.
     """
+    if isinstance(task_set, (str, os.PathLike)):
+        task_set = load(task_set)
     if not isinstance(path, (str, os.PathLike, TraceReader)):
         traces = path if isinstance(path, Traces) else Traces(path)
         from mddag_executor.replay.joining import Joined

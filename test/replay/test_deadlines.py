@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+import re
 import tempfile
 from typing import Any
 
@@ -186,3 +187,17 @@ def test_ranges_that_cannot_be() -> None:
             recording.cut(begin, end)
     with pytest.raises(ReplayError, match='it ends 1.4.. s after its first release'):
         recording.cut(10 ** 12, 2 ** 62)
+
+
+def test_a_recording_in_a_program(tmp_path: Path) -> None:
+    recording = open_recording(BAGS / 'demo_short.mcap')
+    graph = tmp_path / 'graph.yaml'
+    graph.write_text(recording.task_set.text)
+    for path in (graph, str(graph)):
+        judged = open_recording(BAGS / 'demo_short.mcap', path)
+        assert judged.task_set.file == str(graph)
+        assert (judged.executions == recording.executions).all()
+    assert re.fullmatch(
+        r'<Recording .*demo_short\.mcap: 1\.4\d\d s, \d+ jobs, \d+ executions>', repr(recording))
+    with pytest.raises(KeyError, match="no table 'nope': the tables are releases, executions, "):
+        recording.to_pandas('nope')

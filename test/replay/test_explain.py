@@ -14,7 +14,7 @@ from hypothesis import example, given, HealthCheck, settings
 from hypothesis import strategies as st
 from mddag_executor.cli import main as program
 from mddag_executor.core.tally import total
-from mddag_executor.replay import replay
+from mddag_executor.replay import open_recording, replay
 from mddag_executor.replay.causes import CAUSES, REMEDIES
 from msg_graph import loads, TaskSet
 import pytest
@@ -375,6 +375,7 @@ def test_only_misses_in_stops_are_said_to_be_in_them(
                     file.add('stop', last, 1, 1, first, last)
             add_execution(file, start, start + MS, 1, 0, job, ready=release, address=8)
         end_trace(file, START_TIME + 9_000 * MS)
+    assert len(open_recording(path).stops) == 3    # without the empty one
     result = explain(capsys, str(path))
     assert result['causes']['machine'] == result['missed'] == 9
     assert sum(stall['misses'] for stall in result['stalls']) == 2
