@@ -22,6 +22,7 @@ _BEST = '#3182bd'
 def lines(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the tables of callbacks (tightest first) and sinks, and the lines below."""
     short = _short(result)
+    yield from _missed_lines(result)
     yield from _load_lines(result)
     yield '\nHow many times as long each callback may take, if the others take as long as now:'
     yield table(('callback', 'may take', 'then misses'), [
@@ -45,9 +46,23 @@ def _margins(sink: Mapping[str, Any]) -> list[Cell]:
     margin, deadline = sink['margin_ns'], sink['relative_deadline_ns']
     if margin is None:
         return [format_ns(deadline), None, None, None, None]
-    least = max(0, margin['min'])
-    return [format_ns(deadline), format_ns(margin['min'], 3), percent(least, deadline),
+    of_it = percent(margin['min'], deadline) if margin['min'] >= 0 else None
+    return [format_ns(deadline), format_ns(margin['min'], 3), of_it,
             format_ns(margin['p1'], 3), format_ns(margin['median'], 3)]
+
+
+def _missed_lines(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the lines about deadlines that are missed already."""
+    if not _is_judged(result):
+        return
+    if result['left_out']:
+        yield (f'left out, because they miss every deadline already: '
+               f'{listed(result["left_out"])}')
+    some = {name: n for name, n in result['missed'].items() if name not in result['left_out']}
+    if some:
+        yield (f'{counted(sum(some.values()), "deadline")} missed already: '
+               + listed([f'{name} ({n})' for name, n in some.items()])
+               + '; what follows says when another one is missed')
 
 
 def _summary(result: Mapping[str, Any]) -> Iterator[str]:
@@ -64,14 +79,6 @@ def _summary(result: Mapping[str, Any]) -> Iterator[str]:
     most = result['most']
     if free:
         yield f'{counted(free, "callback")} may take {most:g} times as long and more'
-    if result['left_out']:
-        yield (f'left out, because they miss every deadline already: '
-               f'{listed(result["left_out"])}')
-    some = {name: n for name, n in result['missed'].items() if name not in result['left_out']}
-    if some:
-        yield (f'{counted(sum(some.values()), "deadline")} missed already: '
-               + listed([f'{name} ({n})' for name, n in some.items()])
-               + '; the factors say when another one is missed')
 
 
 def _load_lines(result: Mapping[str, Any]) -> Iterator[str]:
@@ -87,7 +94,9 @@ def _load_lines(result: Mapping[str, Any]) -> Iterator[str]:
         fewer = result[of]
         if fewer is not None:
             of_each = each if of == 'workers' else ''
-            yield f'{fewer["least"]} of {counted(fewer["given"], name)}{of_each} are enough' + (
+            some = f'{fewer["least"]} of {counted(fewer["given"], name)}{of_each}'
+            yield (f'with {some} no further deadline is missed' if result['missed'] else
+                   f'{some} {"is" if fewer["least"] == 1 else "are"} enough') + (
                 '' if fewer['breaks'] is None else
                 f'; with one less {printable(fewer["breaks"])} misses')
 
@@ -96,7 +105,7 @@ def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
     """Yield the parts of an HTML page."""
     heading = escape(printable(f'Slack: {title}'))
     yield f'{page_head(heading)}</head><body>\n<h1>{heading}</h1>\n'
-    for line in (*_load_lines(result), *_summary(result)):
+    for line in (*_missed_lines(result), *_load_lines(result), *_summary(result)):
         yield f'<p class="note">{escape(line)}</p>\n'
     short = _short(result)
     yield ('<h2>How many times as long each callback may take</h2>\n<p class="note">If the others '
