@@ -42,7 +42,7 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
     undeclared = {
         name: each['unattributed' if each['declared'] else 'ran']
         for name, each in result['callbacks'].items()}
-    yield (f'{counted(result["undeclared"], "run")} of undeclared callbacks'
+    yield (f'{counted(sum(undeclared.values()), "run")} of undeclared callbacks'
            + _details({name: count for name, count in undeclared.items() if count}))
     deaf = {name: each['incompatible_qos'] for name, each in result['callbacks'].items()
             if each.get('incompatible_qos') and not each['ran']}

@@ -110,6 +110,19 @@ class Detector(Node):
 """
 
 
+def test_runs_of_undeclared_callbacks_are_those_that_are_listed(
+    folder: Path, mddag: Mddag
+) -> None:
+    slow = ROBOT.replace('pass\n', 'time.sleep(0.05)\n')    # so that most images are dropped
+    Path('robot.py').write_text(f'import time\n{slow}')
+    done = mddag('run', '--node', 'robot:Camera', '--node', 'robot:Detector', '--duration', '1s')
+    assert done.returncode == 0, done.stderr
+    dropped, = re.findall(r'^(\d+) dropped', done.stdout, re.MULTILINE)
+    every, = re.findall(r'^(\d+) runs of undeclared callbacks: (.*)', done.stdout, re.MULTILINE)
+    assert int(dropped) > 10
+    assert int(every[0]) == sum(map(int, re.findall(r' (\d+)(?:,|$)', every[1])))
+
+
 def test_three_commands_from_a_robot_to_a_verdict(folder: Path, mddag: Mddag) -> None:
     """Recorded without a declaration, which then comes from the recording."""
     Path('robot.py').write_text(ROBOT)
