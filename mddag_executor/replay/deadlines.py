@@ -50,7 +50,7 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.recording import tables as recorded
-from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by, Table
+from mddag_executor.recording.tables import Ints, JobNumbers, Mask, Recording, sort_by, Table
 from mddag_executor.replay.miss_tally import MissTally
 from mddag_executor.text import counted
 import numpy as np
@@ -358,7 +358,12 @@ class Judged:
     def _tally(self) -> MissTally:
         tally = MissTally(self.task_set, self.tables)
         judging = self._judging
-        demoted = Counter(self._recording.demotions['vertex'].tolist())
+        demotions = self._recording.demotions
+        if self.skip:
+            numbers = JobNumbers(self._recording.releases)
+            kept = numbers.marked(self._recording.releases['release'] >= self.judge_from)
+            demotions = demotions[kept[numbers.of(demotions)]]
+        demoted = Counter(demotions['vertex'].tolist())
         for dag, outcome, released, over in self._outcomes:
             tally.jobs[dag] = int(judging.is_judged(released, self.jobs[dag].release).sum())
             for end, n in Counter(outcome[over].tolist()).items():

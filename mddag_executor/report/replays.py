@@ -146,7 +146,9 @@ def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> st
 def summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines below the tables of a replay."""
     if result['skip_ns']:
-        yield f'left out: jobs released in the first {format_ns(result["skip_ns"])}'
+        yield f'left out: jobs released in the first {format_ns(result["skip_ns"])}' + (
+            '' if result['skip_ns'] < result['duration_ns'] else
+            f', so all of them: the run has only {format_ns(result["duration_ns"])}')
     yield from run_lines(result, _use(result))
     if result.get('misses') is not None:
         yield from causes_line(result['misses'])
