@@ -43,6 +43,7 @@ R = TypeVar('R', bound='str | Traces')
 FORMAT = 2
 """Version of the results for machines; a change of the meaning of a key raises it."""
 STDIN = '<stdin>'
+GRAPHS = ('.yaml', '.yml')
 _MCAP = b'\x89MCAP'
 MOST_BYTES = 64 << 20
 """The largest declaration, architecture file or table of execution times."""
@@ -71,6 +72,8 @@ def load_graph(path: str) -> TaskSet:
     """Return the task set that a declaration gives, from a file or from standard input for `-`."""
     import msg_graph
     if path != '-':
+        if os.path.isfile(path) and _is_trace(path):
+            raise InputError(path, 'this is a recording, no declaration', 'name a YAML file')
         return msg_graph.load(path)
     name, text = read_text(path)
     return msg_graph.loads(text, name=name)
@@ -99,6 +102,8 @@ def recording_and_graph(args: argparse.Namespace) -> None:
     traces = args.trace
     if len(traces) > 1 and not _is_trace(traces[-1]):
         *traces, args.graph = traces
+    elif len(traces) > 1 and traces[0].endswith(GRAPHS):
+        raise UsageError(f'{traces[0]}: this is a declaration: name it after the recordings')
     args.trace = one_run(traces, args.offset)
 
 

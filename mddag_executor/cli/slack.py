@@ -29,7 +29,6 @@ mddag slack config/autoware.yaml --utilisation 0.6 --workers 6
 mddag slack run.mcap --fail-under 1.2 --json slack.json --report slack.html"""
 
 _ONLY_GRAPH = ('duration', 'execution_times', 'seed', 'utilisation')
-_GRAPHS = ('.yaml', '.yml')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +60,7 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.replay.slack import find_slack, slack_result
     from mddag_executor.report.slack import lines, page
     common.recording_and_graph(args)
-    is_graph = str(args.trace).lower().endswith(_GRAPHS)
+    is_graph = str(args.trace).lower().endswith(common.GRAPHS)
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
     callbacks = len(set(problem.callback_of))
     with Progress('searching', callbacks) as line:

@@ -17,7 +17,6 @@ from msg_graph import GraphError, loads, TaskSet
 TASK_SET = 'mddag:task_set'
 _RENAMED = re.compile(r'\bon_miss(?=[\'"]?\s*:)')
 """Older name of ``on_late``, written before version 2.0."""
-_RECORD = 'record a run with mddag run GRAPH … --trace'
 
 
 class ReplayError(InputError):
@@ -85,11 +84,14 @@ def no_end(name: str) -> str:
 
 def no_run(reader: TraceReader) -> ReplayError:
     """Return the error for a completely read trace without a run of this executor."""
-    what = f'no run of this executor is recorded in it (it has no event {TASK_SET})'
     if reader.warnings:
         damage = reader.warnings[0].removeprefix(f'{reader.path}: ').partition(': ')[0]
-        what = f'it is damaged ({damage}), and the declaration of its run is lost'
-    return ReplayError(reader.path, what, _RECORD)
+        return ReplayError(
+            reader.path, f'it is damaged ({damage}), and nothing of a run is left in it',
+            'take another copy of the file, or record the run again')
+    return ReplayError(
+        reader.path, f'no run of this executor is recorded in it (it has no event {TASK_SET})',
+        'record a run with mddag run GRAPH … --trace')
 
 
 @contextmanager

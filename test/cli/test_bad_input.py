@@ -78,6 +78,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('evaluate g.yaml --policies rad,rad', "--policies: 'rad' is listed twice: name each once"),
     ('diff run.mcap run.mcap --tolerance 5', "mddag diff: argument --tolerance: '5' is no share"),
     # files to read
+    ('replay g.yaml run.mcap', 'g.yaml: this is a declaration: name it after the recordings'),
+    ('run run.mcap --synthetic sleep',
+     'run.mcap: this is a recording, no declaration: name a YAML file'),
     ('graph check none.yaml', 'none.yaml: the file cannot be read (No such file'),
     ('simulate g.yaml --execution-times none.json', 'none.json: no such file or directory: check'),
     ('simulate g.yaml --execution-times folder', 'folder: is a directory: name a file'),

@@ -81,6 +81,11 @@ def test_a_truncated_trace_gives_what_is_there(
     assert '3 results due' in out
     assert err.startswith(f'warning: {cut}: the summary at the end is damaged or missing: ')
     assert err.count('\n') == 1
+    cut.write_bytes(data[:100])
+    status, _, err = call(capsys, cut)
+    assert status == 2 and err.startswith(f'error: {cut}: it is damaged (')
+    assert err.endswith('nothing of a run is left in it: take another copy of the file, or record '
+                        'the run again\n')
 
 
 def test_standard_input(
