@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack
-import math
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded, verdicts
@@ -109,11 +108,8 @@ def _result(
 
 
 def _share(text: str) -> float:
-    """Return the share that `10%` is."""
-    try:
-        value = float(text.removesuffix('%')) / 100
-    except ValueError:
-        value = math.nan
-    if not text.endswith('%') or not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text!r} is no share from 0 % up, as 10%')
+    """Return a share; `10` may mean 10 %, or ten times as much."""
+    value = options.share(text)
+    if value > 1 and not text.endswith('%'):
+        raise argparse.ArgumentTypeError(f'{text!r} is no share: write 10% or 0.1')
     return value

@@ -64,6 +64,12 @@ positive_float = _number(float, lambda value: 0 < value < math.inf, 'a number ab
 not_negative = _number(float, lambda value: 0 <= value < math.inf, 'a number from 0 up')
 
 
+def share(text: str) -> float:
+    """Return the share that `10%` or `0.1` is."""
+    number = text.removesuffix('%')
+    return not_negative(number) / (1 if number == text else 100)
+
+
 def or_zero(kind: Callable[[str], int]) -> Callable[[str], int]:
     """Return a kind of argument that may be `0` as well."""
     return lambda text: 0 if text == '0' else kind(text)

@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, TYPE_CHECKING
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import printable, Progress, warn
-from mddag_executor.text import counted
+from mddag_executor.text import counted, listed
 
 if TYPE_CHECKING:
     from mddag_executor.rerun import Difference, Result
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--expect', metavar='OUT.mcap', type=options.Input,
         help='compare what the nodes publish with this bag, and exit with status 1 if it '
         'differs')
-    add('--tolerance', type=options.not_negative, default=0.0, metavar='X',
+    add('--tolerance', type=options.share, default=0.0, metavar='X',
         help='with --expect: floating-point numbers may differ by this much, or by this share of '
         'the larger one (default: 0)')
     add('--times', metavar='WHICH', type=options.Input,
@@ -143,7 +143,9 @@ def _lines(
     speed = result.virtual_ns / 1e9 / max(result.elapsed_s, 1e-9)
     yield (f'{counted(result.callbacks, "callback")}, {result.virtual_ns / 1e9:.3f} s in '
            f'{result.elapsed_s:.3f} s ({speed:.1f} times as fast as real time)')
-    yield f'{counted(sum(result.counts.values()), "message")} published, {result.digest}'
+    topics = listed([f'{topic} {n}' for topic, n in sorted(result.counts.items())])
+    yield (f'{counted(sum(result.counts.values()), "message")} published'
+           + (f' ({printable(topics)})' if topics else '') + f', {result.digest}')
     if result.recorded_topics:
         same = len(result.recorded_topics) - len(result.recorded)
         yield f'{counted(len(result.recorded_topics), "topic")} recorded, too, {same} the same'

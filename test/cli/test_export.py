@@ -87,7 +87,7 @@ def test_diff(
     assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse')[0] == 0
     assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse', '--tolerance', '50%')[0] \
         == 1
-    assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse', '--tolerance', '100%')[0] \
+    assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse', '--tolerance', '1.0')[0] \
         == 0
 
 

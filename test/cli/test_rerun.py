@@ -106,7 +106,7 @@ def test_differences_end_with_status_1(drive: Path, tmp_path: Path) -> None:
     difference, = json.loads(done.stdout)['differences']
     assert (difference['topic'], difference['field'], difference['number']) == (
         '/track', 'data', 1)
-    mddag(tmp_path, *expect, '--tolerance', '1e-2')
+    mddag(tmp_path, *expect, '--tolerance', '1%')
 
 
 def test_unmodified_programs(drive: Path, tmp_path: Path) -> None:
