@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import time
 from typing import Any, NamedTuple
 
-from mddag_executor.report.text import printable, table
+from mddag_executor.report.text import format_ns, printable, table
 
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 GONE = 'GONE'
@@ -133,12 +133,15 @@ def _cell(status: Status, column: Column) -> str:
     if column.key in _WORDS:
         return printable(getattr(status, column.key))
     value = status.values.get(column.key) or '-'
-    if column.unit == '%':
-        try:
-            return f'{100 * float(value):.0f} %'
-        except (ValueError, OverflowError):
-            return printable(value)
-    return printable(value if value == '-' or not column.unit else f'{value} {column.unit}')
+    try:
+        number = float(value)
+        if column.unit == '%':
+            return f'{100 * number:.0f} %'
+        if column.unit == 'ms':
+            return format_ns(round(number * 1e6))
+        return f'{number:.0f}'
+    except (ValueError, OverflowError):
+        return printable(value)     # no number
 
 
 def columns_that_fit(
