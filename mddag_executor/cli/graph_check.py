@@ -29,7 +29,8 @@ DESCRIPTION = """\
 Validate a declaration and show the DAG tasks that it gives: period, number of vertices, sinks with
 deadlines, critical path and load in cores, the last two with the mean execution times (- if one
 is not declared). The utilisation is the load of all DAGs divided by the workers. A path that takes
-longer than its deadline, and a load that the workers or CPUs cannot do, are warned of."""
+longer than its deadline, and a load that the workers or CPUs cannot do, are warned of; to fail
+then, use `mddag graph analyse --fail-on-unschedulable`."""
 
 _HEADER = ('DAG', 'period', 'vertices', 'critical path', 'load', 'sink', 'deadline')
 
@@ -155,6 +156,8 @@ def _summary(task_set: TaskSet, result: dict[str, Any]) -> str:
     if result['utilisation'] is not None:
         text += (f', load {result["load"]:.3f}, utilisation {result["utilisation"]:.3f} of '
                  f'{counted(result["workers"], "worker")}')
+        if task_set.workers is None:
+            text += ' (the default)'
     from msg_graph.draft import open_blanks
     left = [str(each.line) for each in open_blanks(task_set.text, task_set.file)]
     if left:
