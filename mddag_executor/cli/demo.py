@@ -119,6 +119,7 @@ def _side_by_side(ours: dict[str, Any], peer: dict[str, Any]) -> str:
         return (what, *map(cells, (ours, peer)))
 
     return table(('', 'MultiDeadlineExecutor', 'MultiThreadedExecutor'), (
+        row('measured for', lambda r: f'{r["window_ns"] / 1e9:.1f} s'),
         row('results due', lambda r: str(r['sink_jobs_due'])),
         row('in time', lambda r: percent(r['on_time'], r['sink_jobs_due'])),
         row('late', lambda r: str(r['late'])), row('missing', lambda r: str(r['missing'])),

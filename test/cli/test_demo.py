@@ -35,7 +35,8 @@ def test_the_main_job_end_to_end(
     verdicts = measured['on_time'] + measured['late'] + measured['missing']
     assert verdicts == measured['sink_jobs_due'] > 200
     assert (tmp_path / 'demo.mcap').read_bytes()[:5] == b'\x89MCAP'
-    for text in ('$ mddag run ', '$ mddag replay ', 'MultiThreadedExecutor', 'CPU each'):
+    for text in ('$ mddag run ', '$ mddag replay ', 'MultiThreadedExecutor', 'measured for',
+                 'CPU each'):
         assert text in process.stdout
 
 
