@@ -5,7 +5,8 @@ Latest starts from measured execution times, for drivers that measure (rule 7).
 
 ``State.start_by`` and ``reach_by`` begin with the declared execution times.  When the measured
 mean of a vertex has changed by more than an eighth, those of its DAG are computed again.  So most
-executions cost one comparison.
+executions cost one comparison.  The live executor measures CPU time: a callback that waits counts
+only for what it computes, since its wall time also has what it waited for others.
 """
 
 from __future__ import annotations
