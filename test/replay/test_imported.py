@@ -154,7 +154,7 @@ def test_nothing_is_judged_without_links(recorded: Recorded, graph: TaskSet) -> 
     assert not any(camera['ends'].values())
     assert not any(camera['sinks']['/fuse:join'][key]
                    for key in ('completed', 'late', 'overdue', 'expired'))
-    assert [line for line in warnings if line.endswith(f'theirs: {N} jobs: /camera ({N})')]
+    assert [line for line in warnings if line.endswith(f'missing: {N} jobs: /camera ({N})')]
     assert not [line for line in warnings if 'is not in it' in line]
 
 
