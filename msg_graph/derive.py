@@ -70,6 +70,8 @@ def load(path: str | PathLike[str]) -> TaskSet:
     try:
         with open(path, 'rb') as file:
             data = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise GraphError(name, None, 'no such file or directory', 'check the path') from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else None
         raise GraphError(

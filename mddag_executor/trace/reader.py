@@ -45,6 +45,8 @@ def _opened(path: str) -> BinaryIO:
 
 
 def _unreadable(path: str, error: OSError) -> TraceError:
+    if isinstance(error, FileNotFoundError):
+        return TraceError(path, 'no such file or directory', 'check the path')
     return TraceError(path, f'cannot be read ({error.strerror})', _REMEDY)
 
 

@@ -118,7 +118,7 @@ def no_declaration(path: Path) -> None:
 
 
 @pytest.mark.parametrize(('content', 'says'), [
-    (None, 'cannot be read (No such file or directory): check '),
+    (None, 'no such file or directory: check the path'),
     (b'', 'is empty: give a trace'),
     (b'8 bytes!', 'is no MCAP file: give a trace'),
     (b'\x89MCAP0\r\n', 'ends or is damaged before its first event: give a trace'),
