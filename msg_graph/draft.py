@@ -264,9 +264,22 @@ class _Writer:
         for node in self._draft.nodes:
             yield f'  - node: {plain_scalar(node.name)}'
             yield '    callbacks:'
+            yield from self._possible_syncs(node)
             for callback in node.callbacks.values():
                 yield from self._callback(callback)
         yield from self._paths()
+
+    def _possible_syncs(self, node: DraftNode) -> Iterator[str]:
+        """Yield a comment on the subscriptions of a node that one source leads to."""
+        topics: dict[str, list[str]] = {}
+        for callback in node.callbacks.values():
+            if callback.kind == 'subscription' and not self._is_source(callback) and (
+                    source := self._period.get(callback.key)):
+                topics.setdefault(source.key, []).append(plain_scalar(callback.starts[0]))
+        for each in topics.values():
+            if len({*each}) > 1:
+                yield ('      # If these are one sync, declare one callback: '
+                       f'sync: [{", ".join(each)}]')
 
     def _callback(self, callback: DraftCallback) -> Iterator[str]:
         yield f'      - name: {plain_scalar(callback.name)}'

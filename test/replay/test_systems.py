@@ -14,7 +14,7 @@ from mddag_executor.replay.drafting import System
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
 from msg_graph.caret import declaration_from_caret
-from msg_graph.draft import declaration_of, LEFT_OUT, MARK
+from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, LEFT_OUT, MARK
 import pytest
 
 MS = 1_000_000
@@ -116,6 +116,22 @@ def test_from_a_trace(recorded: Path) -> None:
         2 * MS, 2 * MS + 9, 2 * MS + 17, 2 * MS + 19, 2 * MS + 19)
     assert time.percent == (0, 50, 90, 99, 100)
     assert 'get_parameters' not in text and 'parameter_events' not in text
+
+
+def test_subscriptions_that_may_be_a_sync_have_a_comment() -> None:
+    """One source leads to /left and /right, another one to /other."""
+    timer, hear = 'timer', 'subscription'
+    text = declaration_of(Draft('a test', [
+        DraftNode('/a', {
+            'both': DraftCallback(
+                '/a', 'both', timer, period_ns=MS, publishes=['/left', '/right']),
+            'other': DraftCallback('/a', 'other', timer, period_ns=2 * MS, publishes=['/other'])}),
+        DraftNode('/b', {topic: DraftCallback('/b', topic, hear, [f'/{topic}'])
+                         for topic in ('left', 'right', 'other')}),
+        DraftNode('/c', {topic: DraftCallback('/c', topic, hear, [f'/{topic}'])
+                         for topic in ('left', 'other')})]))
+    assert [line for line in text.splitlines() if 'sync' in line] == [
+        '      # If these are one sync, declare one callback: sync: [/left, /right]']
 
 
 def test_names_periods_and_what_no_one_declares(tmp_path: Path) -> None:
