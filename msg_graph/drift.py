@@ -15,8 +15,8 @@ The rules are the same for live runs and recordings. Observations are counts by 
    released, by more than ``TOLERANCE``. At least ``LEAST`` expected messages are needed. Dropped
    messages count as received: their loss is no fault of the declaration. Syncs are not checked,
    because a declaration does not say how messages are joined.
-4. *never ran*: a callback never ran, but should have run at least twice. The report suggests an
-   undeclared entity that may be meant (``binding.meant``).
+4. *never ran*: a callback never ran, or a sync never got one of its topics, but should have run at
+   least twice. The report suggests an undeclared entity that may be meant (``binding.meant``).
 5. A callback may run in another process if all its DAGs may span processes (``release_from:
    header_stamp``) or the declaration has ``processes:``, and its node was not seen here. Then it
    is not reported.
@@ -27,7 +27,7 @@ The rules are the same for live runs and recordings. Observations are counts by 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from msg_graph.binding import Entity, is_background, meant
@@ -67,6 +67,7 @@ class Observed:
     :ivar releases: the releases of each DAG, by the key of its source callback.
     :ivar got: by callback, the number of its messages or of its timer's releases.
     :ivar ran: by callback, the number of its executions.
+    :ivar came: by sync, the topics that it got messages of; a sync that is missing is not checked.
     :ivar publishes: by callback, the topics that it published, declared or not.
     :ivar nodes: the nodes that were seen; None if unknown.
     :ivar undeclared: the undeclared entities that were seen.
@@ -76,6 +77,7 @@ class Observed:
     releases: dict[str, Releases] = field(default_factory=dict)
     got: dict[str, int] = field(default_factory=dict)
     ran: dict[str, int] = field(default_factory=dict)
+    came: Mapping[str, Set[str]] = field(default_factory=dict)
     publishes: dict[str, Set[str]] = field(default_factory=dict)
     nodes: Set[str] | None = None
     undeclared: Sequence[Entity] = ()
@@ -87,7 +89,7 @@ class Drift:
     One difference.
 
     :ivar kind: ``publishes``, ``rate`` or ``never ran``.
-    :ivar topic: the undeclared topic that is published, or None.
+    :ivar topic: the undeclared topic that is published, or the one that a sync never got, or None.
     :ivar declared: the declared value: a period in ns, or a number of messages; or None.
     :ivar observed: the observed value, or None.
     """
@@ -157,16 +159,24 @@ def may_run_elsewhere(
 
 
 def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift | None:
-    if observed.ran.get(callback.key, 0) or not dags:
+    ran = observed.ran.get(callback.key, 0)
+    topic = None
+    if ran and callback.kind == 'sync':
+        came = observed.came.get(callback.key, callback.topics)
+        topic = next((each for each in callback.topics if each not in came), None)
+    if ran and topic is None or not dags:
         return None
     slowest = min(dag.period_ns for dag in dags)
     latest = max((dag.vertices[sink].deadline_ns or 0 for dag in dags for sink in dag.sinks),
                  default=0)
     if observed.duration_ns < 2 * slowest + latest:
         return None
-    text = f'{callback.key} never ran in {observed.duration_ns / 1e9:.3f} s'
-    question = meant(callback, observed.undeclared)
-    return Drift('never ran', callback.key, None, None, 0,
+    text = (f'{callback.key} never {"ran" if topic is None else f"got a message of {topic}"} in '
+            f'{observed.duration_ns / 1e9:.3f} s')
+    question = meant(
+        callback if topic is None else replace(callback, kind='subscription', topics=(topic,)),
+        observed.undeclared)
+    return Drift('never ran', callback.key, topic, None, 0,
                  printable(text if question is None else f'{text}: {question}'))
 
 

@@ -94,6 +94,7 @@ class Registry:
         self._retired: list[Entity] = []
         self._past: dict[str, dict[str, Any]] = {}
         self._published: dict[str, set[str]] = {}
+        self._came: dict[str, set[str]] = {}
         self._undeclared: dict[binding.Entity, None] = {}
         self._names: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
 
@@ -171,6 +172,8 @@ class Registry:
                 entity.count_into(self._past)
                 if entity.callback is not None:
                     self._published.setdefault(entity.callback.key, set()).update(entity.publishes)
+                    if entity.ready:
+                        self._came.setdefault(entity.callback.key, set()).add(entity.topic)
             else:
                 self._retired.append(entity)
 
@@ -182,6 +185,16 @@ class Registry:
             for entity in (*self._retired, *self.by_id.values()):
                 if entity.callback is not None:
                     found[entity.callback.key] |= entity.publishes
+        return found
+
+    def came(self) -> dict[str, set[str]]:
+        """Return of which topics each sync has got messages."""
+        with self._counting:
+            found = {callback.key: set(self._came.get(callback.key, ()))
+                     for callback in self.declared if callback.kind == 'sync'}
+            for entity in (*self._retired, *self.by_id.values()):
+                if entity.ready and entity.callback is not None and entity.callback.key in found:
+                    found[entity.callback.key].add(entity.topic)
         return found
 
     def counts(self) -> dict[str, dict[str, Any]]:

@@ -375,6 +375,7 @@ def _observed(task_set: TaskSet, results: Results) -> Observed:
         dag.vertices[dag.source].callback.node) for dag in task_set.dags}
     undeclared: list[Entity] = []
     publishes: dict[str, set[str]] = {}
+    came: dict[str, set[str]] = {}
     for name, result in results:
         part = result['observed']
         whole.duration_ns = max(whole.duration_ns, part['duration_ns'])
@@ -385,9 +386,10 @@ def _observed(task_set: TaskSet, results: Results) -> Observed:
             sums = getattr(whole, name_of)
             for key, count in part[name_of].items():
                 sums[key] = sums.get(key, 0) + count
-        for key, topics in part['publishes'].items():
-            publishes.setdefault(key, set()).update(topics)
+        for name_of, found in (('publishes', publishes), ('came', came)):
+            for key, topics in part[name_of].items():
+                found.setdefault(key, set()).update(topics)
         undeclared += [Entity(*entity) for entity in part['undeclared']]
-    whole.publishes = {**publishes}
+    whole.publishes, whole.came = {**publishes}, {**came}
     whole.undeclared = undeclared
     return whole

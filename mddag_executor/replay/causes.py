@@ -19,8 +19,8 @@ along its critical chain (see ``chains``):
   *ran long* beyond.  If its CPU time is recorded, shows computing and is not unusual, the excess
   is *interpreter* while other callbacks held the GIL, else *machine*: it got no CPU;
 * end of a callback until the next one is ready: *transport*;
-* job that ended early because of a callback that never ran: *waited* if the callback was ready,
-  else its message is *lost*.
+* job that ended early because of a callback that never ran, or a sync that did not get all of its
+  messages: *waited* if the callback was ready, else its message is *lost*.
 
 The largest part, beyond what is usual, is the cause of the miss.  Two rules precede:
 
@@ -229,7 +229,7 @@ def _spans(rows: Table, chain: Table, is_source: Any) -> Table:
     done = np.maximum(start, np.minimum(end, after))
     at = chain['vertex']
     after_vertex = np.where(is_last, rows['at'][of], np.r_[0, at[:-1]])
-    onward = np.where(is_last & (after_vertex != at), _PENDING, _TRANSPORT)
+    onward = np.where(is_last, _PENDING, _TRANSPORT)
     some = lengths > 0
     begins = (first + lengths - 1)[some]
     whole = is_source[at[begins]]
@@ -297,12 +297,13 @@ def _pending(
     """
     open_ones = np.flatnonzero(spans['kind'] == _PENDING).tolist()
     started = never.started if open_ones else never.started[:0]
-    ready = dict(zip(zip(started['vertex'].tolist(), started['job'].tolist()),
-                     started['ready'].tolist()))
+    waiting = {(vertex, job): (ready, start) for vertex, job, ready, start in zip(*(
+        started[name].tolist() for name in ('vertex', 'job', 'ready', 'start')))}
     for i in open_ones:
         miss, vertex, _, begin, end, _ = spans[i].item()
         key = vertex, int(rows['job'][miss])
-        waits = never.dropped.get(key) == 'aborted' or ready.get(key, end) < end
+        ready, start = waiting.get(key, (end, end))
+        waits = never.dropped.get(key) == 'aborted' or ready < end <= start
         if not waits and key not in never.dropped and (
                 rows['kind'][miss] != SINK_EXPIRED or is_source[vertex]):
             full, = pool.full.within(*(np.array([each]) for each in (begin, end)))

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, NEVER
 from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
-from mddag_executor.recording.tables import EXECUTIONS, Ints, Mask, pick, rows, sort_by, Table
+from mddag_executor.recording.tables import EXECUTIONS, Ints, LEG, Mask, pick, rows, sort_by, Table
 from mddag_executor.replay.deadlines import Judged
 from msg_graph import TaskSet
 import numpy as np
@@ -156,6 +156,7 @@ class Chains:
     def links(self, dag: int, link: Ints, running: Mask) -> Table:
         """Return executions as links; the end of a running execution is unknown."""
         table = pick(self._executions, link)
+        running = running & (table['completes'] != LEG)     # a sync waits for its other messages
         found = np.zeros(len(link), dtype=LINKS)
         found['vertex'], found['ready'] = table['vertex'], table['ready']
         n_legs = self._dags[dag].n_legs[found['vertex'] - self._dags[dag].first]

@@ -16,7 +16,7 @@ from collections import Counter, defaultdict
 from collections.abc import Set
 
 from mddag_executor.recording.mapping import declared_keys
-from mddag_executor.recording.tables import Recording
+from mddag_executor.recording.tables import Recording, VERTEX
 from msg_graph.drift import Drift, drift, Observed, Releases
 import numpy as np
 
@@ -47,6 +47,13 @@ def drift_of(recording: Recording) -> list[Drift]:
     ran: Counter[str] = Counter()
     for callback, key in keys.items():
         ran[key] += counts.get(callback, 0)
+    came: defaultdict[str, Set[str]] = defaultdict(set)
+    for each in who.made:
+        if counts.get(each.number) and each.number in keys:
+            came[keys[each.number]] |= {each.start}
+    whole = table['vertex'][declared & (table['completes'] == VERTEX)]
+    for vertex in np.unique(whole).tolist():
+        came.pop(vertices[vertex].callback.key, None)   # it got all of them
     dropped = Counter(vertices[v].callback.key for v in recording.drops['vertex'].tolist()
                       if v >= 0)
     publishes: defaultdict[str, Set[str]] = defaultdict(set)
@@ -64,6 +71,6 @@ def drift_of(recording: Recording) -> list[Drift]:
     bound = declared_keys(who, judge)
     return drift(judge, Observed(
         0 if recording.start is None else max(0, recording.end - recording.start), releases,
-        dict(ran + dropped), dict(ran), publishes, set(who.names_of_nodes) or None,
+        dict(ran + dropped), dict(ran), came, publishes, set(who.names_of_nodes) or None,
         [each.entity for each in who.made
          if each.entity is not None and each.number not in bound]))

@@ -5,10 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor.statistics import Watch
+from mddag_executor.replay import open_recording
+from mddag_executor.replay.drift import drift_of
 from mddag_executor.report.live_runs import summary
 from msg_graph import loads
 import pytest
@@ -51,6 +54,36 @@ nodes:
     texts = {each.callback: each.text for each in watch.drift(executor.statistics())}
     assert texts['/camera:grab'].endswith(': did you mean its timer of 25ms?')
     assert texts['/eye:see'].endswith(": did you mean the node '/robot/eye'?")
+
+
+def test_a_sync_that_never_got_one_of_its_topics(
+        make_executor: Callable[..., Any], make_node: Callable[..., Node], tmp_path: Path) -> None:
+    task_set = loads("""
+mddag: 1
+nodes:
+  - node: /camera
+    callbacks: [{name: grab, timer: 20ms, publishes: [/image, /info]}]
+  - node: /eye
+    callbacks: [{name: see, sync: [/image, /info], deadline: 20ms}]
+""")
+    path = str(tmp_path / 'run.mcap')
+    executor = make_executor(task_set, num_workers=2, trace=path)
+    watch = Watch(executor, task_set)
+    camera, eye = make_node('camera'), make_node('eye')
+    image = camera.create_publisher(Empty, 'image', 10)
+    seen: list[int] = []
+    eye.create_subscription(Empty, 'image', lambda _: seen.append(1), 10)
+    eye.create_subscription(Empty, 'inf', lambda _: seen.append(1), 10)
+    camera.create_timer(0.02, lambda: image.publish(Empty()))
+    for node in (camera, eye):
+        executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(seen) > 8, 10.0)
+    live = watch.drift(executor.statistics())
+    executor.shutdown()
+    for text in (live[0].text, drift_of(open_recording(path))[0].text):
+        assert text.startswith('/eye:see never got a message of /info in ')
+        assert text.endswith(": did you mean the topic '/inf'?")
 
 
 LEAST_S = 0.3

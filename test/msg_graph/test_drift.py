@@ -93,6 +93,18 @@ def test_a_callback_that_never_ran_is_the_reason_for_those_after_it() -> None:
     assert kinds(drift(TASKS, seen)) == [('never ran', '/b:s'), ('never ran', '/b:e')]
 
 
+def test_a_sync_that_never_got_one_of_its_topics() -> None:
+    seen = observed()
+    seen.came = {'/b:s': {'/x', '/z'}}
+    assert drift(TASKS, seen) == []
+    seen.came = {'/b:s': {'/x'}}
+    seen.undeclared = [Entity('/c', 'subscription', '/x'), Entity('/b', 'subscription', '/zz')]
+    found, = drift(TASKS, seen)
+    assert (found.kind, found.callback, found.topic) == ('never ran', '/b:s', '/z')
+    assert found.text == (
+        "/b:s never got a message of /z in 0.500 s: did you mean the topic '/zz'?")
+
+
 def test_a_short_run_says_nothing_of_what_never_ran() -> None:
     seen = Observed(duration_ns=24 * MS)
     assert drift(TASKS, seen) == []

@@ -358,6 +358,30 @@ def test_an_undeclared_callback_may_hold_the_interpreter(
         assert behind['ns'] == 50 * MS
 
 
+def test_a_sync_that_lacks_a_message_did_not_run_long(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # /image has another name in the node
+    path = tmp_path / 'run.mcap'
+    with begin_trace(path, SYNC) as file:
+        for job in range(20):
+            time = START_TIME + job * 50 * MS
+            file.add('job_release', time, 1, 1, 0, job, time)
+            for vertex, address in ((TICK, 7), (2, 8)):
+                add_execution(file, time, time + MS, 0, vertex, job, address=address)
+                time += MS
+            for kind, *fields in (
+                    ('dispatch', 0, USE, job, 0, time, 0), ('callback_start', False),
+                    ('callback_end',), ('complete', 0, USE, job, False, time + MS, 0)):
+                file.add(kind, time + MS * (kind[-3:] in ('end', 'ete')), 1, 10, 9, *fields)
+            file.add('expire', time + 30 * MS, 1, 1, 0, job)
+        end_trace(file, START_TIME + 2_000 * MS)
+    result = explain(capsys, str(path))
+    assert result['causes']['lost'] == result['missed'] == 20
+    assert result['jobs'][0]['parts'][-1] == {
+        'vertex': '/victim:use', 'cause': 'lost', 'ns': 29 * MS, 'behind': []}
+
+
 def test_only_misses_in_stops_are_said_to_be_in_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
