@@ -275,9 +275,8 @@ class Tally:
         self.dropped = 0
         #: By vertex and job: the deadlines of sinks that are overdue and have no verdict yet.
         self.overdue: dict[tuple[int, int], int] = {}
-        #: The first known miss; of those judged at the run's end, the one with the first deadline.
+        #: The miss with the earliest deadline.
         self.first_miss: dict[str, Any] | None = None
-        self._first_kind = -1
 
     def released(self, dag: int) -> None:
         """Count the release of a job."""
@@ -333,10 +332,7 @@ class Tally:
             sink.aborted += 1
         elif kind == SINK_DROPPED:
             sink.dropped += 1
-        if self.first_miss is None or (
-                kind == self._first_kind == SINK_MISSED
-                and deadline < self.first_miss['deadline_ns']):
-            self._first_kind = kind
+        if self.first_miss is None or deadline < self.first_miss['deadline_ns']:
             self.first_miss = self._miss(
                 vertex, job, deadline, time if kind == SINK_LATE else None)
 
@@ -348,11 +344,12 @@ class Tally:
                 'deadline_ns': deadline, 'completed_ns': completed}
 
     def _first_of_all(self) -> dict[str, Any] | None:
-        """Return the first miss, of an overdue sink if there is no verdict yet."""
-        if self.first_miss is not None or not self.overdue:
-            return self.first_miss
-        (vertex, job), deadline = min(self.overdue.items(), key=lambda item: item[1])
-        return self._miss(vertex, job, deadline, None)
+        """Return the miss of the earliest deadline, also of overdue sinks without verdict yet."""
+        first = self.first_miss
+        for (vertex, job), deadline in self.overdue.items():
+            if first is None or deadline < first['deadline_ns']:
+                first = self._miss(vertex, job, deadline, None)
+        return first
 
     def sinks_of(self, dag: Dag) -> dict[int, SinkTally]:
         """Return the results of the sinks of a DAG, by global vertex."""

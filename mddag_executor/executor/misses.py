@@ -155,7 +155,8 @@ class MissLog:
             if self._logged and now - self._at < LOG_EVERY_S:
                 return
             dag, sink, job, deadline_ns = self._verdicts.last_missed()
-            since = f' within {now - self._at:.0f} s, the last' if self._logged else ''
+            since = f' within {now - self._at:.0f} s' if self._logged else ''
+            since += ', the last' if count > 1 else ''
             get_logger('mddag_executor').warning(printable(
                 f'{counted(count, "deadline")} missed{since}: {sink}, {deadline_ns / 1e6:g} ms, '
                 f'job {job} of {dag}'))

@@ -46,9 +46,9 @@ import numpy as np
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
           'lost', 'failed', 'overload')
 (WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, LOST, FAILED, OVERLOAD,
- RAN_USUALLY, UNKNOWN) = range(12)
-#: Kinds of time of a job; the last two are not causes.
-PARTS = (*CAUSES, 'ran', 'unknown')
+ RAN_USUALLY, UNKNOWN, SKIPPED) = range(13)
+#: Kinds of time of a job; the last three are not causes.
+PARTS = (*CAUSES, 'ran', 'unknown', 'skipped')
 #: By cause what to do about it.
 REMEDIES = {
     'waited': 'more workers, or shorter callbacks before it',
@@ -295,11 +295,12 @@ def _pending(
 
     A timer's skipped release waited if all workers were busy for most of the time.
     """
-    open_ones = np.flatnonzero(spans['kind'] == _PENDING).tolist()
-    started = never.started if open_ones else never.started[:0]
+    pending = np.flatnonzero(spans['kind'] == _PENDING)
+    started = never.started if len(pending) else never.started[:0]
     waiting = {(vertex, job): (ready, start) for vertex, job, ready, start in zip(*(
         started[name].tolist() for name in ('vertex', 'job', 'ready', 'start')))}
-    for i in open_ones:
+    before = never.waiting(spans['vertex'][pending], spans['end'][pending])
+    for i, waiting_job in zip(pending.tolist(), before.tolist()):
         miss, vertex, _, begin, end, _ = spans[i].item()
         key = vertex, int(rows['job'][miss])
         ready, start = waiting.get(key, (end, end))
@@ -311,7 +312,8 @@ def _pending(
         if waits:
             spans['kind'][i] = _WAIT
         else:
-            times[i, LOST] = left[i]
+            is_skipped = is_source[vertex] and key not in never.dropped and waiting_job >= 0
+            times[i, SKIPPED if is_skipped else LOST] = left[i]
 
 
 def _unusual(total: Ints, lags: Ints) -> Ints:
@@ -350,7 +352,7 @@ def _causes(
     causes[rows['kind'] == SINK_FAILED] = FAILED
     given_up = np.flatnonzero(
         np.isin(rows['kind'], (SINK_EXPIRED, SINK_ABORTED))
-        & ((total[:, LOST] > 0) | (amounts.max(axis=1) == 0)))
+        & ((total[:, LOST] + total[:, SKIPPED] > 0) | (amounts.max(axis=1) == 0)))
     causes[given_up] = _given_up(
         rows, given_up, causes, np.where(after_stall, MACHINE, RELEASED_LATE), never, is_source)
     return causes

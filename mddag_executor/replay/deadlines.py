@@ -388,10 +388,7 @@ class Judged:
                     tally.windows[v].add(job)
         missed = self.missed
         if len(missed):
-            first = missed[0]
-            if first['kind'] == SINK_MISSED:
-                overdue = missed[missed['kind'] == SINK_MISSED]
-                first = overdue[overdue['deadline'].argmin()]
+            first = missed[missed['deadline'].argmin()]
             tally.first_miss = {
                 'dag': self.task_set.dags[int(first['dag'])].name,
                 'vertex': tally.vertex_name(int(first['sink'])), 'job': int(first['job']),

@@ -34,6 +34,7 @@ from mddag_executor.replay.causes import (
     Pool,
     RAN_LONG,
     RAN_USUALLY,
+    SKIPPED,
     to_explain,
     Usual,
 )
@@ -62,8 +63,9 @@ class Explanation:
         self.stops = self._stops()
         missed, links = self._missed(judged, chains)
         pool = self._pool(missed)
+        self._never = Never(self._dropped(), self._started())
         self.found = find(
-            missed, links, pool, self._usual(), Never(self._dropped(), self._started()),
+            missed, links, pool, self._usual(), self._never,
             np.array([*self._tables.dag_of, 0], dtype=np.int64),
             np.array([*self._tables.sink_deadline, 0], dtype=np.int64),
             np.array([*(not v.predecessors for v in self._task_set.vertices), False]))
@@ -248,10 +250,14 @@ class Explanation:
     def _part(
         self, part: Any, waited: Iterable[tuple[int, int]], names: dict[int, str]
     ) -> dict[str, Any]:
-        return {
+        found = {
             'vertex': self._task_set.vertices[int(part['vertex'])].name,
             'cause': PARTS[part['cause']], 'ns': int(part['ns']), 'behind': [
                 {'callback': names[callback], 'ns': took} for callback, took in waited]}
+        if part['cause'] == SKIPPED:
+            found['waiting_job'] = int(self._never.waiting(
+                part['vertex'][None], part['end'][None])[0])
+        return found
 
     def _names(self) -> dict[int, str]:
         """Return the names of the callbacks that others waited for."""

@@ -72,6 +72,7 @@ def job_lines(job: Mapping[str, Any]) -> Iterator[str]:
     yield (f'Job {job["job"]} of {printable(names[job["sink"]])}: {late} (deadline '
            f'{format_ns(allowed)} after its release): {job["cause"]}')
     yield table(('callback', 'what', 'time', 'behind'), [
-        [names[part['vertex']], part['cause'], format_ns(part['ns'], 3),
+        [names[part['vertex']], part['cause'] if 'waiting_job' not in part else
+         f'skipped: job {part["waiting_job"]} had not started', format_ns(part['ns'], 3),
          ', '.join(f'{names[each["callback"]]} {format_ns(each["ns"], 3)}'
                    for each in part['behind']) or None] for part in parts])

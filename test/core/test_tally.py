@@ -58,9 +58,9 @@ def test_a_tally_of_everything() -> None:
     counts.released(1)  # the undeclared DAG's jobs are not judged
     counts.add([done(1, 0, 10 * US), done(2, 0, 3 * US), (JOB_END, 0, -1, 0, COMPLETED, 1)])
     assert not counts.missed
-    counts.add([done(1, 1, 10 * US + 1), done(2, 1, 20 * US), (JOB_END, 0, -1, 1, LATE, 1)])
     counts.add([done(1, 2, 5 * US), (SINK_EXPIRED, 0, 2, 2, 220 * US, -1),
                 (JOB_END, 0, -1, 2, EXPIRED, 1)])
+    counts.add([done(1, 1, 10 * US + 1), done(2, 1, 20 * US), (JOB_END, 0, -1, 1, LATE, 1)])
     counts.add([(SINK_ABORTED, 0, 1, 3, 310 * US, -1), (SINK_ABORTED, 0, 2, 3, 320 * US, -1),
                 (JOB_END, 0, -1, 3, ABORTED, 1), (DROP, 0, 2, 3, 17, 1)])
     counts.add([(SINK_MISSED, 0, 1, 4, 410 * US, -1)])

@@ -338,7 +338,8 @@ def test_a_callback_that_has_lent_its_worker_keeps_none_busy(
 def test_an_undeclared_callback_may_hold_the_interpreter(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # one of two workers runs it: the other worker's callback cannot begin before it ends
+    # one of two workers runs it: the other worker's callback cannot begin before it ends; its next
+    # release is skipped
     path = tmp_path / 'run.mcap'
     with begin_trace(path, LENT.replace('50ms', '15ms'), workers=2) as file:
         for job in range(5):
@@ -347,15 +348,25 @@ def test_an_undeclared_callback_may_hold_the_interpreter(
             file.add('dispatch', release, 1, 10, 5, -1, -1, -1, 0, release, 0)
             file.add('callback_start', release, 1, 10, 5, False)
             file.add('callback_end', start, 1, 10, 5)
-            file.add('job_release', release, 1, 1, 1, job, release)
-            add_execution(file, start, start + MS, 1, 0, job, 1, ready=release, thread=11,
+            file.add('job_release', release, 1, 1, 1, 2 * job, release)
+            file.add('job_release', release + 20 * MS, 1, 1, 1, 2 * job + 1, release + 20 * MS)
+            file.add('expire', release + 25 * MS, 1, 1, 1, 2 * job + 1)
+            add_execution(file, start, start + MS, 1, 0, 2 * job, 1, ready=release, thread=11,
                           address=8, computed=(MS, True))
         end_trace(file, START_TIME + 5_000 * MS)
     result = explain(capsys, str(path))
-    assert result['causes']['interpreter'] == result['missed'] == 5
+    assert result['causes']['interpreter'] == result['missed'] == 10
     for job in result['jobs']:
-        (behind,) = job['parts'][0]['behind']
-        assert behind['ns'] == 50 * MS
+        if job['job'] % 2:
+            assert job['parts'] == [{'vertex': '/x:late', 'cause': 'skipped', 'ns': 5 * MS,
+                                     'behind': [], 'waiting_job': job['job'] - 1}]
+        else:
+            assert [each['ns'] for each in job['parts'][0]['behind']] == [50 * MS]
+    assert program.main(['explain', str(path), '--job', '3']) == 0
+    assert 'skipped: job 2 had not started' in capsys.readouterr().out
+    # the miss of the earliest deadline is the first one, though the other one was known before
+    assert program.main(['replay', str(path)]) == 0
+    assert 'first miss: /x:late, job 0, 36 ms late' in capsys.readouterr().out
 
 
 def test_a_sync_that_lacks_a_message_did_not_run_long(

@@ -1,6 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The sample traces in `bags/` and results that have been the same since version 1.0.0."""
+"""
+The sample traces in `bags/` and results that have been the same since version 1.0.0.
+
+One is not: the first miss is that of the earliest deadline since 2.0.0.
+"""
 
 from __future__ import annotations
 
