@@ -30,7 +30,7 @@ from mddag_executor.replay.run import Given, open_recording, Progress, undeclare
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import LogEntry, schedule, Settings
 from mddag_executor.simulate.intakes import Intakes
-from mddag_executor.simulate.load import edge_numbers
+from mddag_executor.simulate.load import edge_numbers, SKIPPED
 from mddag_executor.simulate.workload import with_execution_times
 from mddag_executor.text import counted, listed
 from msg_graph import NO_GRAPH, Process, TaskSet
@@ -111,6 +111,7 @@ class Reschedule:
         """Return the result format of ``replay --json``, including the recorded run."""
         duration, settings, work = self.duration_ns, self.settings, self.work
         verdicts = self.tally.result()
+        skipped = work.load.fates.count(SKIPPED)
         miss = verdicts['first_miss']
         if miss is not None:
             dag = self.task_set.dag(miss['dag']).index
@@ -125,6 +126,7 @@ class Reschedule:
             'utilisation': share(work.demand, self.workers, duration),
             **verdicts, 'first_miss': miss, 'rescheduled': True, 'skip_ns': self._skip,
             'executions': work.executions, 'estimated_executions': work.estimated,
+            **({'skipped_jobs': skipped} if skipped else {}),
             'overheads': {
                 'included': self._overheads, 'added_ns': settings.dispatch_overhead_ns,
                 'dispatch_median_ns': work.dispatch_ns,

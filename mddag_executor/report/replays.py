@@ -156,6 +156,9 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
         if result['estimated_executions']:
             yield (f'{result["estimated_executions"]} of {result["executions"]} executions did '
                    'not complete in the recording: they take the median of their callback')
+        if result.get('skipped_jobs'):
+            yield (f'{counted(result["skipped_jobs"], "job")} skipped by a timer in the '
+                   'recording: skipped again, so expired')
         return
     undeclared = result['undeclared']
     if undeclared['executions']:

@@ -349,7 +349,7 @@ def test_an_undeclared_callback_may_hold_the_interpreter(
             file.add('callback_start', release, 1, 10, 5, False)
             file.add('callback_end', start, 1, 10, 5)
             file.add('job_release', release, 1, 1, 1, 2 * job, release)
-            file.add('job_release', release + 20 * MS, 1, 1, 1, 2 * job + 1, release + 20 * MS)
+            file.add('job_release', release + 25 * MS, 1, 1, 1, 2 * job + 1, release + 20 * MS)
             file.add('expire', release + 25 * MS, 1, 1, 1, 2 * job + 1)
             add_execution(file, start, start + MS, 1, 0, 2 * job, 1, ready=release, thread=11,
                           address=8, computed=(MS, True))
@@ -367,6 +367,8 @@ def test_an_undeclared_callback_may_hold_the_interpreter(
     # the miss of the earliest deadline is the first one, though the other one was known before
     assert program.main(['replay', str(path)]) == 0
     assert 'first miss: /x:late, job 0, 36 ms late' in capsys.readouterr().out
+    assert program.main(['replay', str(path), '--reschedule']) == 0
+    assert '5 jobs skipped by a timer in the recording: skipped' in capsys.readouterr().out
 
 
 def test_a_sync_that_lacks_a_message_did_not_run_long(
