@@ -43,6 +43,10 @@ def test_standard_input_and_output(call: Mddag, monkeypatch: pytest.MonkeyPatch)
     control = result['dags']['control']
     assert control['rad_offset_ns'] == [15_000_000, 30_000_000, *[15_000_000] * 3]
     assert list(control['sinks'].values()) == [30_000_000, 15_000_000]
+    for workers, shown in (('', '0.100 of 7 workers (the default)'),
+                           ('workers: 2\n', '0.350 of 2 workers')):
+        done = call('graph', 'check', '-', stdin=GRAPH.replace('nodes:', f'{workers}nodes:'))
+        assert done.stdout.endswith(f', load 0.700, utilisation {shown}\n')
 
 
 def test_utilisation_is_one_thing_in_all_commands(call: Mddag, tmp_path: Path) -> None:
