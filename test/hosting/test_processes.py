@@ -235,6 +235,7 @@ def test_an_exception_in_one_ends_the_run_with_its_status(world: Path) -> None:
     with running('graph.yaml', *nodes) as run:
         result, _, errors = run.end()
     assert run.process.returncode == 70
-    assert 'warning: process up ended with status 70: ValueError: boom' in errors
+    assert ('warning: process up ended with status 70: error: /sensor: fail (timer 50ms): '
+            'it raised ValueError: boom, ') in errors
     assert '[up] Traceback' in errors
     assert result['processes'][0]['died']
