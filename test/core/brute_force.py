@@ -486,10 +486,10 @@ class BruteForce:
                 **self.counts[dag.index, sink], 'response_ns': response}
 
     def first_miss(self) -> dict[str, Any] | None:
-        """Return the miss that was known first, in the result format."""
+        """Return the miss of the earliest deadline, in the result format."""
         if not self.misses:
             return None
-        first = self.misses[0]
+        first = min(self.misses, key=lambda miss: miss.deadline)
         return {'dag': first.dag, 'vertex': first.vertex, 'job': first.job,
                 'deadline_ns': first.deadline * self.tick,
                 'completed_ns': None if first.completed is None else first.completed * self.tick}
