@@ -35,6 +35,9 @@ from msg_graph import TaskSet
 ROUNDING_NS = 2
 """DDS timestamps are multiples of 2**-32 s: they may be this far outside of the window."""
 
+MANY_UNLIKE = 4
+"""After so many publications in a row the numbers of a publisher are known to have shifted."""
+
 _STILL_PUBLISHING = 2 ** 63 - 1
 NO_NUMBER = -(2 ** 62)
 """The count of a publication made by a signal handler within another one of its publisher."""
@@ -82,32 +85,56 @@ class PublisherNumbers:
         self.offset = 0
         # the count of the last publication whose message was found
         self._found = NO_NUMBER
-        # another possible offset, and the count of the last message that it would explain
-        self._unlike: tuple[int, int] | None = None
+        # another possible offset, the count of the last message that it would explain, and for
+        # how many publications in a row it does
+        self._unlike = (0, NO_NUMBER, 0)
 
     def agree(self, count: int, sequence: int) -> bool:
         """
         Return whether a message is the publication with this count; only its window fits.
 
         Messages of two publications in a row that differ from the count by the same number show
-        that the publisher had sent messages before.  A message that differs after that of the
-        publication was found is of another publisher.
+        that the publisher had sent messages before.  Once messages were found, the difference only
+        changes when a publication has failed, which ``MANY_UNLIKE`` in a row show: two may be of
+        another publisher, in windows that follow each other.  A message that differs after that of
+        the publication was found is of another publisher.
         """
         offset = sequence - count
-        is_explained = self._unlike is not None and (
-            self._unlike[0] == offset and self._unlike[1] != count)
-        if offset == self.offset or count > self._found and is_explained:
+        if offset == self.offset:
             self.confirm(count, sequence)
             return True
-        if count > self._found:
-            self._unlike = offset, count
-        return False
+        if count <= self._found:
+            return False
+        unlike, last, times = self._unlike
+        if unlike != offset:
+            times = 0
+        if count != last or not times:
+            times += 1
+        self._unlike = offset, count, times
+        if times < (2 if self._found == NO_NUMBER else MANY_UNLIKE):
+            return False
+        self.confirm(count, sequence)
+        return True
+
+    def agree_at_once(self, count: int, sequence: int) -> bool:
+        """
+        Return whether the only message announced during the publication with this count is its.
+
+        The first one is believed; a later one may be of another publisher, if another thread has
+        received that of the publication meanwhile.
+        """
+        if count == NO_NUMBER:
+            return True
+        if self._found != NO_NUMBER:
+            return self.agree(count, sequence)
+        self.confirm(count, sequence)
+        return True
 
     def confirm(self, count: int, sequence: int) -> None:
         """Note that a message is the publication with this count."""
         self.offset = sequence - count
         self._found = max(count, self._found)
-        self._unlike = None
+        self._unlike = (0, NO_NUMBER, 0)
 
 
 class PublisherState:

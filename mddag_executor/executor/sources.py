@@ -197,12 +197,11 @@ class SubscriptionSource(Source):
             return False
         if publication is not None:
             info = taken[1]
-            if not publication.holds(info['source_timestamp']):
+            sequence = info.get('publication_sequence_number')
+            if not publication.holds(info['source_timestamp']) or (
+                    sequence is not None and not publication.numbers.agree_at_once(
+                        publication.sequence, sequence)):
                 publication = None
-            else:
-                sequence = info.get('publication_sequence_number')
-                if sequence is not None:
-                    publication.numbers.confirm(publication.sequence, sequence)
         self.post(taken, publication)
         return True
 
