@@ -316,16 +316,17 @@ def test_a_signal_s_handler_may_publish(where):
 
 def test_a_callback_of_spin_once_may_shut_down(make_executor, make_node):
     """After a spin, threads are parked; the shutdown ends them though a step is running."""
-    node, future, done = make_node(), rclpy.Future(), []
+    node, future, steps, done = make_node(), rclpy.Future(), threading.Event(), []
     executor = make_executor(num_workers=2, nodes=[node])
 
     def callback() -> None:
-        if future.done():
+        if steps.is_set():
             done.append(executor.shutdown(5.0))
-        else:
+        elif not future.done():  # a worker may run it again before the spin has ended
             future.set_result(None)
     node.create_timer(0.01, callback)
     executor.spin_until_future_complete(future, 10.0)
+    steps.set()
     with contextlib.suppress(ExternalShutdownException, ShutdownException):
         for _ in range(100):
             executor.spin_once(0.1)
