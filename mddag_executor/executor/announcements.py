@@ -40,12 +40,11 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.executor.jobs import (
     Announced,
-    header_stamp,
     NO_ORIGIN,
     Origin,
     Publication,
     PublisherNumbers,
-    steady_time,
+    stamped_release,
 )
 from mddag_executor.executor.other_processes import contested
 from mddag_executor.executor.work import Work
@@ -184,8 +183,7 @@ class Announcements:
         if isinstance(origin, Announced):
             release = origin.release + self._clock.offset_ns
         elif origin is None and work.entity.remote_publishers:
-            stamp = header_stamp(work.args[0])
-            release = steady_time(stamp, now)
+            release, stamp = stamped_release(work.args[0], now)
         self._engine.arrived(work, origin, release, stamp, now)
 
     def _take_in(

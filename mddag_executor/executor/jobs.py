@@ -106,10 +106,7 @@ class PublisherNumbers:
         if count <= self._found:
             return False
         unlike, last, times = self._unlike
-        if unlike != offset:
-            times = 0
-        if count != last or not times:
-            times += 1
+        times = times + (count != last) if unlike == offset else 1
         self._unlike = offset, count, times
         if times < (2 if self._found == NO_NUMBER else MANY_UNLIKE):
             return False
@@ -316,12 +313,21 @@ class Jobs:
         :return: the release, and the header's stamp if the release was taken from it, else -1.
         """
         kind = self._release_from[dag]
-        stamp = header_stamp(message) if kind == 'header_stamp' else -1
-        if kind == 'arrival' or (kind == 'header_stamp' and stamp < 0):
-            return now, -1  # raw, without header or stamp: only its arrival is known
         if kind == 'source_timestamp':
             return steady_time(source_timestamp, now), -1
-        return steady_time(stamp, now), stamp
+        release, stamp = (now, -1) if kind == 'arrival' else stamped_release(message, now)
+        # raw, without header or stamp: only its arrival is known
+        return now if stamp < 0 else release, stamp
+
+
+def stamped_release(message: Any, now: int) -> tuple[int, int]:
+    """
+    Return the release by the stamp of a message's header, on the trace's clock, and the stamp.
+
+    :param now: the time on the trace's clock.
+    """
+    stamp = header_stamp(message)
+    return steady_time(stamp, now), stamp
 
 
 def steady_time(system_time: int, now: int) -> int:

@@ -63,6 +63,17 @@ def _listed(node: Node, name: str) -> list[Any]:
     return found
 
 
+_TopicsOf = Callable[[Entity], set[str]]
+
+
+def _topics_published(entity: Entity) -> set[str]:
+    return entity.publishes
+
+
+def _topics_received(entity: Entity) -> set[str]:
+    return {entity.topic} if entity.ready else set()
+
+
 class Registry:
     """
     The records of all entities of the executor's nodes.
@@ -93,8 +104,9 @@ class Registry:
         # destroyed entities with unfinished executions, and the counts of earlier ones
         self._retired: list[Entity] = []
         self._past: dict[str, dict[str, Any]] = {}
-        self._published: dict[str, set[str]] = {}
-        self._came: dict[str, set[str]] = {}
+        # by kind and declared callback: the topics of retired entities
+        self._past_topics: dict[_TopicsOf, dict[str, set[str]]] = {
+            _topics_published: {}, _topics_received: {}}
         self._undeclared: dict[binding.Entity, None] = {}
         self._names: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
 
@@ -171,30 +183,30 @@ class Registry:
             if entity.is_through():
                 entity.count_into(self._past)
                 if entity.callback is not None:
-                    self._published.setdefault(entity.callback.key, set()).update(entity.publishes)
-                    if entity.ready:
-                        self._came.setdefault(entity.callback.key, set()).add(entity.topic)
+                    for topics_of, past in self._past_topics.items():
+                        past.setdefault(entity.callback.key, set()).update(topics_of(entity))
             else:
                 self._retired.append(entity)
 
     def publishes(self) -> dict[str, set[str]]:
         """Return on which topics each declared callback has published."""
-        with self._counting:
-            found = {callback.key: set(self._published.get(callback.key, ()))
-                     for callback in self.declared}
-            for entity in (*self._retired, *self.by_id.values()):
-                if entity.callback is not None:
-                    found[entity.callback.key] |= entity.publishes
-        return found
+        return self._topics(self.declared, _topics_published)
 
     def came(self) -> dict[str, set[str]]:
         """Return of which topics each sync has got messages."""
+        syncs = [callback for callback in self.declared if callback.kind == 'sync']
+        return self._topics(syncs, _topics_received)
+
+    def _topics(
+        self, callbacks: Iterable[Callback], topics_of: _TopicsOf
+    ) -> dict[str, set[str]]:
+        """Return by callback the topics of its entities, also of removed ones."""
         with self._counting:
-            found = {callback.key: set(self._came.get(callback.key, ()))
-                     for callback in self.declared if callback.kind == 'sync'}
+            past = self._past_topics[topics_of]
+            found = {callback.key: set(past.get(callback.key, ())) for callback in callbacks}
             for entity in (*self._retired, *self.by_id.values()):
-                if entity.ready and entity.callback is not None and entity.callback.key in found:
-                    found[entity.callback.key].add(entity.topic)
+                if entity.callback is not None and entity.callback.key in found:
+                    found[entity.callback.key] |= topics_of(entity)
         return found
 
     def counts(self) -> dict[str, dict[str, Any]]:

@@ -23,7 +23,7 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor.executor import compat
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.jobs import header_stamp, Publication, steady_time
+from mddag_executor.executor.jobs import Publication, stamped_release
 from mddag_executor.executor.listeners import clear_listener, MANY, set_listener
 from mddag_executor.executor.loop import ChannelSource, EventLoop
 from mddag_executor.executor.work import Work
@@ -168,8 +168,7 @@ class SubscriptionSource(Source):
             origin = publication.origin if publication is not None else engine.jobs.find(
                 entity.topic, stamp, info.get('publication_sequence_number'))
             if origin is None and entity.remote_publishers:
-                header = header_stamp(message)
-                release = steady_time(header, now)
+                release, header = stamped_release(message, now)
         engine.arrived(work, origin, release, header, now)
 
     def collect_published(self, publication: Publication | None) -> bool:

@@ -95,12 +95,14 @@ def numbers(values: Any, known: Any = None) -> Any:
     """
     import pyarrow
     plain = np.ascontiguousarray(values)
-    data, mask = (
-        each if each is None or each.dtype != np.bool_ else np.packbits(each, bitorder='little')
-        for each in (plain, None if known is None or known.all() else known))
+    mask = None if known is None or known.all() else pyarrow.py_buffer(_bits(known))
+    data = _bits(plain) if plain.dtype == np.bool_ else plain
     return pyarrow.Array.from_buffers(
-        pyarrow.from_numpy_dtype(plain.dtype), len(plain),
-        [None if mask is None else pyarrow.py_buffer(mask), pyarrow.py_buffer(data)])
+        pyarrow.from_numpy_dtype(plain.dtype), len(plain), [mask, pyarrow.py_buffer(data)])
+
+
+def _bits(flags: Any) -> Any:
+    return np.packbits(flags, bitorder='little')
 
 
 def named(codes: Any, names: Sequence[str], known: Any = None) -> Any:

@@ -226,9 +226,14 @@ class Recording:
 
     def __repr__(self) -> str:
         """Return one line: the name, and how much is recorded."""
-        length = 0 if self.start is None else self.end - self.start
+        length = self.end - self.begin
         return (f'<Recording {self.name}: {length / 1e9:.3f} s, {len(self.releases)} jobs, '
                 f'{len(self.executions)} executions>')
+
+    @property
+    def begin(self) -> int:
+        """Return ``start``, or the end if nothing is recorded."""
+        return self.end if self.start is None else self.start
 
     @property
     def dropped(self) -> Counter[str]:

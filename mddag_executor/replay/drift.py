@@ -70,7 +70,7 @@ def drift_of(recording: Recording) -> list[Drift]:
             publishes[keys[callback]] |= {publisher.topic}
     bound = declared_keys(who, judge)
     return drift(judge, Observed(
-        0 if recording.start is None else max(0, recording.end - recording.start), releases,
+        max(0, recording.end - recording.begin), releases,
         dict(ran + dropped), dict(ran), came, publishes, set(who.names_of_nodes) or None,
         [each.entity for each in who.made
          if each.entity is not None and each.number not in bound]))

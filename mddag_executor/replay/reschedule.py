@@ -62,7 +62,7 @@ class Reschedule:
         self.workers = settings.workers * settings.processes
         self.warnings = warnings
         self._skip, self._overheads, self._about = skip, overheads, recording_result(run)
-        self._start = run.end if run.start is None else run.start
+        self._start = run.begin
         self.tally = MissTally(task_set, tables)
         load, end = work.load, settings.duration_ns
         self._run = partial(schedule, tables) if work.intakes is None else Intakes(
@@ -230,8 +230,7 @@ def reschedule(
         tables, builder.callback_of, run.who.groups, declared_first=not run.same)
     del builder     # the load has copies of its data
     give_back()
-    start = run.end if run.start is None else run.start
-    warnings, judge_from = run.warnings, start + skip if skip else -NEVER
+    warnings, judge_from = run.warnings, run.begin + skip if skip else -NEVER
     if recorded is not None:
         warnings, judge_from = recorded.warnings, recorded.judged.judge_from
     if cpus is not None and run.declared and len(work.load.computed) == 0:

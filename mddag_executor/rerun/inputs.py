@@ -198,7 +198,6 @@ def _recorded(path: str, task_set: TaskSet, name: str) -> RerunInput:
     tables = Tables.build(task_set, max_active_jobs=NEVER)
     head = run.head
     builder = LoadBuilder(run, tables, head.workers, max(0, head.cpus))
-    start = run.end if run.start is None else run.start
     return RerunInput(
-        name, min(start, head.time or start), run.end, None,
+        name, min(run.begin, head.time or run.begin), run.end, None,
         Durations(tables, builder.build().load, recorded=True))

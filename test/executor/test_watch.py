@@ -26,6 +26,19 @@ from test_msgs.action import Fibonacci
 from .conftest import Spinning, wait_for
 
 
+def add_camera_and_eye(
+        executor: Any, camera: Node, eye: Node, period: float, published: str,
+        *heard: str) -> list[int]:
+    """Connect and add the nodes; the returned list grows with each message that the eye gets."""
+    image, seen = camera.create_publisher(Empty, published, 10), list[int]()
+    for topic in heard:
+        eye.create_subscription(Empty, topic, lambda _: seen.append(1), 10)
+    camera.create_timer(period, lambda: image.publish(Empty()))
+    for node in (camera, eye):
+        executor.add_node(node)
+    return seen
+
+
 def test_what_never_ran_and_is_probably_meant(
         make_executor: Callable[..., Any], make_node: Callable[..., Node]) -> None:
     """A namespace more, and a timer of another period; the nodes are gone when it is asked."""
@@ -40,12 +53,7 @@ nodes:
     executor = make_executor(task_set, num_workers=2)
     watch = Watch(executor, task_set)
     camera, eye = make_node('camera'), make_node('eye', namespace='/robot')
-    image = camera.create_publisher(Empty, '/robot/image', 10)
-    seen: list[int] = []
-    eye.create_subscription(Empty, 'image', lambda _: seen.append(1), 10)
-    camera.create_timer(0.025, lambda: image.publish(Empty()))
-    for node in (camera, eye):
-        executor.add_node(node)
+    seen = add_camera_and_eye(executor, camera, eye, 0.025, '/robot/image', 'image')
     with Spinning(executor):
         assert wait_for(lambda: len(seen) > 8, 10.0)
         for node in (camera, eye):
@@ -70,13 +78,7 @@ nodes:
     executor = make_executor(task_set, num_workers=2, trace=path)
     watch = Watch(executor, task_set)
     camera, eye = make_node('camera'), make_node('eye')
-    image = camera.create_publisher(Empty, 'image', 10)
-    seen: list[int] = []
-    eye.create_subscription(Empty, 'image', lambda _: seen.append(1), 10)
-    eye.create_subscription(Empty, 'inf', lambda _: seen.append(1), 10)
-    camera.create_timer(0.02, lambda: image.publish(Empty()))
-    for node in (camera, eye):
-        executor.add_node(node)
+    seen = add_camera_and_eye(executor, camera, eye, 0.02, 'image', 'image', 'inf')
     with Spinning(executor):
         assert wait_for(lambda: len(seen) > 8, 10.0)
     live = watch.drift(executor.statistics())
