@@ -175,7 +175,8 @@ def check_files(args: argparse.Namespace) -> None:
     What an output may replace says `output_rules`.
     """
     for kind, stream in ((Input, 'input'), (Output, 'output')):
-        same = [name for name, each in _files(args) if isinstance(each, kind) and each == '-']
+        same = sorted(name for name, each in _files(args)
+                      if isinstance(each, kind) and each == '-')
         if len(same) > 1:
             raise UsageError(f'-: standard {stream} can be only one of {" and ".join(same)}: '
                              'name a file for each other one')
