@@ -111,7 +111,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('graph check g.yaml --json folder', 'folder: this is a directory: name a file'),
     ('simulate g.yaml --trace -', '--trace -: it is not written to standard output: name a file'),
     ('graph assign-deadlines g.yaml --json -',
-     '-: standard output can be only one of output and json: name a file for each other one'),
+     '-: standard output can be only one of json and output: name a file for each other one'),
     ('graph draw g.yaml -o out.jpeg', 'out.jpeg: no ending that says what to draw: use one of .s'),
     ('replay run.mcap --report out.pdf', '--report out.pdf: a report is an HTML file: let its na'),
     ('export run.mcap -o out.xlsx', '-o out.xlsx: it is not known what to write: let the name en'),
