@@ -271,7 +271,7 @@ def test_a_run_in_which_nothing_was_due_is_no_better(
 
 @pytest.mark.parametrize(('options', 'says'), [
     (['--junit', '/gone/out.xml'], 'there is no directory /gone'),
-    (['--junit', '-', '--json', '-'], 'can be only one of junit and json'),
+    (['--junit', '-', '--json', '-'], 'can be only one of json and junit'),
 ])
 def test_wrong_options(
     trace: Path, options: list[str], says: str, capsys: pytest.CaptureFixture[str]
