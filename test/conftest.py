@@ -20,6 +20,7 @@ import contextlib
 from functools import cache
 import importlib
 import io
+import json
 import os
 from pathlib import Path, PurePosixPath
 import signal
@@ -31,7 +32,7 @@ import threading
 import time
 import traceback
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import hypothesis
 import pytest
@@ -235,31 +236,43 @@ def ros_context(no_thread_leak: None) -> Iterator[Any]:
     context.try_shutdown()
 
 
+class Done(NamedTuple):
+    """How a command ended, and what it printed."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+    @property
+    def result(self) -> Any:
+        """What it printed as JSON; its status must be 0."""
+        assert self.returncode == 0, self.stderr
+        return json.loads(self.stdout)
+
+
+Call = Callable[..., Done]
+
+
 @pytest.fixture
-def call(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., subprocess.CompletedProcess[str]]:
+def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Call:
     """Give a function that runs `mddag` with arguments in this process, which is quicker."""
-    def run(*arguments: str | Path, cwd: Path | None = None,
-            stdin: str | bytes = b'') -> subprocess.CompletedProcess[str]:
+    def run(*arguments: object, cwd: Path | None = None, stdin: str | bytes = b'') -> Done:
         from mddag_executor.cli.main import main
-        command = [*map(str, arguments)]
+        capsys.readouterr()
         with monkeypatch.context() as patch:
             if cwd is not None:
                 patch.chdir(cwd)
             given = stdin if isinstance(stdin, bytes) else stdin.encode()
             patch.setattr('sys.stdin', io.TextIOWrapper(io.BytesIO(given), encoding='utf-8'))
-            status = main(command)
-        out, err = capsys.readouterr()
-        return subprocess.CompletedProcess(command, status, out, err)
+            status = main([*map(str, arguments)])
+        return Done(status, *capsys.readouterr())
     return run
 
 
 @pytest.fixture
-def mddag() -> Callable[..., subprocess.CompletedProcess[str]]:
+def mddag() -> Call:
     """Give a function that runs `mddag` with arguments in a process of its own."""
-    def call(*arguments: str | Path, timeout: float = 60.0,
-             **options: Any) -> subprocess.CompletedProcess[str]:
+    def call(*arguments: object, timeout: float = 60.0, **options: Any) -> Done:
         given = options.pop('input', None)
         options.setdefault('stdin', subprocess.DEVNULL if given is None else subprocess.PIPE)
         environment = {**(options.pop('env', None) or os.environ), 'PYTHONFAULTHANDLER': '1'}
@@ -280,5 +293,5 @@ def mddag() -> Callable[..., subprocess.CompletedProcess[str]]:
             except BaseException:
                 process.kill()
                 raise
-        return subprocess.CompletedProcess(command, process.returncode, out, err)
+        return Done(process.returncode, out, err)
     return call

@@ -1,11 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What tests of verbs share: a declaration in the working directory, standard input."""
+"""What tests of verbs share: a declaration in the working directory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-import io
 from pathlib import Path
 
 import pytest
@@ -24,11 +22,3 @@ def graph(folder: Path, request: pytest.FixtureRequest) -> Path:
     path = folder / 'graph.yaml'
     path.write_text(request.module.GRAPH)
     return path
-
-
-@pytest.fixture
-def stdin(monkeypatch: pytest.MonkeyPatch) -> Callable[[bytes], None]:
-    """Give a function that sets what standard input holds."""
-    def put(data: bytes) -> None:
-        monkeypatch.setattr('sys.stdin', io.TextIOWrapper(io.BytesIO(data), encoding='utf-8'))
-    return put

@@ -11,9 +11,7 @@ from mddag_executor.cli import main as program
 import numpy as np
 import pytest
 
-from .helpers import caller
-
-call = caller()
+from ..conftest import Call
 
 GRAPH = """\
 mddag: 1
@@ -168,12 +166,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('run g.yaml --synthetic sleep --processes 0', '--processes 0: give 1 or more, or a file'),
 ])
 def test_bad_input(
-    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
-    command: str, line: str,
+    files: Path, call: Call, monkeypatch: pytest.MonkeyPatch, command: str, line: str
 ) -> None:
     monkeypatch.chdir(files)
     before = sorted(files.rglob('*'))
-    status, out, err = call(capsys, *command.split())
+    status, out, err = call(*command.split())
     assert (status, out) == (2, '')
     assert err.startswith(f'error: {line}'), err
     assert err.count('\n') == 1 and '\x1b' not in err

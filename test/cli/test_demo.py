@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import json
 from pathlib import Path
-import subprocess
 
 import pytest
+
+from ..conftest import Call
 
 
 @pytest.mark.slow
 def test_the_main_job_end_to_end(
-    tmp_path: Path, mddag: Callable[..., subprocess.CompletedProcess[str]]
+    tmp_path: Path, mddag: Call
 ) -> None:
     process = mddag('demo', '--duration', '3s', '--utilisation', '0.3', '--output', tmp_path,
                     '--json', tmp_path / 'all.json', timeout=150.0)
@@ -41,7 +41,7 @@ def test_the_main_job_end_to_end(
 
 
 def test_a_step_that_fails_is_one_line(
-    tmp_path: Path, mddag: Callable[..., subprocess.CompletedProcess[str]]
+    tmp_path: Path, mddag: Call
 ) -> None:
     (tmp_path / 'demo.mcap').mkdir()  # the trace cannot be written
     process = mddag('demo', '--duration', '1s', '--output', tmp_path)

@@ -16,9 +16,7 @@ from msg_graph import load
 from msg_graph.model import load_of
 import pytest
 
-from .helpers import caller
-
-call = caller('evaluate')
+from ..conftest import Call
 
 GRAPH = """\
 mddag: 1
@@ -37,14 +35,12 @@ nodes:
 
 @pytest.mark.parametrize(('ending', 'start'), [
     ('png', b'\x89PNG'), ('svg', b'<?xml'), ('pdf', b'%PDF')])
-def test_figure(
-    graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], ending: str, start: bytes
-) -> None:
+def test_figure(graph: Path, tmp_path: Path, call: Call, ending: str, start: bytes) -> None:
     """It is a picture of that kind, and the same for the same runs."""
     pictures = []
     for name in ('one', 'two'):
         path = tmp_path / f'{name}.{ending.upper() if name == "two" else ending}'
-        assert call(capsys, graph, '--runs', 20, '--plot', path, '--jobs', 1)[0] == 0
+        assert call('evaluate', graph, '--runs', 20, '--plot', path, '--jobs', 1)[0] == 0
         pictures.append(path.read_bytes())
     assert pictures[0].startswith(start) and len(pictures[0]) > 5000
     assert pictures[0] == pictures[1]
@@ -97,18 +93,15 @@ def test_interrupted(graph: Path, tmp_path: Path) -> None:
     assert f"{result['runs']} runs in" in out
 
 
-def test_several_graphs(
-    graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_several_graphs(graph: Path, tmp_path: Path, call: Call) -> None:
     """A folder's declarations come by name; the bins begin at 0.05; each is counted."""
     (tmp_path / 'sets').mkdir()
     (tmp_path / 'sets' / 'b.yaml').write_text(GRAPH.replace('14000', '2000').replace(
         '10000', '1000'))
     (tmp_path / 'sets' / 'a.yaml').write_text(GRAPH.replace('workers: 1', 'workers: 2'))
     (tmp_path / 'sets' / 'notes.txt').write_text('no declaration')
-    status, out, err = call(
-        capsys, graph, 'sets', '--runs', 20, '--policies', 'rad', '--no-preemptive', '--json',
-        'out.json', '--plot', 'out.svg')
+    status, out, err = call('evaluate', graph, 'sets', '--runs', 20, '--policies', 'rad',
+                            '--no-preemptive', '--json', 'out.json', '--plot', 'out.svg')
     assert (status, err) == (0, '')
     assert '60 runs of 3 task sets in' in out
     result = json.loads((tmp_path / 'out.json').read_text())
@@ -124,16 +117,14 @@ def test_several_graphs(
     assert b'3 task sets' in (tmp_path / 'out.svg').read_bytes()
 
 
-call_generate = caller('generate')
 pytestmark = pytest.mark.usefixtures('folder')
 
 
-def test_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folder(folder: Path, call: Call) -> None:
     (folder / 'again').mkdir()  # an empty one is taken
     for name in ('sets', 'again'):
-        status, out, err = call_generate(
-            capsys, '--sets', 5, '--utilisation', '0.2:0.6', '--workers', 3, '-o', name)
-        assert (status, out, err) == (0, '', '')
+        assert call('generate', '--sets', 5, '--utilisation', '0.2:0.6', '--workers', 3,
+                    '-o', name) == (0, '', '')
     files = sorted((folder / 'sets').iterdir())
     assert [file.name for file in files] == [f'set_{i:04d}.yaml' for i in range(5)]
     for i, file in enumerate(files):

@@ -4,22 +4,16 @@
 
 from __future__ import annotations
 
-from contextlib import redirect_stdout
-import io
-import json
 import os
 from pathlib import Path
 import subprocess
 import sys
 
-from mddag_executor.cli import main as program
 from mddag_executor.recording.tables import TABLES
 from mddag_executor.replay import open_recording
 import pytest
 
-from .helpers import caller
-
-call = caller()
+from ..conftest import Call
 
 DEMO = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
 GRAPH = """\
@@ -40,63 +34,54 @@ def graph(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def trace(graph: Path, tmp_path: Path) -> Path:
+def trace(graph: Path, tmp_path: Path, call: Call) -> Path:
     path = tmp_path / 'run.mcap'
-    with redirect_stdout(io.StringIO()):
-        assert program.main(['simulate', str(graph), '--duration', '100ms', '--workers', '1',
-                             '--trace', str(path)]) == 0
+    call('simulate', graph, '--duration', '100ms', '--workers', 1, '--trace', path)
     return path
 
 
-def test_a_report_of_each_kind(
-    graph: Path, trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_report_of_each_kind(graph: Path, trace: Path, tmp_path: Path, call: Call) -> None:
     pytest.importorskip('bokeh', reason='Bokeh is not installed')
     for name, arguments in (
             ('Replay as recorded', ['replay', trace]),
             ('Replay, rescheduled', ['replay', trace, graph, '--reschedule', '--workers', 3]),
             ('Simulation', ['simulate', graph, '--duration', '50ms'])):
         out = tmp_path / 'out.html'
-        status, text, err = call(capsys, *arguments, '--report', out)
+        status, text, err = call(*arguments, '--report', out)
         assert (status, err) == (0, '') and 'results due' in text
         page = out.read_text()
         assert f'<h1>{name}: ' in page and page.endswith('</html>\n')
         assert not list(tmp_path.glob('.*.part'))
 
 
-def test_diff(
-    graph: Path, trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_diff(graph: Path, trace: Path, tmp_path: Path, call: Call) -> None:
     quick = tmp_path / 'quick.yaml'
     quick.write_text(GRAPH % '1ms')
     after = tmp_path / 'after.mcap'
-    call(capsys, 'simulate', quick, '--duration', '100ms', '--workers', 1, '--trace', after)
-    status, out, err = call(capsys, 'diff', trace, after, '--fail-on-worse')
+    call('simulate', quick, '--duration', '100ms', '--workers', 1, '--trace', after)
+    status, out, err = call('diff', trace, after, '--fail-on-worse')
     assert (status, err) == (0, '') and 'worse in B: 0 sinks' in out
-    status, out, _ = call(capsys, 'diff', after, trace, '--fail-on-worse')
+    status, out, _ = call('diff', after, trace, '--fail-on-worse')
     assert status == 1 and 'worse in B: 1 sink' in out
-    assert call(capsys, 'diff', after, trace)[0] == 0
-    status, out, _ = call(capsys, 'diff', after, trace, '--json', '-')
-    result = json.loads(out)
-    assert status == 0 and result['worse'] is True
+    assert call('diff', after, trace)[0] == 0
+    result = call('diff', after, trace, '--json', '-').result
+    assert result['worse'] is True
     sink = result['dags']['/n']['sinks']['/n:s']
     assert sink['change_ns']['median'] == 3_000_000 and sink['change']['median'] == 1.0
     # by another declaration nothing is late in either run, but one is slower
     wide = tmp_path / 'wide.yaml'
     wide.write_text(GRAPH.replace('5ms', '9ms') % '4ms')
-    assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse')[0] == 0
-    assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse', '--tolerance', '50%')[0] \
+    assert call('diff', after, trace, wide, '--fail-on-worse')[0] == 0
+    assert call('diff', after, trace, wide, '--fail-on-worse', '--tolerance', '50%')[0] \
         == 1
-    assert call(capsys, 'diff', after, trace, wide, '--fail-on-worse', '--tolerance', '1.0')[0] \
+    assert call('diff', after, trace, wide, '--fail-on-worse', '--tolerance', '1.0')[0] \
         == 0
 
 
-def test_the_tables_of_a_recording(
-    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_tables_of_a_recording(trace: Path, tmp_path: Path, call: Call) -> None:
     parquet = pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
     out = tmp_path / 'tables'
-    assert call(capsys, 'export', DEMO, '-o', f'{out}/') == (0, f'exported: {out}/\n', '')
+    assert call('export', DEMO, '-o', f'{out}/') == (0, f'exported: {out}/\n', '')
     recording = open_recording(DEMO)
     assert {path.stem for path in out.iterdir()} == set(TABLES)
     for name in TABLES:
@@ -112,29 +97,27 @@ def test_the_tables_of_a_recording(
     assert {row['callback'] for row in executions.to_pylist() if row['vertex']} <= keys
 
 
-def test_a_folder_replaces_an_earlier_export_only(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_replaces_an_earlier_export_only(tmp_path: Path, call: Call) -> None:
     pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
     out, part = tmp_path / 'tables', tmp_path / '.tables.part'
     done = 0, f'exported: {out}/\n', ''
     part.mkdir()        # as a killed command leaves it
     (part / 'releases.parquet').write_bytes(b'half')
-    assert call(capsys, 'export', DEMO, '-o', f'{out}/') == done
+    assert call('export', DEMO, '-o', f'{out}/') == done
     whole = {path.name: path.read_bytes() for path in out.iterdir()}
     (out / 'misses.parquet').unlink()
     (out / 'releases.parquet').write_bytes(b'old')
-    assert call(capsys, 'export', DEMO, '-o', f'{out}/') == done
+    assert call('export', DEMO, '-o', f'{out}/') == done
     assert {path.name: path.read_bytes() for path in out.iterdir()} == whole
     assert os.listdir(tmp_path) == ['tables']
     (out / 'mine.txt').write_text('notes')
-    assert call(capsys, 'export', DEMO, '-o', f'{out}/') == (
+    assert call('export', DEMO, '-o', f'{out}/') == (
         2, '', f'error: {out}: this folder holds other files, for instance mine.txt: name a new '
         'folder, or remove this one\n')
     assert len(os.listdir(out)) == len(whole) + 1 and os.listdir(tmp_path) == ['tables']
     file = tmp_path / 'file'
     file.write_text('notes')
-    status, _, error = call(capsys, 'export', DEMO, '-o', f'{file}/')
+    status, _, error = call('export', DEMO, '-o', f'{file}/')
     assert status == 2 and error.startswith(f'error: {file}: there is a file already')
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import re
 import shutil
 
-from mddag_executor.cli import main as program
 import pytest
 
+from ..conftest import Call
 from ..replay.recorded import four_jobs
 from ..report import runs
 from ..report.test_pictures import GRAPH
@@ -87,14 +87,14 @@ def files(folder: Path) -> Path:
 @pytest.mark.parametrize('name', [
     pytest.param(name, marks=[pytest.mark.needs('babeltrace2')] * (name == 'import_ctf'))
     for name in COMMANDS])
-def test_output(name: str, files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_output(name: str, files: Path, call: Call) -> None:
     if '.html' in COMMANDS[name]:
         pytest.importorskip('bokeh', reason='Bokeh is not installed')
     session(files / 'session', [('ros2:callback_end', [('callback', 'u64')]),
                                 ('sensors:sample', [('value', 'u64')])],
             [(kind, 5 + kind, 1, 2, 'p', 3) for kind in (0, 1)])
-    assert program.main(COMMANDS[name].split()) == 0
-    out, err = capsys.readouterr()
+    status, out, err = call(*COMMANDS[name].split())
+    assert status == 0
     found = f'$ mddag {COMMANDS[name]}\n{out}' + (f'--- standard error\n{err}' if err else '')
     for path in sorted(files.glob('out.*')):
         text = path.read_bytes().decode()
@@ -104,11 +104,9 @@ def test_output(name: str, files: Path, capsys: pytest.CaptureFixture[str]) -> N
     golden.compare(name, found)
 
 
-def test_quiet(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet(files: Path, call: Call) -> None:
     """With -q nothing is printed that was not asked for."""
     for words in (['graph', 'check', 'graph.yaml'], ['replay', 'run.mcap'],
                   ['simulate', 'graph.yaml', '--trace', 'new.mcap']):
-        assert program.main([*words, '-q']) == 0
-        assert capsys.readouterr() == ('', '')
-    assert program.main(['graph', 'check', 'graph.yaml', '-q', '--json', '-']) == 0
-    assert capsys.readouterr().out.startswith('{')
+        assert call(*words, '-q') == (0, '', '')
+    assert call('graph', 'check', 'graph.yaml', '-q', '--json', '-').stdout.startswith('{')

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import json
 from pathlib import Path
 import re
@@ -15,9 +14,8 @@ from mddag_executor.report.tables import MOST_LINES
 import msg_graph
 import pytest
 
+from ..conftest import Call
 from ..replay.recorded import MS, Recorded
-
-Mddag = Callable[..., subprocess.CompletedProcess[str]]
 
 BAG = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
 
@@ -72,7 +70,7 @@ print(node.asked)
 """
 
 
-def test_from_trace(call: Mddag, tmp_path: Path) -> None:
+def test_from_trace(call: Call, tmp_path: Path) -> None:
     done = call('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, 'no blanks to fill in\n', '')
     task_set = msg_graph.load(tmp_path / 'g.yaml')
@@ -82,8 +80,7 @@ def test_from_trace(call: Mddag, tmp_path: Path) -> None:
     assert done.stdout.splitlines()[1:] == (tmp_path / 'g.yaml').read_text().splitlines()[1:]
 
 
-def test_from_trace_keeps_what_was_declared(
-        call: Mddag, mddag: Mddag, tmp_path: Path) -> None:
+def test_from_trace_keeps_what_was_declared(call: Call, mddag: Call, tmp_path: Path) -> None:
     pytest.importorskip('rclpy')
     (tmp_path / 'g.yaml').write_text(
         'mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n      - {name: t, timer: 10ms, '
@@ -116,7 +113,7 @@ def composed(path: Path) -> Path:
     return r.write()
 
 
-def test_messages_within_a_process_count(call: Mddag, tmp_path: Path) -> None:
+def test_messages_within_a_process_count(call: Call, tmp_path: Path) -> None:
     """From the recording alone, and with an architecture file."""
     composed(tmp_path / 'c.mcap')
     done = call('graph', 'from-trace', 'c.mcap', '--accept', '-o', 'g.yaml', cwd=tmp_path)
@@ -126,9 +123,8 @@ def test_messages_within_a_process_count(call: Mddag, tmp_path: Path) -> None:
         ('/image',), ('/image',), 100 * MS)
     assert detect.execution_time is not None
     assert set(detect.execution_time.quantiles_ns) == {4 * MS}
-    done = call('replay', 'c.mcap', 'g.yaml', '--json', '-', cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    sink, = json.loads(done.stdout)['dags']['/camera']['sinks'].values()
+    result = call('replay', 'c.mcap', 'g.yaml', '--json', '-', cwd=tmp_path).result
+    sink, = result['dags']['/camera']['sinks'].values()
     assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (5, 0, 7 * MS + 1)
     (tmp_path / 'a.yaml').write_text("""\
 nodes:
@@ -146,7 +142,7 @@ nodes:
     assert done.stdout.count('# measured in 5 executions') == 2
 
 
-def test_from_trace_accepts_the_proposals(call: Mddag, tmp_path: Path) -> None:
+def test_from_trace_accepts_the_proposals(call: Call, tmp_path: Path) -> None:
     """Two sources in a node, and what has no rate; the declaration then judges the recording."""
     r = Recorded(tmp_path / 'r.mcap')
     r.node(1, '/n')
@@ -186,16 +182,16 @@ def test_from_trace_accepts_the_proposals(call: Mddag, tmp_path: Path) -> None:
             for dag in dags] == [
         ('/n/callback_0', 10 * MS, [10 * MS]), ('/n/callback_2', 20 * MS, [20 * MS]),
         ('/n/callback_5', 20 * MS, [20 * MS])]
-    done = call('replay', 'r.mcap', 'g.yaml', '--json', '-', cwd=tmp_path)
-    assert done.returncode == 0
-    judged = json.loads(done.stdout)['dags']
+    judged = json.loads(
+        call('replay', 'r.mcap', 'g.yaml', '--json', '-', cwd=tmp_path).stdout)['dags']
     assert {name: [(sink['completed'], sink['late']) for sink in dag['sinks'].values()]
             for name, dag in judged.items()} == {
         '/n/callback_0': [(10, 1)], '/n/callback_2': [(5, 0)], '/n/callback_5': [(5, 0)]}
 
 
 def test_a_coroutine_is_one_execution_however_often_it_is_resumed(
-        call: Mddag, tmp_path: Path) -> None:
+    call: Call, tmp_path: Path
+) -> None:
     pytest.importorskip('rclpy')
     (tmp_path / 'ask.py').write_text(ASKING)
     done = subprocess.run(
@@ -211,7 +207,7 @@ def test_a_coroutine_is_one_execution_however_often_it_is_resumed(
     assert counts == {'ask': str(asked + 1), 'inner': str(2 * asked), 'outer': str(asked)}
 
 
-def test_from_ros_where_nothing_runs(mddag: Mddag, tmp_path: Path) -> None:
+def test_from_ros_where_nothing_runs(mddag: Call, tmp_path: Path) -> None:
     pytest.importorskip('rclpy')
     done = mddag('graph', 'from-ros', '--timeout', '0.3', '-o', 'g.yaml', cwd=tmp_path)
     assert done.returncode == 2
@@ -221,10 +217,8 @@ def test_from_ros_where_nothing_runs(mddag: Mddag, tmp_path: Path) -> None:
     assert (done.returncode, done.stderr.count('\n')) == (2, 1)
 
 
-def test_replay_tells_of_drift(call: Mddag, tmp_path: Path) -> None:
-    done = call('replay', BAG, '--json', '-')
-    assert done.returncode == 0
-    assert json.loads(done.stdout)['drift'] == []
+def test_replay_tells_of_drift(call: Call, tmp_path: Path) -> None:
+    assert call('replay', BAG, '--json', '-').result['drift'] == []
     assert 'difference' not in call('replay', BAG).stdout
     call('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
     text = (tmp_path / 'g.yaml').read_text()
@@ -237,7 +231,7 @@ def test_replay_tells_of_drift(call: Mddag, tmp_path: Path) -> None:
         f'{len(found)} difference')
 
 
-def test_includes(call: Mddag, tmp_path: Path) -> None:
+def test_includes(call: Call, tmp_path: Path) -> None:
     (tmp_path / 'part.yaml').write_text(
         'mddag: 1\narguments:\n  d:\nnodes:\n  - {node: /n, callbacks: '
         '[{name: t, timer: 10ms, deadline: $(d)}]}\n')

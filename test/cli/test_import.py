@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 import sys
 
 from mddag_executor.trace import ctf, read_events
 import pytest
 
-from ..cli.helpers import caller
+from ..conftest import Call
 from ..trace.ctf_session import session
-
-call = caller('import')
 
 HELPER = """\
 import json
@@ -38,14 +35,12 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_what_was_there_stays_when_the_import_fails(
-    recording: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_there_stays_when_the_import_fails(recording: Path, call: Call) -> None:
     out = recording.with_name('out.mcap')
     out.write_text('precious')
     recording.with_name('helper.py').write_text(HELPER.format(last='nothing'))
     before = sorted(recording.parent.iterdir())
-    status, text, errors = call(capsys, 'ctf', recording, '-o', out, '--overwrite')
+    status, text, errors = call('import', 'ctf', recording, '-o', out, '--overwrite')
     assert (status, text) == (2, '')
     assert errors.startswith(f'error: {recording}: babeltrace2 gave up')
     assert errors.count('\n') == 1
@@ -57,13 +52,12 @@ def test_what_was_there_stays_when_the_import_fails(
     ('missing', 'there is no such folder'), ('file', 'is no folder'),
     ('empty', 'holds no CTF recording'), ('cache', 'holds only what CARET converted'),
 ])
-def test_bad_sessions(name: str, what: str, tmp_path: Path,
-                      capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_sessions(name: str, what: str, tmp_path: Path, call: Call) -> None:
     (tmp_path / 'file').touch()
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'cache').mkdir()
     (tmp_path / 'cache' / 'caret_converted').touch()
-    status, text, errors = call(capsys, 'ctf', tmp_path / name, '-o', tmp_path / 'out.mcap')
+    status, text, errors = call('import', 'ctf', tmp_path / name, '-o', tmp_path / 'out.mcap')
     assert (status, text, errors.count('\n')) == (2, '', 1)
     assert errors.startswith(f'error: {tmp_path / name}: {what}')
     assert not list(tmp_path.glob('*.mcap')) + list(tmp_path.glob('.*'))
@@ -80,41 +74,37 @@ def of_session(
 
 
 @pytest.mark.needs('babeltrace2')
-def test_several_sessions_are_named_one_by_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_several_sessions_are_named_one_by_one(tmp_path: Path, call: Call) -> None:
     """Parts of one session are one recording, wherever they lie; two sessions need to be named."""
     out = tmp_path / 'out.mcap'
     of_session(tmp_path / 'one' / 'ust/uid/1000/64-bit', 'drive', 'monday', callback=1)
     of_session(tmp_path / 'one' / 'archives/chunk-0/ust/uid/1000/64-bit', 'drive', 'monday',
                callback=2)
     of_session(tmp_path / 'one' / 'kernel', 'drive (kernel)', 'mon', callback=3)
-    status, text, errors = call(capsys, 'ctf', tmp_path / 'one', '-o', out)
+    status, text, errors = call('import', 'ctf', tmp_path / 'one', '-o', out)
     assert (status, errors) == (0, '')
     assert [event['callback'] for event in read_events(out)] == [1, 2, 3]
     out.unlink()
     for name, host in (('another', 'robot'), ('elsewhere', 'tower')):
         of_session(tmp_path / name / 'ust/uid/1000/64-bit', 'drive', 'tuesday', host, callback=4)
-        status, text, errors = call(capsys, 'ctf', tmp_path, '-o', out)
+        status, text, errors = call('import', 'ctf', tmp_path, '-o', out)
         assert (status, text, errors.count('\n')) == (2, '', 1)
         count = 2 if name == 'another' else 3
         assert errors.startswith(f'error: {tmp_path}: it holds {count} sessions: another, ')
         assert 'name the folder of one' in errors
         assert not out.exists()
-    status, text, errors = call(
-        capsys, 'ctf', tmp_path / 'one', tmp_path / 'elsewhere', '-o', out)
-    assert (status, errors) == (0, '')
+    done = call('import', 'ctf', tmp_path / 'one', tmp_path / 'elsewhere', '-o', out)
+    assert (done.returncode, done.stderr) == (0, '')
     assert [event['callback'] for event in read_events(out)] == [1, 2, 3, 4]
     out.unlink()
-    status, _, errors = call(
-        capsys, 'ctf', tmp_path / 'one', tmp_path / 'one' / 'kernel', '-o', out)
-    assert (status, errors.count('\n')) == (2, 1)
-    assert errors.endswith(': a session is named twice: name each once\n')
+    done = call('import', 'ctf', tmp_path / 'one', tmp_path / 'one' / 'kernel', '-o', out)
+    assert (done.returncode, done.stderr.count('\n')) == (2, 1)
+    assert done.stderr.endswith(': a session is named twice: name each once\n')
 
 
 @pytest.mark.needs('babeltrace2')
 def test_processes_of_several_containers_may_have_the_same_numbers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, call: Call
 ) -> None:
     # in both containers process 1 runs a callback of the same address, at overlapping times
     kinds = [(f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')]
@@ -124,12 +114,9 @@ def test_processes_of_several_containers_may_have_the_same_numbers(
         session(tmp_path / name / 'ust', kinds, events, environment={
             'trace_name': 'drive', 'trace_creation_datetime': made, 'hostname': 'robot'})
     out = tmp_path / 'out.mcap'
-    status, text, errors = call(
-        capsys, 'ctf', tmp_path / 'camera', tmp_path / 'control', '-o', out)
-    assert (status, errors) == (0, '') and 'from 2 processes' in text
-    status, text, _ = caller('replay')(capsys, out, '--json', '-')
-    assert status == 0
-    result = json.loads(text)
+    done = call('import', 'ctf', tmp_path / 'camera', tmp_path / 'control', '-o', out)
+    assert (done.returncode, done.stderr) == (0, '') and 'from 2 processes' in done.stdout
+    result = call('replay', out, '--json', '-').result
     assert [(use['executions'], use['unfinished'], use['busy_ns'])
             for use in result['recorded_callbacks'].values()] == [(5, 0, 30), (5, 0, 30)]
 
@@ -137,14 +124,14 @@ def test_processes_of_several_containers_may_have_the_same_numbers(
 @pytest.mark.parametrize('version, reads', [
     ('2.0.4', False), ('2.0.6-rc1', False), ('2.1.0', True), ('2.10', True), ('3.0', True)])
 def test_ctf_2_needs_babeltrace_2_1(
-    version: str, reads: bool, recording: Path, capsys: pytest.CaptureFixture[str]
+    version: str, reads: bool, recording: Path, call: Call
 ) -> None:
     out, metadata = recording.with_name('out.mcap'), recording / 'metadata'
     metadata.write_text('\x1e{"type": "preamble", "version": 2}\n\x1e{"type": "trace-class", '
                         '"environment": {"hostname": "robot", "trace_name": "drive"}}\n')
     helper = recording.with_name('helper.py')
     helper.write_text(helper.read_text().replace("'2'", repr(version)))
-    status, text, errors = call(capsys, 'ctf', recording, '-o', out)
+    status, text, errors = call('import', 'ctf', recording, '-o', out)
     if reads:
         assert (status, errors) == (0, '')
         assert [event['callback'] for event in read_events(out)] == [3]

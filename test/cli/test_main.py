@@ -27,7 +27,7 @@ from mddag_executor.simulate.run import check
 from msg_graph import errors, GraphError, loads
 import pytest
 
-Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
+from ..conftest import Call
 
 
 @pytest.fixture
@@ -202,7 +202,7 @@ def test_completion(tmp_path: Path) -> None:
     assert completed('mddag graph place g.yaml --pro') == {'--processes'}
 
 
-def test_module_and_program_are_the_same(mddag: Mddag) -> None:
+def test_module_and_program_are_the_same(mddag: Call) -> None:
     result = mddag('--version')
     assert (result.returncode, result.stdout) == (0, f'mddag {__version__}\n')
     script = Path(sys.executable).with_name('mddag')

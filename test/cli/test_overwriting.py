@@ -13,12 +13,11 @@ import subprocess
 import sys
 
 from mddag_executor.cli import common
-from mddag_executor.cli import main as program
 from mddag_executor.errors import InputError
 from mddag_executor.trace import TraceError, TraceFile, TraceWriter
 import pytest
 
-from .helpers import caller
+from ..conftest import Call
 
 GRAPH = """\
 mddag: 1
@@ -28,15 +27,12 @@ nodes:
       - {name: t, timer: 10ms, publishes: [/a], execution_time: 2ms}
       - {name: s, subscription: /a, deadline: 5ms, execution_time: 4ms}
 """
-call = caller()
 
 
 @pytest.fixture
-def run(graph: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+def run(graph: Path, call: Call) -> Path:
     """Give a recorded run, run.mcap in the working directory."""
-    assert program.main(
-        ['simulate', 'graph.yaml', '--duration', '100ms', '--trace', 'run.mcap']) == 0
-    capsys.readouterr()
+    assert call('simulate', graph, '--duration', '100ms', '--trace', 'run.mcap').returncode == 0
     return Path('run.mcap')
 
 
@@ -64,11 +60,11 @@ def run(graph: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     'rerun run.mcap graph.yaml --node a:b --expect out.mcap -o out.mcap',
 ])
 def test_an_output_is_never_an_input_or_another_output(
-    run: Path, capsys: pytest.CaptureFixture[str], command: str
+    run: Path, call: Call, command: str
 ) -> None:
     Path('link.csv').symlink_to(run)
     before = {path.name: path.read_bytes() for path in Path().iterdir()}
-    status, out, err = call(capsys, *command.split())
+    status, out, err = call(*command.split())
     assert (status, out, err.count('\n')) == (2, '', 1)
     assert 'it cannot be both' in err
     assert {path.name: path.read_bytes() for path in Path().iterdir()} == before
@@ -82,12 +78,10 @@ def test_an_output_is_never_an_input_or_another_output(
     'run graph.yaml --synthetic sleep --duration 100ms --trace run.mcap',
     'simulate graph.yaml --duration 50ms --trace precious.txt',
 ])
-def test_a_recording_replaces_no_file(
-    run: Path, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
+def test_a_recording_replaces_no_file(run: Path, call: Call, command: str) -> None:
     Path('precious.txt').write_text('precious')
     before = {path.name: path.read_bytes() for path in Path().iterdir()}
-    status, out, err = call(capsys, *command.split())
+    status, out, err = call(*command.split())
     assert (status, out) == (2, '')
     name = command.split()[-1]
     assert err == (f'error: {name}: there is a file already: name another file, or replace this '
@@ -101,48 +95,41 @@ def test_a_recording_replaces_no_file(
     'generate -o other.dat',
     'simulate graph.yaml --report damaged.mcap.html --json damaged.mcap',
 ])
-def test_no_other_output_replaces_a_recording(
-    run: Path, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
+def test_no_other_output_replaces_a_recording(run: Path, call: Call, command: str) -> None:
     Path('other.dat').write_bytes(run.read_bytes())
     Path('damaged.mcap').write_bytes(b'\0' + run.read_bytes()[1:])
     before = {path.name: path.read_bytes() for path in Path().iterdir()}
-    status, out, err = call(capsys, *command.split())
+    status, out, err = call(*command.split())
     assert (status, out) == (2, '')
     assert 'this file is a recording: name another file for the result' in err
     assert {path.name: path.read_bytes() for path in Path().iterdir()} == before
 
 
-def test_overwrite_replaces_a_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_overwrite_replaces_a_recording(run: Path, call: Call) -> None:
     before = run.read_bytes()
     command = ['simulate', 'graph.yaml', '--duration', '50ms', '--trace', run, '--overwrite']
-    assert call(capsys, *command)[0] == 0
+    assert call(*command)[0] == 0
     assert run.read_bytes() != before
-    assert call(capsys, 'replay', run)[0] == 0
+    assert call('replay', run)[0] == 0
 
 
-def test_empty_files_and_other_results_are_replaced(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_empty_files_and_other_results_are_replaced(run: Path, call: Call) -> None:
     Path('new.mcap').touch()    # as mktemp leaves it
     Path('result.json').write_text('{"old": true}')
-    assert call(capsys, 'simulate', 'graph.yaml', '--trace', 'new.mcap')[0] == 0
-    assert call(capsys, 'replay', 'new.mcap', '--json', 'result.json')[0] == 0
+    assert call('simulate', 'graph.yaml', '--trace', 'new.mcap')[0] == 0
+    assert call('replay', 'new.mcap', '--json', 'result.json')[0] == 0
     assert 'dags' in json.loads(Path('result.json').read_text())
-    assert call(capsys, 'replay', run, '--json', '/dev/null', '--junit', '/dev/null')[0] == 0
+    assert call('replay', run, '--json', '/dev/null', '--junit', '/dev/null')[0] == 0
 
 
 @pytest.mark.parametrize('there', ['run.p.mcap', 'run.q.mcap'])
-def test_several_processes_replace_no_trace(
-    folder: Path, capsys: pytest.CaptureFixture[str], there: str
-) -> None:
+def test_several_processes_replace_no_trace(folder: Path, call: Call, there: str) -> None:
     Path('two.yaml').write_text(
         GRAPH + '  - {node: /m, callbacks: [{name: t, timer: 10ms, deadline: 9ms}]}\n'
         'processes: {p: [/n], q: [/m]}\n')
     Path(there).write_text('precious')
-    status, out, err = call(
-        capsys, 'run', 'two.yaml', '--synthetic', 'sleep', '--duration', '10ms', '--trace',
-        'run.mcap')
+    status, out, err = call('run', 'two.yaml', '--synthetic', 'sleep', '--duration', '10ms',
+                            '--trace', 'run.mcap')
     assert (status, out) == (2, '')
     assert f'{there}: there is a file already' in err
     assert Path(there).read_text() == 'precious'

@@ -7,18 +7,15 @@ from __future__ import annotations
 from contextlib import redirect_stdout
 import csv
 import io
-import json
 from pathlib import Path
 from typing import Any
 
 from mddag_executor.cli import main as program
 import pytest
 
+from ..conftest import Call
 from ..replay.recorded import four_jobs, MS
 from ..replay.test_ordinary_bags import write_bag
-from .helpers import caller
-
-call = caller()
 
 GRAPH = """\
 mddag: 1
@@ -57,15 +54,14 @@ def sink(result: Any) -> Any:
 @pytest.mark.parametrize('form', ['csv', 'parquet', 'pftrace'])
 def test_export(
     files: dict[str, str], arguments: list[str], verdicts: list[str], form: str, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    call: Call,
 ) -> None:
     if form != 'csv':
         pytest.importorskip('perfetto' if form == 'pftrace' else 'pyarrow')
     out = tmp_path / f'out.{form}'
     rows = [] if form == 'pftrace' else ['--rows', 'jobs']
-    status, text, errors = call(
-        capsys, 'export', *(files.get(word, word) for word in arguments), '-o', str(out), *rows)
-    assert (status, text, errors) == (0, f'exported: {out}\n', '')
+    assert call('export', *(files.get(word, word) for word in arguments), '-o', out, *rows) == (
+        0, f'exported: {out}\n', '')
     if form == 'csv':
         with out.open(newline='') as stream:
             assert [row['verdict'] for row in csv.DictReader(stream)] == verdicts
@@ -87,18 +83,18 @@ def test_export(
     (['imported.mcap', 'imported.mcap', 'graph.yaml'], (5, 5), (4, 4))])
 def test_diff(
     files: dict[str, str], arguments: list[str], medians: tuple[int, int], due: tuple[int, int],
-    capsys: pytest.CaptureFixture[str],
+    call: Call,
 ) -> None:
     words = [files.get(word, word) for word in arguments]
-    status, text, errors = call(capsys, 'diff', *words, '--json', '-')
-    assert (status, errors) == (0, '')
-    found = json.loads(text)
+    done = call('diff', *words, '--json', '-')
+    found = done.result
+    assert not done.stderr
     sides = sink(found)['a'], sink(found)['b']
     assert tuple(round(side['response_ns']['median'] / MS) for side in sides) == medians
     assert tuple(side['due'] for side in sides) == due
     assert [found[mark]['imported'] for mark in 'ab'] == [
         word == 'imported.mcap' for word in arguments[:2]]
-    lines = call(capsys, 'diff', *words)[1].splitlines()
+    lines = call('diff', *words)[1].splitlines()
     assert all(('imported, 2 threads' in line) == found[mark]['imported']
                for mark, line in zip('ab', lines[-3:-1]))
 
@@ -114,26 +110,24 @@ def test_diff(
     (['diff', 'own.mcap', 'imported.mcap', 'other.yaml'], 'none of the callbacks')])
 def test_what_can_not_be(
     files: dict[str, str], arguments: list[str], problem: str, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, call: Call,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    status, out, errors = call(capsys, *(files.get(word, word) for word in arguments))
+    status, out, errors = call(*(files.get(word, word) for word in arguments))
     assert (status, out, errors.count('\n')) == (2, '', 1), errors
     assert errors.startswith('error: ') and problem in errors
     assert not list(tmp_path.iterdir())
 
 
-def test_a_part_by_time(
-    files: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_part_by_time(files: dict[str, str], tmp_path: Path, call: Call) -> None:
     """Ten jobs, one each 100 ms: that at `--from` is in the part, that at `--to` is not."""
     part = '--from', '200ms', '--to', '500ms'
     for name, due in (('own.mcap', 3), ('imported.mcap', 2)):
         given = files[name], *(() if name == 'own.mcap' else (files['graph.yaml'],))
-        status, output, _ = call(capsys, 'replay', *given, *part, '--json', '-')
-        assert status == 0 and json.loads(output)['dags']['/camera']['jobs'] == due
-        status, output, _ = call(capsys, 'explain', *given, *part)
+        result = call('replay', *given, *part, '--json', '-').result
+        assert result['dags']['/camera']['jobs'] == due
+        status, output, _ = call('explain', *given, *part)
         assert status == 0 and f'{due} results due' in output
         jobs = tmp_path / 'jobs.csv'
-        assert call(capsys, 'export', *given, *part, '--rows', 'jobs', '-o', str(jobs))[0] == 0
+        assert call('export', *given, *part, '--rows', 'jobs', '-o', str(jobs))[0] == 0
         assert len(jobs.read_text().splitlines()) == 1 + due

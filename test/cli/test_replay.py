@@ -4,21 +4,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import json
 from pathlib import Path
-import subprocess
 from typing import Any
 
 from mddag_executor.trace import TraceFile
 import pytest
 
-from ..cli.helpers import caller
+from ..conftest import Call
 from ..replay.recorded import four_jobs, MS
 from ..report.runs import by_hand, GRAPH, START
 from .test_golden import SEEN
-
-call = caller('replay')
 
 
 @pytest.fixture
@@ -27,33 +23,29 @@ def trace(tmp_path: Path) -> Path:
     return by_hand(tmp_path / 'run.mcap', undeclared=False)
 
 
-def test_a_given_graph_judges(
-    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_given_graph_judges(trace: Path, tmp_path: Path, call: Call) -> None:
     graph = tmp_path / 'strict.yaml'
     graph.write_text(GRAPH.replace('8ms', '5ms'))
-    status, out, err = call(capsys, trace, graph, '--fail-on-miss')
+    status, out, err = call('replay', trace, graph, '--fail-on-miss')
     assert (status, err) == (1, '')
     assert '3 results due, 1 in time (33.33 %), 2 late, 0 expired' in out
     graph.write_text(GRAPH.replace('8ms', '10ms'))
-    status, out, err = call(capsys, trace, graph, '--fail-on-miss')
+    status, out, err = call('replay', trace, graph, '--fail-on-miss')
     assert (status, err) == (0, '')
     assert 'first miss' not in out
 
 
-def test_overheads(trace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_overheads(trace: Path, call: Call) -> None:
     # the second callback was dispatched 1 ms after it was ready, though its worker was free
     for options, longest in (([], 10 * MS), (['--overheads', 'recorded'], 10 * MS),
                              (['--overheads', 'none'], 9 * MS), (['--overheads', '2ms'], 13 * MS)):
-        result = json.loads(call(capsys, trace, '--reschedule', '--json', '-', *options)[1])
+        result = call('replay', trace, '--reschedule', '--json', '-', *options).result
         sink = result['dags']['/driver']['sinks']['/filter:run']
         assert sink['response_ns']['max'] == longest
         assert result['overheads']['dispatch_median_ns'] == 0
 
 
-def test_a_run_without_jobs_proves_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_without_jobs_proves_nothing(tmp_path: Path, call: Call) -> None:
     # only an undeclared callback ran, 1.5 s after the recording began
     trace, report = tmp_path / 'run.mcap', tmp_path / 'report.html'
     with TraceFile(trace) as file:
@@ -63,48 +55,38 @@ def test_a_run_without_jobs_proves_nothing(
         file.add('callback_start', now, 1, 9, 77, False)
         file.add('callback_end', now + MS, 1, 9, 77)
         file.add('shutdown', now + MS, 1, 9, now + MS)
-    status, out, _ = call(capsys, trace, '--report', report)
+    status, out, _ = call('replay', trace, '--report', report)
     assert status == 0 and ', 1.501 s, utilisation 0.000 ' in out
     page = report.read_text()
     assert 'No deadline was missed' not in page
     assert 'No job was due at any sink: nothing is proven.' in page
 
 
-def test_a_truncated_trace_gives_what_is_there(
-    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_truncated_trace_gives_what_is_there(trace: Path, tmp_path: Path, call: Call) -> None:
     cut = tmp_path / 'cut.mcap'
     data = trace.read_bytes()
     cut.write_bytes(data[:-40])
-    status, out, err = call(capsys, cut)
+    status, out, err = call('replay', cut)
     assert status == 0
     assert '3 results due' in out
     assert err.startswith(f'warning: {cut}: the summary at the end is damaged or missing: ')
     assert err.count('\n') == 1
     cut.write_bytes(data[:100])
-    status, _, err = call(capsys, cut)
+    status, _, err = call('replay', cut)
     assert status == 2 and err.startswith(f'error: {cut}: it is damaged (')
     assert err.endswith('nothing of a run is left in it: take another copy of the file, or record '
                         'the run again\n')
 
 
-def test_standard_input(
-    trace: Path, tmp_path: Path, stdin, capsys: pytest.CaptureFixture[str]
-) -> None:
-    stdin(trace.read_bytes())
-    status, out, err = call(capsys, '-')
-    assert (status, err) == (0, '')
-    assert out == call(capsys, trace)[1]
-    stdin(trace.read_bytes()[:-40])
-    status, out, err = call(capsys, '-', '--json', '-')
+def test_standard_input(trace: Path, call: Call) -> None:
+    assert call('replay', '-', stdin=trace.read_bytes()) == call('replay', trace)
+    status, out, err = call('replay', '-', '--json', '-', stdin=trace.read_bytes()[:-40])
     assert err.startswith('warning: <stdin>: the summary')
     assert json.loads(out)['recording']['trace'] == '<stdin>'
-    stdin(b'nonsense')
-    assert call(capsys, '-') == (
+    assert call('replay', '-', stdin=b'nonsense') == (
         2, '', 'error: <stdin>: is no MCAP file: give a trace written by this program or another '
         'MCAP recording\n')
-    stdin(GRAPH.encode())
-    assert call(capsys, trace, '-')[::2] == (0, '')
+    assert call('replay', trace, '-', stdin=GRAPH)[::2] == (0, '')
 
 
 def nothing_recorded(path: Path) -> None:
@@ -130,8 +112,7 @@ def no_declaration(path: Path) -> None:
 ])
 @pytest.mark.parametrize('options', [[], ['--reschedule']])
 def test_what_is_no_trace_is_one_line(
-    content: Any, says: str, options: list[str], tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    content: Any, says: str, options: list[str], tmp_path: Path, call: Call
 ) -> None:
     path = tmp_path / 'bad.mcap'
     if callable(content):
@@ -139,16 +120,14 @@ def test_what_is_no_trace_is_one_line(
     elif content is not None:
         path.write_bytes(content)
     result = tmp_path / 'result.json'
-    status, out, err = call(capsys, path, '--json', result, *options)
+    status, out, err = call('replay', path, '--json', result, *options)
     assert (status, out) == (2, '')
     assert err.startswith(f'error: {path}: {says}')
     assert err.count('\n') == 1
     assert not result.exists()
 
 
-def test_a_sink_is_named_as_tables_do_or_by_a_unique_end(
-    call: Callable[..., subprocess.CompletedProcess[str]], folder: Path
-) -> None:
+def test_a_sink_is_named_as_tables_do_or_by_a_unique_end(call: Call, folder: Path) -> None:
     Path('g.yaml').write_text("""\
 mddag: 1
 workers: 1
@@ -169,14 +148,11 @@ nodes:
         assert (done.returncode, done.stderr) == (2, f'error: --sink: {says}\n')
 
 
-def test_an_imported_run_is_rescheduled_with_a_graph_only(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_imported_run_is_rescheduled_with_a_graph_only(tmp_path: Path, call: Call) -> None:
     drive, graph = four_jobs(tmp_path / 'drive.mcap'), tmp_path / 'graph.yaml'
     graph.write_text(SEEN)
-    status, text, errors = call(
-        capsys, drive, graph, '--reschedule', '--policy', 'rad', '--workers', 1)
-    assert (status, errors) == (0, '') and 'policy rad, 1 worker' in text
-    status, _, errors = call(capsys, drive, '--reschedule')
+    done = call('replay', drive, graph, '--reschedule', '--policy', 'rad', '--workers', 1)
+    assert (done.returncode, done.stderr) == (0, '') and 'policy rad, 1 worker' in done.stdout
+    status, _, errors = call('replay', drive, '--reschedule')
     assert (status, errors.count('\n')) == (2, 1)
     assert errors.startswith(f'error: {drive}: it was imported') and 'GRAPH' in errors

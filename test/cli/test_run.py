@@ -20,9 +20,8 @@ from mddag_executor.trace import read_events, TraceError, TraceReader
 from msg_graph import load
 import pytest
 
+from ..conftest import Call
 from . import golden
-
-Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
 
 GRAPH = """\
 mddag: 1
@@ -42,7 +41,7 @@ nodes:
 # --- bad input -----------------------------------------------------------------------------------
 
 
-def test_the_declaration_comes_from_standard_input(graph: Path, mddag: Mddag) -> None:
+def test_the_declaration_comes_from_standard_input(graph: Path, mddag: Call) -> None:
     process = mddag(
         'run', '-', '--synthetic', 'sleep', '--duration', '0.2s', '--json', '-', input=GRAPH)
     assert process.returncode == 0, process.stderr
@@ -52,7 +51,7 @@ def test_the_declaration_comes_from_standard_input(graph: Path, mddag: Mddag) ->
 # --- runs ----------------------------------------------------------------------------------------
 
 
-def test_a_synthetic_run_is_counted_measured_and_recorded(graph: Path, mddag: Mddag) -> None:
+def test_a_synthetic_run_is_counted_measured_and_recorded(graph: Path, mddag: Call) -> None:
     process = mddag(
         'run', graph, '--synthetic', 'sleep', '--duration', '2s', '--workers', '3',
         '--trace', 'out.mcap', '--json', 'result.json')
@@ -111,7 +110,7 @@ class Detector(Node):
 
 
 def test_runs_of_undeclared_callbacks_are_those_that_are_listed(
-    folder: Path, mddag: Mddag
+    folder: Path, mddag: Call
 ) -> None:
     slow = ROBOT.replace('pass\n', 'time.sleep(0.05)\n')    # so that most images are dropped
     Path('robot.py').write_text(f'import time\n{slow}')
@@ -123,7 +122,7 @@ def test_runs_of_undeclared_callbacks_are_those_that_are_listed(
     assert int(every[0]) == sum(map(int, re.findall(r' (\d+)(?:,|$)', every[1])))
 
 
-def test_three_commands_from_a_robot_to_a_verdict(folder: Path, mddag: Mddag) -> None:
+def test_three_commands_from_a_robot_to_a_verdict(folder: Path, mddag: Call) -> None:
     """Recorded without a declaration, which then comes from the recording."""
     Path('robot.py').write_text(ROBOT)
     done = mddag('run', '--node', 'robot:Camera', '--node', 'robot:Detector', '--duration', '1s',
@@ -149,7 +148,7 @@ def test_three_commands_from_a_robot_to_a_verdict(folder: Path, mddag: Mddag) ->
 @pytest.mark.parametrize(('tolerate', 'status'), [('1 of 1000', 1), ('999 of 1000', 0)])
 @pytest.mark.parametrize('processes', ['1', '2'])
 def test_fail_on_miss_judges_by_what_the_declaration_tolerates(
-    graph: Path, mddag: Mddag, tolerate: str, status: int, processes: str
+    graph: Path, mddag: Call, tolerate: str, status: int, processes: str
 ) -> None:
     """The slow sink misses every deadline; the other one may miss what a busy machine costs."""
     text = graph.read_text().replace('500ms,', '500ms, tolerate: 999 of 1000,')
@@ -327,7 +326,7 @@ nodes:
     'bad:Calibrated', 'bad:Uncalibrated', 'bad:main', 'bad_module:main'])
 @pytest.mark.parametrize('verb', ['run', 'rerun'])
 def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(
-    folder: Path, mddag: Mddag, verb: str, spec: str
+    folder: Path, mddag: Call, verb: str, spec: str
 ) -> None:
     Path('n.yaml').write_text(ONE_TIMER)
     Path('bad.py').write_text(BAD_NODES)

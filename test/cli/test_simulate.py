@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import errno
 import json
 import os
@@ -13,8 +14,9 @@ import subprocess
 import sys
 from typing import Any
 
-from mddag_executor.cli.main import main
 import pytest
+
+from ..conftest import Call
 
 GRAPH = """\
 mddag: 1
@@ -38,18 +40,18 @@ def times(tmp_path: Path) -> Path:
     return path
 
 
-def result_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
-    status = main(['simulate', *map(str, arguments), '--json', '-'])
-    captured = capsys.readouterr()
-    assert (status, captured.err) == (0, '')
-    result: dict[str, Any] = json.loads(captured.out)
-    return result
+@pytest.fixture
+def result_of(call: Call) -> Callable[..., Any]:
+    """Give a function that simulates, without a warning, and returns what is written as JSON."""
+    def simulate(*arguments: object) -> Any:
+        done = call('simulate', *arguments, '--json', '-')
+        assert not done.stderr
+        return done.result
+    return simulate
 
 
-def test_execution_times_from_a_file(
-    capsys: pytest.CaptureFixture[str], graph: Path, times: Path
-) -> None:
-    result = result_of(capsys, graph, '--duration', '10ms', '--execution-times', times)
+def test_execution_times_from_a_file(result_of: Any, graph: Path, times: Path) -> None:
+    result = result_of(graph, '--duration', '10ms', '--execution-times', times)
     assert result['seed'] is None
     assert result['utilisation'] == pytest.approx((2000 + 3500.5 + 1) / 10_000 / 2)
     assert result['first_miss'] == {
@@ -58,28 +60,26 @@ def test_execution_times_from_a_file(
     assert result['dags']['lidar']['sinks']['/filter:far']['response_ns']['max'] == 2_001_000
 
 
-def test_what_is_asked_for_is_done(
-    capsys: pytest.CaptureFixture[str], graph: Path
-) -> None:
+def test_what_is_asked_for_is_done(result_of: Any, graph: Path) -> None:
     # One worker, 11 ms of work each 10 ms. Job k: tick from 11k, near done at 11k + 3, far at
     # 11k + 11. Late: near from job 3 on (36 ms), far from job 2 on (33 ms).
-    plain = result_of(capsys, graph, '--workers', 1, '--duration', '100ms')
+    plain = result_of(graph, '--workers', 1, '--duration', '100ms')
     assert (plain['workers'], plain['preemptive']) == (1, False)
     near = plain['dags']['lidar']['sinks']['/filter:near']
     assert (near['completed'], near['late'], near['overdue']) == (9, 7, 1)
     judged = result_of(
-        capsys, graph, '--workers', 1, '--duration', '100ms', '--judge', 'completions')
+        graph, '--workers', 1, '--duration', '100ms', '--judge', 'completions')
     near = judged['dags']['lidar']['sinks']['/filter:near']
     assert (near['completed'], near['late'], near['overdue']) == (9, 6, 0)
     # With more time for far the next tick goes before it: late are the jobs 3 to 7 only; with
     # preemption near does not wait.
     graph.write_text(GRAPH.replace('12ms', '60ms'), encoding='utf-8')
     for option, late in (([], 5), (['--preemptive'], 0)):
-        result = result_of(capsys, graph, '--workers', 1, '--duration', '100ms', *option)
+        result = result_of(graph, '--workers', 1, '--duration', '100ms', *option)
         assert result['preemptive'] is bool(option)
         assert result['dags']['lidar']['sinks']['/filter:near']['late'] == late
     graph.write_text(GRAPH, encoding='utf-8')
-    stopped = result_of(capsys, graph, '--workers', 1, '--stop-at-first-miss')
+    stopped = result_of(graph, '--workers', 1, '--stop-at-first-miss')
     assert stopped['ended_ns'] == stopped['first_miss']['completed_ns'] == 33_000_000
     assert stopped['deadline_missed'] is True
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import json
 import os
 from pathlib import Path
@@ -22,10 +22,10 @@ from mddag_executor.report.board import Board, GONE_AFTER_S, tables
 from msg_graph import load
 import pytest
 
+from ..conftest import Call
 from . import golden
 from .test_run import GRAPH
 
-Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 EVIL = 'mddag: \x1b]0;owned\x07\x1b[2J[bold]x[/bold]\nrm'
 
@@ -121,10 +121,9 @@ def running(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     assert process.returncode == 0
 
 
-def test_once_shows_another_process(running: Any, mddag: Mddag):
-    done = mddag('top', '--once', '--json', '-')
-    assert (done.returncode, done.stderr) == (0, '')
-    found = {s['name']: s for s in json.loads(done.stdout)['statuses']}
+def test_once_shows_another_process(running: Any, mddag: Call):
+    statuses = mddag('top', '--once', '--json', '-').result['statuses']
+    found = {s['name']: s for s in statuses}
     assert set(found) == {'mddag: main', 'mddag: workers'}
     assert found['mddag: main']['process'].endswith(f'/{running.pid}')
     assert found['mddag: main']['values']['period_ms'] == '20.000'
@@ -166,7 +165,7 @@ def test_live_in_a_terminal_until_the_user_ends_it(running: Any):
     assert 'workers of' in text and 'Traceback' not in text
 
 
-def test_no_process_to_hear(call: Mddag):
+def test_no_process_to_hear(call: Call):
     done = call('top', '--once', '--timeout', '300ms')
     assert done.returncode == 2 and done.stdout == ''
     assert done.stderr.startswith('error: /diagnostics: no executor has published its state')

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable
 import json
 from pathlib import Path
-import subprocess
 from types import SimpleNamespace
 
 from mddag_executor.cli.main import user_line
@@ -23,9 +22,10 @@ from mddag_executor.trace.schema import EVENTS
 import pytest
 import yaml
 
+from ..conftest import Call
+
 TOP = Path(__file__).resolve().parents[2]
 BAG = TOP / 'bags' / 'demo_short.mcap'
-Mddag = Callable[..., subprocess.CompletedProcess[str]]
 
 HOSTILE = [
     '\x1b]0;owned\x07', '\x1b[2J\x1b[31m', '\x9b31m', '\r\n\x08', '\x00', '\u202e\u2066',
@@ -81,7 +81,7 @@ VERBS = {
 
 
 @pytest.mark.parametrize('name', VERBS)
-def test_no_verb_obeys_a_name(call: Mddag, trace: Path, tmp_path: Path, name: str) -> None:
+def test_no_verb_obeys_a_name(call: Call, trace: Path, tmp_path: Path, name: str) -> None:
     before = {path for path in Path('/tmp').iterdir() if 'mddag-owned' in path.name}
     arguments = [str(trace) if word == 'TRACE' else word for word in VERBS[name]]
     done = call(*arguments, cwd=tmp_path)
@@ -135,7 +135,7 @@ def judge_with(tmp_path: Path, field: str, text: str) -> None:
 
 @pytest.mark.parametrize('include', ['/etc/passwd', 'secret.yaml', '../secret.yaml'])
 def test_a_declaration_in_a_trace_includes_nothing(
-    call: Mddag, tmp_path: Path, include: str
+    call: Call, tmp_path: Path, include: str
 ) -> None:
     (tmp_path / 'secret.yaml').write_text('mddag: 1\nnodes: [this is secret]\n')
     event = next(event for event in read_events(BAG) if event['_name'] == 'mddag:task_set')
@@ -153,7 +153,7 @@ def test_a_declaration_in_a_trace_includes_nothing(
 
 @pytest.mark.parametrize('names', [
     ['../secret.mcap'], ['/etc/passwd'], ['sub/../../secret.mcap'], ['\x00'], [5], {}, [[]], None])
-def test_a_bag_names_only_its_own_files(call: Mddag, tmp_path: Path, names: object) -> None:
+def test_a_bag_names_only_its_own_files(call: Call, tmp_path: Path, names: object) -> None:
     (tmp_path / 'secret.mcap').write_bytes(BAG.read_bytes())
     bag = tmp_path / 'bag'
     bag.mkdir()

@@ -26,6 +26,7 @@ from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecu
 import rclpy.experimental
 from rclpy.node import Node
 
+from ..conftest import Call
 from .conftest import wait_for
 from .workspace import GRAPH, make_workspace
 
@@ -33,9 +34,6 @@ from .workspace import GRAPH, make_workspace
 @pytest.fixture
 def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return make_workspace(tmp_path, monkeypatch)
-
-
-Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
 
 
 def run(
@@ -140,7 +138,7 @@ def test_the_run_ends_when_all_programs_have_ended(world: Path) -> None:
     ('chat:needs_two', 'the function requires the arguments one, two'),
 ])
 def test_a_program_that_cannot_start_ends_the_run_with_one_line(
-    world: Path, mddag: Mddag, spec: str, message: str
+    world: Path, mddag: Call, spec: str, message: str
 ) -> None:
     process = mddag('run', 'graph.yaml', '--node', spec, '--trace', 'out.mcap')
     assert process.returncode == 2
@@ -150,7 +148,7 @@ def test_a_program_that_cannot_start_ends_the_run_with_one_line(
 
 
 def test_an_exception_during_the_run_comes_out_behind_the_summary(
-    world: Path, mddag: Mddag
+    world: Path, mddag: Call
 ) -> None:
     spec, message = 'chat:raises_in_a_callback', 'ZeroDivisionError'
     process = mddag(
@@ -162,7 +160,7 @@ def test_an_exception_during_the_run_comes_out_behind_the_summary(
     assert 'results due' in process.stdout
 
 
-def test_exceptions_that_no_spin_waits_for_end_the_run(world: Path, mddag: Mddag) -> None:
+def test_exceptions_that_no_spin_waits_for_end_the_run(world: Path, mddag: Call) -> None:
     process = mddag('run', 'graph.yaml', '--node', 'chat:no_longer_spins', '--duration', '50s')
     assert process.returncode == 70
     assert 'ZeroDivisionError' in process.stderr.splitlines()[-1]
@@ -175,7 +173,7 @@ def test_exceptions_that_no_spin_waits_for_end_the_run(world: Path, mddag: Mddag
     ('chat:blocks_in_a_callback', 'a callback has not ended in time; it is left behind'),
 ])
 def test_what_does_not_end_is_left_behind(
-    world: Path, mddag: Mddag, spec: str, warning: str
+    world: Path, mddag: Call, spec: str, warning: str
 ) -> None:
     process = mddag(
         'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '1s')
@@ -184,14 +182,14 @@ def test_what_does_not_end_is_left_behind(
     assert 'results due' in process.stdout
 
 
-def test_what_nodes_print_stays_out_of_the_json(world: Path, mddag: Mddag) -> None:
+def test_what_nodes_print_stays_out_of_the_json(world: Path, mddag: Call) -> None:
     process = mddag('run', 'graph.yaml', '--node', 'chat:prints', '--duration', '0.2s',
                     '--json', '-')
     assert json.loads(process.stdout)['nodes'] == ['chat:prints']
     assert 'not JSON' in process.stderr
 
 
-def test_ros_arguments_reach_the_nodes(world: Path, mddag: Mddag) -> None:
+def test_ros_arguments_reach_the_nodes(world: Path, mddag: Call) -> None:
     (world / 'graph.yaml').write_text(GRAPH.replace('/chatter', '/talk'))
     process = mddag(
         'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', 'chat:Listener',

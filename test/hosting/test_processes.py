@@ -23,6 +23,8 @@ from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
 
+from ..conftest import Call
+
 GUESTS = Path(__file__).resolve().parent / 'guests'
 CHAIN = """\
 mddag: 1
@@ -41,8 +43,6 @@ nodes:
 PROCESSES = 'processes: {up: [/first], down: [/second, /last]}\n'
 NODES = [argument for name in ('sensor', 'first', 'second', 'last')
          for argument in ('--node', f'relay:{name}')]
-
-Mddag = Callable[..., 'subprocess.CompletedProcess[str]']
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def running(*arguments: str) -> Iterator[Running]:
 
 
 def test_synthetic_nodes_in_two_processes_are_measured_as_one_run(
-        world: Path, mddag: Mddag) -> None:
+        world: Path, mddag: Call) -> None:
     (world / 'chain.yaml').write_text(CHAIN.replace('60s', '500ms'))
     run = mddag('run', 'chain.yaml', '--synthetic', 'sleep', '--processes', '2',
                 '--duration', '1s', '--trace', 'out.mcap', '--json', 'result.json')

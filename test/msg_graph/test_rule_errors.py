@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-import subprocess
 import textwrap
 
 from msg_graph import GraphError, GraphErrors, loads
 from msg_graph.errors import MOST_ERRORS
 import pytest
 
+from ..conftest import Call
 from .helpers import graph, MARK, nodes_error
 
 T = '{name: t, timer: 10ms, publishes: [/a]}'
@@ -144,8 +143,6 @@ def test_edges_must_not_explode() -> None:
         loads(text)
 
 
-Mddag = Callable[..., subprocess.CompletedProcess[str]]
-
 ENTRIES = """\
 mddag: 1
 workers: none
@@ -219,7 +216,7 @@ def test_a_file_full_of_errors() -> None:
     assert len(found(text).errors) == len(found(text.replace('nme', 'name')).errors) == MOST_ERRORS
 
 
-def test_the_program_says_where_it_stops(call: Mddag) -> None:
+def test_the_program_says_where_it_stops(call: Call) -> None:
     lines = [f'      - {{name: c{i}, timer: 10}}' for i in range(200)]
     text = '\n'.join(['mddag: 1', 'nodes:', '  - node: /n', '    callbacks:', *lines])
     done = call('graph', 'check', '-', stdin=text)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 import tempfile
 
@@ -17,7 +16,7 @@ from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
-from ..cli.helpers import caller
+from ..conftest import Call
 from ..replay.helpers import (
     begin_trace,
     declarations,
@@ -344,7 +343,7 @@ nodes:
 
 @pytest.mark.parametrize('seconds', [50, 70, 4_000])
 def test_a_callback_that_runs_for_minutes_is_counted_and_judged(
-    seconds: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    seconds: int, tmp_path: Path, call: Call
 ) -> None:
     path, second = tmp_path / 'run.mcap', 1_000 * MS
     with begin_trace(path, SLOW, workers=2) as file:
@@ -364,9 +363,9 @@ def test_a_callback_that_runs_for_minutes_is_counted_and_judged(
                 file.flush()
         end_trace(file, START_TIME + (seconds + 30) * second)
     for more in ((), ('--reschedule',)):
-        status, out, errors = caller('replay')(capsys, path, *more, '--json', '-')
-        assert (status, errors) == (0, '')
-        result = json.loads(out)
+        done = call('replay', path, *more, '--json', '-')
+        result = done.result
+        assert not done.stderr
         sink = result['dags']['slow']['sinks']['/slow:plan']
         assert sink['response_ns']['max'] == seconds * second
         assert (sink['completed'], sink['late']) == (1, int(seconds > 3600))

@@ -19,11 +19,12 @@ from typing import Any
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from mddag_executor.cli import main as program
 from mddag_executor.replay.bags import Bag, UNKNOWN
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
+
+from ..conftest import Call
 
 MS = 1_000_000
 BEGIN = 1_732_166_766_000_000_000
@@ -148,9 +149,7 @@ def graph(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize('split', [False, True], ids=['one file', '-b'])
 @pytest.mark.parametrize('kind', BAGS)
-def test_each_kind_of_bag(
-    tmp_path: Path, graph: Path, kind: str, split: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_kind_of_bag(tmp_path: Path, graph: Path, kind: str, split: bool, call: Call) -> None:
     bag, write = tmp_path / 'drive', BAGS[kind]
     if split:
         join(bag, [parted(tmp_path / f'part{i}', write, i) for i in range(2)])
@@ -162,11 +161,9 @@ def test_each_kind_of_bag(
         assert list(stamps.arrival) == [BEGIN + (i * 100 + 5) * MS for i in range(20)]
         assert list(stamps.header) == [
             BEGIN + i * 100 * MS if topic in STAMPED else UNKNOWN for i in range(20)], topic
-    assert program.main(['replay', str(bag), str(graph), '--reschedule', '--json', '-']) == 0
-    output = capsys.readouterr()
-    has_metadata = (bag / 'metadata.yaml').exists()
-    assert output.err == '' or not has_metadata and output.err.count('\n') == 1
-    result = json.loads(output.out)
+    done = call('replay', bag, graph, '--reschedule', '--json', '-')
+    assert done.stderr.count('\n') == (not (bag / 'metadata.yaml').exists())
+    result = json.loads(done.stdout)
     assert {name: dag['jobs'] for name, dag in result['dags'].items()} == {
         f'd{i}': 20 for i in range(len(TOPICS))}
 

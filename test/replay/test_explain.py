@@ -6,20 +6,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-import json
 from pathlib import Path
 import re
 from typing import Any
 
 from hypothesis import example, given, HealthCheck, settings
 from hypothesis import strategies as st
-from mddag_executor.cli import main as program
 from mddag_executor.core.tally import total
 from mddag_executor.replay import open_recording, replay
 from mddag_executor.replay.causes import CAUSES, REMEDIES
 from msg_graph import loads, TaskSet
 import pytest
 
+from ..conftest import Call
 from .helpers import (
     add_execution,
     begin_trace,
@@ -225,31 +224,26 @@ def test_all_misses_of_any_run_are_explained(tmp_path: Path, seed: int, workers:
                 assert each['ns'] <= workers * (job['until_ns'] - job['release_ns'])
 
 
-def test_what_people_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_people_see(tmp_path: Path, call: Call) -> None:
     declaration, plan = PLANS['waited']
-    path = str(tmp_path / 'run.mcap')
-    Planned(Path(path), loads(declaration, 'g.yaml'), **plan)
-    assert program.main(['explain', path]) == 0
-    out = capsys.readouterr().out
+    path, page = tmp_path / 'run.mcap', tmp_path / 'run.html'
+    Planned(path, loads(declaration, 'g.yaml'), **plan)
+    out = call('explain', path).stdout
     assert REMEDIES['waited'] in out
     assert out.splitlines()[-1] == '119 misses: 119 waited'
-    assert program.main(['explain', path, '--sink', '/victim:use', '--job', '9']) == 0
-    out = capsys.readouterr().out
+    out = call('explain', path, '--sink', '/victim:use', '--job', '9').stdout
     assert out.startswith('Job 9 of victim:use: late by ')
     assert 'heavy:first' in out
-    assert program.main(['explain', path, '--job', '8']) == 0
     assert re.fullmatch(
         r'no such job missed its deadline: 119 jobs did: \d+, \d+, .*, … \(114 more\)\n',
-        capsys.readouterr().out)
-    assert program.main(['explain', path, '--sink', '/victim:uze']) == 2
-    assert "did you mean '/victim:use'" in capsys.readouterr().err
-    assert program.main(['explain', path, '--job', '9', '--json', '-']) == 0
-    result = json.loads(capsys.readouterr().out)
+        call('explain', path, '--job', '8').stdout)
+    refused = call('explain', path, '--sink', '/victim:uze')
+    assert refused.returncode == 2 and "did you mean '/victim:use'" in refused.stderr
+    result = call('explain', path, '--job', '9', '--json', '-').result
     assert [job['job'] for job in result['jobs']] == [9]
     assert result['missed'] == 119
-    assert program.main(['replay', path, '--report', path + '.html']) == 0
-    assert '119 misses: 119 waited' in capsys.readouterr().out
-    assert '119 misses: 119 waited' in Path(path + '.html').read_text()
+    assert '119 misses: 119 waited' in call('replay', path, '--report', page).stdout
+    assert '119 misses: 119 waited' in page.read_text()
 
 
 MINUTE = 60_000 * MS
@@ -264,16 +258,9 @@ nodes:
 """
 
 
-def explain(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    """Return what `mddag explain --json -` prints."""
-    assert program.main(['explain', *arguments, '--json', '-']) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
-
-
 @pytest.mark.parametrize('cause', ['waited', 'machine'])
 def test_misses_of_one_cause_have_it_however_long_the_run_is(
-    cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    cause: str, tmp_path: Path, call: Call
 ) -> None:
     # every minute the short one waits 50 ms for the only worker, or for the machine to go on
     path = tmp_path / 'run.mcap'
@@ -292,7 +279,7 @@ def test_misses_of_one_cause_have_it_however_long_the_run_is(
             file.add('job_release', start, 1, 1, 1, job, release)
             add_execution(file, start, start + MS, 1, 0, job, ready=ready, address=8)
         end_trace(file, START_TIME + minutes * MINUTE)
-    result = explain(capsys, str(path))
+    result = call('explain', path, '--json', '-').result
     assert result['missed'] == result['causes'][cause] == len(result['jobs']) == minutes
     for job in result['jobs']:
         parts = {part['cause']: part['ns'] for part in job['parts']}
@@ -314,7 +301,7 @@ nodes:
 
 @pytest.mark.parametrize(('worker', 'cause'), [(-1, 'machine'), (0, 'waited')])
 def test_a_callback_that_has_lent_its_worker_keeps_none_busy(
-    worker: int, cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    worker: int, cause: str, tmp_path: Path, call: Call
 ) -> None:
     # the one waits for the answer to a service call; the other starts 300 ms after it is ready
     path = tmp_path / 'run.mcap'
@@ -328,16 +315,14 @@ def test_a_callback_that_has_lent_its_worker_keeps_none_busy(
             add_execution(file, late + 300 * MS, late + 301 * MS, 1, 0, job, ready=late,
                           thread=11, address=8)
         end_trace(file, START_TIME + 5_000 * MS)
-    result = explain(capsys, str(path))
+    result = call('explain', path, '--json', '-').result
     assert {job['cause'] for job in result['jobs']} == {cause} and result['missed'] == 5
     behind = [{'callback': '/a:asks', 'ns': 290 * MS}] if cause == 'waited' else []
     for job in result['jobs']:
         assert job['parts'][0]['behind'] == behind
 
 
-def test_an_undeclared_callback_may_hold_the_interpreter(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_undeclared_callback_may_hold_the_interpreter(tmp_path: Path, call: Call) -> None:
     # one of two workers runs it: the other worker's callback cannot begin before it ends; its next
     # release is skipped
     path = tmp_path / 'run.mcap'
@@ -354,7 +339,7 @@ def test_an_undeclared_callback_may_hold_the_interpreter(
             add_execution(file, start, start + MS, 1, 0, 2 * job, 1, ready=release, thread=11,
                           address=8, computed=(MS, True))
         end_trace(file, START_TIME + 5_000 * MS)
-    result = explain(capsys, str(path))
+    result = call('explain', path, '--json', '-').result
     assert result['causes']['interpreter'] == result['missed'] == 10
     for job in result['jobs']:
         if job['job'] % 2:
@@ -362,18 +347,14 @@ def test_an_undeclared_callback_may_hold_the_interpreter(
                                      'behind': [], 'waiting_job': job['job'] - 1}]
         else:
             assert [each['ns'] for each in job['parts'][0]['behind']] == [50 * MS]
-    assert program.main(['explain', str(path), '--job', '3']) == 0
-    assert 'skipped: job 2 had not started' in capsys.readouterr().out
+    assert 'skipped: job 2 had not started' in call('explain', path, '--job', '3').stdout
     # the miss of the earliest deadline is the first one, though the other one was known before
-    assert program.main(['replay', str(path)]) == 0
-    assert 'first miss: /x:late, job 0, 36 ms late' in capsys.readouterr().out
-    assert program.main(['replay', str(path), '--reschedule']) == 0
-    assert '5 jobs skipped by a timer in the recording: skipped' in capsys.readouterr().out
+    assert 'first miss: /x:late, job 0, 36 ms late' in call('replay', path).stdout
+    assert '5 jobs skipped by a timer in the recording: skipped' in call(
+        'replay', path, '--reschedule').stdout
 
 
-def test_a_sync_that_lacks_a_message_did_not_run_long(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path: Path, call: Call) -> None:
     # /image has another name in the node
     path = tmp_path / 'run.mcap'
     with begin_trace(path, SYNC) as file:
@@ -389,15 +370,13 @@ def test_a_sync_that_lacks_a_message_did_not_run_long(
                 file.add(kind, time + MS * (kind[-3:] in ('end', 'ete')), 1, 10, 9, *fields)
             file.add('expire', time + 30 * MS, 1, 1, 0, job)
         end_trace(file, START_TIME + 2_000 * MS)
-    result = explain(capsys, str(path))
+    result = call('explain', path, '--json', '-').result
     assert result['causes']['lost'] == result['missed'] == 20
     assert result['jobs'][0]['parts'][-1] == {
         'vertex': '/victim:use', 'cause': 'lost', 'ns': 29 * MS, 'behind': []}
 
 
-def test_only_misses_in_stops_are_said_to_be_in_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_only_misses_in_stops_are_said_to_be_in_them(tmp_path: Path, call: Call) -> None:
     # each job's callback starts 20 ms after it was ready, with an idle worker; the machine stood
     # still twice in that of one job, and once in that of another
     path = tmp_path / 'run.mcap'
@@ -416,21 +395,18 @@ def test_only_misses_in_stops_are_said_to_be_in_them(
             add_execution(file, start, start + MS, 1, 0, job, ready=release, address=8)
         end_trace(file, START_TIME + 9_000 * MS)
     assert len(open_recording(path).stops) == 3    # without the empty one
-    result = explain(capsys, str(path))
+    result = call('explain', path, '--json', '-').result
     assert result['causes']['machine'] == result['missed'] == 9
     assert sum(stall['misses'] for stall in result['stalls']) == 2
     for verb in ('explain', 'replay'):
-        assert program.main([verb, str(path)]) == 0
-        line, = (line for line in capsys.readouterr().out.splitlines()
+        line, = (line for line in call(verb, path).stdout.splitlines()
                  if line.startswith('9 misses: '))
         assert line.startswith('9 misses: 2 in 2 stops of the machine (0.')
         assert line.endswith(' s), 7 machine')
 
 
-def test_what_an_overload_takes_from_less_important_sinks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    graph, trace, found = (tmp_path / name for name in ('g.yaml', 'run.mcap', 'found.json'))
+def test_what_an_overload_takes_from_less_important_sinks(tmp_path: Path, call: Call) -> None:
+    graph, trace = tmp_path / 'g.yaml', tmp_path / 'run.mcap'
     graph.write_text("""\
 mddag: 1
 nodes:
@@ -439,21 +415,17 @@ nodes:
       - {name: main, timer: 30ms, deadline: 30ms, execution_time: 20ms, importance: high, dag: a}
       - {name: rest, dag: b, timer: 20ms, deadline: 20ms, execution_time: 10ms}
 """)
-    for command in (
-            f'simulate {graph} --workers 1 --preemptive --duration 3s --on-late demote '
-            f'--trace {trace}', f'explain {trace} --json {found}'):
-        assert program.main(command.split()) == 0
+    call('simulate', graph, '--workers', 1, '--preemptive', '--duration', '3s',
+         '--on-late', 'demote', '--trace', trace)
     run = replay(trace)
     sinks = {name: next(iter(dag['sinks'].values()))
              for name, dag in run.result()['dags'].items()}
     assert 'demoted' not in sinks['a'] and sinks['b']['demoted'] > 70
-    capsys.readouterr()
-    assert program.main(['replay', str(trace), '--skip', '100s']) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = call('replay', trace, '--skip', '100s').stdout.splitlines()
     assert 'left out: jobs released in the first 100 s, so all of them: the run has only 3 s' \
         in lines
     assert '0 results due, 0 in time (-), 0 late, 0 expired' in lines   # and none demoted
-    explained = json.loads(found.read_text())
+    explained = call('explain', trace, '--json', '-').result
     assert explained['missed'] == explained['causes']['overload'] > 70
     behind = {each['callback'] for job in explained['jobs'] for part in job['parts']
               for each in part['behind']}

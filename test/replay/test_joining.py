@@ -15,7 +15,7 @@ from mddag_executor.replay.clocks import offsets
 from mddag_executor.trace import TraceFile
 import pytest
 
-from ..cli.helpers import caller
+from ..conftest import Call
 
 MS = 1_000_000
 BASE = 10 ** 18
@@ -138,7 +138,8 @@ def two_machines(folder: Path, late: int, back: bool = True, stranger: bool = Fa
 
 @pytest.mark.parametrize('late', [0, 3 * MS, -3 * MS, 40_000 * MS, -40_000 * MS])
 def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(
-        tmp_path: Path, late: int, call: Any) -> None:
+    tmp_path: Path, late: int, call: Call
+) -> None:
     paths = two_machines(tmp_path, late)
     result = replay(paths).result()
     warning, = result['warnings']
@@ -180,7 +181,8 @@ def test_one_machine_has_one_clock_whatever_it_was_set_to(tmp_path: Path) -> Non
     (['up=1ms'], "up is on the first trace's machine"),
 ])
 def test_offsets_that_cannot_be_are_one_line(
-        tmp_path: Path, call: Any, offsets: list[str], message: str) -> None:
+    tmp_path: Path, call: Call, offsets: list[str], message: str
+) -> None:
     paths = two_machines(tmp_path, 0)
     run = call('replay', *paths, *(f'--offset={each}' for each in offsets))
     assert run.returncode == 2 and message in run.stderr and run.stderr.count('\n') == 1
@@ -238,7 +240,8 @@ def two(tmp_path: Path) -> list[str]:
 
 
 def test_each_process_has_its_workers_and_interpreter_again(
-        two: list[str], tmp_path: Path, call: Any) -> None:
+    two: list[str], tmp_path: Path, call: Call
+) -> None:
     outcome = reschedule(two)
     assert [(p.name, p.nodes) for p in outcome.processes] == [('up', ('/a',)), ('down', ('/b',))]
     assert (outcome.workers, outcome.settings.workers) == (4, 2) and not outcome.tally.missed
@@ -257,7 +260,7 @@ def test_each_process_has_its_workers_and_interpreter_again(
     assert '9 late' in call('replay', *two, tmp_path / 'graph.yaml', '--reschedule').stdout
 
 
-def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path: Path, call: Any) -> None:
+def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path: Path, call: Call) -> None:
     for folder, takes in (('before', 2), ('after', 7)):
         (tmp_path / folder).mkdir()
         up, down = Trace(tmp_path / folder, 'up', 0), Trace(tmp_path / folder, 'down', 1)
@@ -278,7 +281,7 @@ def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path: Path, call: Any) -> N
     assert refused.returncode == 2 and 'another declaration' in refused.stderr
 
 
-def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, call: Any) -> None:
+def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, call: Call) -> None:
     trace = Trace(tmp_path, 'whole', 0, graph=TWO)
     for i in range(9):
         for trace.dag in range(2):
@@ -299,7 +302,8 @@ def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, call: Any) -
     (['--reschedule', '--preemptive'], 'preemption is known of one process only'),
 ])
 def test_bad_placements_are_one_line(
-        two: list[str], call: Any, arguments: list[str], message: str) -> None:
+    two: list[str], call: Call, arguments: list[str], message: str
+) -> None:
     run = call('replay', *two, *arguments)
     assert (run.returncode, run.stdout) == (2, '')
     assert message in run.stderr and run.stderr.count('\n') == 1
@@ -317,7 +321,7 @@ def test_traces_of_different_runs_are_refused(tmp_path: Path) -> None:
         replay([up, empty])
 
 
-def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path: Path, call: Any) -> None:
+def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path: Path, call: Call) -> None:
     paths = {}
     for run, begin in (('one', 0), ('two', 200 * MS)):
         for vertex, name in enumerate(('up', 'down')):
@@ -347,7 +351,7 @@ def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path: Path, call:
         replay([twin.end(50 * MS), paths['one', 'up'], long.path])
 
 
-def test_the_command_takes_several_traces(tmp_path: Path, call: Any) -> None:
+def test_the_command_takes_several_traces(tmp_path: Path, call: Call) -> None:
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
     up.runs(0, MS)
     down.runs(0, 3 * MS)
@@ -365,9 +369,7 @@ def test_the_command_takes_several_traces(tmp_path: Path, call: Any) -> None:
     assert refused.returncode == 2 and 'standard input' in refused.stderr
 
 
-def test_processes_of_containers_may_have_the_same_numbers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_processes_of_containers_may_have_the_same_numbers(tmp_path: Path, call: Call) -> None:
     found = []
     for pids in ((101, 102), (7, 7)):
         traces = [Trace(tmp_path, name, vertex, pid=pid)
@@ -378,9 +380,7 @@ def test_processes_of_containers_may_have_the_same_numbers(
         paths = [trace.end(100 * MS) for trace in traces]
         for verb, *more in (('replay', '--callbacks'), ('replay', '--reschedule'),
                             ('explain',), ('slack',)):
-            status, out, _ = caller(verb)(capsys, *paths, *more, '--json', '-')
-            assert status == 0
-            found.append(json.loads(out))
+            found.append(call(verb, *paths, *more, '--json', '-').result)
     apart, same = found[:4], found[4:]
     assert {name: (use['executions'], use['busy_ns'])
             for name, use in same[0]['callbacks'].items()} == {

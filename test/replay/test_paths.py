@@ -9,7 +9,6 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.cli import main as program
 from mddag_executor.core import quantile
 from mddag_executor.recording import tables
 from mddag_executor.recording.entities import Entities, Node, Publisher
@@ -22,6 +21,7 @@ from msg_graph import loads
 import numpy as np
 import pytest
 
+from ..conftest import Call
 from .cases_by_hand import slow_cases
 from .flows import flows
 from .recorded import BEGIN, Recorded
@@ -264,12 +264,12 @@ paths:
 
 
 @pytest.fixture
-def simulated(tmp_path: Path) -> Path:
+def simulated(tmp_path: Path, call: Call) -> Path:
     graph = tmp_path / 'graph.yaml'
     graph.write_text(GRAPH_OWN)
     trace = tmp_path / 'run.mcap'
-    assert program.main(['simulate', str(graph), '--policy', 'rad', '--workers', '4',
-                         '--duration', '500ms', '--trace', str(trace)]) == 0
+    call('simulate', graph, '--policy', 'rad', '--workers', 4, '--duration', '500ms',
+         '--trace', trace)
     return trace
 
 

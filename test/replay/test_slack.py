@@ -7,14 +7,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 import re
-from typing import Any
 
-from mddag_executor.cli import main as program
 from mddag_executor.replay import reschedule
 from mddag_executor.replay import slack as module
 from mddag_executor.replay.slack import find_slack, Problem, Search
 import pytest
 
+from ..conftest import Call
 from .helpers import (
     add_execution,
     begin_trace,
@@ -39,19 +38,12 @@ nodes:
 """
 
 
-def slack_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, Any]:
-    status = program.main(['slack', *arguments, '--json', '-'])
-    return status, json.loads(capsys.readouterr().out)
-
-
 @pytest.mark.parametrize('recorded', [False, True])
-def test_by_hand(recorded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_by_hand(recorded: bool, tmp_path: Path, call: Call) -> None:
     graph, trace = tmp_path / 'g.yaml', tmp_path / 't.mcap'
     graph.write_text(BY_HAND)
-    assert program.main(['simulate', str(graph), '--trace', str(trace), '--duration', '1s']) == 0
-    capsys.readouterr()
-    status, result = slack_of(capsys, str(trace if recorded else graph), '--jobs', '1')
-    assert status == 0
+    call('simulate', graph, '--trace', trace, '--duration', '1s')
+    result = call('slack', trace if recorded else graph, '--jobs', 1, '--json', '-').result
     factors = {name: one['factor'] for name, one in result['callbacks'].items()}
     assert 5.94 <= factors['/a:first'] <= 6
     assert 3.46 <= factors['/b:last'] <= 3.5
@@ -64,13 +56,12 @@ def test_by_hand(recorded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert result['left_out'] == []
 
 
-def test_what_misses_already_is_left_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_misses_already_is_left_out(tmp_path: Path, call: Call) -> None:
     graph = tmp_path / 'g.yaml'
     graph.write_text(BY_HAND.replace('deadline: 8ms', 'deadline: 2ms').replace(
         'alone, timer: 100ms, deadline: 100ms', 'alone, timer: 100ms, deadline: 5ms'))
-    status, result = slack_of(capsys, str(graph), '--fail-under', '0.5')
+    status, out, _ = call('slack', graph, '--fail-under', '0.5', '--json', '-')
+    result = json.loads(out)
     assert status == 1
     assert result['left_out'] == ['/b:last']
     assert 49.5 <= result['callbacks']['/c:alone']['factor'] <= 50
@@ -78,7 +69,7 @@ def test_what_misses_already_is_left_out(
 
 
 def test_a_sink_that_misses_some_deadlines_has_the_factor_at_which_it_misses_another(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, call: Call
 ) -> None:
     # /some takes 10 ms, but in two jobs more than its deadline; /every is always late
     path = tmp_path / 'run.mcap'
@@ -100,51 +91,46 @@ nodes:
                     file.add('deadline', at + took * MS, 1, 1, dag, 0, job,
                              at + (90, 10)[dag] * MS, at + took * MS)
         end_trace(file, START_TIME + 3_000 * MS)
-    status, result = slack_of(capsys, str(path), '--cpus', '6', '--fail-under', '1.2')
+    status, out, _ = call('slack', path, '--cpus', 6, '--fail-under', '1.2', '--json', '-')
+    result = json.loads(out)
     assert status == 1
     assert result['missed'] == {'/some:run': 2, '/every:run': 30}
     assert result['left_out'] == ['/every:run']
     some = result['callbacks']['/some:run']
     assert 8.9 <= some['factor'] <= 9 and some['breaks'] == '/some:run'
     assert result['load']['breaks'] == '/some:run'
-    assert program.main(['slack', str(path)]) == 0
-    out = capsys.readouterr().out
+    out = call('slack', path).stdout
     assert out.startswith('left out, because they miss every deadline already: /every:run\n'
                           '2 deadlines missed already: /some:run (2); what follows says when')
     assert 'enough' not in out and re.search('with . of 6 workers no further deadline', out)
     assert re.search(r'some:run +90 ms +-5 ms +- ', out)
 
 
-def test_where_nothing_was_due_nothing_is_proven(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_where_nothing_was_due_nothing_is_proven(tmp_path: Path, call: Call) -> None:
     graph = tmp_path / 'g.yaml'
     graph.write_text(BY_HAND)
-    arguments = ['slack', str(graph), '--duration', '1us']
-    assert program.main(arguments) == 0
-    out = capsys.readouterr().out
+    arguments = 'slack', graph, '--duration', '1us'
+    out = call(*arguments).stdout
     assert 'never completed, so not judged: 2 sinks: ' in out and '100 times' not in out
-    assert program.main([*arguments, '--fail-under', '1.2']) == 1
-    err = capsys.readouterr().err
-    assert err.startswith(f'error: {graph}: no job was due at any sink') and err.count('\n') == 1
+    status, _, err = call(*arguments, '--fail-under', '1.2')
+    assert (status, err.count('\n')) == (1, 1)
+    assert err.startswith(f'error: {graph}: no job was due at any sink')
 
 
-def test_what_people_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_people_see(tmp_path: Path, call: Call) -> None:
     graph, page = tmp_path / 'g.yaml', tmp_path / 's.html'
     graph.write_text(BY_HAND)
-    assert program.main(['slack', str(graph), '--fail-under', '3', '--report', str(page)]) == 0
-    out = capsys.readouterr().out
-    assert 'b:last    3.49 times  b:last' in out
+    status, out, _ = call('slack', graph, '--fail-under', 3, '--report', page)
+    assert status == 0 and 'b:last    3.49 times  b:last' in out
     assert '1 callback may take 100 times as long and more' in out
     assert '1 of 2 workers is enough' in out
     assert 'b:last' in page.read_text()
-    assert program.main(['slack', str(graph), '--fail-under', '3.6']) == 1
+    assert call('slack', graph, '--fail-under', 3.6).returncode == 1
     for arguments, error in (
-            ([str(graph), str(graph)], 'there is a declaration already'),
-            ([str(graph), '--skip', '1s'], '--skip'),
-            ([str(tmp_path / 'none.mcap')], 'none.mcap')):
-        assert program.main(['slack', *arguments]) == 2
-        assert error in capsys.readouterr().err
+            ([graph, graph], 'there is a declaration already'),
+            ([graph, '--skip', '1s'], '--skip'), ([tmp_path / 'none.mcap'], 'none.mcap')):
+        done = call('slack', *arguments)
+        assert done.returncode == 2 and error in done.stderr
 
 
 @pytest.mark.parametrize('seed', [3, 4])

@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.cli import main as program
 from mddag_executor.core import Tables
 from mddag_executor.core.state import (
     Decision,
@@ -31,6 +30,7 @@ from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
+from ..conftest import Call
 from .helpers import add_execution
 
 MS = 1_000_000
@@ -123,15 +123,13 @@ def trace(tmp_path: Path) -> Path:
     ('2 of 3', 2, True), ('1 of 2', 2, False), ('2 of 100', 2, True), ('1 of 3', 2, False)])
 @pytest.mark.parametrize('mode', [[], ['--reschedule']])
 def test_the_declaration_says_what_a_sink_tolerates(
-    trace: Path, tmp_path: Path, tolerate: str, worst: int, kept: bool, mode: list[str],
-    capsys: pytest.CaptureFixture[str],
+    trace: Path, tmp_path: Path, tolerate: str, worst: int, kept: bool, mode: list[str], call: Call
 ) -> None:
     graph, out = tmp_path / 'g.yaml', tmp_path / 'out.xml'
     graph.write_text(GRAPH.replace('8ms}', f'8ms, tolerate: {tolerate}}}'))
-    arguments = ['replay', str(trace), str(graph), *mode]
-    assert program.main(
-        [*arguments, '--fail-on-miss', '--github', '--junit', str(out)]) == (not kept)
-    output = capsys.readouterr().out
+    arguments = 'replay', trace, graph, *mode, '--fail-on-miss'
+    status, output, _ = call(*arguments, '--github', '--junit', out)
+    assert status == (not kept)
     assert ('all misses, if any, are within what is tolerated' in output) == kept
     why = f'{worst} of {tolerate.split()[-1]} jobs in a row missed the deadline, ' \
           f'tolerated: {tolerate}'
@@ -143,20 +141,19 @@ def test_the_declaration_says_what_a_sink_tolerates(
         header, row = output[output.index('DAG '):].splitlines()[:2]
         assert header.split()[-2:] == ['tolerates', 'worst']
         assert row.split()[-4:] == [*tolerate.split(), str(worst)]
-    assert program.main([*arguments, '--fail-on-miss', '--json', '-']) == (not kept)
-    sink = json.loads(capsys.readouterr().out)['dags']['/n']['sinks']['/n:a']
+    status, output, _ = call(*arguments, '--json', '-')
+    sink = json.loads(output)['dags']['/n']['sinks']['/n:a']
     misses, of = map(int, tolerate.split(' of '))
     assert sink['tolerate'] == {'misses': misses, 'of': of, 'worst': worst}
 
 
-def test_a_simulation_respects_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_simulation_respects_it(tmp_path: Path, call: Call) -> None:
     graph = tmp_path / 'g.yaml'
     late = GRAPH.replace('8ms}', '8ms, execution_time: 9ms}')
     for tolerate, status in (('', 1), (', tolerate: 9 of 10', 1), (', tolerate: 10 of 11', 0)):
         graph.write_text(late.replace('9ms}', f'9ms{tolerate}}}'))
-        assert program.main(
-            ['simulate', str(graph), '--duration', '105ms', '--fail-on-miss']) == status
-        assert ' 10 of 11 ' in capsys.readouterr().out or status
+        done = call('simulate', graph, '--duration', '105ms', '--fail-on-miss')
+        assert done.returncode == status and (' 10 of 11 ' in done.stdout or status)
 
 
 def test_annotations_with_hostile_names() -> None:
@@ -171,7 +168,7 @@ def test_annotations_with_hostile_names() -> None:
 
 
 def test_a_failed_job_is_told_wherever_verdicts_are(
-    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trace: Path, tmp_path: Path, call: Call
 ) -> None:
     """The first job's callback raised, in a run that was in time but for the third and fourth."""
     failed, out = tmp_path / 'failed.mcap', tmp_path / 'out.xml'
@@ -183,39 +180,34 @@ def test_a_failed_job_is_told_wherever_verdicts_are(
             file.add(name, time, pid, thread, *fields)
     for mode in ([], ['--reschedule']):
         page = tmp_path / 'page.html'
-        assert program.main(['replay', str(failed), *mode, '--junit', str(out), '--report',
-                             str(page)]) == 0
-        output = capsys.readouterr()
-        assert output.err == '' and '2 late, 0 expired, 1 failed\n' in output.out
+        done = call('replay', failed, *mode, '--junit', out, '--report', page)
+        assert (done.returncode, done.stderr) == (0, '')
+        assert '2 late, 0 expired, 1 failed\n' in done.stdout
         assert '2 late, 0 expired, 1 failed<' in page.read_text()
         failure = ElementTree.parse(out).getroot().find('testsuite/testcase/failure')
         assert failure is not None and failure.attrib['message'] == (
             '3 of 10 jobs missed the deadline (1 failed: a callback raised)')
-        assert program.main(['replay', str(failed), *mode, '--json', '-']) == 0
-        dag = json.loads(capsys.readouterr().out)['dags']['/n']
+        dag = call('replay', failed, *mode, '--json', '-').result['dags']['/n']
         assert dag['ends'] == {'completed': 7, 'late': 2, 'aborted': 0, 'expired': 0, 'failed': 1,
                                'dropped': 0}
         assert dag['sinks']['/n:a']['failed'] == 1
-    assert program.main(['diff', str(trace), str(failed), '--fail-on-worse']) == 1
-    assert '2 late, 0 expired, 1 failed; policy' in capsys.readouterr().out
+    done = call('diff', trace, failed, '--fail-on-worse')
+    assert done.returncode == 1 and '2 late, 0 expired, 1 failed; policy' in done.stdout
     jobs = tmp_path / 'jobs.csv'
-    assert program.main(['export', str(failed), '-o', str(jobs), '--rows', 'jobs']) == 0
+    call('export', failed, '-o', jobs, '--rows', 'jobs')
     assert jobs.read_text().count(',failed') == 1
 
 
 @pytest.mark.parametrize('mode', [[], ['--reschedule']])
-def test_a_warm_up_is_left_out(
-    trace: Path, tmp_path: Path, mode: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_warm_up_is_left_out(trace: Path, tmp_path: Path, mode: list[str], call: Call) -> None:
     """The jobs 2 and 3, released 20 ms and 30 ms after the first, are the late ones."""
     for skip, due, late in (('0', 10, 2), ('20ms', 8, 2), ('20001us', 7, 1), ('31ms', 6, 0)):
-        arguments = ['replay', str(trace), *mode, '--skip', skip]
-        assert program.main([*arguments, '--fail-on-miss']) == (late > 0)
-        output = capsys.readouterr()
-        assert output.err == '' and f'{due} results due, {due - late} in time' in output.out
-        assert ('left out: jobs released in the first' in output.out) == (skip != '0')
-        assert program.main([*arguments, '--json', '-']) == 0
-        result = json.loads(capsys.readouterr().out)
+        arguments = 'replay', trace, *mode, '--skip', skip
+        status, out, err = call(*arguments, '--fail-on-miss')
+        assert (status, err) == (late > 0, '')
+        assert f'{due} results due, {due - late} in time' in out
+        assert ('left out: jobs released in the first' in out) == (skip != '0')
+        result = call(*arguments, '--json', '-').result
         assert result['dags']['/n']['jobs'] == due
         assert result['dags']['/n']['ends'] == {
             'completed': due - late, 'late': late, 'aborted': 0, 'expired': 0, 'failed': 0,
@@ -223,13 +215,13 @@ def test_a_warm_up_is_left_out(
         assert result['skip_ns'] == {'0': 0, '20ms': 20 * MS, '20001us': 20_001_000}.get(
             skip, 31 * MS)
     page = tmp_path / 'report.html'
-    assert program.main([*arguments, '--report', str(page)]) == 0
+    call(*arguments, '--report', page)
     assert '6 results due, 6 in time (100.00 %)' in page.read_text()
 
 
 @pytest.mark.parametrize('mode', [[], ['--reschedule']])
 def test_where_nothing_was_due_nothing_is_proven(
-    trace: Path, tmp_path: Path, mode: list[str], capsys: pytest.CaptureFixture[str]
+    trace: Path, tmp_path: Path, mode: list[str], call: Call
 ) -> None:
     """A run of the declaration's nodes in which no job came is no run that held its deadlines."""
     empty, out = tmp_path / 'empty.mcap', tmp_path / 'out.xml'
@@ -241,42 +233,34 @@ def test_where_nothing_was_due_nothing_is_proven(
         file.add('shutdown', 200 * MS, 1, 1, 200 * MS)
     graph = tmp_path / 'g.yaml'
     graph.write_text(GRAPH.replace('8ms}', '8ms, execution_time: 1ms}'))
-    arguments = ['replay', str(empty), str(graph), *mode]
-    assert program.main([*arguments, '--fail-on-miss', '--junit', str(out)]) == 1
-    output = capsys.readouterr()
-    assert output.err.count(f'error: {empty}: no job was due at any sink') == 1
-    assert 'never due, so not judged: 1 sink: /n:a' in output.out
+    arguments = 'replay', empty, graph, *mode
+    status, said, err = call(*arguments, '--fail-on-miss', '--junit', out)
+    assert status == 1 and err.count(f'error: {empty}: no job was due at any sink') == 1
+    assert 'never due, so not judged: 1 sink: /n:a' in said
     failure = ElementTree.parse(out).getroot().find('testsuite/testcase/failure')
     assert failure is not None and 'no job was due' in failure.attrib['message']
-    assert program.main([*arguments, '--json', '-']) == 0
-    assert json.loads(capsys.readouterr().out)['never_due'] == ['/n:a']
+    assert json.loads(call(*arguments, '--json', '-').stdout)['never_due'] == ['/n:a']
 
 
 def test_a_run_in_which_nothing_was_due_is_no_better(
-    trace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trace: Path, tmp_path: Path, call: Call
 ) -> None:
     empty = tmp_path / 'empty.mcap'
     with TraceFile(empty) as file:
         file.add('task_set', 0, 1, 1, GRAPH, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
         file.add('shutdown', 200 * MS, 1, 1, 200 * MS)
-    assert program.main(['diff', str(trace), str(empty), '--fail-on-worse']) == 1
-    output = capsys.readouterr()
-    assert 'error' not in output.err and 'worse, never due in B' in output.out
-    assert program.main(['diff', str(empty), str(empty), '--fail-on-worse']) == 1
-    output = capsys.readouterr()
-    assert (f'error: {empty} and {empty}: no sink was due in both, so nothing was compared: '
-            in output.err)
-    assert program.main(['diff', str(empty), str(empty)]) == 0
+    status, out, err = call('diff', trace, empty, '--fail-on-worse')
+    assert status == 1 and 'error' not in err and 'worse, never due in B' in out
+    status, _, err = call('diff', empty, empty, '--fail-on-worse')
+    assert status == 1 and (
+        f'error: {empty} and {empty}: no sink was due in both, so nothing was compared: ' in err)
+    assert call('diff', empty, empty).returncode == 0
 
 
 @pytest.mark.parametrize(('options', 'says'), [
     (['--junit', '/gone/out.xml'], 'there is no directory /gone'),
     (['--junit', '-', '--json', '-'], 'can be only one of json and junit'),
 ])
-def test_wrong_options(
-    trace: Path, options: list[str], says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert program.main(['replay', str(trace), *options]) == 2
-    output = capsys.readouterr()
-    assert output.out == ''
-    assert says in output.err and output.err.count('\n') == 1
+def test_wrong_options(trace: Path, options: list[str], says: str, call: Call) -> None:
+    status, out, err = call('replay', trace, *options)
+    assert (status, out, err.count('\n')) == (2, '', 1) and says in err

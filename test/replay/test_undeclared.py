@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from mddag_executor.trace import EVENTS, TraceFile, TraceReader
 import pytest
 
-from ..cli.helpers import caller
+from ..conftest import Call
 from ..replay.helpers import begin_trace, end_trace, MS, START_TIME, US
 
 DEMO = Path(__file__).parents[2] / 'bags' / 'demo_short.mcap'
@@ -29,13 +28,12 @@ GRAB, SCAN, RUN = 11, 12, 13
 _OF_JOBS = {f'mddag:{name}' for name in (
     'job_release', 'complete', 'deadline', 'fail', 'expire', 'abort', 'hosted', 'judge_from')}
 
-call = caller('replay')
-
 
 class Run:
     """The trace of a run of three nodes; times are ns since the start."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, call: Call) -> None:
+        self._call = call
         self.path = folder / 'run.mcap'
         self.graph = folder / 'graph.yaml'
         self.graph.write_text(GRAPH)
@@ -75,17 +73,18 @@ class Run:
         self.takes(stamp, taken)
         self.runs(RUN, taken + US, taken + 2 * US, taken + 2 * US + took)
 
-    def result(self, capsys: pytest.CaptureFixture[str], until: int | None = None
-               ) -> dict[str, Any]:
+    def result(self, until: int | None = None) -> Any:
         """End the run and return what `mddag replay --json` says of it."""
         if until is None:
             self.file.finish()
         else:
             end_trace(self.file, START_TIME + until)
-        status, out, _ = call(capsys, self.path, self.graph, '--json', '-')
-        assert status == 0
-        found: dict[str, Any] = json.loads(out)
-        return found
+        return self._call('replay', self.path, self.graph, '--json', '-').result
+
+
+@pytest.fixture
+def run(tmp_path: Path, call: Call) -> Run:
+    return Run(tmp_path, call)
 
 
 def undeclared(source: Path, target: Path) -> str:
@@ -102,16 +101,13 @@ def undeclared(source: Path, target: Path) -> str:
     return text
 
 
-def test_the_same_run_gets_the_same_verdicts(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_same_run_gets_the_same_verdicts(tmp_path: Path, call: Call) -> None:
     trace, graph = tmp_path / 'run.mcap', tmp_path / 'graph.yaml'
     graph.write_text(undeclared(DEMO, trace))
-    _, out, _ = call(capsys, DEMO, '--json', '-')
-    declared = json.loads(out)
-    status, out, errors = call(capsys, trace, graph, '--json', '-')
-    found = json.loads(out)
-    assert (status, errors) == (0, '')
+    declared = call('replay', DEMO, '--json', '-').result
+    done = call('replay', trace, graph, '--json', '-')
+    found = done.result
+    assert not done.stderr
     assert found['first_miss']['job'] == declared['first_miss']['job']
     assert (found['policy'], found['workers']) == (declared['policy'], declared['workers'])
     assert found['callbacks'].keys() == declared['callbacks'].keys()
@@ -132,36 +128,31 @@ def test_the_same_run_gets_the_same_verdicts(
                 assert abs(mean['release_lag_ns'] - wanted['release_lag_ns']) < MS
 
 
-def test_other_verbs_take_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = Run(tmp_path)
+def test_other_verbs_take_it(run: Run, call: Call) -> None:
     for job in range(5):
         at = job * 100 * MS
         run.runs(GRAB, at, at, at + 2 * MS, at + MS)
         run.detects(at + MS + 9 * US, at + MS + 99 * US, (60 if job == 3 else 5) * MS)
-    assert run.result(capsys, 500 * MS)['warnings'] == []
-    for verb in ('explain', 'slack', 'diff'):
-        files = [run.path, run.path] if verb == 'diff' else [run.path]
-        assert caller(verb)(capsys, *files, run.graph, '--json', '-')[0] == 0
-    status, out, _ = caller('explain')(capsys, run.path, run.graph, '--json', '-')
-    assert {cause: n for cause, n in json.loads(out)['causes'].items() if n} == {'ran long': 1}
-    status, out, _ = call(capsys, run.path, run.graph, '--reschedule', '--json', '-')
-    sink = json.loads(out)['dags']['/camera']['sinks']['/detect:run@/camera']
-    assert (status, sink['completed'], sink['late']) == (0, 5, 1)
+    assert run.result(500 * MS)['warnings'] == []
+    assert call('slack', run.path, run.graph).returncode == 0
+    assert call('diff', run.path, run.path, run.graph).returncode == 0
+    causes = call('explain', run.path, run.graph, '--json', '-').result['causes']
+    assert {cause: n for cause, n in causes.items() if n} == {'ran long': 1}
+    result = call('replay', run.path, run.graph, '--reschedule', '--json', '-').result
+    sink = result['dags']['/camera']['sinks']['/detect:run@/camera']
+    assert (sink['completed'], sink['late']) == (5, 1)
 
 
-def test_messages_of_others_are_of_no_job(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_messages_of_others_are_of_no_job(run: Run) -> None:
     # another process publishes while nothing of this one is being sent, or while /camera still
     # runs: its own message has been taken then
-    run = Run(tmp_path)
     for job in range(4):
         at = job * 100 * MS
         run.runs(GRAB, at, at, at + 20 * MS, at + MS)
         run.detects(at + MS + 9 * US, at + MS + 99 * US)
         run.detects(at + 10 * MS, at + 10 * MS + 99 * US)
         run.detects(at + 50 * MS, at + 50 * MS + 99 * US)
-    result = run.result(capsys, 400 * MS)
+    result = run.result(400 * MS)
     sink = result['dags']['/camera']['sinks']['/detect:run@/camera']
     assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (
         4, 0, 6 * MS + 101 * US)
@@ -172,11 +163,8 @@ def test_messages_of_others_are_of_no_job(
 
 
 @pytest.mark.parametrize('in_order', [True, False])
-def test_who_published_is_never_guessed(
-    in_order: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_who_published_is_never_guessed(in_order: bool, run: Run) -> None:
     # both publish on one topic while both run; messages are taken later
-    run = Run(tmp_path)
     for job in range(3):
         at = job * 100 * MS
         run.runs(GRAB, at, at, at + 20 * MS, at + MS)
@@ -186,7 +174,7 @@ def test_who_published_is_never_guessed(
         run.takes(at + 2 * MS + 10 * US, at + 31 * MS)
         run.runs(RUN, at + 30 * MS + US, at + 30 * MS + US, at + 32 * MS)
         run.runs(RUN, at + 31 * MS + US, at + 33 * MS, at + 35 * MS)
-    result = run.result(capsys, 300 * MS)
+    result = run.result(300 * MS)
     sinks = [dag['sinks'][f'/detect:run@{name}'] for name, dag in result['dags'].items()]
     if in_order:
         assert [sink['response_ns']['max'] for sink in sinks] == [32 * MS, 35 * MS]
@@ -198,11 +186,8 @@ def test_who_published_is_never_guessed(
         assert '6 jobs' in ' '.join(result['warnings'])
 
 
-def test_the_pieces_of_a_coroutine_are_one_execution(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_pieces_of_a_coroutine_are_one_execution(run: Run) -> None:
     # /detect awaits something for 30 ms, in every second job for 50 ms
-    run = Run(tmp_path)
     for job in range(4):
         at, rest = job * 100 * MS, (50 if job % 2 else 30) * MS
         run.runs(GRAB, at, at, at + 2 * MS, at + MS)
@@ -210,7 +195,7 @@ def test_the_pieces_of_a_coroutine_are_one_execution(
         ready = at + MS + 100 * US
         run.runs(RUN, ready, at + 2 * MS, at + 3 * MS)
         run.runs(RUN, ready, at + 3 * MS + rest, at + 4 * MS + rest, thread=99)
-    result = run.result(capsys, 400 * MS)
+    result = run.result(400 * MS)
     sink = result['dags']['/camera']['sinks']['/detect:run@/camera']
     assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (4, 2, 54 * MS)
     mean = sink['breakdown']['mean']
@@ -221,9 +206,8 @@ def test_the_pieces_of_a_coroutine_are_one_execution(
 
 
 def test_a_request_is_released_when_it_was_ready_also_for_a_coroutine(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, call: Call
 ) -> None:
-    run = Run(tmp_path)
     run.graph.write_text(GRAPH + """\
   - node: /detect
     callbacks: [{name: ask, service: /ask, period: 1s, deadline: 20ms}]
@@ -233,16 +217,13 @@ def test_a_request_is_released_when_it_was_ready_also_for_a_coroutine(
     run.runs(14, 100 * MS, 103 * MS, 104 * MS)
     run.runs(14, 100 * MS, 120 * MS, 121 * MS)      # resumed
     run.runs(14, 200 * MS, 201 * MS, 202 * MS)
-    sink = run.result(capsys)['dags']['/detect']['sinks']['/detect:ask']
+    sink = run.result()['dags']['/detect']['sinks']['/detect:ask']
     assert (sink['completed'], sink['late']) == (2, 1)
     assert (sink['response_ns']['min'], sink['response_ns']['max']) == (2 * MS, 21 * MS)
 
 
-def test_timers_are_released_on_their_grid_if_they_keep_to_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_timers_are_released_on_their_grid_if_they_keep_to_one(run: Run) -> None:
     # /camera's timer is noticed 30 ms late once; /radar's is reset all the time
-    run = Run(tmp_path)
     for job in range(6):
         at, late = job * 100 * MS, 30 * MS * (job == 2)
         run.runs(GRAB, at + late, at + late, at + late + 2 * MS, at + late + MS)
@@ -250,7 +231,7 @@ def test_timers_are_released_on_their_grid_if_they_keep_to_one(
         at += 50 * MS + 37 * job * job % 41 * MS
         run.runs(SCAN, at, at, at + 2 * MS, at + MS)
         run.detects(at + MS + 9 * US, at + MS + 99 * US, 7 * MS)
-    result = run.result(capsys, 700 * MS)
+    result = run.result(700 * MS)
     camera, radar = (result['dags'][name]['sinks'][f'/detect:run@{name}']['breakdown']['worst']
                      for name in ('/camera', '/radar'))
     assert (camera['job'], camera['release_lag_ns']) == (2, 30 * MS)
@@ -259,27 +240,21 @@ def test_timers_are_released_on_their_grid_if_they_keep_to_one(
     assert '6 executions of timers off the grid' in warning and '/radar timer' in warning
 
 
-def test_a_job_that_is_open_at_the_end_is_judged_by_that(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = Run(tmp_path)
+def test_a_job_that_is_open_at_the_end_is_judged_by_that(run: Run) -> None:
     run.runs(GRAB, 0, 0, 2 * MS, MS)
     run.add('drop', 3 * MS, 1, RUN, -1, -1, -1, 'qos_depth')
-    result = run.result(capsys, 80 * MS)
+    result = run.result(80 * MS)
     sink = result['dags']['/camera']['sinks']['/detect:run@/camera']
     assert (sink['completed'], sink['late'], sink['overdue']) == (0, 1, 1)
     assert result['dropped'] == {'qos_depth': 1}
 
 
-def test_without_a_graph_it_says_how_to_get_a_verdict(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = Run(tmp_path)
-    run.result(capsys, 10 * MS)
+def test_without_a_graph_it_says_how_to_get_a_verdict(run: Run, call: Call) -> None:
+    run.result(10 * MS)
     for verb in ('replay', 'explain', 'slack'):
-        status, _, errors = caller(verb)(capsys, run.path)
+        status, _, errors = call(verb, run.path)
         assert (status, errors.count('\n')) == (2, 1)
         assert 'give the GRAPH that judges it' in errors
-    status, _, errors = call(capsys, run.path, run.path, run.graph)
+    status, _, errors = call('replay', run.path, run.path, run.graph)
     assert (status, errors.count('\n')) == (2, 1)
     assert 'replay it by itself, with a GRAPH' in errors

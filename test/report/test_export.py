@@ -75,6 +75,3 @@ def test_the_rows_are_those_of_the_replay() -> None:
     busy = sum(int(row['executing_ns']) for row in declared)
     assert busy == sum(use['busy_ns'] for use in result['callbacks'].values())
     assert all(row['release_ns'] for row in declared)
-
-
-# --- Perfetto ------------------------------------------------------------------------------------

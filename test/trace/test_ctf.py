@@ -10,10 +10,10 @@ import struct
 import sys
 from typing import NoReturn
 
-from mddag_executor.cli.main import main
 from mddag_executor.trace import ctf, import_ctf, read_events, TraceError, TraceReader
 import pytest
 
+from ..conftest import Call
 from ..replay.test_caret_sample import CARET
 from ..trace.ctf_session import CLOCK_OFFSET, session
 
@@ -76,20 +76,17 @@ def test_unknown_events_keep_all_fields(tmp_path: Path) -> None:
 
 
 @bt2
-def test_providers_that_replay_does_not_know_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_providers_that_replay_does_not_know_are_named(tmp_path: Path, call: Call) -> None:
     written = ('dds:write', [('writer', 'u64'), ('timestamp', 'i64')])
     hook = ('ros2_hook:dds_write', [('message_addr', 'u64')])
     app = ('my_app:frame', [('number', 'u64')])
     folder = session(tmp_path / 's', [written, hook, app], [
         (0, 1, 1, 1, 'p', 5, 77), (1, 2, 1, 1, 'p', 6), (2, 3, 1, 1, 'p', 7),
         (2, 4, 1, 1, 'p', 8)])
-    assert main(['import', 'ctf', str(folder), '-o', str(tmp_path / 'out.mcap')]) == 0
-    said = capsys.readouterr()
+    status, out, err = call('import', 'ctf', folder, '-o', tmp_path / 'out.mcap')
     # the field `timestamp` is called otherwise in every trace: no warning about that
-    assert said.err == ''
-    assert said.out.splitlines() == [
+    assert (status, err) == (0, '')
+    assert out.splitlines() == [
         f'4 events of 3 kinds from 1 process: {tmp_path / "out.mcap"}',
         'replay does not use the events of these providers: my_app (2)']
 
