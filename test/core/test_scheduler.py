@@ -103,9 +103,6 @@ def test_an_unknown_policy_is_refused_with_the_list() -> None:
         live(policy_name='edf')
 
 
-# --- legs of a sync ------------------------------------------------------------------------------
-
-
 # --- workers -------------------------------------------------------------------------------------
 
 
@@ -196,12 +193,6 @@ def ros2(callbacks: list[dict[str, Any]], ticks: dict[str, int], **more: Any) ->
     return case(callbacks, ticks, policy='ros2', **more)
 
 
-# --- order ---------------------------------------------------------------------------------------
-
-
-# --- callback groups -----------------------------------------------------------------------------
-
-
 # --- the core by itself --------------------------------------------------------------------------
 
 
@@ -246,7 +237,7 @@ def test_no_preemption() -> None:
         simulate(task_set, of.load(10), Settings(policy='ros2', workers=0))
 
 
-URGENT, MIDDLE, RELAXED = range(3)
+URGENT = 0
 DEADLINES = (10, 20, 30)
 
 

@@ -16,6 +16,9 @@ from typing import Any
 import pytest
 from rclpy.task import Future, Task
 
+from .test_asked_for import (  # noqa: F401
+    test_an_exception_that_is_handled_does_not_end_the_executor,
+)
 from .test_executor import (  # noqa: F401
     test_service_and_client_from_a_coroutine,
     test_tasks_functions_coroutines_and_futures_across_them,
@@ -26,7 +29,6 @@ from .test_like_rclpy import (  # noqa: F401
 )
 from .test_spin import (  # noqa: F401
     test_a_coroutine_that_awaits_something_unknown_is_asked_again,
-    test_an_awaited_exception_does_not_end_spin,
 )
 from .test_waitables import test_many_goals_at_once  # noqa: F401
 

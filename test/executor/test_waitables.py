@@ -137,9 +137,6 @@ class spun:
         assert not self._thread.is_alive()
 
 
-# --- QoS events ----------------------------------------------------------------------------------
-
-
 # --- guard conditions, and waitables of a user's own ---------------------------------------------
 
 
@@ -195,9 +192,6 @@ def test_each_trigger_of_a_guard_condition_is_noticed(make_executor, make_node, 
             rounds()
         assert spinning.error is None
         assert wait_set_threads() == 0
-
-
-# --- taking --------------------------------------------------------------------------------------
 
 
 # --- timers --------------------------------------------------------------------------------------
@@ -267,9 +261,3 @@ def test_a_waitable_that_takes_nothing_is_executed(make_executor, make_node):
         assert wait_for(lambda: waitable.guard.trigger() or len(waitable.got) >= 3)
     assert set(waitable.got) == {None}
     node.remove_waitable(waitable)
-
-
-# --- executors and nodes -------------------------------------------------------------------------
-
-
-# --- what is behind a handle ---------------------------------------------------------------------

@@ -4,6 +4,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from ..executor.conftest import make_node, wait_for
 
-__all__ = ['make_node', 'wait_for']
+__all__ = ['has_ended', 'make_node', 'wait_for']
+
+
+def has_ended(pid: int) -> bool:
+    """Tell whether a process is gone; no process may be there to take note of its end."""
+    try:
+        return ') Z ' in Path(f'/proc/{pid}/stat').read_text()
+    except (ProcessLookupError, FileNotFoundError):
+        return True

@@ -8,12 +8,13 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
-import time
 
 from mddag_executor.hosting.child import ChildError, CrashError, run_child
 from mddag_executor.hosting.peers import measure_peer
 from msg_graph import GraphError
 import pytest
+
+from .conftest import has_ended, wait_for
 
 GRAPH = """
 mddag: 1
@@ -82,16 +83,10 @@ def test_a_child_does_not_outlive_who_wants_its_result(tmp_path: Path, hangs: st
         'from mddag_executor.hosting.child import run_child; '
         f'run_child({child(body)!r}, "it", 60.0)')])
     try:
-        end = time.monotonic() + 60
-        while not mark.exists():
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        assert wait_for(mark.exists, 60.0)
         parent.send_signal(signal.SIGKILL)
         parent.wait()
-        stat = Path(f'/proc/{mark.read_text()}/stat')
-        while stat.exists() and ') Z ' not in stat.read_text():
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        assert wait_for(lambda: has_ended(int(mark.read_text())), 60.0)
     finally:
         parent.kill()
         parent.wait()

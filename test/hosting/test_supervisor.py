@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import io
-import os
 from pathlib import Path
 import signal
 import subprocess
@@ -19,6 +18,8 @@ from mddag_executor.hosting import processes as module
 from mddag_executor.hosting.processes import Run, Supervisor
 from mddag_executor.hosting.session import Session
 import pytest
+
+from .conftest import has_ended, wait_for
 
 WAITS = """
 import signal, sys, threading
@@ -129,26 +130,11 @@ def test_it_ends_with_who_started_it(tmp_path: Path) -> None:
         'import os, subprocess, sys; '
         f'subprocess.run([sys.executable, "-c", {child!r}, str(os.getpid())])')])
     try:
-        end = time.monotonic() + 60
-        while not mark.exists():
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        assert wait_for(mark.exists, 60.0)
     finally:
         parent.kill()
         parent.wait()
-    pid = int(mark.read_text())
-    while is_alive(pid):
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
-def is_alive(pid: int) -> bool:
-    """Tell whether a process runs; no process may be there to take note of its end."""
-    try:
-        os.kill(pid, 0)
-        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
-    except (ProcessLookupError, FileNotFoundError):
-        return False
+    assert wait_for(lambda: has_ended(int(mark.read_text())), 60.0)
 
 
 DEEPEST = 60

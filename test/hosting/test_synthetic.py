@@ -131,9 +131,6 @@ def test_spinning_takes_cpu_of_its_own_thread_only() -> None:
     assert len(taken) == 3 and min(taken) >= 30 * MS
 
 
-# --- joins and releases --------------------------------------------------------------------------
-
-
 # --- nodes ---------------------------------------------------------------------------------------
 
 

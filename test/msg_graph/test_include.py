@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-import os
 from pathlib import Path
 import re
 
@@ -164,14 +163,8 @@ def test_includes_within_includes(tmp_path: Path) -> None:
     ('namespace: /rear', 'name: /rear', 'top.yaml:9', "unknown key 'name'"),
     ('parts/sensor.yaml\n    namespace: /rear', 'parts/none.yaml\n    namespace: /rear',
      'top.yaml:8', 'cannot be read (No such file or directory)'),
-    ('parts/sensor.yaml\n    namespace: /rear', '/etc/passwd\n    namespace: /rear',
-     'top.yaml:8', "'/etc/passwd' is no relative path"),
     ('parts/sensor.yaml\n    namespace: /rear', '../x.yaml\n    namespace: /rear',
      'top.yaml:8', 'lies outside of the folder of the first file'),
-    ('parts/sensor.yaml\n    namespace: /rear', 'link.yaml\n    namespace: /rear',
-     'top.yaml:8', 'lies outside of the folder of the first file'),
-    ('parts/sensor.yaml\n    namespace: /rear', 'pipe.yaml\n    namespace: /rear',
-     'top.yaml:8', 'it is no regular file'),
     ('parts/sensor.yaml\n    namespace: /rear', 'parts\n    namespace: /rear',
      'top.yaml:8', 'it is no regular file'),
     ('namespace: /rear', 'namespace: /front/left', 'parts/sensor.yaml:9',
@@ -186,10 +179,6 @@ def test_includes_within_includes(tmp_path: Path) -> None:
 def test_errors_name_their_file(
         tmp_path: Path, wrong: str, right: str, place: str, problem: str) -> None:
     assert wrong in TOP + SENSOR
-    outside = tmp_path.parent / 'outside.yaml'
-    outside.write_text('mddag: 1\n')
-    (tmp_path / 'link.yaml').symlink_to(outside)
-    os.mkfifo(tmp_path / 'pipe.yaml')
     top = write(tmp_path, top=TOP.replace(wrong, right),
                 parts__sensor=SENSOR.replace(wrong, right))
     with pytest.raises(GraphError) as caught:

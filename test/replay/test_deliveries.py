@@ -1,66 +1,17 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The event loop with messages that take time, and the overheads measured in a recording."""
+"""The overheads measured in a recording, and that a reschedule has them again."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from mddag_executor.core import Tables
-from mddag_executor.core.state import SINK_COMPLETED
 from mddag_executor.replay import reschedule
-from mddag_executor.simulate import Load, schedule, Settings, START
-from mddag_executor.simulate.load import edge_numbers, edges_of
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
 import pytest
 
 from .helpers import add_execution, Chances, MS, SMALL, START_TIME, VirtualRun
-
-CHAIN = """\
-mddag: 1
-nodes:
-  - node: /a
-    callbacks:
-      - {name: a, timer: 100ms, publishes: [/x, /y], dag: a}
-  - node: /b
-    callbacks:
-      - {name: b, subscription: /x, publishes: [/z]}
-  - node: /c
-    callbacks:
-      - {name: c, sync: [/y, /z], deadline: 90ms}
-  - node: /d
-    callbacks:
-      - {name: d, timer: 100ms, deadline: 20ms, dag: d}
-"""
-
-
-def engine(
-    delays: list[int], workers: int = 2, preemptive: bool = False, horizon: int = 100 * MS,
-    late: int = 50 * MS, jobs: int = 1, bound: int = 64,
-) -> tuple[list[tuple[int, int, int]], list[tuple[int, ...]]]:
-    """
-    Run a (4 ms), b (2 ms), c (3 ms), and d (1 ms, later); return starts and completed sinks.
-
-    :param delays: of the messages from a to b, from a to c and from b to c.
-    """
-    task_set = loads(CHAIN, 'g.yaml')
-    tables = Tables.build(task_set, max_active_jobs=bound)
-    load = Load([*(job * MS for job in range(jobs)), late], [0] * jobs + [1],
-                [*range(jobs), 0], [4 * MS, 2 * MS, 3 * MS] * jobs + [MS], [0, 3 * jobs], [3, 1])
-    numbers = edge_numbers(tables)
-    by_edge = [delay for _, delay in sorted(zip(
-        (numbers[edge] for edge in ((0, 1), (0, 2), (1, 2))), delays))]
-    load = load._replace(
-        delays=by_edge * jobs, delay_base=[0, 0], delay_stride=[3, 0])
-    found = schedule(
-        tables, load, Settings('rad', workers, horizon, preemptive, 'completions'), log=True,
-        compiled=False)
-    starts = [(time // 1000, worker, vertex) for time, kind, worker, _, vertex, _ in found.log
-              if kind == START]
-    done = [(d[2], d[5] // 1000) for d in found.decisions if d[0] in SINK_COMPLETED]
-    assert edges_of(tables) == [3, 0]
-    return starts, done
 
 
 def record(path: Path, delay: int, wake: int, ready_early: int = 0) -> None:

@@ -16,9 +16,7 @@ from mddag_executor.replay import isolation as module
 from mddag_executor.replay import replay
 from mddag_executor.replay.dispatches import dispatch_times
 from mddag_executor.replay.isolation import isolated_times, Recorded
-from mddag_executor.replay.noticed import Noticed
 from mddag_executor.replay.usage import group_waits, PoolUse
-from mddag_executor.simulate.machine import SWITCH_NS
 from mddag_executor.trace import TraceFile
 import numpy as np
 import pytest
@@ -143,35 +141,6 @@ def test_waiting_for_what_computes_is_not_late() -> None:
         (1, None, 0, 10 * ms + 50, 20 * ms), (4, None, 12 * ms, 13 * ms + 9, 22 * ms),
         (2, None, 15 * ms, 20 * ms + 60, 30 * ms), holding=(overtakes, first, second, third),
     ) == [ms + 7, 30, 50, ms + 9, 60]
-
-
-TIMER, MESSAGE = 200_000, 400_000
-
-
-def recorded(count: int) -> tuple[Recorded, Noticed]:
-    """
-    Return executions of 5 ms of CPU time, one each 20 ms, and what was noticed.
-
-    In turn: a timer while one computes, a message, nothing; a timer and a message where nothing
-    computes.
-    """
-    could, took, due, ready, timer = [], [], [], [], []
-    for turn in range(count):
-        begin = 20 * MS * turn
-        what = turn % 3
-        could.append(begin)
-        took.append(5 * MS + (TIMER, MESSAGE, 0)[what])
-        if what < 2:
-            due.append(begin + MS)
-            ready.append(begin + MS + SWITCH_NS + 150_000)
-            timer.append(what == 0)
-        due += [begin + 10 * MS, begin + 15 * MS]
-        ready += [begin + 10 * MS + 120_000, begin + 15 * MS + 180_000]
-        timer += [True, False]
-    one = np.ones(count, dtype=np.int64)
-    return Recorded(
-        np.array(could), np.array(took), 5 * MS * one, one > 0, one), Noticed(
-        np.array(due), np.array(ready), np.ones(len(due), dtype=np.int64), np.array(timer))
 
 
 STEP = PoolUse.FIRST_STEP_NS

@@ -11,7 +11,6 @@ import shutil
 import sqlite3
 from typing import Any
 
-from mddag_executor.cli import main as program
 from mddag_executor.errors import InputError
 from mddag_executor.replay import bags, Reschedule
 from mddag_executor.replay.bags import Bag, BagError, is_ordinary
@@ -23,6 +22,8 @@ import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 import zstandard
+
+from ..conftest import Call
 
 MS = 1_000_000
 BEGIN = 1_732_166_766_000_000_000
@@ -42,15 +43,6 @@ nodes:
       - {name: tick, timer: 30ms, deadline: 10ms, execution_time: 3ms}
 """
 BY_HEADER = GRAPH.replace('period: 100ms', 'period: 100ms, release_from: header_stamp')
-FORMATS: dict[str, tuple[StoragePlugin, CompressionMode | None]] = {
-    'mcap': (StoragePlugin.MCAP, None),
-    'mcap with zstd chunks': (StoragePlugin.MCAP, CompressionMode.STORAGE),
-    'mcap, messages in zstd': (StoragePlugin.MCAP, CompressionMode.MESSAGE),
-    'mcap, file in zstd': (StoragePlugin.MCAP, CompressionMode.FILE),
-    'sqlite3': (StoragePlugin.SQLITE3, None),
-    'sqlite3, messages in zstd': (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
-    'sqlite3, file in zstd': (StoragePlugin.SQLITE3, CompressionMode.FILE),
-}
 
 
 def header(stamp: int) -> bytes:
@@ -200,9 +192,7 @@ def killed_recorder(folder: Path, source: Path) -> Path:
     return file
 
 
-def test_the_write_ahead_log_belongs_to_a_bag(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_write_ahead_log_belongs_to_a_bag(tmp_path: Path, call: Call) -> None:
     """Whether the file is named or its folder; the user's files stay as they are."""
     whole = write_bag(tmp_path / 'bag', StoragePlugin.SQLITE3)
     file = killed_recorder(tmp_path / 'killed', whole)
@@ -211,11 +201,9 @@ def test_the_write_ahead_log_belongs_to_a_bag(
     graph = tmp_path / 'g.yaml'
     graph.write_text(BY_HEADER)
     for given in (file, file.parent):
-        assert program.main(['replay', str(given), str(graph), '--reschedule', '--json', '-']) == 0
-        said = capsys.readouterr()
-        assert [line for line in said.err.splitlines() if 'metadata.yaml is missing' not in line
-                ] == []
-        result = json.loads(said.out)
+        done = call('replay', given, graph, '--reschedule', '--json', '-')
+        assert all('metadata.yaml is missing' in line for line in done.stderr.splitlines())
+        result = json.loads(done.stdout)
         assert result['recording']['messages'] == 11
         assert result['dags']['/lidar']['jobs'] == 10
     assert {path: path.read_bytes() for path in file.parent.iterdir()} == before
@@ -261,25 +249,19 @@ def test_hostile_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         Bag(tmp_path / 'folder', {'/points'})
 
 
-def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_on_the_command_line(tmp_path: Path, call: Call) -> None:
     path = write_bag(tmp_path / 'bag')
     graph = tmp_path / 'g.yaml'
     graph.write_text(BY_HEADER)
     times = tmp_path / 'times.json'
     times.write_text('{"/lidar": {"/lidar:in": 2000, "/detector:detect": 16000}, '
                      '"/control": {"/control:tick": 100}}')
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        status = program.main(['replay', *map(str, arguments)])
-        output = capsys.readouterr()
-        return status, output.out, output.err
-
-    status, out, err = call(path, graph, '--reschedule', '--fail-on-miss')
+    status, out, err = call('replay', path, graph, '--reschedule', '--fail-on-miss')
     assert (status, err) == (0, '')
     assert '/lidar: 10 jobs from the header stamp of /points' in out.splitlines()
     assert 'policy rad, 2 workers' in out
-    status, out, _ = call(
-        path, graph, '--reschedule', '--execution-times', times, '--fail-on-miss')
+    status, out, _ = call('replay', path, graph, '--reschedule', '--execution-times', times,
+                          '--fail-on-miss')
     assert status == 1
     assert '9 late' in out     # the last one is open at the end
     for arguments, says in (
@@ -287,7 +269,7 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
             ([path, graph], 'no run of this executor is recorded in it'),
             ([path, graph, '--reschedule', '--overheads', 'recorded'], 'a bag has none'),
             ([path, '--reschedule', '--execution-times', times], 'give a GRAPH')):
-        status, out, err = call(*arguments)
+        status, out, err = call('replay', *arguments)
         assert (status, out) == (2, '')
         assert err.startswith('error: ') and says in err and err.count('\n') == 1
 

@@ -4,24 +4,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import json
 from pathlib import Path
-import random
-import tempfile
 from typing import Any
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from mddag_executor.cli import main as program
-from mddag_executor.core import PolicyError, Tally
-from mddag_executor.core.state import Decision
+from mddag_executor.core import PolicyError
 from mddag_executor.core.tally import counts
 from mddag_executor.errors import UsageError
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import (
-    END,
     LogEntry,
     periodic_load,
     PREEMPT,
@@ -29,110 +21,26 @@ from mddag_executor.simulate import (
     simulate,
     START,
 )
-from mddag_executor.simulate import schedule as schedule_load
 from mddag_executor.simulate.load import Load
 from mddag_executor.trace import TraceFile
-from msg_graph import loads, TaskSet
+from msg_graph import loads
 import pytest
 
-from ..cli.helpers import caller
+from ..conftest import Call
 from ..replay.helpers import (
     add_execution,
     begin_trace,
-    declarations,
     end_trace,
     MS,
     START_TIME,
     VPID,
 )
-from ..replay.simulated import executions, loose, write_simulated
-
-JOBS = 12
-
-
-def random_load(task_set: TaskSet, seed: int, longest: int, undeclared: int) -> Load:
-    """Return a load with its own execution times in each job, and undeclared executions."""
-    rng = random.Random(seed)
-    releases = []
-    costs: list[int] = []
-    bases = []
-    for dag in task_set.dags:
-        bases.append(len(costs))
-        for job in range(JOBS):
-            time = START_TIME + job * dag.period_ns + rng.choice((0, 0, rng.randrange(MS)))
-            releases.append((time, dag.index, job))
-            costs.extend(rng.randrange(1, longest) for _ in dag.vertices)
-    bases.append(len(costs))
-    for number in range(undeclared):
-        releases.append((START_TIME + rng.randrange(100 * MS), len(task_set.dags), number))
-    releases.sort()
-    renumbered = 0
-    load = []
-    for time, dag_index, job in releases:
-        if dag_index == len(task_set.dags):
-            job, renumbered = renumbered, renumbered + 1
-            costs.append(rng.randrange(1, longest))
-        load.append((time, dag_index, job))
-    strides = [*(len(dag.vertices) for dag in task_set.dags), 1]
-    return Load([e[0] for e in load], [e[1] for e in load], [e[2] for e in load], costs, bases,
-                strides)
-
-
-def schedule(
-    task_set: TaskSet, load: Load, policy: str, workers: int, end: int
-) -> tuple[Sequence[LogEntry], Tally, Sequence[Decision]]:
-    """Simulate a load, non-preemptively."""
-    tables = loose(task_set)
-    found = schedule_load(
-        tables, load, Settings(policy, workers, end, judge='completions'), log=True,
-        compiled=False)
-    tally = Tally(task_set, tables)
-    for dag in load.dags:
-        tally.released(dag)
-    tally.add(found.decisions)
-    return found.log, tally, found.decisions
-
-
-@given(declarations(), st.integers(0, 2**32), st.integers(1, 4),
-       st.sampled_from(['rad', 'rm', 'wc', 'gedf']), st.integers(2, 9), st.integers(0, 10))
-@settings(max_examples=100)
-def test_the_same_settings_give_the_same_schedule(
-    text: str, seed: int, workers: int, policy: str, longest: int, undeclared: int
-) -> None:
-    """A schedule of the core, recorded and rescheduled, is the same: starts, ends, verdicts."""
-    text = text.replace('on_late: abort, ', '').replace('max_active_jobs: 2, ', '')
-    task_set = loads(text, 'g.yaml')
-    load = random_load(task_set, seed, longest * MS, undeclared)
-    end = START_TIME + 10_000 * MS
-    log, tally, decisions = schedule(task_set, load, policy, workers, end)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, 'run.mcap')
-        write_simulated(path, task_set, load, log, decisions, policy=policy, workers=workers,
-                        end=end)
-        outcome = reschedule(path)
-        recorded = replay(path)
-    assert outcome.warnings == []
-    assert outcome.log == log
-    expected = tally.result()
-    result = outcome.result()
-    assert {key: result[key] for key in expected} == expected
-    assert (result['policy'], result['workers'], result['preemptive']) == (policy, workers, False)
-    assert result['estimated_executions'] == 0
-    # and as recorded it has the verdicts of the simulation, too
-    assert recorded.tally.result() == expected
-    assert result['recorded']['dags'] == expected['dags']
-    use = result['worker_use']['busy_ns']
-    assert sum(use['executions'] for use in recorded.result()['callbacks'].values()) == sum(
-        entry[1] == END and entry[3] < len(task_set.dags) for entry in log)
-    busy = [0] * workers
-    for start, entry in executions(log):
-        busy[entry[2]] += entry[0] - start
-    assert use == {str(worker): took for worker, took in enumerate(busy)}
+from ..simulate.test_run import executions
 
 
 def starts(log: list[LogEntry]) -> list[tuple[int, int, int, int]]:
-    """Return time in ms, worker, vertex and job of each start in a log."""
-    return [((time - START_TIME) // MS, worker, vertex, job)
+    """Return ms since the first one, worker, vertex and job of each start in a log."""
+    return [((time - log[0][0]) // MS, worker, vertex, job)
             for time, kind, worker, _, vertex, job in log if kind == START]
 
 
@@ -148,11 +56,11 @@ nodes:
 
 def write_two(path: Path) -> None:
     """Record a run of 20 ms with a slow job from 0 to 12 and fast ones at 5 and 15 ms."""
-    slow = Load([START_TIME, START_TIME + 5 * MS, START_TIME + 15 * MS], [0, 1, 1], [0, 0, 1],
-                [12 * MS, 2 * MS, 2 * MS], [0, 1], [1, 1])
+    load = Load([0, 5 * MS, 15 * MS], [0, 1, 1], [0, 0, 1], [12 * MS, 2 * MS, 2 * MS], [0, 1],
+                [1, 1])
     task_set = loads(TWO, 'two.yaml')
-    log, _, decisions = schedule(task_set, slow, 'rad', 2, START_TIME + 20 * MS)
-    write_simulated(path, task_set, slow, log, decisions, end=START_TIME + 20 * MS)
+    write_trace(path, task_set, load, simulate(
+        task_set, load, Settings(workers=2, duration_ns=20 * MS), log=True))
 
 
 def test_policy_workers_and_preemption_are_those_asked_for(tmp_path: Path) -> None:
@@ -163,10 +71,10 @@ def test_policy_workers_and_preemption_are_those_asked_for(tmp_path: Path) -> No
     alone = reschedule(path, workers=1)
     assert starts(alone.log) == [(0, 0, 0, 0), (12, 0, 1, 0), (15, 0, 1, 1)]
     assert alone.tally.first_miss is not None
-    assert alone.tally.first_miss['completed_ns'] == START_TIME + 14 * MS
+    assert alone.tally.first_miss['completed_ns'] == 14 * MS
     preemptive = reschedule(path, workers=1, preemptive=True)
     assert starts(preemptive.log) == [(0, 0, 0, 0), (5, 0, 1, 0), (7, 0, 0, 0), (15, 0, 1, 1)]
-    assert [e[0] - START_TIME for e in preemptive.log if e[1] == PREEMPT] == [5 * MS]
+    assert [e[0] for e in preemptive.log if e[1] == PREEMPT] == [5 * MS]
     assert preemptive.busy == [16 * MS]
     assert not preemptive.tally.missed
     fifo = reschedule(path, workers=1, policy='fifo', preemptive=True).result()
@@ -431,8 +339,7 @@ nodes:
     ['--processes', '2']])
 @pytest.mark.parametrize('computes', [False, True])
 def test_what_was_not_published_is_not_published_again(
-    options: list[str], computes: bool, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    options: list[str], computes: bool, tmp_path: Path, call: Call
 ) -> None:
     # /detect finds an object in every third image; the other jobs expire
     path, jobs = tmp_path / 'run.mcap', 40
@@ -459,9 +366,7 @@ def test_what_was_not_published_is_not_published_again(
         end_trace(file, START_TIME + jobs * 100 * MS)
     found = []
     for more in ([], ['--reschedule', *options]):
-        status, out, _ = caller('replay')(capsys, path, *more, '--json', '-')
-        assert status == 0
-        found.append(json.loads(out))
+        found.append(json.loads(call('replay', path, *more, '--json', '-').stdout))
     recorded, again = (each['dags']['/camera']['sinks']['/brake:act'] for each in found)
     for verdict in ('completed', 'late', 'overdue', 'expired'):
         assert again[verdict] == recorded[verdict], verdict
@@ -472,7 +377,7 @@ def test_what_was_not_published_is_not_published_again(
         pytest.approx((40 * 7 + 14) * MS)
 
 
-def test_what_would_have_been_with_demote(tmp_path: Path) -> None:
+def test_what_would_have_been_with_demote(tmp_path: Path, call: Call) -> None:
     """The recorded execution times say what is too much; nothing is declared."""
     graph, trace, times = (tmp_path / name for name in ('g.yaml', 'run.mcap', 'times.json'))
     graph.write_text("""\
@@ -484,9 +389,8 @@ nodes:
       - {name: rest, timer: 20ms, deadline: 20ms, dag: rest}
 """)
     times.write_text('{"main": {"/n:main": 20000}, "rest": {"/n:rest": 10000}}')
-    assert program.main([
-        'simulate', str(graph), '--workers', '1', '--preemptive', '--duration', '3s',
-        '--execution-times', str(times), '--trace', str(trace)]) == 0
+    call('simulate', graph, '--workers', 1, '--preemptive', '--duration', '3s',
+         '--execution-times', times, '--trace', trace)
     in_time = {}
     for on_late in ('continue', 'demote'):
         sink = reschedule(trace, on_late=on_late).result()['dags']['main']['sinks']['/n:main']

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 import tempfile
@@ -20,11 +20,13 @@ from mddag_executor.simulate import (
     draw_execution_times,
     END,
     Load,
+    LogEntry,
     periodic_load,
     scale_execution_times,
     Settings,
     simulate,
     SimulatedRun,
+    START,
     utilisation,
 )
 from msg_graph import loads, TaskSet
@@ -175,6 +177,17 @@ def test_the_replayer_counts_the_same(
         assert replay(trace).result()['duration_ns'] <= stopped.ended_ns
 
 
+def executions(log: Sequence[LogEntry]) -> Iterator[tuple[int, LogEntry]]:
+    """Yield the start of each stretch in which a callback ran, and the entry of its end."""
+    since: dict[int, int] = {}
+    for entry in log:
+        time, kind, worker, *_ = entry
+        if kind == START:
+            since[worker] = time
+        else:
+            yield since.pop(worker), entry
+
+
 @examples(100)
 @given(case=cases(), last_release=st.integers(5, 25))
 def test_rescheduled_alike_it_runs_alike(trace: Path, case: Case, last_release: int) -> None:
@@ -189,12 +202,18 @@ def test_rescheduled_alike_it_runs_alike(trace: Path, case: Case, last_release: 
     if Counter(entry[1] for entry in run.log)[END] < sum(
             len(case.task_set.dags[dag].vertices) for dag in case.load(last_release).dags):
         return  # something was aborted or has expired
-    rescheduled = reschedule(trace, preemptive=case.preemptive)
-    result = rescheduled.result()
-    for name, dag in run.result()['dags'].items():
-        for sink, values in dag['sinks'].items():
-            found = result['dags'][name]['sinks'][sink]
-            assert {key: found[key] for key in values} == values
+    rescheduled = reschedule(trace)
+    result, expected = rescheduled.result(), run.tally.result()
+    assert (rescheduled.log, rescheduled.warnings) == (run.log, [])
+    assert {key: result[key] for key in expected} == expected
+    assert (result['policy'], result['workers'], result['preemptive']) == (
+        case.policy, case.workers, run.settings.preempts)
+    assert result['recorded']['dags'] == expected['dags']
+    assert result['estimated_executions'] == 0
+    busy = [0] * case.workers
+    for start, (end, _, worker, *_) in executions(run.log):
+        busy[worker] += end - start
+    assert result['worker_use']['busy_ns'] == {str(n): took for n, took in enumerate(busy)}
 
 
 @pytest.mark.parametrize(('holds', 'cpus'), [('true', None), ('true', 2), ('false', 1)])
