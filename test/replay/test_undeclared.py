@@ -205,9 +205,7 @@ def test_the_pieces_of_a_coroutine_are_one_execution(run: Run) -> None:
     assert result['warnings'] == []
 
 
-def test_a_request_is_released_when_it_was_ready_also_for_a_coroutine(
-    tmp_path: Path, call: Call
-) -> None:
+def test_a_request_is_released_when_it_was_ready_also_for_a_coroutine(run: Run) -> None:
     run.graph.write_text(GRAPH + """\
   - node: /detect
     callbacks: [{name: ask, service: /ask, period: 1s, deadline: 20ms}]
