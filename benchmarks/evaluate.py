@@ -52,7 +52,7 @@ def main(args: argparse.Namespace) -> int:
     """Measure and print."""
     from benchmarks.virtual_time import time_runs, time_vertex_jobs
     from mddag_executor.laboratory.experiment import Experiment
-    from mddag_executor.simulate.compiling import available
+    from mddag_executor.simulate.compiled import available
     policies = options.policies(args.policies)
     if max(args.vertices) > 100_000:
         raise UsageError('--vertices: that is too many: give at most 100000')

@@ -1,25 +1,42 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Runs of the compiled core: calls the entry points of ``kernel`` with memory for their data.
+The core's own source, compiled to machine code, and runs of it.
 
-A structure has three words for each field: the words of a vector (address, length, capacity; see
-``vectors``), or an integer in the first word.
+Theory of operation
+-------------------
+1. The functions of the core and of the event loop are used unchanged: each is bound to a common
+   namespace, in which the names of the others refer to their compiled versions, and the names of
+   ``heapq`` to those of ``vectors``.  So a name, also of a constant, must mean the same in all
+   modules.  No rule exists twice.  Only ``add_queue`` is replaced, because an empty list has no
+   type.  The policy is an additional field of the tables; the key function selects by it, so one
+   compilation is enough for all policies.
+2. numba stores the machine code of the entry points (``kernel``) on disk (``cache=True``).  It
+   only checks the file of the entry point itself, so a hash of all sources is part of the stored
+   name.  numba is imported, and code is compiled, on first use only.
+3. Named tuples are passed as structures, which have three words for each field: the words of a
+   vector (address, length, capacity; see ``vectors``), or an integer in the first word.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import ctypes
+from functools import cache
+import hashlib
+from importlib.util import find_spec
+import os
 from pathlib import Path
+from types import FunctionType, ModuleType
 from typing import Any, NamedTuple
 
 from mddag_executor import progress
+from mddag_executor.core import jobs, overload, policies, queues, rules, state, tables
 from mddag_executor.core.policies import POLICIES
 from mddag_executor.core.state import Decision, State
 from mddag_executor.core.tables import Tables
 from mddag_executor.errors import UsageError
-from mddag_executor.simulate.compiling import available, entry_points
+from mddag_executor.simulate import deliveries, engine, load, machine
 from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import LogEntry, Orders
 from mddag_executor.simulate.load import Load
@@ -28,6 +45,74 @@ import numpy as np
 import numpy.typing as npt
 
 _COMPILE_S = 25.0   # approximate compile time
+
+_MODULES = (
+    tables, state, queues, jobs, overload, policies, rules, load, machine, deliveries, engine)
+_NOT_COMPILED = frozenset({
+    # for plain lists
+    'empty', 'as_object', 'new_state', 'add_queue', 'rad_offsets', 'reached_sinks', 'mean_time',
+    'policy', 'new_machine', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
+ENTRY_POINTS = ('run_once', 'free_run')
+_REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')
+
+
+def available() -> bool:
+    """Return whether numba is installed and may compile."""
+    return find_spec('numba') is not None and os.environ.get('NUMBA_DISABLE_JIT', '0') == '0'
+
+
+@cache
+def entry_points() -> dict[str, Callable[..., Any]]:
+    """Return the compiled entry points of ``kernel`` by name; they are compiled when called."""
+    from mddag_executor.simulate import kernel, vectors
+    from numba import njit
+    space = dict(vars(kernel))  # with its name: code loaded from disk looks its module up
+    for module in _MODULES:
+        for name, value in vars(module).items():
+            if not name.startswith('__'):
+                assert space.setdefault(name, value) is value, f'there are two of {name}'
+    space.update((name, getattr(vectors, name)) for name in _REPLACED)
+    for module in _MODULES:
+        inner = ModuleType(module.__name__)  # for names such as `rules.complete`
+        for name, function in _functions(module):
+            space[name] = njit(error_model='numpy')(_bound(function, space))
+            setattr(inner, name, space[name])
+        if module in (jobs, overload, rules):
+            space[module.__name__.rsplit('.', 1)[1]] = inner
+    kernel.bind_policies(space)
+    sources = _hash_of(*_MODULES, kernel, vectors)
+    return {name: _cached(_bound(getattr(kernel, name), space), sources)
+            for name in ENTRY_POINTS}
+
+
+def _cached(function: FunctionType, sources: str) -> Any:
+    from numba import njit
+    # part of the names of numba's files
+    function.__qualname__ = f'{function.__name__}_{sources}'
+    try:
+        return njit(error_model='numpy', nogil=True, cache=True)(function)
+    except RuntimeError:    # no writable folder
+        return njit(error_model='numpy', nogil=True)(function)
+
+
+def _functions(module: ModuleType) -> list[tuple[str, FunctionType]]:
+    """Return the functions of a module that are to be compiled."""
+    return [
+        (name, value) for name, value in vars(module).items()
+        if isinstance(value, FunctionType) and value.__module__ == module.__name__
+        and name not in _NOT_COMPILED]
+
+
+def _bound(function: FunctionType, space: dict[str, Any]) -> FunctionType:
+    """Return a function with the same code and another global namespace."""
+    return FunctionType(function.__code__, space, function.__name__, function.__defaults__)
+
+
+def _hash_of(*modules: ModuleType) -> str:
+    digest = hashlib.sha256()
+    for module in modules:
+        digest.update(Path(str(module.__file__)).read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def check_available() -> None:
@@ -66,14 +151,14 @@ def run_once(
     :return: the end, the log of every worker, the decisions, the busy time of each worker.
     """
     lent = [LentTuple(tables, list(POLICIES).index(policy)), LentTuple(load), LentTuple(orders)]
-    state, _, _, busy, log = working = [
+    core, _, _, busy, log = working = [
         EmptyMemory(len(fields)) for fields in (
             State._fields, Deliveries._fields, Machine._fields, ('busy',), ('log',))]
     addresses = [each.address for each in working]
     ended = entry_points()['run_once'](*(each.address for each in lent), *addresses)
     try:
         place = State._fields.index('decisions')
-        return (int(ended), log.rows(0, 6), state.rows(place, 6),  # type: ignore[return-value]
+        return (int(ended), log.rows(0, 6), core.rows(place, 6),  # type: ignore[return-value]
                 busy.words(0, 1)[:, 0].tolist())
     finally:
         entry_points()['free_run'](*addresses)

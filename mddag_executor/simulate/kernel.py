@@ -4,37 +4,80 @@
 Entry points of the compiled core: a whole run, in memory that ``compiled`` provides.
 
 They are only called compiled: the names of the core that they use are then bound to its compiled
-functions (see ``compiling``).  Structures are passed as addresses.
+functions.  The core's named tuples are structures (see ``vectors``), which are passed as
+addresses.
+
+This module needs numba; nothing is compiled when it is imported.
 """
 
 from __future__ import annotations
 
-from mddag_executor.core.state import State
-from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import run
-from mddag_executor.simulate.machine import Machine
-from mddag_executor.simulate.structures import (
-    as_deliveries,
-    as_load,
-    as_log,
-    as_machine,
-    as_orders,
-    as_state,
-    as_tables,
-    as_vector,
-    key_of_policy,
-)
-from mddag_executor.simulate.vectors import free
+from typing import Any
 
+from mddag_executor.core.policies import Key, POLICIES
+from mddag_executor.core.state import State
+from mddag_executor.core.tables import Tables
+from mddag_executor.simulate.deliveries import Deliveries
+from mddag_executor.simulate.engine import Orders, run
+from mddag_executor.simulate.load import Load
+from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.vectors import at, free, StructureType, VectorType
+from numba import extending, types
+
+_KINDS = {
+    'int': types.int64,
+    'list[int]': VectorType(),
+    'list[QueueEntry]': VectorType(5),
+    'list[list[int]]': VectorType(nested=True),
+    'list[list[QueueEntry]]': VectorType(5, nested=True),
+    'list[Decision]': VectorType(6),
+}
+
+
+def _structure(row: Any, **more: Any) -> Any:
+    """Return the structure type of a class of named tuples, with additional fields."""
+    fields = {
+        name: _KINDS[str(getattr(kind, '__forward_arg__', kind))]
+        for name, kind in row.__annotations__.items()}
+    return StructureType(row.__name__, {**fields, **more})
+
+
+# Functions for compiled code that turn an address into a structure or vector.
+as_tables = at(_structure(Tables, policy=types.int64))
+as_state = at(_structure(State))
+as_load = at(_structure(Load))
+as_deliveries = at(_structure(Deliveries))
+as_machine = at(_structure(Machine))
+as_orders = at(_structure(Orders))
+as_log = at(VectorType(6))
+as_vector = at(VectorType())
 STATE_FIELDS = len(State._fields)
 DELIVERIES_FIELDS = len(Deliveries._fields)
 MACHINE_FIELDS = len(Machine._fields)
 
 
-def free_fields(structure: int, fields: int) -> None:
-    """Free the memory of a structure of vectors without nested vectors."""
-    for field in range(fields):
-        free(as_vector(structure + 24 * field))
+def key_of_policy(t: Any, v: int, release: int, job: int, order: int) -> Key:
+    """
+    Return the key of the policy whose number is in the additional field ``policy`` of the tables.
+
+    It is an overloaded function, because only these can be passed between functions in stored
+    code.
+    """
+    key: Key = list(POLICIES.values())[t.policy].key(t, v, release, job, order)
+    return key
+
+
+def bind_policies(space: dict[str, Any]) -> None:
+    """Register ``key_of_policy`` with numba, with the key functions of a namespace."""
+    arguments = 't, v, release, job, order'
+    *others, last = (row.key.__name__ for row in POLICIES.values())
+    lines = [f'def choose({arguments}):']
+    for number, key in enumerate(others):
+        lines += [f'    if t.policy == {number}:', f'        return {key}({arguments})']
+    lines.append(f'    return {last}({arguments})')
+    exec('\n'.join(lines), space)
+    chosen = space['choose']
+    extending.overload(key_of_policy, strict=False)(lambda t, v, release, job, order: chosen)
 
 
 def run_once(
@@ -49,18 +92,13 @@ def run_once(
 
 def free_run(state: int, deliveries: int, machine: int, busy: int, log: int) -> None:
     """Free the results of ``run_once``."""
-    s = as_state(state)
-    for group in range(len(s.group_heap)):
-        free(s.group_heap[group])
-    for entity in range(len(s.entity_queue)):
-        free(s.entity_queue[entity])
-    for vertex in range(len(s.demoted)):
-        free(s.demoted[vertex])
-    queues = as_machine(machine).lock_queue
-    for process in range(len(queues)):
-        free(queues[process])
-    free_fields(state, STATE_FIELDS)
-    free_fields(deliveries, DELIVERIES_FIELDS)
-    free_fields(machine, MACHINE_FIELDS)
-    free(as_vector(busy))
-    free(as_log(log))
+    s, m = as_state(state), as_machine(machine)
+    for nested in (s.group_heap, s.entity_queue, s.demoted):
+        for place in range(len(nested)):
+            free(nested[place])
+    for process in range(len(m.lock_queue)):
+        free(m.lock_queue[process])
+    for structure, fields in ((state, STATE_FIELDS), (deliveries, DELIVERIES_FIELDS),
+                              (machine, MACHINE_FIELDS), (busy, 1), (log, 1)):
+        for field in range(fields):
+            free(as_vector(structure + 24 * field))

@@ -31,6 +31,7 @@ from llvmlite import ir
 from numba import njit, types
 from numba.core.imputils import lower_getattr_generic
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
+from numba.cpython.heapq import _siftdown, _siftup
 from numba.extending import intrinsic, models, overload, overload_method, register_model
 
 WORDS = 3
@@ -194,54 +195,50 @@ def _grow(vector, words):
     _set_word(vector, 2, capacity)
 
 
-@overload(operator.getitem, strict=False)
-def _overload_getitem(vector: Any, index: Any) -> Any:
-    if isinstance(vector, VectorType) and isinstance(index, types.Integer):
-        return lambda vector, index: _load(vector, index)
-    return None
+def _for_vectors(operation: Any, *kinds: Any) -> Callable[[Any], Any]:
+    """Return a decorator of an operation on vectors, with arguments of these kinds."""
+    def register(function: Any) -> Any:
+        @overload(operation, strict=False)
+        def choose(vector: Any, *arguments: Any) -> Any:
+            fits = isinstance(vector, VectorType) and all(map(isinstance, arguments, kinds))
+            return function if fits else None
+
+        return function
+
+    return register
 
 
-@overload(operator.setitem, strict=False)
-def _overload_setitem(vector: Any, index: Any, value: Any) -> Any:
-    if isinstance(vector, VectorType) and not vector.nested and isinstance(index, types.Integer):
-        return lambda vector, index, value: _store(vector, index, value)
-    return None
+@_for_vectors(operator.getitem, types.Integer)
+def _get_item(vector, index):
+    return _load(vector, index)
 
 
-@overload(operator.delitem, strict=False)
-def _overload_delitem(vector: Any, index: Any) -> Any:
-    # del vector[start:], which truncates
-    if isinstance(vector, VectorType) and isinstance(index, types.SliceType):
-        return lambda vector, index: _set_word(vector, 1, index.start)
-    return None
+@_for_vectors(operator.setitem, types.Integer)
+def _set_item(vector, index, value):
+    _store(vector, index, value)
 
 
-@overload(len, strict=False)
-def _overload_len(vector: Any) -> Any:
-    if isinstance(vector, VectorType):
-        return lambda vector: _get_word(vector, 1)
-    return None
+@_for_vectors(operator.delitem, types.SliceType)
+def _truncate(vector, index):
+    _set_word(vector, 1, index.start)   # del vector[start:]
 
 
-@overload(bool, strict=False)
-def _overload_bool(vector: Any) -> Any:
-    if isinstance(vector, VectorType):
-        return lambda vector: _get_word(vector, 1) != 0
-    return None
+@_for_vectors(len)
+def _length(vector):
+    return _get_word(vector, 1)
 
 
-@overload(operator.contains, strict=False)
-def _overload_contains(vector: Any, value: Any) -> Any:
-    if not isinstance(vector, VectorType) or vector.width or vector.nested:
-        return None
+@_for_vectors(bool)
+def _is_not_empty(vector):
+    return _get_word(vector, 1) != 0
 
-    def contains(vector, value):
-        for place in range(len(vector)):
-            if vector[place] == value:
-                return True
-        return False
 
-    return contains
+@_for_vectors(operator.contains)
+def _contains(vector, value):
+    for place in range(len(vector)):
+        if vector[place] == value:
+            return True
+    return False
 
 
 @overload_method(VectorType, 'append', strict=False)
@@ -292,52 +289,23 @@ def free(vector):
         _set_word(vector, place, 0)
 
 
-# --- heapq ------------------------------------------------------------------------------
-
-@njit
-def _rise(heap, place):
-    entry = heap[place]
-    while place > 0:
-        parent = (place - 1) >> 1
-        if not entry < heap[parent]:
-            break
-        heap[place] = heap[parent]
-        place = parent
-    heap[place] = entry
-
-
-@njit
-def _sink(heap, place):
-    entry = heap[place]
-    length = len(heap)
-    child = 2 * place + 1
-    while child < length:
-        if child + 1 < length and heap[child + 1] < heap[child]:
-            child += 1
-        if not heap[child] < entry:
-            break
-        heap[place] = heap[child]
-        place = child
-        child = 2 * place + 1
-    heap[place] = entry
-
+# --- heapq, with numba's port of the same algorithm ----------------------------------------------
 
 @njit
 def heappush(heap, entry):
     """Do the same as ``heapq.heappush``."""
     heap.append(entry)
-    _rise(heap, len(heap) - 1)
+    _siftdown(heap, 0, len(heap) - 1)
 
 
 @njit
 def heappop(heap):
     """Do the same as ``heapq.heappop``, on a heap that is not empty."""
-    last = len(heap) - 1
     top = heap[0]
-    heap[0] = heap[last]
-    _set_word(heap, 1, last)
-    if last > 0:
-        _sink(heap, 0)
+    last = heap.pop()
+    if len(heap) > 0:
+        heap[0] = last
+        _siftup(heap, 0)
     return top
 
 
@@ -345,4 +313,4 @@ def heappop(heap):
 def heapify(heap):
     """Do the same as ``heapq.heapify``."""
     for place in range(len(heap) // 2 - 1, -1, -1):
-        _sink(heap, place)
+        _siftup(heap, place)

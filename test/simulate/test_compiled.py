@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from mddag_executor.core import POLICIES, Tables
 from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.experiment import judge_of
-from mddag_executor.simulate import compiling, Load, schedule, Settings, simulate, START
+from mddag_executor.simulate import compiled, Load, schedule, Settings, simulate, START
 from mddag_executor.simulate.load import as_arrays, FAILS, RUNS, SKIPPED
 from msg_graph import load
 import numpy as np
@@ -30,7 +30,7 @@ import pytest
 from ..core.task_sets import Case, cases, declaration, examples, TICK
 
 pytestmark = [
-    pytest.mark.skipif(not compiling.available(), reason='numba is not there'),
+    pytest.mark.skipif(not compiled.available(), reason='numba is not there'),
     pytest.mark.timeout(400),  # a first run compiles
 ]
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
@@ -208,12 +208,12 @@ def test_compiled_code_is_kept_until_a_source_changes(tmp_path: Path) -> None:
     """The hash of the sources decides, not only the file that numba checks."""
     def hits_and_misses(*change: str) -> str:
         return python(
-            'from mddag_executor.simulate import compiled, compiling', *change,
-            'entry = compiling.entry_points()["free_run"]',
+            'from mddag_executor.simulate import compiled', *change,
+            'entry = compiled.entry_points()["free_run"]',
             'memory = [compiled.EmptyMemory(99) for _ in range(5)]',
             'entry(*(each.address for each in memory))',
             'print(sum(entry.stats.cache_hits.values()), sum(entry.stats.cache_misses.values()))',
             NUMBA_CACHE_DIR=str(tmp_path))
 
     assert [hits_and_misses() for _ in range(2)] == ['0 1', '1 0']
-    assert hits_and_misses('compiling._hash_of = lambda *modules: "another"') == '0 1'
+    assert hits_and_misses('compiled._hash_of = lambda *modules: "another"') == '0 1'
