@@ -22,8 +22,7 @@ from mddag_executor.cli.text import Progress, table
 from mddag_executor.core import Tables
 from mddag_executor.core.state import SINK_DROPPED, SINK_IN_TIME
 from mddag_executor.core.tables import IMPORTANT, ON_LATE
-from mddag_executor.laboratory.generate import generate
-from mddag_executor.laboratory.generate_options import Options
+from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.simulate import (
     draw_execution_times,
     Load,

@@ -16,7 +16,7 @@ from typing import Any
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
 from mddag_executor.errors import UsageError
-from mddag_executor.laboratory.generate_options import Options
+from mddag_executor.laboratory.generate import Options
 
 EXAMPLE = """\
 mddag generate --utilisation 0.6 --seed 7 -o random.yaml

@@ -24,7 +24,7 @@ import zipfile
 import zlib
 
 from mddag_executor.core import rad_offsets
-from mddag_executor.errors import InputError, UsageError
+from mddag_executor.errors import InputError
 from msg_graph import ExecutionTime, TaskSet
 from msg_graph.duration import DAY
 from msg_graph.model import topological_order
@@ -92,8 +92,6 @@ class Draws:
     """
 
     def __init__(self, task_set: TaskSet, seed: int, samples: Samples | None = None) -> None:
-        if not 0 <= seed < 2 ** 64:
-            raise UsageError(f'seed {seed}: it is out of range: give 0 to 2**64 - 1')
         self._seed = seed
         self._pickers: list[Callable[[Floats], Times]] = []
         for vertex in task_set.vertices:

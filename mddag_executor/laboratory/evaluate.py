@@ -35,6 +35,7 @@ from typing import Any
 from mddag_executor import __version__
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.laboratory.acceptance import Evaluation
+from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.experiment import Chunk, Evaluator, Experiment, STRIDE
 from mddag_executor.simulate.schedule import SOON_S
 
@@ -73,7 +74,7 @@ def evaluate(
     :raises InputError: when a callback declares no execution time.
     """
     experiments = (experiment,) if isinstance(experiment, Experiment) else tuple(experiment)
-    _check(experiments, runs, first_run, jobs)
+    _check(experiments, runs, first_run)
     if compiled is None:
         compiled = compiling_pays(experiments, runs, jobs)
     elif compiled:
@@ -82,7 +83,8 @@ def evaluate(
     if not compiled and dask is None and _plain_s(experiments, runs) < SOON_S:
         jobs = 1  # it is done before other processes have started
     evaluator = Evaluator(experiments, runs, first_run, compiled)
-    evaluator.check()
+    for each in experiments:
+        Draws(each.task_set, each.seed, each.samples)   # before any run, if something is missing
     outcome = Evaluation(experiments, runs, first_run, compiled, jobs)
     begin = time.monotonic()
     try:
@@ -94,19 +96,13 @@ def evaluate(
     return outcome
 
 
-def _check(experiments: Sequence[Experiment], runs: int, first_run: int, jobs: int) -> None:
-    if not experiments:
-        raise UsageError('graphs: there is none: name at least one declaration')
-    if runs < 1:
-        raise UsageError(f'runs: {runs} is too few: give at least 1')
+def _check(experiments: Sequence[Experiment], runs: int, first_run: int) -> None:
     if runs * len(experiments) > MOST_RUNS:
         raise UsageError(f'runs: {runs * len(experiments)} is too many: give at most '
                          f'{MOST_RUNS}, and evaluate more in ranges (--first-run)')
     if not 0 <= first_run < STRIDE - MOST_RUNS:
         raise UsageError(
             f'first run: {first_run} is out of range: give 0 to {STRIDE - MOST_RUNS - 1}')
-    if jobs < 1:
-        raise UsageError(f'jobs: {jobs} is too few: give at least 1')
 
 
 def compiling_pays(experiments: Sequence[Experiment], runs: int, jobs: int) -> bool:

@@ -37,7 +37,6 @@ from mddag_executor.laboratory.draws import (
     utilisations,
 )
 from mddag_executor.simulate.load import as_arrays
-from mddag_executor.simulate.run import check
 from mddag_executor.simulate.schedule import schedule, Settings
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import TaskSet
@@ -141,13 +140,6 @@ class Evaluator:
         experiment = self._arguments[0][index]
         return (Draws(experiment.task_set, experiment.seed, experiment.samples),
                 judge_of(experiment.task_set, experiment.duration_ns, self.compiled))
-
-    def check(self) -> None:
-        """Check that all experiments can be evaluated."""
-        for experiment in self._arguments[0]:
-            for name in experiment.policies:
-                check(experiment.settings(name))
-            Draws(experiment.task_set, experiment.seed, experiment.samples)
 
     def __call__(self, first: int, count: int) -> Chunk:
         """Evaluate ``count`` runs from the place ``first`` on."""

@@ -27,11 +27,6 @@ from mddag_executor.laboratory.tasks import Task
 MOST_POINTS = 300_000
 
 
-def late_paths(tasks: Sequence[Task]) -> list[tuple[Task, int, int, int]]:
-    """Return task, sink, deadline and longest path of the sinks whose path is too long."""
-    return [(task, *sink) for task in tasks for sink in task.sinks if sink[2] > sink[1]]
-
-
 class Demand(NamedTuple):
     """The largest demand found: at ``time`` ns that much work, ns; ``points`` were checked."""
 

@@ -55,19 +55,6 @@ class Dice:
         return choices[self.whole(0, len(choices) - 1)]
 
 
-def deal(dice: Dice, total: float, most: Sequence[float]) -> list[float]:
-    """
-    Return shares that sum up to a total, each with its upper bound.
-
-    :raises UsageError: the bounds are too low.
-    """
-    if total > sum(most) * (1 + 1e-9):
-        raise UsageError(
-            f'--utilisation: a load of {total:g} does not fit into DAGs of {sum(most):g} in all: '
-            'give more --dags, or a larger --max-dag-load')
-    return dirichlet_rescale(dice, total, most)
-
-
 def dirichlet_rescale(dice: Dice, total: float, most: Sequence[float]) -> list[float]:
     """Return shares that sum up to a total of at most ``sum(most)``, each with its bound."""
     room = sum(most)

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 import hypothesis.strategies as st
 from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.assign_deadlines import proportional
-from mddag_executor.laboratory.generate import generate
-from mddag_executor.laboratory.generate_options import Options
+from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.laboratory.shapes import draw_shape, MOST_COPIES
 from mddag_executor.laboratory.shares import Dice
 from msg_graph import loads, TaskSet
