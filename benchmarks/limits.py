@@ -1,13 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Limits that the GIL, the garbage collector and the system's scheduler set to an executor.
+Limits that the garbage collector and the system's scheduler set to an executor.
 
-python benchmarks/limits.py gil|gc|policy [--seconds 2] [--workers 7]
+python benchmarks/limits.py gc|policy [--seconds 2] [--workers 7]
 
-* ``gil``: callbacks a second with one, two and all workers, for callbacks that wait (``sleep``),
-  compute in C without the GIL (``sha256``), or compute in Python (``python``), each about 5 ms
-  long in isolation; and the lateness of an empty 10 ms timer meanwhile, with one worker left free.
 * ``gc``: the longest collection and the timer's lateness in a program with a million objects, with
   and without ``freeze_gc``.
 * ``policy``: the timer's lateness while other processes use every CPU, with the workers and with
@@ -21,7 +18,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 import gc
-import hashlib
 import json
 import os
 import subprocess
@@ -53,44 +49,6 @@ nodes:
     callbacks: [{name: tick, timer: 10ms, deadline: 10ms}]
 """
 
-Body = Callable[[], None]
-
-
-def sleeping() -> Body:
-    """Return a body that waits, like one that uses a device or a GPU."""
-    return lambda: time.sleep(BODY_S)
-
-
-def hashing() -> Body:
-    """Return a body that computes in C, without the GIL."""
-    data = bytes(1 << 24)
-    begin = time.thread_time()
-    hashlib.sha256(data).digest()
-    part = data[:max(4096, int(len(data) * BODY_S / (time.thread_time() - begin)))]
-    return lambda: _discard(hashlib.sha256(part).digest())
-
-
-def _discard(value: Any) -> None:
-    pass
-
-
-def counting() -> Body:
-    """Return a body that computes in Python."""
-    def count(n: int) -> None:
-        x = 0
-        for i in range(n):
-            x ^= i
-
-    n = 20_000
-    begin = time.thread_time()
-    count(10 * n)
-    n = max(1, int(10 * n * BODY_S / (time.thread_time() - begin)))
-    return lambda: count(n)
-
-
-BODIES: dict[str, Callable[[], Body]] = {
-    'sleep': sleeping, 'sha256': hashing, 'python': counting}
-
 
 class Lateness:
     """A node with an empty timer that notes how late it runs, ns."""
@@ -113,32 +71,8 @@ class Lateness:
                 'max': ordered[-1] / 1e3}
 
 
-def throughput(body: Body, workers: int, seconds: float) -> float:
-    """Return the bodies a second that a pool runs if more are always ready."""
-    done = [0] * (2 * workers)
-    ending = threading.Event()
-    executor = MultiDeadlineExecutor(num_workers=workers)
-
-    def run(i: int) -> None:
-        body()
-        done[i] += 1
-        if not ending.is_set():
-            executor.create_task(run, i)
-
-    for i in range(len(done)):
-        executor.create_task(run, i)
-    with Session(executor):
-        time.sleep(0.2)
-        before, begin = sum(done), time.monotonic()
-        time.sleep(seconds)
-        rate = (sum(done) - before) / (time.monotonic() - begin)
-        ending.set()
-        time.sleep(4 * BODY_S)
-    return rate
-
-
 def lateness(
-    seconds: float, workers: int, body: Body | None = None, **arguments: Any
+    seconds: float, workers: int, body: Callable[[], None] | None = None, **arguments: Any
 ) -> dict[str, float]:
     """Return the lateness of an empty timer (us) while all workers but one run bodies."""
     ending = threading.Event()
@@ -164,20 +98,6 @@ def lateness(
     if session.error is not None:
         raise session.error
     return result
-
-
-def measure_gil(seconds: float, workers: int) -> list[dict[str, Any]]:
-    """Measure the throughput of each kind of body by number of workers."""
-    rows = []
-    for name, make in BODIES.items():
-        body = make()
-        rates = {n: throughput(body, n, seconds) for n in (1, 2, workers)}
-        rows.append({
-            'callbacks': name, **{f'{n} workers /s': round(r) for n, r in rates.items()},
-            'speed-up': round(rates[workers] / rates[1], 2),
-            **{f'timer late {k} us': round(v) for k, v in lateness(
-                seconds, workers, body).items()}})
-    return rows
 
 
 class GcWatch:
@@ -268,7 +188,7 @@ def _set_policy(policy: int, priority: int) -> None:
             'limit (ulimit -r) or run it with CAP_SYS_NICE') from None
 
 
-MEASUREMENTS = {'gil': measure_gil, 'gc': measure_gc, 'policy': measure_policy}
+MEASUREMENTS = {'gc': measure_gc, 'policy': measure_policy}
 
 
 def main(arguments: list[str] | None = None) -> int:

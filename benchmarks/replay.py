@@ -16,7 +16,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from benchmarks import arguments
 from benchmarks.slack import check_slack
@@ -26,9 +26,6 @@ from mddag_executor.cli.text import format_ns, one_line, printable, Progress, ta
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.resources import find
 from mddag_executor.text import counted
-
-if TYPE_CHECKING:
-    from benchmarks.long_traces import Agreement
 
 HELP = 'measure the replayer'
 DESCRIPTION = """\
@@ -121,14 +118,13 @@ def _slack(args: argparse.Namespace, folder: str) -> dict[str, Any]:
 # --- speed ---------------------------------------------------------------------------------------
 
 def _speed(args: argparse.Namespace, folder: str) -> dict[str, Any]:
-    from benchmarks.long_traces import measure, OTHERS, READERS, write_long_trace
+    from benchmarks.readers import measure, OTHERS, READERS, write_long_trace
     from mddag_executor.trace import TraceReader
     path = args.trace
     if path is None:
         path = os.path.join(folder, 'long.mcap')
         task_set = arguments.load_workload(args.graph)
-        with Progress('writing the trace', args.events) as line:
-            write_long_trace(path, task_set, args.events, progress=line.update)
+        write_long_trace(path, task_set, args.events)
     events = TraceReader(path).message_count
     rows: dict[str, dict[str, Any]] = {}
     with Progress('measuring', len(READERS) * args.repeat) as line:
@@ -201,43 +197,48 @@ def _compared(
     recorded_before: str, path: str, utilisation: float, workers: int, recorded_workers: int
 ) -> dict[str, Any]:
     """Return how well a run is predicted from a recording of the same or another run."""
-    from benchmarks.long_traces import agreements
     from mddag_executor.replay import replay, reschedule
     skip = _WARM_UP_S * 1_000_000_000
+    recorded = replay(path, skip=skip).result()
     predicted = reschedule(recorded_before, workers=workers, skip=skip).result()
     ideal = reschedule(recorded_before, workers=workers, skip=skip, overheads=False).result()
-    rows = agreements(replay(path, skip=skip).result()['dags'], predicted['dags'], ideal['dags'])
+    rows = []
+    for dag_name, dag in recorded['dags'].items():
+        for name, sink in dag['sinks'].items():
+            times, expected, without = (
+                side['dags'][dag_name]['sinks'][name]['response_ns']
+                for side in (recorded, predicted, ideal))
+            if times and expected and without:
+                rows.append(_with_errors({
+                    'dag': dag_name, 'sink': name, 'jobs': sink['completed'],
+                    'recorded_median': times['median'], 'predicted_median': expected['median'],
+                    'ideal_median': without['median'], 'recorded_p99': times['p99'],
+                    'predicted_p99': expected['p99']}))
     return {
         'utilisation': utilisation, 'workers': workers, 'recorded_workers': recorded_workers,
-        'overheads': predicted['overheads'], 'sinks': [_row(row) for row in rows]}
+        'overheads': predicted['overheads'], 'sinks': rows}
 
 
-def _row(row: Agreement) -> dict[str, Any]:
-    return {
-        **row._asdict(), 'median_error': row.median_error, 'p99_error': row.p99_error,
-        'within': abs(row.median_error) <= MEDIAN_LIMIT and abs(row.p99_error) <= P99_LIMIT}
+def _with_errors(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a row with the relative errors of the prediction."""
+    median, p99 = (row[f'predicted_{name}'] / row[f'recorded_{name}'] - 1
+                   for name in ('median', 'p99'))
+    return {**row, 'median_error': median, 'p99_error': p99,
+            'within': abs(median) <= MEDIAN_LIMIT and abs(p99) <= P99_LIMIT}
 
 
 def _summaries(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return a row for each setting and sink, with medians of the repeated runs."""
-    from benchmarks.long_traces import Agreement
     found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for run in runs:
+        setting = {name: run[name] for name in ('utilisation', 'workers', 'recorded_workers')}
         for row in run['sinks']:
-            key = (run['utilisation'], run['workers'], run['recorded_workers'], row['dag'],
-                   row['sink'])
-            found.setdefault(key, []).append(row)
-    rows = []
-    for key, group in found.items():
-        if statistics.median(row['jobs'] for row in group) < _FEW:
-            continue
-        medians = (statistics.median(row[name] for row in group) for name in (
-            'jobs', 'recorded_median', 'predicted_median', 'ideal_median', 'recorded_p99',
-            'predicted_p99'))
-        rows.append({
-            **dict(zip(('utilisation', 'workers', 'recorded_workers'), key)),
-            **_row(Agreement(*key[-2:], *medians))})
-    return rows
+            which = {**setting, 'dag': row['dag'], 'sink': row['sink']}
+            found.setdefault(tuple(which.items()), []).append(row)
+    medians = ({**dict(which), **{
+        name: statistics.median(row[name] for row in rows) for name in rows[0]
+        if name == 'jobs' or name.endswith(('_median', '_p99'))}} for which, rows in found.items())
+    return [_with_errors(row) for row in medians if row['jobs'] >= _FEW]
 
 
 def _show_accuracy(result: dict[str, Any]) -> None:
