@@ -16,11 +16,13 @@ def boot() -> str:
         return ''
 
 
-def epoch_offset_ns() -> int:
+def epoch_offset_ns(enough_ns: int = 0) -> int:
     """
-    Return what turns ``time.monotonic_ns()`` into ns since the epoch, for a whole run.
+    Return what turns ``time.monotonic_ns()`` into ns since the epoch, now.
 
     The best of several readings, so that an interruption between the two clocks does no harm.
+
+    :param enough_ns: a reading within this time is good enough.
     """
     readings = []
     for _ in range(20):
@@ -28,6 +30,8 @@ def epoch_offset_ns() -> int:
         now = time.time_ns()
         after = time.monotonic_ns()
         readings.append((after - before, now - (before + after) // 2))
+        if after - before <= enough_ns:
+            break
     return min(readings)[1]
 
 
@@ -42,3 +46,7 @@ class TraceClock:
     def now(self) -> int:
         """Return the time."""
         return time.monotonic_ns() + self.offset_ns
+
+    def of_system(self, at: int) -> int:
+        """Convert a time of the system clock, which may have been set since the run began."""
+        return at - epoch_offset_ns(2_000) + self.offset_ns

@@ -183,7 +183,7 @@ class Announcements:
         if isinstance(origin, Announced):
             release = origin.release + self._clock.offset_ns
         elif origin is None and work.entity.remote_publishers:
-            release, stamp = stamped_release(work.args[0], now)
+            release, stamp = stamped_release(work.args[0], self._clock)
         self._engine.arrived(work, origin, release, stamp, now)
 
     def _take_in(

@@ -29,6 +29,7 @@ import threading
 from time import time_ns
 from typing import Any, NamedTuple
 
+from mddag_executor.clocks import TraceClock
 from mddag_executor.executor.bounds import MOST
 from msg_graph import TaskSet
 
@@ -304,35 +305,26 @@ class Jobs:
         return self._release_from[dag] == 'arrival'
 
     def release(
-        self, dag: int, message: Any, source_timestamp: int, now: int
+        self, dag: int, message: Any, source_timestamp: int, now: int, clock: TraceClock
     ) -> tuple[int, int]:
         """
         Return the release of the job that a source's message starts, on the trace's clock.
 
-        :param now: the time on the trace's clock.
+        :param now: the time of its arrival.
         :return: the release, and the header's stamp if the release was taken from it, else -1.
         """
         kind = self._release_from[dag]
         if kind == 'source_timestamp':
-            return steady_time(source_timestamp, now), -1
-        release, stamp = (now, -1) if kind == 'arrival' else stamped_release(message, now)
+            return clock.of_system(source_timestamp), -1
+        release, stamp = (now, -1) if kind == 'arrival' else stamped_release(message, clock)
         # raw, without header or stamp: only its arrival is known
         return now if stamp < 0 else release, stamp
 
 
-def stamped_release(message: Any, now: int) -> tuple[int, int]:
-    """
-    Return the release by the stamp of a message's header, on the trace's clock, and the stamp.
-
-    :param now: the time on the trace's clock.
-    """
+def stamped_release(message: Any, clock: TraceClock) -> tuple[int, int]:
+    """Return the release by the stamp of a message's header, and the stamp."""
     stamp = header_stamp(message)
-    return steady_time(stamp, now), stamp
-
-
-def steady_time(system_time: int, now: int) -> int:
-    """Convert a time of the system clock to the trace's clock, which reads ``now``."""
-    return now - time_ns() + system_time
+    return clock.of_system(stamp), stamp
 
 
 def header_stamp(message: Any) -> int:

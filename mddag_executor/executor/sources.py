@@ -163,12 +163,12 @@ class SubscriptionSource(Source):
         release = header = -1
         if entity.source >= 0:
             release, header = engine.jobs.release(
-                engine.tables.dag_of[entity.source], message, stamp, now)
+                engine.tables.dag_of[entity.source], message, stamp, now, self._pool.clock)
         elif entity.targets:
             origin = publication.origin if publication is not None else engine.jobs.find(
                 entity.topic, stamp, info.get('publication_sequence_number'))
             if origin is None and entity.remote_publishers:
-                release, header = stamped_release(message, now)
+                release, header = stamped_release(message, self._pool.clock)
         engine.arrived(work, origin, release, header, now)
 
     def collect_published(self, publication: Publication | None) -> bool:

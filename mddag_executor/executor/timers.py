@@ -25,6 +25,7 @@ from heapq import heapify, heappop, heappush
 import time
 from typing import Any
 
+from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.executor.compat import RCL_ERRORS, timer_functions, with_timer_info
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.listeners import NextCall
@@ -93,10 +94,8 @@ class TimerSource(EntitySource):
             return None
         if self._is_steady:
             return at
-        offset = time.time_ns() - _now()
-        if abs(offset - self._offset) > TOLERANCE_NS:
-            # a pause between two readings makes the offset smaller, never larger
-            self._offset = max(offset, time.time_ns() - _now())
+        if abs(time.time_ns() - _now() - self._offset) > TOLERANCE_NS:
+            self._offset = epoch_offset_ns()
         return at - self._offset
 
     def is_simulated(self) -> bool:

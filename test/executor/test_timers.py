@@ -22,6 +22,18 @@ from std_msgs.msg import Header
 from .conftest import is_idle, Spinning, wait_for
 
 MS = 1_000_000
+STAMPED = """
+mddag: 1
+nodes:
+  - node: /node
+    callbacks:
+      - name: heard
+        subscription: /topic
+        period: 10ms
+        release_from: {}
+        execution_time: 1us
+        deadline: 1s
+"""
 
 
 class Stepping(Spinning):
@@ -222,22 +234,10 @@ def test_a_message_from_before_the_spin_is_released_when_it_begins(
     make_executor, make_node, stamp
 ):
     node, got = make_node(), []
-    graph: Any = loads(f"""
-mddag: 1
-nodes:
-  - node: /node
-    callbacks:
-      - name: heard
-        subscription: /topic
-        period: 10ms
-        release_from: {stamp}
-        execution_time: 1us
-        deadline: 1s
-""")
     publisher = node.create_publisher(Header, '/topic', 10)
     node.create_subscription(Header, '/topic', got.append, 10)
     assert wait_for(publisher.get_subscription_count)
-    executor = make_executor(graph, nodes=[node])
+    executor = make_executor(loads(STAMPED.format(stamp)), nodes=[node])
     releases: list[int] = []
     executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
     publisher.publish(Header(stamp=node.get_clock().now().to_msg()))
@@ -246,3 +246,29 @@ nodes:
     with Spinning(executor):
         assert wait_for(lambda: got)
     assert len(releases) == 1 and releases[0] >= begin
+
+
+@pytest.mark.parametrize('stamp', ['source_timestamp', 'header_stamp'])
+def test_a_pause_while_a_message_is_taken_does_not_move_its_release(
+    make_executor, make_node, stamp
+):
+    node, got = make_node(), []
+    publisher = node.create_publisher(Header, '/topic', 10)
+    subscription = node.create_subscription(
+        Header, '/topic', lambda message, info: got.append(info['source_timestamp']), 10)
+    assert wait_for(publisher.get_subscription_count)
+    executor = make_executor(loads(STAMPED.format(stamp)), nodes=[node])
+    releases: list[int] = []
+    executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
+    with Spinning(executor):
+        assert wait_for(lambda: executor._pool.is_current)
+        source = executor._upkeep._sources[executor._registry.by_id[id(subscription)]]
+        take = source._take
+        source._take = lambda: (take(), time.sleep(0.1))[0]
+        time.sleep(0.2)  # no release is before the spin
+        sent = node.get_clock().now()
+        publisher.publish(Header(stamp=sent.to_msg()))
+        assert wait_for(lambda: got)
+    expected = got[0] if stamp == 'source_timestamp' else sent.nanoseconds
+    assert len(releases) == 1
+    assert abs(releases[0] - executor._trace_clock.of_system(expected)) < MS
