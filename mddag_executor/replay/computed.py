@@ -159,13 +159,13 @@ class _Player:
         return found
 
     def _drops(self) -> tables.Table:
-        """Return the dropped executions; ``reason``: whether the job was aborted."""
-        decisions = self._schedule.decisions
-        aborted = {(dag, job) for kind, dag, _, job, end, _ in decisions
-                   if kind == JOB_END and end == ABORTED}
+        """Return the dropped executions; ``reason``: whether the job had been aborted."""
+        aborted = set()
         drops = Rows(tables.DROPS, 'vertex', 'job', 'time', 'reason')
-        for kind, dag, vertex, job, _, now in decisions:
-            if kind == DROP and dag < self._n_dags:
+        for kind, dag, vertex, job, end, now in self._schedule.decisions:
+            if kind == JOB_END and end == ABORTED:
+                aborted.add((dag, job))
+            elif kind == DROP and dag < self._n_dags:
                 drops.add(vertex, self._number(dag, job), now, (dag, job) in aborted)
         return drops.table()
 

@@ -174,7 +174,8 @@ class Judged:
             closed = np.maximum(closed, np.where(
                 inner, np.where(jobs.done_order < jobs.ended[:, None], jobs.done_order, NEVER),
                 -1).max(axis=1, initial=-1))
-        closed[closed < 0] = NEVER      # no sinks here
+        # no sinks here, or not the last completion but a drop closed the job
+        closed[(closed < 0) | (reason == recorded.OUTDATED)] = NEVER
         ended = np.minimum(jobs.ended, closed)
         judged_order, judged_until = self._recording.judged_order, self._recording.judged_until
         open_then = (jobs.released < judged_order) & (ended > judged_order)

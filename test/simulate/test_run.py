@@ -137,6 +137,21 @@ nodes:
 """), ((1, 1, 1),), 2, 'rad', False, 0, 0)
 
 
+# Two of three sinks of a job have completed when the third one is dropped, which closes the job.
+DROPPED_LAST = Case(loads("""\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: s, timer: 3us, dag: d, on_late: continue, publishes: [/t]}
+      - {name: a, subscription: /t, deadline: 1us}
+      - {name: b, subscription: /t, deadline: 2us, keep: newest}
+  - node: /m
+    callbacks:
+      - {name: other, timer: 3us, dag: e, on_late: continue, deadline: 1us}
+"""), ((1, 1, 1), (1,)), 1, 'rad', False, 0, 0)
+
+
 @pytest.fixture(scope='module')
 def trace() -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
@@ -152,6 +167,7 @@ def record(case: Case, horizon: int, trace: Path, **how: Any) -> SimulatedRun:
 
 @examples(60)
 @example(case=TWO_SINKS_AT_ONCE, horizon=5, stop=False)
+@example(case=DROPPED_LAST, horizon=12, stop=False)
 @given(case=cases(overheads=True, newest=True), horizon=st.integers(5, 50), stop=st.booleans())
 def test_the_replayer_counts_the_same(
     trace: Path, case: Case, horizon: int, stop: bool
