@@ -45,6 +45,7 @@ Delay = Callable[[int, int, int, int], int]
 Id = tuple[int, int, int]
 """DAG, global vertex, job in the load."""
 
+_DROPS = -1, ABORTED, EXPIRED      # ends of jobs, in the order of the drop reasons
 _REASONS = {ABORTED: tables.ABORTED, EXPIRED: tables.EXPIRED, OUTDATED: tables.OUTDATED}
 """Reasons, in terms of a recording, why jobs ended early."""
 
@@ -151,7 +152,8 @@ class _Player:
                                 DEFAULT_DEADLINE_NS, 0, False),
             task_set, task_set, who, same=False, releases=self._releases.table(),
             executions=self._executions.table(), job_ends=self._ends.table(),
-            drops=self._drops(), drop_reasons=('newer', 'aborted'), demotions=self._demotions(),
+            drops=self._drops(), drop_reasons=('newer', 'aborted', 'expired'),
+            demotions=self._demotions(),
             end=schedule.end, judged=schedule.judged, judged_until=schedule.end,
             workers_each=workers,
             judge_from=() if schedule.judge_from == -NEVER else [(-1, schedule.judge_from)])
@@ -159,14 +161,14 @@ class _Player:
         return found
 
     def _drops(self) -> tables.Table:
-        """Return the dropped executions; ``reason``: whether the job had been aborted."""
-        aborted = set()
+        """Return the dropped executions; ``reason``: how their job had ended."""
+        ended: dict[tuple[int, int], int] = {}
         drops = Rows(tables.DROPS, 'vertex', 'job', 'time', 'reason')
         for kind, dag, vertex, job, end, now in self._schedule.decisions:
-            if kind == JOB_END and end == ABORTED:
-                aborted.add((dag, job))
+            if kind == JOB_END and end in _DROPS:
+                ended[dag, job] = _DROPS.index(end)
             elif kind == DROP and dag < self._n_dags:
-                drops.add(vertex, self._number(dag, job), now, (dag, job) in aborted)
+                drops.add(vertex, self._number(dag, job), now, ended.get((dag, job), 0))
         return drops.table()
 
     def _demotions(self) -> tables.Table:
