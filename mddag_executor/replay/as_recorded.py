@@ -70,7 +70,7 @@ class Replay:
 
     def drift(self) -> list[Drift]:
         """Return the differences between the run and the declaration."""
-        return drift_of(self.recording)
+        return drift_of(self.recording, self.judged.skip)
 
     @property
     def duration_ns(self) -> int:

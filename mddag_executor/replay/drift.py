@@ -21,13 +21,19 @@ from msg_graph.drift import Drift, drift, Observed, Releases
 import numpy as np
 
 
-def drift_of(recording: Recording) -> list[Drift]:
-    """Return the differences between a recording and the declaration that judges it."""
+def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
+    """
+    Return the differences between a recording and the declaration that judges it.
+
+    :param skip: warm-up time after the first release that does not count for rates, ns.
+    """
     judge, who, table = recording.task_set, recording.who, recording.executions
     vertices = judge.vertices
     releases: dict[str, Releases] = {}
+    released, since = recording.releases, (recording.start or 0) + skip
     for dag in judge.dags:
-        mine = recording.releases[recording.releases['dag'] == dag.index]['release']
+        mine = released['release'][released['dag'] == dag.index]
+        mine = mine[mine >= since]
         if len(mine):
             of = releases[dag.vertices[dag.source].callback.key] = Releases()
             of.add(int(mine.min()))
@@ -37,16 +43,21 @@ def drift_of(recording: Recording) -> list[Drift]:
     declared = (table['vertex'] >= 0) & (table['start'] >= 0)
     others = (table['vertex'] < 0) & (table['end'] >= 0) & (table['piece'] == 0)
     numbers, callback_of = recording.callbacks()
-    counts = dict(zip(numbers.tolist(), np.bincount(
-        callback_of[declared | others], minlength=len(numbers)).tolist()))
+    late = (table['end'] >= since) | (table['end'] < 0)
+    counts, late_counts = (dict(zip(numbers.tolist(), np.bincount(
+        callback_of[which], minlength=len(numbers)).tolist()))
+        for which in (declared | others, (declared | others) & late))
     keys = declared_keys(who, recording.recorded_set)
     for callback, vertex in zip(
             numbers.tolist(), recording.vertices_of_callbacks(declared).tolist()):
         if vertex >= 0:
             keys[callback] = vertices[vertex].callback.key
     ran: Counter[str] = Counter()
+    got = Counter(vertices[v].callback.key for v in recording.drops['vertex'][
+        recording.drops['time'] >= since].tolist() if v >= 0)
     for callback, key in keys.items():
         ran[key] += counts.get(callback, 0)
+        got[key] += late_counts.get(callback, 0)
     came: defaultdict[str, Set[str]] = defaultdict(set)
     for each in who.made:
         if counts.get(each.number) and each.number in keys:
@@ -54,8 +65,6 @@ def drift_of(recording: Recording) -> list[Drift]:
     whole = table['vertex'][declared & (table['completes'] == VERTEX)]
     for vertex in np.unique(whole).tolist():
         came.pop(vertices[vertex].callback.key, None)   # it got all of them
-    dropped = Counter(vertices[v].callback.key for v in recording.drops['vertex'].tolist()
-                      if v >= 0)
     publishes: defaultdict[str, Set[str]] = defaultdict(set)
     sent = recording.publications
     publishers, publisher_of = np.unique(sent['publisher'], return_inverse=True)
@@ -71,6 +80,6 @@ def drift_of(recording: Recording) -> list[Drift]:
     bound = declared_keys(who, judge)
     return drift(judge, Observed(
         max(0, recording.end - recording.begin), releases,
-        dict(ran + dropped), dict(ran), came, publishes, set(who.names_of_nodes) or None,
+        dict(got), dict(ran), came, publishes, set(who.names_of_nodes) or None,
         [each.entity for each in who.made
          if each.entity is not None and each.number not in bound]))

@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from mddag_executor.core import POLICIES
+from mddag_executor.core import legs_of, POLICIES
 from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
@@ -27,6 +27,7 @@ from mddag_executor.replay.causes import (
     CAUSES,
     delayed_by,
     find,
+    LOST,
     MACHINE,
     MISSED,
     Never,
@@ -244,11 +245,11 @@ class Explanation:
                 'release_ns': release, 'deadline_ns': release + deadline, 'until_ns': until,
                 'late_ns': until - release - deadline if kind == SINK_LATE else None,
                 'cause': CAUSES[self.found.causes[miss]], 'parts': [
-                    self._part(parts[i], waited.get(i, ()), names)
+                    self._part(parts[i], number, waited.get(i, ()), names)
                     for i in range(first[miss], first[miss + 1])]}
 
     def _part(
-        self, part: Any, waited: Iterable[tuple[int, int]], names: dict[int, str]
+        self, part: Any, job: int, waited: Iterable[tuple[int, int]], names: dict[int, str]
     ) -> dict[str, Any]:
         found = {
             'vertex': self._task_set.vertices[int(part['vertex'])].name,
@@ -257,7 +258,17 @@ class Explanation:
         if part['cause'] == SKIPPED:
             found['waiting_job'] = int(self._never.waiting(
                 part['vertex'][None], part['end'][None])[0])
+        if part['cause'] == LOST:
+            found['topics'] = self._missing(int(part['vertex']), job)
         return found
+
+    def _missing(self, vertex: int, job: int) -> list[str]:
+        """Return the topics whose messages a vertex of a job has not got."""
+        one, started = self._task_set.vertices[vertex], self._never.started
+        got = set(started['leg'][(started['vertex'] == vertex) & (started['job'] == job)].tolist())
+        legs = legs_of(one, self._task_set.dags[one.dag].vertices)
+        return sorted({one.callback.topics[place] for leg, (place, _) in enumerate(legs)
+                       if leg not in got and one.callback.topics})
 
     def _names(self) -> dict[int, str]:
         """Return the names of the callbacks that others waited for."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from mddag_executor.replay.causes import REMEDIES
 from mddag_executor.report.tables import percent, short_names
-from mddag_executor.report.text import Cell, format_ns, printable, table
+from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 
 MOST_STALLS = 10
@@ -72,7 +72,14 @@ def job_lines(job: Mapping[str, Any]) -> Iterator[str]:
     yield (f'Job {job["job"]} of {printable(names[job["sink"]])}: {late} (deadline '
            f'{format_ns(allowed)} after its release): {job["cause"]}')
     yield table(('callback', 'what', 'time', 'behind'), [
-        [names[part['vertex']], part['cause'] if 'waiting_job' not in part else
-         f'skipped: job {part["waiting_job"]} had not started', format_ns(part['ns'], 3),
+        [names[part['vertex']], _what(part), format_ns(part['ns'], 3),
          ', '.join(f'{names[each["callback"]]} {format_ns(each["ns"], 3)}'
                    for each in part['behind']) or None] for part in parts])
+
+
+def _what(part: Mapping[str, Any]) -> str:
+    """Return what a part of a job's time was, and which job or message is meant."""
+    text: str = part['cause']
+    if 'waiting_job' in part:
+        return f'{text}: job {part["waiting_job"]} had not started'
+    return f'{text}: {listed(part["topics"])}' if part.get('topics') else text

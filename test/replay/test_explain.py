@@ -373,7 +373,10 @@ def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path: Path, call: Call
     result = call('explain', path, '--json', '-').result
     assert result['causes']['lost'] == result['missed'] == 20
     assert result['jobs'][0]['parts'][-1] == {
-        'vertex': '/victim:use', 'cause': 'lost', 'ns': 29 * MS, 'behind': []}
+        'vertex': '/victim:use', 'cause': 'lost', 'ns': 29 * MS, 'behind': [],
+        'topics': ['/image']}
+    assert program.main(['explain', str(path), '--job', '3']) == 0
+    assert 'lost: /image' in capsys.readouterr().out
 
 
 def test_only_misses_in_stops_are_said_to_be_in_them(tmp_path: Path, call: Call) -> None:

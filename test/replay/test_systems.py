@@ -9,13 +9,15 @@ from pathlib import Path
 import re
 
 from mddag_executor.errors import InputError
-from mddag_executor.replay import replay
+from mddag_executor.replay import Replay, replay
 from mddag_executor.replay.drafting import System
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
 from msg_graph.caret import declaration_from_caret
 from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, LEFT_OUT, MARK
 import pytest
+
+from .helpers import add_execution, begin_trace, end_trace, START_TIME
 
 MS = 1_000_000
 PID = 7
@@ -216,3 +218,31 @@ nodes:
     assert [(each.kind, each.callback) for each in found] == [
         ('publishes', '/a:zwei'), ('rate', '/b:x'), ('never ran', '/b:o')]
     assert (found[1].declared, found[1].observed) == (15 * MS, 10 * MS)
+
+
+def test_a_warm_up_does_not_count_for_rates(tmp_path: Path) -> None:
+    path = tmp_path / 'run.mcap'
+    with begin_trace(path, """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: tick, timer: 10ms, publishes: [/x]}
+      - {name: once, subscription: /once, period: 10ms, deadline: 5ms}
+  - node: /b
+    callbacks:
+      - {name: x, subscription: /x, deadline: 5ms}
+""") as file:
+        file.add('job_release', START_TIME, 1, 1, 1, 0, START_TIME)
+        add_execution(file, START_TIME, START_TIME + MS, 1, 0, 0, address=8)
+        start = START_TIME
+        for job in range(60):
+            start += 50 * MS if job < 20 else 10 * MS   # until 1 s it is slow
+            file.add('job_release', start, 1, 1, 0, job, start)
+            add_execution(file, start, start + MS, 0, 0, job, address=7)
+            if job >= 20:
+                add_execution(file, start + MS, start + 2 * MS, 0, 1, job)
+        end_trace(file, start + 10 * MS)
+    recording = replay(path).recording
+    assert [each.kind for each in Replay(recording).drift()] == ['rate']
+    assert Replay(recording, skip=1_000 * MS).drift() == []
