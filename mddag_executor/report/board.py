@@ -138,7 +138,7 @@ def _cell(status: Status, column: Column) -> str:
         if column.unit == '%':
             return f'{100 * number:.0f} %'
         if column.unit == 'ms':
-            return format_ns(round(number * 1e6))
+            return format_ns(round(number * 1e6), 3)
         return f'{number:.0f}'
     except (ValueError, OverflowError):
         return printable(value)     # no number

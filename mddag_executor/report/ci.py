@@ -70,7 +70,7 @@ def _facts(sink: Mapping[str, Any]) -> str:
             f'{verdicts.due} in time, longest burst of misses {sink["longest_burst"]}')
     if response:
         text += ', response time ' + ', '.join(
-            f'{key} {format_ns(response[key])}' for key in ('median', 'p99', 'max'))
+            f'{key} {format_ns(response[key], 3)}' for key in ('median', 'p99', 'max'))
     return text
 
 

@@ -177,8 +177,8 @@ def misses_html(data: ReportData, prepared: Prepared) -> str:
     for miss in prepared.misses:
         vertex = data.task_set.vertices[miss.sink]
         dag = data.task_set.dags[vertex.dag]
-        late = None if miss.completed is None else format_ns(miss.completed - miss.deadline)
-        response = None if miss.completed is None else format_ns(miss.completed - miss.release)
+        late = None if miss.completed is None else format_ns(miss.completed - miss.deadline, 3)
+        response = None if miss.completed is None else format_ns(miss.completed - miss.release, 3)
         cause = [data.causes.get((miss.sink, miss.job))] if data.causes else []
         rows.append((dag.name, short[vertex.name], miss.verdict, *cause, miss.job,
                      f'{miss.release / 1e9:.6f} s', response, late))
@@ -214,7 +214,7 @@ def worst_html(data: ReportData) -> str:
         split = [worst[name] for name in Breakdown._fields]
         rows.append((
             data.task_set.dags[one.dag].name, short[one.name],
-            _stack(split, deadline, max(1.0, longest)), worst['job'], format_ns(response),
+            _stack(split, deadline, max(1.0, longest)), worst['job'], format_ns(response, 3),
             *(format_ns(part, 3) for part, shown in zip(split, used) if shown),
             format_ns(deadline)))
     parts = [part for part, shown in zip(_PARTS, used) if shown]

@@ -163,7 +163,7 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     undeclared = result['undeclared']
     if undeclared['executions']:
         yield (f'{counted(undeclared["executions"], "run")} of undeclared callbacks, '
-               f'{format_ns(undeclared["busy_ns"])} altogether')
+               f'{_time(undeclared["busy_ns"])} altogether')
     dropped = result['dropped']
     if dropped:
         yield f'{sum(dropped.values())} dropped: ' + ', '.join(

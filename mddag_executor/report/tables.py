@@ -81,7 +81,7 @@ def sink_table(dags: Mapping[str, Any]) -> str:
             '' if sink.dag == above else sink.dag, sink.shown_name, verdicts.due,
             percent(verdicts.in_time, verdicts.due), verdicts.late,
             *(getattr(verdicts, name) for name in rare),
-            *response_cells(sink.result['response_ns'], 3),
+            *response_cells(sink.result['response_ns']),
             format_ns(sink.result['relative_deadline_ns']),
             *(weakly_hard and tolerate_cells(sink.result))])
         above = sink.dag
@@ -119,11 +119,11 @@ def rare_ends(every: Counts) -> list[str]:
     return [name for name in ('failed', 'aborted', 'dropped', 'demoted') if getattr(every, name)]
 
 
-def response_cells(response: Mapping[str, int] | None, digits: int = 4) -> list[Cell]:
+def response_cells(response: Mapping[str, int] | None) -> list[Cell]:
     """Return the cells for median, p99 and max of response times."""
     if response is None:
         return [None, None, None]
-    return [format_ns(response[key], digits) for key in ('median', 'p99', 'max')]
+    return [format_ns(response[key], 3) for key in ('median', 'p99', 'max')]
 
 
 def percent(part: int, whole: int) -> str:
@@ -174,7 +174,7 @@ def run_lines(result: Mapping[str, Any], more: str = '') -> Iterator[str]:
     miss = result['first_miss']
     if miss is not None:
         late = 'never completed' if miss['completed_ns'] is None else \
-            f'{format_ns(miss["completed_ns"] - miss["deadline_ns"])} late'
+            f'{format_ns(miss["completed_ns"] - miss["deadline_ns"], 3)} late'
         yield f'first miss: {printable(miss["vertex"])}, job {miss["job"]}, {late}'
 
 
