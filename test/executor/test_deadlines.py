@@ -15,7 +15,7 @@ from builtin_interfaces.msg import Time
 from mddag_executor import DeadlineMiss
 from mddag_executor.executor import current_job
 from mddag_executor.executor.work import Work
-from msg_graph import loads, TaskSet
+from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
@@ -332,36 +332,11 @@ def tick_as_timer(executor: Any, timer: Any, tick: Any) -> None:
         lambda now: executor._engine.timer_due(Work(entity, timer.callback), now, now))
 
 
-def with_source(more: str) -> TaskSet:
-    return loads(CHAIN.replace('dag: chain', f'dag: chain, {more}'))
-
-
-def test_abort_drops_what_is_left_of_a_late_job(make_executor, make_node):
-    chain = Chain(make_node, {'relay': lambda: time.sleep(0.06)})
-    executor = make_executor(with_source('on_late: abort'), num_workers=2)
-
-    def all_ended() -> bool:
-        dag = executor.statistics()['dags']['chain']
-        return is_idle(executor) and sum(dag['ends'].values()) == dag['jobs']
-
-    with Spinning(executor):
-        chain.start(executor)
-        assert wait_for(lambda: len(chain.jobs['relay']) >= 5)
-        chain.timer.cancel()
-        assert wait_for(all_ended)
-    dag = executor.statistics()['dags']['chain']
-    assert dag['ends']['aborted'] > 0
-    assert sum(dag['ends'].values()) == dag['jobs']
-    assert dag['sinks']['/sink:last']['aborted'] > 0
-    assert sum(executor.statistics()['dropped'].values()) > 0
-    assert len(chain.jobs['last']) < len(chain.jobs['tick'])
-
-
 def test_a_lost_message_expires_its_job(make_executor, make_node):
     """Nobody runs the relay: its jobs cannot complete, expire, and free their places."""
     chain = Chain(make_node)
     chain.nodes['middle'].destroy_subscription(next(iter(chain.nodes['middle'].subscriptions)))
-    executor = make_executor(with_source('max_active_jobs: 3'))
+    executor = make_executor(loads(CHAIN.replace('dag: chain', 'dag: chain, max_active_jobs: 3')))
     with Spinning(executor):
         for node in chain.nodes.values():
             executor.add_node(node)

@@ -11,20 +11,10 @@ from mddag_executor import DeadlineMiss
 from mddag_executor.executor import current_job
 from mddag_executor.replay import replay, reschedule
 from msg_graph import loads
-from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 
 from .conftest import Spinning, wait_for
 from .test_deadlines import CHAIN, Chain, sinks
-
-SYNC = """
-mddag: 1
-nodes:
-  - node: /source
-    callbacks: [{name: tick, timer: 20ms, publishes: [/a, /b], dag: chain}]
-  - node: /join
-    callbacks: [{name: both, sync: [/a, /b], deadline: 5s}]
-"""
 
 
 class Wrong(Exception):
@@ -161,36 +151,6 @@ def test_a_listener_may_handle_exceptions_of_callbacks(make_executor, make_node)
     assert spinning.error is None
     assert set(ended) == {
         (timers[0], 'None'), (timers[0], 'odd'), (timers[1], 'None')}
-
-
-def test_a_leg_of_a_sync_that_raises(make_executor, make_node) -> None:
-    source, join = make_node('source'), make_node('join')
-    publishers = [source.create_publisher(Header, topic, 10) for topic in ('/a', '/b')]
-    ran: list[int] = []
-
-    def tick() -> None:
-        for publisher in publishers:
-            publisher.publish(Header())
-
-    def take(topic: str) -> None:
-        if topic == '/b':
-            ran.append(current_job().job)
-            odd_jobs_raise()
-
-    timer = source.create_timer(0.02, tick, autostart=False)
-    for topic in ('/a', '/b'):
-        join.create_subscription(
-            Header, topic, lambda message, topic=topic: take(topic), 10,
-            callback_group=ReentrantCallbackGroup())
-    executor = make_executor(loads(SYNC), nodes=[source, join])
-    assert wait_for(lambda: all(p.get_subscription_count() == 1 for p in publishers))
-    timer.reset()
-    spin_until(executor, lambda: sum(job % 2 for job in ran) >= 3)  # periods may be missed
-    timer.cancel()
-    spin_until(executor, lambda: executor.statistics()['queue'] == 0)
-    executor.shutdown(5.0)
-    failed = sinks(executor)['/join:both']['failed']
-    assert failed == sum(job % 2 for job in ran) >= 3
 
 
 def test_a_coroutine_that_raises_after_it_has_waited(make_executor, make_node) -> None:

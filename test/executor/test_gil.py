@@ -137,28 +137,6 @@ def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_
     assert min(seen[:3]) >= 3
 
 
-def test_one_that_waits_for_another_gives_the_interpreter_back(make_executor, make_node):
-    """Declared as computing, but it waits for one that is held back: no deadlock."""
-    node = make_node()
-    done, waited = threading.Event(), []
-
-    def body(name: str) -> None:
-        if name == 'a':
-            compute(3)
-            waited.append(done.wait(20.0))
-        else:
-            done.set()
-
-    bodies = Bodies(node, body)
-    executor = make_executor(graph('true'), nodes=[node])
-    with Spinning(executor):
-        bodies.publish('a')
-        assert wait_for(lambda: bodies.ran == ['a'])
-        bodies.publish('b')
-        assert wait_for(lambda: waited, 20.0)
-    assert waited == [True]
-
-
 def test_who_computes_is_learnt_and_shown(make_executor, make_node):
     node, ran = make_node(), []
     node.create_timer(0.01, lambda: (compute(3), ran.append('computes')))

@@ -14,7 +14,6 @@ from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.guard_condition import GuardCondition
 from rclpy.qos import QoSProfile
-from rclpy.waitable import NumberOfEntities, Waitable
 from test_msgs.action import Fibonacci
 
 from .conftest import is_idle, Spinning, wait_for
@@ -219,31 +218,12 @@ def test_a_timer_gives_its_info_to_who_asks_for_it(make_executor, make_node):
     assert all(step % 20_000_000 == 0 for step in steps)
 
 
-# --- futures and tasks ---------------------------------------------------------------------------
-
-
-class Always(Waitable):
-    """A waitable that its executor finds ready each time, and whose take gives nothing."""
+class Empty(Pulse):
+    """A waitable whose take gives nothing."""
 
     def __init__(self, node: Any) -> None:
-        super().__init__(node.default_callback_group)
-        self.guard = node.create_guard_condition(None)
+        super().__init__(node, node.default_callback_group)
         self.got: list[Any] = []
-
-    def __enter__(self) -> None:
-        self.guard.handle.__enter__()
-
-    def __exit__(self, *_: Any) -> None:
-        self.guard.handle.__exit__(None, None, None)
-
-    def get_num_entities(self) -> NumberOfEntities:
-        return NumberOfEntities()
-
-    def add_to_wait_set(self, wait_set: Any) -> None:
-        pass
-
-    def is_ready(self, wait_set: Any) -> bool:
-        return len(self.got) < 3
 
     def take_data(self) -> None:
         return None
@@ -254,7 +234,7 @@ class Always(Waitable):
 
 def test_a_waitable_that_takes_nothing_is_executed(make_executor, make_node):
     node = make_node()
-    waitable = Always(node)
+    waitable = Empty(node)
     node.add_waitable(waitable)
     executor = make_executor(nodes=[node])
     with Spinning(executor):

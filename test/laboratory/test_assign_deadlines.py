@@ -19,7 +19,7 @@ from mddag_executor.laboratory.evaluate import Experiment
 from msg_graph import loads
 import pytest
 
-from .graphs import GRAPH
+from .graphs import GRAPH, SHARED
 
 
 def experiment(**changes: object) -> Experiment:
@@ -34,16 +34,7 @@ def test_scaled() -> None:
 
 
 def test_a_callback_that_is_several_sinks() -> None:
-    task_set = loads("""\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: a, timer: 20ms, publishes: [/a], dag: one, execution_time: 3ms}
-      - {name: b, timer: 40ms, publishes: [/a], dag: two, execution_time: 1ms}
-      - {name: s, subscription: /a, deadline: 5ms, execution_time: 1ms}
-""")
-    assert scaled(task_set, 'max', 2.0) == {'/n:s': 8_000_000}
+    assert scaled(loads(SHARED), 'max', 2.0) == {'/n:s': 8_000_000}
 
 
 def test_search_finds_the_tightest_scale() -> None:

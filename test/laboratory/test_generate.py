@@ -17,7 +17,7 @@ from msg_graph import loads, TaskSet
 from msg_graph.model import load_of
 import pytest
 
-from .graphs import GRAPH
+from .graphs import GRAPH, SHARED
 
 
 def pairs(low: int, high: int) -> st.SearchStrategy[tuple[int, int]]:
@@ -131,13 +131,4 @@ def test_proportional() -> None:
 
 
 def test_a_callback_that_is_several_sinks() -> None:
-    task_set = loads("""\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: a, timer: 20ms, publishes: [/a], dag: one, execution_time: 3ms}
-      - {name: b, timer: 40ms, publishes: [/a], dag: two, execution_time: 1ms}
-      - {name: s, subscription: /a, deadline: 5ms, execution_time: 1ms}
-""")
-    assert proportional(task_set, 'max') == {'/n:s': 20_000_000}
+    assert proportional(loads(SHARED), 'max') == {'/n:s': 20_000_000}

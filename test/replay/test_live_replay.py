@@ -157,7 +157,9 @@ def test_replay_counts_what_the_executor_counted(ros_context: Any, tmp_path: Pat
     assert min(dag['jobs'] for dag in live['dags'].values()) > 30
     assert sinks['/fuse:join']['late'] > 3
     assert sinks['/right:watch']['completed'] > 20
-    assert sinks['/filter:show']['aborted'] + sinks['/filter:show']['late'] > 3
+    imu = live['dags']['/imu']
+    assert sinks['/filter:show']['aborted'] == imu['ends']['aborted'] > 3
+    assert sum(imu['ends'].values()) == imu['jobs'] and sum(live['dropped'].values()) > 0
     for breakdown, response in breakdowns:
         worst = breakdown['worst']
         assert worst['completed_ns'] - worst['release_ns'] == response['max']
