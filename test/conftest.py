@@ -15,7 +15,7 @@ line says so. With CI in the environment nothing may be missing: such a test fai
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import contextlib
 from functools import cache
 import importlib
@@ -153,7 +153,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+def pytest_xdist_make_scheduler(config, log):
     from xdist.scheduler import LoadScopeScheduling
 
     class Scheduling(LoadScopeScheduling):
@@ -176,7 +176,7 @@ def _is_in(nodeid: str, places: tuple[str, ...]) -> bool:
 
 
 @pytest.fixture(scope='session', autouse=True)
-def nothing_left_behind() -> Iterator[None]:
+def nothing_left_behind():
     """Fail a session that leaves temporary files behind, or processes for more than a while."""
     yield
     end = time.monotonic() + 10.0
@@ -209,7 +209,7 @@ def _processes() -> dict[int, str]:
 
 
 @pytest.fixture
-def no_thread_leak() -> Iterator[None]:
+def no_thread_leak():
     """Fail a test that leaves a Python thread running for more than two seconds."""
     before = set(threading.enumerate())
     yield
@@ -226,7 +226,7 @@ def no_thread_leak() -> Iterator[None]:
 
 
 @pytest.fixture
-def ros_context(no_thread_leak: None) -> Iterator[Any]:
+def ros_context(no_thread_leak):
     """Give an rclpy context of its own, shut down afterwards; no thread may be left then."""
     import rclpy
     from rclpy.context import Context
@@ -254,9 +254,9 @@ Call = Callable[..., Done]
 
 
 @pytest.fixture
-def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Call:
+def call(capsys, monkeypatch):
     """Give a function that runs `mddag` with arguments in this process, which is quicker."""
-    def run(*arguments: object, cwd: Path | None = None, stdin: str | bytes = b'') -> Done:
+    def run(*arguments, cwd=None, stdin=b''):
         from mddag_executor.cli.main import main
         capsys.readouterr()
         with monkeypatch.context() as patch:
@@ -270,9 +270,9 @@ def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.fixture
-def mddag() -> Call:
+def mddag():
     """Give a function that runs `mddag` with arguments in a process of its own."""
-    def call(*arguments: object, timeout: float = 60.0, **options: Any) -> Done:
+    def call(*arguments, timeout=60.0, **options):
         given = options.pop('input', None)
         options.setdefault('stdin', subprocess.DEVNULL if given is None else subprocess.PIPE)
         environment = {**(options.pop('env', None) or os.environ), 'PYTHONFAULTHANDLER': '1'}

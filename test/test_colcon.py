@@ -35,7 +35,7 @@ needs_ros2 = pytest.mark.skipif(
 
 
 @pytest.fixture(scope='module')
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workspace(tmp_path_factory):
     """Give a workspace in which this package has been built."""
     place = tmp_path_factory.mktemp('workspace')
     shutil.copytree(
@@ -64,7 +64,7 @@ def in_workspace(
         env={**os.environ, 'COLCON_TRACE': '', 'PYTHON': sys.executable})
 
 
-def test_what_was_built_is_what_runs(workspace: Path):
+def test_what_was_built_is_what_runs(workspace):
     installed = workspace / 'install' / NAME
     share = installed / 'share'
     assert (share / 'ament_index/resource_index/packages' / NAME).is_file()
@@ -81,7 +81,7 @@ def test_what_was_built_is_what_runs(workspace: Path):
 
 
 @needs_ros2
-def test_ros2_finds_and_runs_it(workspace: Path, tmp_path: Path):
+def test_ros2_finds_and_runs_it(workspace, tmp_path):
     done = in_workspace(
         workspace, f'ros2 run {NAME} mddag --version && ros2 mddag --version && ros2 --help && '
         f'ros2 launch {NAME} run.launch.py --show-args', tmp_path)
@@ -105,9 +105,7 @@ nodes:
 @needs_ros2
 @pytest.mark.parametrize(('deadline', 'status'), [
     ('20s, tolerate: 999 of 1000', 0), ('1ms', 1)])
-def test_ros2_launch_ends_with_the_verdict(
-    workspace: Path, tmp_path: Path, deadline: str, status: int
-):
+def test_ros2_launch_ends_with_the_verdict(workspace, tmp_path, deadline, status):
     (tmp_path / 'graph.yaml').write_text(GRAPH.replace('DEADLINE', deadline))
     done = in_workspace(
         workspace, f'ros2 launch {NAME} run.launch.py graph:=graph.yaml synthetic:=sleep '
@@ -121,7 +119,7 @@ def test_ros2_launch_ends_with_the_verdict(
 
 
 @needs_ros2
-def test_bad_input_ends_ros2_launch(workspace: Path, tmp_path: Path):
+def test_bad_input_ends_ros2_launch(workspace, tmp_path):
     for arguments, says in (('graph:=none.yaml nodes:=a/b', 'error: none.yaml: '),
                             ('nodes:="\'a/b"', 'No closing quotation'),
                             ('graph:=x.yaml', 'required')):
@@ -132,9 +130,7 @@ def test_bad_input_ends_ros2_launch(workspace: Path, tmp_path: Path):
 @needs_ros2
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('to_all', [True, False])
-def test_a_signal_ends_ros2_launch_and_the_run(
-    workspace: Path, tmp_path: Path, number: signal.Signals, to_all: bool
-):
+def test_a_signal_ends_ros2_launch_and_the_run(workspace, tmp_path, number, to_all):
     """As a terminal or systemd sends it, or to `ros2 launch` only."""
     (tmp_path / 'graph.yaml').write_text(GRAPH.replace('DEADLINE', '20s'))
     command = (f'. "{workspace}/install/setup.bash" && exec ros2 launch {NAME} run.launch.py '
@@ -170,7 +166,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-def test_colcon_test_runs_the_tests(workspace: Path):
+def test_colcon_test_runs_the_tests(workspace):
     done = colcon(
         workspace, 'test', '--packages-select', NAME, '--return-code-on-test-failure',
         '--pytest-args', 'test/msg_graph/test_model.py')

@@ -88,7 +88,7 @@ def run_without(
 # --- optional packages ---------------------------------------------------------------------------
 
 
-def test_works_without_anything_optional(tmp_path: Path) -> None:
+def test_works_without_anything_optional(tmp_path):
     commands = [command.split() for command in (
         'graph check graph.yaml',
         'graph analyse graph.yaml',
@@ -114,9 +114,7 @@ def test_works_without_anything_optional(tmp_path: Path) -> None:
     ('rclpy', 'ros', ['run graph.yaml --synthetic sleep', 'top --once',
                       'graph from-ros -o out.yaml']),
 ], ids=lambda value: value if isinstance(value, str) else '')
-def test_says_in_one_line_what_is_missing(
-    tmp_path: Path, missing: str, extra: str, commands: list[str]
-) -> None:
+def test_says_in_one_line_what_is_missing(tmp_path, missing, extra, commands):
     for status, errors in run_without((missing,), [each.split() for each in commands], tmp_path):
         assert status == 2, errors
         assert errors.startswith('error: ') and errors.count('\n') == 1, errors
@@ -141,7 +139,7 @@ def loaded(code: str) -> set[str]:
     return set(done.stderr.split())
 
 
-def test_help_loads_nothing_heavy() -> None:
+def test_help_loads_nothing_heavy():
     modules = loaded(
         'from contextlib import suppress\n'
         'from mddag_executor.cli.main import run\n'
@@ -152,7 +150,7 @@ def test_help_loads_nothing_heavy() -> None:
             } & modules == set()
 
 
-def test_the_executor_loads_little_besides_rclpy() -> None:
+def test_the_executor_loads_little_besides_rclpy():
     rclpy = loaded('import rclpy, rclpy.node, rclpy.executors')
     more = loaded('from mddag_executor import MultiDeadlineExecutor') - rclpy
     foreign = {name.split('.')[0] for name in more}
@@ -168,7 +166,7 @@ def test_the_executor_loads_little_besides_rclpy() -> None:
 
 
 @pytest.fixture(scope='module')
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built(tmp_path_factory):
     """Build a source distribution, and from what is in it a wheel, as pip does."""
     place = tmp_path_factory.mktemp('built')
     files = subprocess.run(
@@ -204,7 +202,7 @@ def files_in(folder: Path, *places: str) -> set[str]:
 
 
 @pytest.mark.slow
-def test_the_distributions_hold_what_they_should(built: Path) -> None:
+def test_the_distributions_hold_what_they_should(built):
     with tarfile.open(next(built.glob('*.tar.gz'))) as archive:
         names = {name.partition('/')[2] for name in archive.getnames()}
     # MANIFEST.in names what there is; something of a new kind has to be added there.
@@ -227,7 +225,7 @@ def test_the_distributions_hold_what_they_should(built: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_installed_works_without_the_checkout(built: Path, tmp_path: Path) -> None:
+def test_what_is_installed_works_without_the_checkout(built, tmp_path):
     target = tmp_path / 'installed'
     done = subprocess.run(
         [sys.executable, '-m', 'pip', 'install', '--quiet', '--no-deps', '--no-index',

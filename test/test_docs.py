@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from pathlib import Path
 import re
 import shlex
 import subprocess
@@ -50,13 +49,13 @@ EXTRAS = {
 
 
 @pytest.mark.parametrize('page', [page for page in PAGES if blocks(page)])
-def test_what_a_page_shows_works(page: str, tmp_path: Path) -> None:
+def test_what_a_page_shows_works(page, tmp_path):
     for name in EXTRAS.get(page, ()):
         pytest.importorskip(name)
     Folder(tmp_path, FILES.get(page)).try_all(blocks(page))
 
 
-def test_no_block_is_overlooked() -> None:
+def test_no_block_is_overlooked():
     for page in PAGES:
         fences = re.findall(r'^ *```', (TOP / page).read_text(encoding='utf-8'), re.MULTILINE)
         assert len(fences) == 2 * len(blocks(page)), page
@@ -103,7 +102,7 @@ def known_options(words: list[str]) -> tuple[str, set[str]]:
 
 
 @pytest.mark.parametrize(('page', 'line'), command_lines())
-def test_commands_and_options_exist(page: str, line: str) -> None:
+def test_commands_and_options_exist(page, line):
     line = re.split(r' [|>] ?', line)[0]
     words = shlex.split(line.replace('…', ' '), comments=True)
     if words[0].startswith('-') or words[0].isupper():
@@ -116,7 +115,7 @@ def test_commands_and_options_exist(page: str, line: str) -> None:
     assert used - options - {'--help'} == set(), f'{page}: {line}'
 
 
-def test_every_verb_is_on_the_page_of_commands() -> None:
+def test_every_verb_is_on_the_page_of_commands():
     text = (TOP / 'docs' / 'commands.md').read_text(encoding='utf-8')
     assert not [verb for verb in program.VERBS if not re.search(rf'`mddag {verb}[ `]', text)]
 
@@ -124,7 +123,7 @@ def test_every_verb_is_on_the_page_of_commands() -> None:
 # --- the site ------------------------------------------------------------------------------------
 
 
-def test_the_site_builds_without_warnings_and_needs_no_network(tmp_path: Path) -> None:
+def test_the_site_builds_without_warnings_and_needs_no_network(tmp_path):
     for name in ('material', 'mkdocs', 'mkdocstrings'):
         pytest.importorskip(name, reason='the extra `docs` is not installed')
     result = subprocess.run(
@@ -147,7 +146,7 @@ def test_the_site_builds_without_warnings_and_needs_no_network(tmp_path: Path) -
         assert f'{name}' in api
 
 
-def test_images_are_small_and_used() -> None:
+def test_images_are_small_and_used():
     texts = ''.join((TOP / page).read_text(encoding='utf-8') for page in PAGES)
     for path in (TOP / 'docs' / 'images').iterdir():
         assert path.stat().st_size <= LARGEST_IMAGE, f'{path.name} is too large'
@@ -155,7 +154,7 @@ def test_images_are_small_and_used() -> None:
 
 
 @pytest.mark.parametrize('page', [page for page in PAGES if not page.startswith('docs/')])
-def test_links_of_other_pages_lead_somewhere(page: str) -> None:
+def test_links_of_other_pages_lead_somewhere(page):
     text = (TOP / page).read_text(encoding='utf-8')
     for name in re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', text):
         assert (TOP / page).parent.joinpath(name).exists(), name

@@ -107,7 +107,7 @@ def modules() -> Iterator[tuple[str, str, bool]]:
                    path.read_text(encoding='utf-8'), is_package)
 
 
-def test_imports_point_one_way() -> None:
+def test_imports_point_one_way():
     folders = {f'mddag_executor.{path.parent.name}'
                for path in (TOP / 'mddag_executor').glob('*/__init__.py')}
     assert folders and folders - set(LEVELS) == set()
@@ -185,7 +185,7 @@ def _attributes_of_its_own(kind: ast.ClassDef) -> set[str]:
     return names
 
 
-def test_only_compat_uses_what_is_private_in_rclpy() -> None:
+def test_only_compat_uses_what_is_private_in_rclpy():
     private = rclpys_private_names()
     assert {'_guard', '_callback_type', 'take_message', 'call_timer', '_rclpy'} <= private
     assert [

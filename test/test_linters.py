@@ -70,7 +70,7 @@ def run(*command: str) -> None:
         pytest.fail(result.stdout, pytrace=False)
 
 
-def test_ruff() -> None:
+def test_ruff():
     run('ruff', 'check', '--no-cache', '--output-format', 'concise', *ROOTS)
 
 
@@ -78,11 +78,11 @@ def test_ruff() -> None:
 @pytest.mark.skipif(sys.version_info[:2] != (3, 12), reason='mypy runs with Python 3.12 only')
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # minutes on a busy machine, without what earlier runs have found
-def test_mypy() -> None:
+def test_mypy():
     run('mypy')
 
 
-def test_copyright() -> None:
+def test_copyright():
     assert SOURCES
     assert not [str(path.relative_to(TOP)) for path in SOURCES
                 if not HEADER.match(path.read_text(encoding='utf-8'))]
@@ -93,7 +93,7 @@ def package_xml() -> ElementTree.Element:
     return ElementTree.parse(TOP / 'package.xml').getroot()
 
 
-def test_names_and_versions_agree() -> None:
+def test_names_and_versions_agree():
     from mddag_executor import __version__
     root = package_xml()
     name = root.findtext('name')
@@ -115,7 +115,7 @@ def run_nodes(node: ast.AST) -> Iterator[ast.AST]:
         yield from run_nodes(child)
 
 
-def test_what_is_imported_is_declared() -> None:
+def test_what_is_imported_is_declared():
     imported: dict[str, str] = {}
     for path in SOURCES:
         parts = path.relative_to(TOP).parts

@@ -9,7 +9,7 @@ from mddag_executor.text import counted, listed
 import pytest
 
 
-def test_public_names_are_those_of_the_live_executor() -> None:
+def test_public_names_are_those_of_the_live_executor():
     from mddag_executor.executor.executor import MultiDeadlineExecutor
     from mddag_executor.executor.verdicts import DeadlineMiss
     assert mddag_executor.MultiDeadlineExecutor is MultiDeadlineExecutor
@@ -21,7 +21,7 @@ def test_public_names_are_those_of_the_live_executor() -> None:
         mddag_executor.Nonsense  # noqa: B018
 
 
-def test_texts_for_messages() -> None:
+def test_texts_for_messages():
     assert [counted(n, 'DAG') for n in (0, 1, 2)] == ['0 DAGs', '1 DAG', '2 DAGs']
     assert [counted(n, 'vertex', 'vertices') for n in (1, 2)] == ['1 vertex', '2 vertices']
     assert listed(['a', 'b']) == 'a, b' and listed([]) == ''

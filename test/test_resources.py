@@ -15,12 +15,12 @@ import pytest
 TOP = Path(__file__).resolve().parent.parent
 
 
-def test_a_checkout_has_its_own_files() -> None:
+def test_a_checkout_has_its_own_files():
     assert resources.find('package.xml') == TOP / 'package.xml'
     assert resources.find('config/autoware.yaml') == TOP / 'config' / 'autoware.yaml'
 
 
-def test_what_is_nowhere_is_one_line() -> None:
+def test_what_is_nowhere_is_one_line():
     with pytest.raises(InputError, match=r'^config/none\.yaml: not found among .*: install'):
         resources.find('config/none.yaml')
 
@@ -37,7 +37,7 @@ def share(prefix: Path) -> Path:
 
 @pytest.mark.parametrize('folder', [
     'lib/python3.12/site-packages', 'local/lib/python3.12/dist-packages', 'elsewhere'])
-def test_an_installation_has_its_own_files(tmp_path: Path, folder: str) -> None:
+def test_an_installation_has_its_own_files(tmp_path, folder):
     mine, workspace = tmp_path / 'mine', share(tmp_path / 'workspace')
     modules = mine / folder / 'mddag_executor'
     modules.mkdir(parents=True)

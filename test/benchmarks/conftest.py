@@ -4,13 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 
 
 @pytest.fixture(scope='module', autouse=True)
-def unchecked() -> Iterator[None]:
+def unchecked():
     """Have no program that a test starts check the engine."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv('MDDAG_DEBUG', raising=False)

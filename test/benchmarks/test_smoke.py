@@ -28,7 +28,7 @@ nodes:
 
 
 @pytest.fixture
-def graph(tmp_path: Path) -> Path:
+def graph(tmp_path):
     path = tmp_path / 'graph.yaml'
     path.write_text(GRAPH)
     return path
@@ -46,7 +46,7 @@ def result_of(*arguments: object) -> Any:
     return json.loads(done.stdout)
 
 
-def test_live() -> None:
+def test_live():
     results = result_of(
         'live', '--load', 'topics', '--topics', 4, '--rate', 50, '--seconds', 0.5, '--executors',
         'rad:fifo,events')
@@ -58,7 +58,7 @@ def test_live() -> None:
         assert 0 < latency['p50'] <= latency['p99'] <= latency['max']
 
 
-def test_live_with_declared_nodes(graph: Path) -> None:
+def test_live_with_declared_nodes(graph):
     results = result_of(
         'live', '--load', 'autoware', '--graph', graph, '--seconds', 0.5, '--utilisation', 0.02,
         '--executors', 'rad,multi,none')
@@ -69,7 +69,7 @@ def test_live_with_declared_nodes(graph: Path) -> None:
         assert each['runs'][0]['attribution'] == {'wrong': 0, 'none': 0}
 
 
-def test_core(graph: Path) -> None:
+def test_core(graph):
     row, = result_of('core', '--graph', graph, '--duration', '1s', '--policies', 'rad',
                      '--repeat', 1)['core']
     # 20 jobs of three vertices, each with a start and an end; 20 releases; nothing preempts.
@@ -78,7 +78,7 @@ def test_core(graph: Path) -> None:
     assert row['live_us_per_vertex_job'] > 0
 
 
-def test_replay(graph: Path) -> None:
+def test_replay(graph):
     result = result_of('replay', '--graph', graph, '--events', 2000, '--repeat', 1, '--others', 9)
     readers = result['readers']
     assert readers['read and linked']['events'] == result['events'] >= 2000
@@ -89,7 +89,7 @@ def test_replay(graph: Path) -> None:
     assert run['sinks'][0]['jobs'] > 0
 
 
-def test_evaluate(graph: Path) -> None:
+def test_evaluate(graph):
     result = result_of('evaluate', '--graph', graph, '--runs', 50, '--policies', 'rad,wc',
                        '--jobs', 1, '--vertices', 10, '--repeat', 1)
     for run in result['runs']:
@@ -97,7 +97,7 @@ def test_evaluate(graph: Path) -> None:
     assert all(row['ns'] > 0 for row in result['vertex_jobs'])
 
 
-def test_a_wrong_command_line_is_one_line() -> None:
+def test_a_wrong_command_line_is_one_line():
     done = call('live', '--load', 'topics', '--executors', 'rad-events')
     assert done.returncode == 2
     assert done.stderr == (

@@ -4,20 +4,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     """Give a new folder, which is the working directory."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 @pytest.fixture
-def graph(folder: Path, request: pytest.FixtureRequest) -> Path:
+def graph(folder, request):
     """Give the declaration `GRAPH` of the test's module, graph.yaml in the working directory."""
     path = folder / 'graph.yaml'
     path.write_text(request.module.GRAPH)

@@ -5,13 +5,10 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 from mddag_executor.cli import main as program
 import numpy as np
 import pytest
-
-from ..conftest import Call
 
 GRAPH = """\
 mddag: 1
@@ -27,7 +24,7 @@ TIMES = {'one': {'/n:t': 1, '/n:x': 1}, '/m': {'/m:t': 1}}
 
 
 @pytest.fixture(scope='module')
-def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def files(tmp_path_factory):
     """Give a folder with good and bad files."""
     folder = tmp_path_factory.mktemp('files')
     for name, text in {
@@ -165,9 +162,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('run g.yaml --synthetic sleep --diagnostics 1ms', 'diagnostics_period: 1000000 ns is too s'),
     ('run g.yaml --synthetic sleep --processes 0', '--processes 0: give 1 or more, or a file'),
 ])
-def test_bad_input(
-    files: Path, call: Call, monkeypatch: pytest.MonkeyPatch, command: str, line: str
-) -> None:
+def test_bad_input(files, call, monkeypatch, command, line):
     monkeypatch.chdir(files)
     before = sorted(files.rglob('*'))
     status, out, err = call(*command.split())

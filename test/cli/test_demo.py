@@ -4,17 +4,12 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
-from ..conftest import Call
-
 
 @pytest.mark.slow
-def test_the_main_job_end_to_end(
-    tmp_path: Path, mddag: Call
-) -> None:
+def test_the_main_job_end_to_end(tmp_path, mddag):
     process = mddag('demo', '--duration', '3s', '--utilisation', '0.3', '--output', tmp_path,
                     '--json', tmp_path / 'all.json', timeout=150.0)
     assert process.returncode == 0, process.stderr
@@ -40,9 +35,7 @@ def test_the_main_job_end_to_end(
         assert text in process.stdout
 
 
-def test_a_step_that_fails_is_one_line(
-    tmp_path: Path, mddag: Call
-) -> None:
+def test_a_step_that_fails_is_one_line(tmp_path, mddag):
     (tmp_path / 'demo.mcap').mkdir()  # the trace cannot be written
     process = mddag('demo', '--duration', '1s', '--output', tmp_path)
     assert process.returncode == 2

@@ -16,8 +16,6 @@ from msg_graph import load
 from msg_graph.model import load_of
 import pytest
 
-from ..conftest import Call
-
 GRAPH = """\
 mddag: 1
 workers: 1
@@ -35,7 +33,7 @@ nodes:
 
 @pytest.mark.parametrize(('ending', 'start'), [
     ('png', b'\x89PNG'), ('svg', b'<?xml'), ('pdf', b'%PDF')])
-def test_figure(graph: Path, tmp_path: Path, call: Call, ending: str, start: bytes) -> None:
+def test_figure(graph, tmp_path, call, ending, start):
     """It is a picture of that kind, and the same for the same runs."""
     pictures = []
     for name in ('one', 'two'):
@@ -81,7 +79,7 @@ def interrupted_after(folder: Path, seconds: float, *arguments: str) -> tuple[st
     return out, err
 
 
-def test_interrupted(graph: Path, tmp_path: Path) -> None:
+def test_interrupted(graph, tmp_path):
     """Ctrl-C: the exit status is 130, and what is done is written as a whole."""
     out, err = interrupted_after(
         tmp_path, 2, str(graph), '--runs', '5000000', '--jobs', '1', '--json',
@@ -93,7 +91,7 @@ def test_interrupted(graph: Path, tmp_path: Path) -> None:
     assert f"{result['runs']} runs in" in out
 
 
-def test_several_graphs(graph: Path, tmp_path: Path, call: Call) -> None:
+def test_several_graphs(graph, tmp_path, call):
     """A folder's declarations come by name; the bins begin at 0.05; each is counted."""
     (tmp_path / 'sets').mkdir()
     (tmp_path / 'sets' / 'b.yaml').write_text(GRAPH.replace('14000', '2000').replace(
@@ -120,7 +118,7 @@ def test_several_graphs(graph: Path, tmp_path: Path, call: Call) -> None:
 pytestmark = pytest.mark.usefixtures('folder')
 
 
-def test_folder(folder: Path, call: Call) -> None:
+def test_folder(folder, call):
     (folder / 'again').mkdir()  # an empty one is taken
     for name in ('sets', 'again'):
         assert call('generate', '--sets', 5, '--utilisation', '0.2:0.6', '--workers', 3,

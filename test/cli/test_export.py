@@ -13,8 +13,6 @@ from mddag_executor.recording.tables import TABLES
 from mddag_executor.replay import open_recording
 import pytest
 
-from ..conftest import Call
-
 DEMO = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
 GRAPH = """\
 mddag: 1
@@ -27,20 +25,20 @@ nodes:
 
 
 @pytest.fixture
-def graph(tmp_path: Path) -> Path:
+def graph(tmp_path):
     path = tmp_path / 'graph.yaml'
     path.write_text(GRAPH % '4ms')
     return path
 
 
 @pytest.fixture
-def trace(graph: Path, tmp_path: Path, call: Call) -> Path:
+def trace(graph, tmp_path, call):
     path = tmp_path / 'run.mcap'
     call('simulate', graph, '--duration', '100ms', '--workers', 1, '--trace', path)
     return path
 
 
-def test_a_report_of_each_kind(graph: Path, trace: Path, tmp_path: Path, call: Call) -> None:
+def test_a_report_of_each_kind(graph, trace, tmp_path, call):
     pytest.importorskip('bokeh', reason='Bokeh is not installed')
     for name, arguments in (
             ('Replay as recorded', ['replay', trace]),
@@ -54,7 +52,7 @@ def test_a_report_of_each_kind(graph: Path, trace: Path, tmp_path: Path, call: C
         assert not list(tmp_path.glob('.*.part'))
 
 
-def test_diff(graph: Path, trace: Path, tmp_path: Path, call: Call) -> None:
+def test_diff(graph, trace, tmp_path, call):
     quick = tmp_path / 'quick.yaml'
     quick.write_text(GRAPH % '1ms')
     after = tmp_path / 'after.mcap'
@@ -78,7 +76,7 @@ def test_diff(graph: Path, trace: Path, tmp_path: Path, call: Call) -> None:
         == 0
 
 
-def test_the_tables_of_a_recording(trace: Path, tmp_path: Path, call: Call) -> None:
+def test_the_tables_of_a_recording(trace, tmp_path, call):
     parquet = pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
     out = tmp_path / 'tables'
     assert call('export', DEMO, '-o', f'{out}/') == (0, f'exported: {out}/\n', '')
@@ -97,7 +95,7 @@ def test_the_tables_of_a_recording(trace: Path, tmp_path: Path, call: Call) -> N
     assert {row['callback'] for row in executions.to_pylist() if row['vertex']} <= keys
 
 
-def test_a_folder_replaces_an_earlier_export_only(tmp_path: Path, call: Call) -> None:
+def test_a_folder_replaces_an_earlier_export_only(tmp_path, call):
     pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
     out, part = tmp_path / 'tables', tmp_path / '.tables.part'
     done = 0, f'exported: {out}/\n', ''
@@ -123,9 +121,7 @@ def test_a_folder_replaces_an_earlier_export_only(tmp_path: Path, call: Call) ->
 
 @pytest.mark.parametrize('command', [
     'export g.mcap -o out.parquet', 'export run.mcap other.yaml -o out.parquet --rows jobs'])
-def test_a_parquet_export_that_fails_is_one_line(
-    trace: Path, tmp_path: Path, command: str
-) -> None:
+def test_a_parquet_export_that_fails_is_one_line(trace, tmp_path, command):
     """In a process of its own: pyarrow complains when its writer is collected."""
     pytest.importorskip('pyarrow', reason='pyarrow is not installed')
     (tmp_path / 'g.mcap').write_text('no recording')

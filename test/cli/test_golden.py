@@ -9,13 +9,11 @@ you commit it.
 
 from __future__ import annotations
 
-from pathlib import Path
 import re
 import shutil
 
 import pytest
 
-from ..conftest import Call
 from ..replay.recorded import four_jobs
 from ..report import runs
 from ..report.test_pictures import GRAPH
@@ -69,7 +67,7 @@ paths:
 
 
 @pytest.fixture
-def files(folder: Path) -> Path:
+def files(folder):
     """Give a working directory with declarations and recordings."""
     for file in golden.FOLDER.glob('*.yaml'):
         shutil.copy(file, folder)
@@ -87,7 +85,7 @@ def files(folder: Path) -> Path:
 @pytest.mark.parametrize('name', [
     pytest.param(name, marks=[pytest.mark.needs('babeltrace2')] * (name == 'import_ctf'))
     for name in COMMANDS])
-def test_output(name: str, files: Path, call: Call) -> None:
+def test_output(name, files, call):
     if '.html' in COMMANDS[name]:
         pytest.importorskip('bokeh', reason='Bokeh is not installed')
     session(files / 'session', [('ros2:callback_end', [('callback', 'u64')]),
@@ -104,7 +102,7 @@ def test_output(name: str, files: Path, call: Call) -> None:
     golden.compare(name, found)
 
 
-def test_quiet(files: Path, call: Call) -> None:
+def test_quiet(files, call):
     """With -q nothing is printed that was not asked for."""
     for words in (['graph', 'check', 'graph.yaml'], ['replay', 'run.mcap'],
                   ['simulate', 'graph.yaml', '--trace', 'new.mcap']):

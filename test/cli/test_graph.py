@@ -13,8 +13,6 @@ import msg_graph
 from msg_graph.language import schema
 import pytest
 
-from ..conftest import Call
-
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 GRAPH = """\
 mddag: 1  # the robot
@@ -28,7 +26,7 @@ nodes:
 """
 
 
-def test_standard_input_and_output(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_standard_input_and_output(call, monkeypatch):
     monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)
     text = msg_graph.load(CONFIG / 'autoware_multi.yaml').text
     done = call('graph', 'check', '-', '--json', '-', stdin=text)
@@ -47,7 +45,7 @@ def test_standard_input_and_output(call: Call, monkeypatch: pytest.MonkeyPatch) 
         assert done.stdout.endswith(f', load 0.700, utilisation {shown}\n')
 
 
-def test_utilisation_is_one_thing_in_all_commands(call: Call, tmp_path: Path) -> None:
+def test_utilisation_is_one_thing_in_all_commands(call, tmp_path):
     (tmp_path / 'g.yaml').write_text(
         'mddag: 1\nworkers: 2\nnodes:\n  - node: /n\n    callbacks:\n'
         '      - {name: t, timer: 10ms, deadline: 10ms, execution_time: 4ms}\n')
@@ -69,10 +67,7 @@ def test_utilisation_is_one_thing_in_all_commands(call: Call, tmp_path: Path) ->
      'g.yaml: a load of 250.000 is more than the 2 CPUs of this machine can do, unless callbacks'),
     ('deadline: 20ms, execution_time: 19ms', 1, None),
     ('deadline: 10ms', 1, None)])
-def test_what_cannot_hold_is_warned_of(
-    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, workers: int,
-    says: str | None,
-) -> None:
+def test_what_cannot_hold_is_warned_of(call, tmp_path, monkeypatch, text, workers, says):
     monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 2)
     (tmp_path / 'g.yaml').write_text(
         f'mddag: 1\nworkers: {workers}\nnodes:\n'
@@ -86,7 +81,7 @@ def test_what_cannot_hold_is_warned_of(
     assert 'dags' in json.loads(done.stdout)
 
 
-def test_rules_of_the_user(graph: Path, call: Call) -> None:
+def test_rules_of_the_user(graph, call):
     place = ['graph', 'place', 'graph.yaml', '--processes', '2', '-o', 'placed.yaml']
     assert call(*place, '--together', '/a, /b').returncode == 0
     assert msg_graph.load('placed.yaml').process_of('/a') == msg_graph.load(
@@ -95,7 +90,7 @@ def test_rules_of_the_user(graph: Path, call: Call) -> None:
     assert [p.nodes for p in msg_graph.load('placed.yaml').processes] == [('/a', '/b'), ('/c',)]
 
 
-def test_times_of_a_recorded_run(graph: Path, call: Call) -> None:
+def test_times_of_a_recorded_run(graph, call):
     Path('times.json').write_text(json.dumps(
         {f'/{n}': {f'/{n}:t': us} for n, us in (('a', 45_000), ('b', 5_000), ('c', 40_000))}))
     recorded = call('simulate', 'graph.yaml', '--execution-times', 'times.json', '--trace',
@@ -118,7 +113,7 @@ nodes:
 """
 
 
-def test_ci_learns_of_deadlines_that_cannot_hold(call: Call) -> None:
+def test_ci_learns_of_deadlines_that_cannot_hold(call):
     for budget, status in (('mean', 0), ('max', 1)):
         done = call('graph', 'analyse', '-', '--budget', budget, '--fail-on-unschedulable',
                     stdin=GRAPH_ANALYSE)
@@ -129,7 +124,7 @@ def test_ci_learns_of_deadlines_that_cannot_hold(call: Call) -> None:
 @pytest.mark.needs('graphviz')
 @pytest.mark.parametrize(('ending', 'begin'), [
     ('svg', b'<?xml'), ('png', b'\x89PNG'), ('pdf', b'%PDF')])
-def test_graphviz(call: Call, tmp_path: Path, ending: str, begin: bytes) -> None:
+def test_graphviz(call, tmp_path, ending, begin):
     text = (CONFIG / 'autoware.yaml').read_text()
     done = call('graph', 'draw', '-', '-o', f'o.{ending}', cwd=tmp_path, stdin=text)
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
@@ -137,7 +132,7 @@ def test_graphviz(call: Call, tmp_path: Path, ending: str, begin: bytes) -> None
 
 
 @pytest.mark.needs('graphviz')
-def test_a_large_graph(call: Call, tmp_path: Path) -> None:
+def test_a_large_graph(call, tmp_path):
     lines = ['mddag: 1', 'nodes:']
     for dag in range(60):
         lines += [f'  - node: /n{dag}', '    callbacks:',
@@ -150,7 +145,7 @@ def test_a_large_graph(call: Call, tmp_path: Path) -> None:
     assert text.count('class="edge"') == 60 * 20
 
 
-def test_without_graphviz(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_graphviz(call, tmp_path, monkeypatch):
     monkeypatch.setenv('PATH', str(Path(sys.executable).parent))
     if shutil.which('dot') is not None:
         pytest.skip('Graphviz is in the folder of Python')
@@ -161,7 +156,7 @@ def test_without_graphviz(call: Call, tmp_path: Path, monkeypatch: pytest.Monkey
         "'sudo apt install graphviz', or name an OUT.dot or OUT.mmd\n")
 
 
-def test_graphviz_that_fails(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_graphviz_that_fails(call, tmp_path, monkeypatch):
     program = tmp_path / 'dot'
     program.write_text('#!/bin/sh\ncat >/dev/null\necho no fonts >&2\nexit 3\n')
     program.chmod(0o755)
@@ -180,7 +175,7 @@ nodes:
 """
 
 
-def test_from_caret(call: Call, tmp_path: Path) -> None:
+def test_from_caret(call, tmp_path):
     (tmp_path / 'arch.yaml').write_text(TEXT)
     done = call('graph', 'from-caret', 'arch.yaml', '-o', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
@@ -193,7 +188,7 @@ def test_from_caret(call: Call, tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, '')
 
 
-def test_schema(call: Call, tmp_path: Path) -> None:
+def test_schema(call, tmp_path):
     assert call('graph', 'schema').result == schema()
     done = call('graph', 'schema', '-o', 's.json', cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, '')
@@ -201,7 +196,7 @@ def test_schema(call: Call, tmp_path: Path) -> None:
 
 
 @pytest.mark.needs('graphviz')
-def test_a_dense_picture_is_refused_at_once(call: Call, tmp_path: Path) -> None:
+def test_a_dense_picture_is_refused_at_once(call, tmp_path):
     made = call('generate', '--dags', '1', '--vertices', '60', '--edge-probability', '1',
                 '--utilisation', '0.2', '-o', 'g.yaml', cwd=tmp_path)
     assert made.returncode == 0

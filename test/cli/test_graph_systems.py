@@ -14,7 +14,6 @@ from mddag_executor.report.tables import MOST_LINES
 import msg_graph
 import pytest
 
-from ..conftest import Call
 from ..replay.recorded import MS, Recorded
 
 BAG = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
@@ -70,7 +69,7 @@ print(node.asked)
 """
 
 
-def test_from_trace(call: Call, tmp_path: Path) -> None:
+def test_from_trace(call, tmp_path):
     done = call('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, 'no blanks to fill in\n', '')
     task_set = msg_graph.load(tmp_path / 'g.yaml')
@@ -80,7 +79,7 @@ def test_from_trace(call: Call, tmp_path: Path) -> None:
     assert done.stdout.splitlines()[1:] == (tmp_path / 'g.yaml').read_text().splitlines()[1:]
 
 
-def test_from_trace_keeps_what_was_declared(call: Call, mddag: Call, tmp_path: Path) -> None:
+def test_from_trace_keeps_what_was_declared(call, mddag, tmp_path):
     pytest.importorskip('rclpy')
     (tmp_path / 'g.yaml').write_text(
         'mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n      - {name: t, timer: 10ms, '
@@ -113,7 +112,7 @@ def composed(path: Path) -> Path:
     return r.write()
 
 
-def test_messages_within_a_process_count(call: Call, tmp_path: Path) -> None:
+def test_messages_within_a_process_count(call, tmp_path):
     """From the recording alone, and with an architecture file."""
     composed(tmp_path / 'c.mcap')
     done = call('graph', 'from-trace', 'c.mcap', '--accept', '-o', 'g.yaml', cwd=tmp_path)
@@ -142,7 +141,7 @@ nodes:
     assert done.stdout.count('# measured in 5 executions') == 2
 
 
-def test_from_trace_accepts_the_proposals(call: Call, tmp_path: Path) -> None:
+def test_from_trace_accepts_the_proposals(call, tmp_path):
     """Two sources in a node, and what has no rate; the declaration then judges the recording."""
     r = Recorded(tmp_path / 'r.mcap')
     r.node(1, '/n')
@@ -189,9 +188,7 @@ def test_from_trace_accepts_the_proposals(call: Call, tmp_path: Path) -> None:
         '/n/callback_0': [(10, 1)], '/n/callback_2': [(5, 0)], '/n/callback_5': [(5, 0)]}
 
 
-def test_a_coroutine_is_one_execution_however_often_it_is_resumed(
-    call: Call, tmp_path: Path
-) -> None:
+def test_a_coroutine_is_one_execution_however_often_it_is_resumed(call, tmp_path):
     pytest.importorskip('rclpy')
     (tmp_path / 'ask.py').write_text(ASKING)
     done = subprocess.run(
@@ -207,7 +204,7 @@ def test_a_coroutine_is_one_execution_however_often_it_is_resumed(
     assert counts == {'ask': str(asked + 1), 'inner': str(2 * asked), 'outer': str(asked)}
 
 
-def test_from_ros_where_nothing_runs(mddag: Call, tmp_path: Path) -> None:
+def test_from_ros_where_nothing_runs(mddag, tmp_path):
     pytest.importorskip('rclpy')
     done = mddag('graph', 'from-ros', '--timeout', '0.3', '-o', 'g.yaml', cwd=tmp_path)
     assert done.returncode == 2
@@ -217,7 +214,7 @@ def test_from_ros_where_nothing_runs(mddag: Call, tmp_path: Path) -> None:
     assert (done.returncode, done.stderr.count('\n')) == (2, 1)
 
 
-def test_replay_tells_of_drift(call: Call, tmp_path: Path) -> None:
+def test_replay_tells_of_drift(call, tmp_path):
     assert call('replay', BAG, '--json', '-').result['drift'] == []
     assert 'difference' not in call('replay', BAG).stdout
     call('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
@@ -231,7 +228,7 @@ def test_replay_tells_of_drift(call: Call, tmp_path: Path) -> None:
         f'{len(found)} difference')
 
 
-def test_includes(call: Call, tmp_path: Path) -> None:
+def test_includes(call, tmp_path):
     (tmp_path / 'part.yaml').write_text(
         'mddag: 1\narguments:\n  d:\nnodes:\n  - {node: /n, callbacks: '
         '[{name: t, timer: 10ms, deadline: $(d)}]}\n')

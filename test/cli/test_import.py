@@ -10,7 +10,6 @@ import sys
 from mddag_executor.trace import ctf, read_events
 import pytest
 
-from ..conftest import Call
 from ..trace.ctf_session import session
 
 HELPER = """\
@@ -23,7 +22,7 @@ for row in rows:
 
 
 @pytest.fixture
-def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def recording(tmp_path, monkeypatch):
     """Give a folder that looks like a session, read by a stand-in for babeltrace2."""
     folder = tmp_path / 'session'
     folder.mkdir()
@@ -35,7 +34,7 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_what_was_there_stays_when_the_import_fails(recording: Path, call: Call) -> None:
+def test_what_was_there_stays_when_the_import_fails(recording, call):
     out = recording.with_name('out.mcap')
     out.write_text('precious')
     recording.with_name('helper.py').write_text(HELPER.format(last='nothing'))
@@ -52,7 +51,7 @@ def test_what_was_there_stays_when_the_import_fails(recording: Path, call: Call)
     ('missing', 'there is no such folder'), ('file', 'is no folder'),
     ('empty', 'holds no CTF recording'), ('cache', 'holds only what CARET converted'),
 ])
-def test_bad_sessions(name: str, what: str, tmp_path: Path, call: Call) -> None:
+def test_bad_sessions(name, what, tmp_path, call):
     (tmp_path / 'file').touch()
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'cache').mkdir()
@@ -74,7 +73,7 @@ def of_session(
 
 
 @pytest.mark.needs('babeltrace2')
-def test_several_sessions_are_named_one_by_one(tmp_path: Path, call: Call) -> None:
+def test_several_sessions_are_named_one_by_one(tmp_path, call):
     """Parts of one session are one recording, wherever they lie; two sessions need to be named."""
     out = tmp_path / 'out.mcap'
     of_session(tmp_path / 'one' / 'ust/uid/1000/64-bit', 'drive', 'monday', callback=1)
@@ -103,9 +102,7 @@ def test_several_sessions_are_named_one_by_one(tmp_path: Path, call: Call) -> No
 
 
 @pytest.mark.needs('babeltrace2')
-def test_processes_of_several_containers_may_have_the_same_numbers(
-    tmp_path: Path, call: Call
-) -> None:
+def test_processes_of_several_containers_may_have_the_same_numbers(tmp_path, call):
     # in both containers process 1 runs a callback of the same address, at overlapping times
     kinds = [(f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')]
     for name, made, late in (('camera', '12:00:01', 0), ('control', '12:00:02', 3)):
@@ -123,9 +120,7 @@ def test_processes_of_several_containers_may_have_the_same_numbers(
 
 @pytest.mark.parametrize('version, reads', [
     ('2.0.4', False), ('2.0.6-rc1', False), ('2.1.0', True), ('2.10', True), ('3.0', True)])
-def test_ctf_2_needs_babeltrace_2_1(
-    version: str, reads: bool, recording: Path, call: Call
-) -> None:
+def test_ctf_2_needs_babeltrace_2_1(version, reads, recording, call):
     out, metadata = recording.with_name('out.mcap'), recording / 'metadata'
     metadata.write_text('\x1e{"type": "preamble", "version": 2}\n\x1e{"type": "trace-class", '
                         '"environment": {"hostname": "robot", "trace_name": "drive"}}\n')

@@ -27,14 +27,12 @@ from mddag_executor.simulate.run import check
 from msg_graph import errors, GraphError, loads
 import pytest
 
-from ..conftest import Call
-
 
 @pytest.fixture
-def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[argparse.Namespace], int]], None]:
+def verb(monkeypatch):
     """Give a function that makes `mddag probe [--number N] [FILE …]` do what a callable does."""
-    def install(action: Callable[[argparse.Namespace], int]) -> None:
-        def add_arguments(parser: argparse.ArgumentParser) -> None:
+    def install(action):
+        def add_arguments(parser):
             parser.add_argument('files', nargs='*')
             parser.add_argument('--number', type=int)
 
@@ -47,13 +45,13 @@ def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[argparse.Namesp
 
 
 def fail_with(error: BaseException) -> Callable[[argparse.Namespace], int]:
-    def action(_: argparse.Namespace) -> int:
+    def action(_):
         raise error
     return action
 
 
 @pytest.mark.parametrize('status', [0, 1])
-def test_the_status_is_that_of_the_verb(verb, status: int) -> None:
+def test_the_status_is_that_of_the_verb(verb, status):
     verb(lambda args: status)
     assert program.main(['probe']) == status
 
@@ -77,8 +75,7 @@ def test_the_status_is_that_of_the_verb(verb, status: int) -> None:
      'error: rclpy: ROS 2 is not there: source the setup file of your ROS 2, '
      "or install 'mddag_executor[ros]' with pip"),
 ])
-def test_bad_input_is_one_line(verb, capsys: pytest.CaptureFixture[str],
-                               error: BaseException, line: str) -> None:
+def test_bad_input_is_one_line(verb, capsys, error, line):
     verb(fail_with(error))
     assert program.main(['probe']) == 2
     assert capsys.readouterr() == ('', line + '\n')
@@ -87,15 +84,14 @@ def test_bad_input_is_one_line(verb, capsys: pytest.CaptureFixture[str],
 @pytest.mark.parametrize('error', [
     ZeroDivisionError('a defect'), OSError('a defect'),
     ModuleNotFoundError('a defect', name='somebodys_module')])
-def test_a_defect_keeps_its_traceback(verb, capsys: pytest.CaptureFixture[str],
-                                      error: BaseException) -> None:
+def test_a_defect_keeps_its_traceback(verb, capsys, error):
     verb(fail_with(error))
     assert program.main(['probe']) == 70
     err = capsys.readouterr().err
     assert 'Traceback' in err and 'in action' in err and 'a defect' in err
 
 
-def test_an_interrupt_is_quiet(verb, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_interrupt_is_quiet(verb, capsys):
     verb(fail_with(KeyboardInterrupt()))
     assert program.main(['probe']) == 130
     assert capsys.readouterr() == ('', '')
@@ -109,8 +105,7 @@ def test_an_interrupt_is_quiet(verb, capsys: pytest.CaptureFixture[str]) -> None
     (['probe', '--\x1b[2J\n'], "there is no option '--\\x1b[2J"),
     (['--nonsense'], '--nonsense: options of a verb follow it'),
 ])
-def test_wrong_usage_is_one_line(verb, capsys: pytest.CaptureFixture[str],
-                                 argv: list[str], says: str) -> None:
+def test_wrong_usage_is_one_line(verb, capsys, argv, says):
     verb(lambda args: 0)
     assert program.main(argv) == 2
     out, err = capsys.readouterr()
@@ -134,8 +129,7 @@ def test_wrong_usage_is_one_line(verb, capsys: pytest.CaptureFixture[str],
     (['graph'], 'mddag graph: a verb is missing'),
     (['replay', '-z', 'run.mcap'], "mddag replay: there is no option '-z'"),
 ])
-def test_the_wrong_word_is_blamed_and_the_right_one_suggested(
-        capsys: pytest.CaptureFixture[str], argv: list[str], says: str) -> None:
+def test_the_wrong_word_is_blamed_and_the_right_one_suggested(capsys, argv, says):
     assert program.main(argv) == 2
     out, err = capsys.readouterr()
     assert out == '' and err.count('\n') == 1 and err.startswith('error: mddag')
@@ -145,7 +139,7 @@ def test_the_wrong_word_is_blamed_and_the_right_one_suggested(
 @pytest.mark.parametrize('words', [
     'a b --number 3 c', '--number 3 a b c', 'a --number=3 b c', 'a b c --number 3',
     '--number 3 -- a b c'])
-def test_options_and_files_come_in_any_order(verb, words: str) -> None:
+def test_options_and_files_come_in_any_order(verb, words):
     found: list[argparse.Namespace] = []
     verb(lambda args: found.append(args) or 0)
     assert program.main(['probe', *words.split()]) == 0
@@ -155,9 +149,7 @@ def test_options_and_files_come_in_any_order(verb, words: str) -> None:
 @pytest.mark.parametrize(('verb', 'options'), [
     ('replay', ['--reschedule']), ('replay', ['--json', 'o.json']), ('explain', ['--skip', '1ms']),
     ('slack', ['--workers', '2']), ('export', ['-o', 'o.csv']), ('diff', ['--callbacks'])])
-def test_a_declaration_may_follow_an_option(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
-        verb: str, options: list[str]) -> None:
+def test_a_declaration_may_follow_an_option(tmp_path, capsys, monkeypatch, verb, options):
     monkeypatch.chdir(tmp_path)
     traces = ['a.mcap', 'b.mcap'] if verb == 'diff' else ['a.mcap']
     assert program.main([verb, *traces, *options, 'gone.yaml']) == 2
@@ -165,7 +157,7 @@ def test_a_declaration_may_follow_an_option(
 
 
 @pytest.mark.parametrize('verb', sorted(program.VERBS))
-def test_the_help_of_each_verb(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_of_each_verb(verb, capsys):
     with pytest.raises(SystemExit) as stop:
         program.main([*verb.split(), '--help'])
     assert stop.value.code == 0
@@ -174,8 +166,7 @@ def test_the_help_of_each_verb(verb: str, capsys: pytest.CaptureFixture[str]) ->
 
 @pytest.mark.parametrize(('words', 'verbs'), [
     ((), set(program.VERBS)), (('graph',), {v for v in program.VERBS if v.startswith('graph')})])
-def test_the_list_of_verbs(
-        words: tuple[str, ...], verbs: set[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_of_verbs(words, verbs, capsys):
     with pytest.raises(SystemExit) as stop:
         program.main([*words, '--help'])
     assert stop.value.code == 0
@@ -183,11 +174,11 @@ def test_the_list_of_verbs(
     assert set(found) == verbs
 
 
-def test_completion(tmp_path: Path) -> None:
+def test_completion(tmp_path):
     """As a shell asks for it; see register-python-argcomplete."""
     pytest.importorskip('argcomplete')
 
-    def completed(line: str) -> set[str]:
+    def completed(line):
         out = tmp_path / 'out'
         out.touch()
         subprocess.run(
@@ -202,7 +193,7 @@ def test_completion(tmp_path: Path) -> None:
     assert completed('mddag graph place g.yaml --pro') == {'--processes'}
 
 
-def test_module_and_program_are_the_same(mddag: Call) -> None:
+def test_module_and_program_are_the_same(mddag):
     result = mddag('--version')
     assert (result.returncode, result.stdout) == (0, f'mddag {__version__}\n')
     script = Path(sys.executable).with_name('mddag')
@@ -212,7 +203,7 @@ def test_module_and_program_are_the_same(mddag: Call) -> None:
 
 
 @pytest.mark.parametrize('length', [1, 100_000])  # less and more than a buffer
-def test_a_reader_that_goes_away_is_no_error(length: int) -> None:
+def test_a_reader_that_goes_away_is_no_error(length):
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, 'w') as gone:
@@ -232,7 +223,7 @@ def test_a_reader_that_goes_away_is_no_error(length: int) -> None:
 
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='this system has no /dev/full')
 @pytest.mark.parametrize('how', ['--json /dev/full', '> /dev/full'])
-def test_a_full_disk_is_one_line(how: str) -> None:
+def test_a_full_disk_is_one_line(how):
     graph = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
     done = subprocess.run(
         f'{sys.executable} -m mddag_executor graph check {graph} {how}', shell=True, text=True,
@@ -247,14 +238,14 @@ def test_a_full_disk_is_one_line(how: str) -> None:
 ONE = 'nodes: [{node: /n, callbacks: [{name: t, timer: 1s, deadline: 1s, execution_time: 1us}]}]\n'
 
 
-def test_the_number_of_workers() -> None:
+def test_the_number_of_workers():
     text = 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, timer: 1s, deadline: 1s}]}]\n'
     assert defaults.workers(None, loads(text)) == 7
     assert defaults.workers(None, loads(text + 'workers: 3\n')) == 3
     assert defaults.workers(2, loads(text + 'workers: 3\n')) == 2
 
 
-def test_the_limit_of_workers_is_the_same_everywhere(tmp_path: Path) -> None:
+def test_the_limit_of_workers_is_the_same_everywhere(tmp_path):
     from mddag_executor.executor.settings import resolve
     graph = tmp_path / 'g.yaml'
     simulate = ['simulate', str(graph), '--duration', '1us', '--workers']
@@ -289,12 +280,12 @@ def test_the_limit_of_workers_is_the_same_everywhere(tmp_path: Path) -> None:
     (123_456_789_012_345, '123457 s'),
     (-1_500_000, '-1.5 ms'),
 ])
-def test_times(ns: int, text: str) -> None:
+def test_times(ns, text):
     assert format_ns(ns) == text
 
 
 @given(strategies.integers(-10**15, 10**15))
-def test_times_are_right_to_four_digits(ns: int) -> None:
+def test_times_are_right_to_four_digits(ns):
     number, unit = format_ns(ns).split()
     value = float(number) * {'ns': 1, 'us': 1e3, 'ms': 1e6, 's': 1e9}[unit]
     assert value == pytest.approx(ns, rel=5.01e-4)
@@ -302,7 +293,7 @@ def test_times_are_right_to_four_digits(ns: int) -> None:
 
 
 @given(strategies.text())
-def test_no_control_character_reaches_the_terminal(text: str) -> None:
+def test_no_control_character_reaches_the_terminal(text):
     for line in (printable(text), one_line(text)):
         assert line.isprintable()
     if text.isprintable():
@@ -324,7 +315,7 @@ class Clock:
         return self.now
 
 
-def test_progress_waits_two_seconds() -> None:
+def test_progress_waits_two_seconds():
     stream, clock = Terminal(), Clock()
     with Progress('simulating', 10, stream=stream, clock=clock) as progress:
         clock.now += 1.9
@@ -341,7 +332,7 @@ def test_progress_waits_two_seconds() -> None:
     assert stream.getvalue().endswith('\r'), 'the line is wiped'
 
 
-def test_both_packages_make_names_harmless_alike() -> None:
+def test_both_packages_make_names_harmless_alike():
     every = ''.join(map(chr, range(0x11000))) + '\U000e0001\U0010ffff'
     assert printable(every) == errors.printable(every)
     assert printable(every).isprintable()
@@ -355,7 +346,7 @@ nodes:
 
 
 @pytest.fixture
-def ros2(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+def ros2(monkeypatch):
     """Give what ros2cli does with a command line, in short: parse it, call the command's main."""
     if find_spec('ros2cli') is None:
         command_module = ModuleType('ros2cli.command')
@@ -368,19 +359,16 @@ def ros2(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     assert entry.name == 'mddag'
     extension = entry.load()()
 
-    def main(*arguments: str) -> int:
+    def main(*arguments):
         parser = argparse.ArgumentParser('ros2')
         commands = parser.add_subparsers(dest='command')
         extension.add_arguments(commands.add_parser(entry.name), 'ros2 mddag')
         args = parser.parse_args(['mddag', *arguments])
-        status: int = extension.main(parser=parser, args=args)
-        return status
+        return extension.main(parser=parser, args=args)
     return SimpleNamespace(main=main, summary=extension.__doc__)
 
 
-def test_it_is_the_same_program(
-    ros2: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_is_the_same_program(ros2, tmp_path, capsys):
     graph = tmp_path / 'graph.yaml'
     graph.write_text(GRAPH)
     assert ros2.main('graph', 'check', str(graph)) == 0
@@ -392,9 +380,7 @@ def test_it_is_the_same_program(
     assert capsys.readouterr().err.startswith('error: mddag: ')
 
 
-def test_completion_is_that_of_mddag(
-    ros2: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_completion_is_that_of_mddag(ros2, monkeypatch):
     asked = []
     monkeypatch.setattr('mddag_executor.cli.completion.complete', lambda: asked.append(
         (os.environ['COMP_LINE'], os.environ['COMP_POINT'])))

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import json
 import os
 from pathlib import Path
@@ -17,8 +16,6 @@ from mddag_executor.errors import InputError
 from mddag_executor.trace import TraceError, TraceFile, TraceWriter
 import pytest
 
-from ..conftest import Call
-
 GRAPH = """\
 mddag: 1
 nodes:
@@ -30,7 +27,7 @@ nodes:
 
 
 @pytest.fixture
-def run(graph: Path, call: Call) -> Path:
+def run(graph, call):
     """Give a recorded run, run.mcap in the working directory."""
     assert call('simulate', graph, '--duration', '100ms', '--trace', 'run.mcap').returncode == 0
     return Path('run.mcap')
@@ -59,9 +56,7 @@ def run(graph: Path, call: Call) -> Path:
     'rerun run.mcap graph.yaml --node a:b -o run.mcap --overwrite',
     'rerun run.mcap graph.yaml --node a:b --expect out.mcap -o out.mcap',
 ])
-def test_an_output_is_never_an_input_or_another_output(
-    run: Path, call: Call, command: str
-) -> None:
+def test_an_output_is_never_an_input_or_another_output(run, call, command):
     Path('link.csv').symlink_to(run)
     before = {path.name: path.read_bytes() for path in Path().iterdir()}
     status, out, err = call(*command.split())
@@ -78,7 +73,7 @@ def test_an_output_is_never_an_input_or_another_output(
     'run graph.yaml --synthetic sleep --duration 100ms --trace run.mcap',
     'simulate graph.yaml --duration 50ms --trace precious.txt',
 ])
-def test_a_recording_replaces_no_file(run: Path, call: Call, command: str) -> None:
+def test_a_recording_replaces_no_file(run, call, command):
     Path('precious.txt').write_text('precious')
     before = {path.name: path.read_bytes() for path in Path().iterdir()}
     status, out, err = call(*command.split())
@@ -95,7 +90,7 @@ def test_a_recording_replaces_no_file(run: Path, call: Call, command: str) -> No
     'generate -o other.dat',
     'simulate graph.yaml --report damaged.mcap.html --json damaged.mcap',
 ])
-def test_no_other_output_replaces_a_recording(run: Path, call: Call, command: str) -> None:
+def test_no_other_output_replaces_a_recording(run, call, command):
     Path('other.dat').write_bytes(run.read_bytes())
     Path('damaged.mcap').write_bytes(b'\0' + run.read_bytes()[1:])
     before = {path.name: path.read_bytes() for path in Path().iterdir()}
@@ -105,7 +100,7 @@ def test_no_other_output_replaces_a_recording(run: Path, call: Call, command: st
     assert {path.name: path.read_bytes() for path in Path().iterdir()} == before
 
 
-def test_overwrite_replaces_a_recording(run: Path, call: Call) -> None:
+def test_overwrite_replaces_a_recording(run, call):
     before = run.read_bytes()
     command = ['simulate', 'graph.yaml', '--duration', '50ms', '--trace', run, '--overwrite']
     assert call(*command)[0] == 0
@@ -113,7 +108,7 @@ def test_overwrite_replaces_a_recording(run: Path, call: Call) -> None:
     assert call('replay', run)[0] == 0
 
 
-def test_empty_files_and_other_results_are_replaced(run: Path, call: Call) -> None:
+def test_empty_files_and_other_results_are_replaced(run, call):
     Path('new.mcap').touch()    # as mktemp leaves it
     Path('result.json').write_text('{"old": true}')
     assert call('simulate', 'graph.yaml', '--trace', 'new.mcap')[0] == 0
@@ -123,7 +118,7 @@ def test_empty_files_and_other_results_are_replaced(run: Path, call: Call) -> No
 
 
 @pytest.mark.parametrize('there', ['run.p.mcap', 'run.q.mcap'])
-def test_several_processes_replace_no_trace(folder: Path, call: Call, there: str) -> None:
+def test_several_processes_replace_no_trace(folder, call, there):
     Path('two.yaml').write_text(
         GRAPH + '  - {node: /m, callbacks: [{name: t, timer: 10ms, deadline: 9ms}]}\n'
         'processes: {p: [/n], q: [/m]}\n')
@@ -136,7 +131,7 @@ def test_several_processes_replace_no_trace(folder: Path, call: Call, there: str
 
 
 @pytest.mark.parametrize('make', [TraceFile, TraceWriter])
-def test_writers_keep_what_is_there(tmp_path: Path, make: Callable[..., object]) -> None:
+def test_writers_keep_what_is_there(tmp_path, make):
     path = tmp_path / 'run.mcap'
     path.write_text('precious')
     with pytest.raises(TraceError, match='run.mcap: there is a file already'):
@@ -144,7 +139,7 @@ def test_writers_keep_what_is_there(tmp_path: Path, make: Callable[..., object])
     assert path.read_text() == 'precious'
 
 
-def test_the_executor_keeps_what_is_there(folder: Path) -> None:
+def test_the_executor_keeps_what_is_there(folder):
     Path('run.mcap').write_text('precious')
     code = ('import rclpy\n'
             'from mddag_executor import MultiDeadlineExecutor\n'
@@ -163,7 +158,7 @@ def test_the_executor_keeps_what_is_there(folder: Path) -> None:
     assert Path('run.mcap').read_bytes().startswith(b'\x89MCAP')
 
 
-def test_rerun_in_python_keeps_what_is_there(run: Path) -> None:
+def test_rerun_in_python_keeps_what_is_there(run):
     from mddag_executor.errors import MddagError
     from mddag_executor.rerun import rerun
     Path('precious.mcap').write_text('precious')
@@ -176,14 +171,14 @@ def test_rerun_in_python_keeps_what_is_there(run: Path) -> None:
 
 
 @pytest.mark.parametrize('value', [{'a': float('nan')}, {'a': object()}])
-def test_what_json_lacks_leaves_no_file(tmp_path: Path, value: object) -> None:
+def test_what_json_lacks_leaves_no_file(tmp_path, value):
     with pytest.raises((ValueError, TypeError)):
         common.write_json(str(tmp_path / 'result.json'), value)
     assert os.listdir(tmp_path) == []
 
 
 @pytest.mark.parametrize('error', [RuntimeError, KeyboardInterrupt])
-def test_a_failed_output_leaves_what_was_there(tmp_path: Path, error: type) -> None:
+def test_a_failed_output_leaves_what_was_there(tmp_path, error):
     path = tmp_path / 'out.bin'
     path.write_bytes(b'before')
     with pytest.raises(error), common.output_file(str(path)) as file:
@@ -193,7 +188,7 @@ def test_a_failed_output_leaves_what_was_there(tmp_path: Path, error: type) -> N
     assert os.listdir(tmp_path) == ['out.bin']
 
 
-def test_an_output_keeps_links_and_permissions(tmp_path: Path) -> None:
+def test_an_output_keeps_links_and_permissions(tmp_path):
     target, link = tmp_path / 'target', tmp_path / 'link'
     target.write_text('before')
     target.chmod(0o640)
@@ -204,7 +199,7 @@ def test_an_output_keeps_links_and_permissions(tmp_path: Path) -> None:
     assert stat.S_IMODE(target.stat().st_mode) == 0o640
 
 
-def test_an_output_may_be_a_pipe(tmp_path: Path) -> None:
+def test_an_output_may_be_a_pipe(tmp_path):
     pipe = tmp_path / 'pipe'
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
@@ -218,7 +213,7 @@ def test_an_output_may_be_a_pipe(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason='root may write everywhere')
-def test_a_folder_without_write_permission(tmp_path: Path) -> None:
+def test_a_folder_without_write_permission(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(InputError, match='cannot be written to'):
         common.check_output(str(tmp_path / 'new.json'))

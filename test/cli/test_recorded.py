@@ -7,13 +7,11 @@ from __future__ import annotations
 from contextlib import redirect_stdout
 import csv
 import io
-from pathlib import Path
 from typing import Any
 
 from mddag_executor.cli import main as program
 import pytest
 
-from ..conftest import Call
 from ..replay.recorded import four_jobs, MS
 from ..replay.test_ordinary_bags import write_bag
 
@@ -29,7 +27,7 @@ OTHER = GRAPH.replace('/camera', '/radar').replace('/detect', '/track')
 
 
 @pytest.fixture(scope='module')
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def files(tmp_path_factory):
     """Give two graphs and a recording of each kind: ten jobs each, but imported four."""
     folder = tmp_path_factory.mktemp('recordings')
     found = {name: folder / name for name in ('graph.yaml', 'other.yaml', 'own.mcap', 'bag')}
@@ -52,10 +50,7 @@ def sink(result: Any) -> Any:
     (['own.mcap'], ['in_time'] * 10),
     (['imported.mcap', 'graph.yaml'], ['in_time'] * 3 + ['late'])])
 @pytest.mark.parametrize('form', ['csv', 'parquet', 'pftrace'])
-def test_export(
-    files: dict[str, str], arguments: list[str], verdicts: list[str], form: str, tmp_path: Path,
-    call: Call,
-) -> None:
+def test_export(files, arguments, verdicts, form, tmp_path, call):
     if form != 'csv':
         pytest.importorskip('perfetto' if form == 'pftrace' else 'pyarrow')
     out = tmp_path / f'out.{form}'
@@ -81,10 +76,7 @@ def test_export(
     (['own.mcap', 'imported.mcap'], (6, 5), (10, 4)),       # judged by the own one's declaration
     (['imported.mcap', 'own.mcap'], (5, 6), (4, 10)),
     (['imported.mcap', 'imported.mcap', 'graph.yaml'], (5, 5), (4, 4))])
-def test_diff(
-    files: dict[str, str], arguments: list[str], medians: tuple[int, int], due: tuple[int, int],
-    call: Call,
-) -> None:
+def test_diff(files, arguments, medians, due, call):
     words = [files.get(word, word) for word in arguments]
     done = call('diff', *words, '--json', '-')
     found = done.result
@@ -108,10 +100,7 @@ def test_diff(
     (['diff', 'bag', 'own.mcap'], 'give a GRAPH and --reschedule'),
     (['diff', 'own.mcap', 'bag', 'graph.yaml'], 'give a GRAPH and --reschedule'),
     (['diff', 'own.mcap', 'imported.mcap', 'other.yaml'], 'none of the callbacks')])
-def test_what_can_not_be(
-    files: dict[str, str], arguments: list[str], problem: str, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, call: Call,
-) -> None:
+def test_what_can_not_be(files, arguments, problem, tmp_path, monkeypatch, call):
     monkeypatch.chdir(tmp_path)
     status, out, errors = call(*(files.get(word, word) for word in arguments))
     assert (status, out, errors.count('\n')) == (2, '', 1), errors
@@ -119,7 +108,7 @@ def test_what_can_not_be(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_part_by_time(files: dict[str, str], tmp_path: Path, call: Call) -> None:
+def test_a_part_by_time(files, tmp_path, call):
     """Ten jobs, one each 100 ms: that at `--from` is in the part, that at `--to` is not."""
     part = '--from', '200ms', '--to', '500ms'
     for name, due in (('own.mcap', 3), ('imported.mcap', 2)):

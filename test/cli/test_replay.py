@@ -6,24 +6,22 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 from mddag_executor.trace import TraceFile
 import pytest
 
-from ..conftest import Call
 from ..replay.recorded import four_jobs, MS
 from ..report.runs import by_hand, GRAPH, START
 from .test_golden import SEEN
 
 
 @pytest.fixture
-def trace(tmp_path: Path) -> Path:
+def trace(tmp_path):
     """Give a trace of three jobs; the third is 2 ms late, its first vertex took 6 ms."""
     return by_hand(tmp_path / 'run.mcap', undeclared=False)
 
 
-def test_a_given_graph_judges(trace: Path, tmp_path: Path, call: Call) -> None:
+def test_a_given_graph_judges(trace, tmp_path, call):
     graph = tmp_path / 'strict.yaml'
     graph.write_text(GRAPH.replace('8ms', '5ms'))
     status, out, err = call('replay', trace, graph, '--fail-on-miss')
@@ -35,7 +33,7 @@ def test_a_given_graph_judges(trace: Path, tmp_path: Path, call: Call) -> None:
     assert 'first miss' not in out
 
 
-def test_overheads(trace: Path, call: Call) -> None:
+def test_overheads(trace, call):
     # the second callback was dispatched 1 ms after it was ready, though its worker was free
     for options, longest in (([], 10 * MS), (['--overheads', 'recorded'], 10 * MS),
                              (['--overheads', 'none'], 9 * MS), (['--overheads', '2ms'], 13 * MS)):
@@ -45,7 +43,7 @@ def test_overheads(trace: Path, call: Call) -> None:
         assert result['overheads']['dispatch_median_ns'] == 0
 
 
-def test_a_run_without_jobs_proves_nothing(tmp_path: Path, call: Call) -> None:
+def test_a_run_without_jobs_proves_nothing(tmp_path, call):
     # only an undeclared callback ran, 1.5 s after the recording began
     trace, report = tmp_path / 'run.mcap', tmp_path / 'report.html'
     with TraceFile(trace) as file:
@@ -62,7 +60,7 @@ def test_a_run_without_jobs_proves_nothing(tmp_path: Path, call: Call) -> None:
     assert 'No job was due at any sink: nothing is proven.' in page
 
 
-def test_a_truncated_trace_gives_what_is_there(trace: Path, tmp_path: Path, call: Call) -> None:
+def test_a_truncated_trace_gives_what_is_there(trace, tmp_path, call):
     cut = tmp_path / 'cut.mcap'
     data = trace.read_bytes()
     cut.write_bytes(data[:-40])
@@ -78,7 +76,7 @@ def test_a_truncated_trace_gives_what_is_there(trace: Path, tmp_path: Path, call
                         'the run again\n')
 
 
-def test_standard_input(trace: Path, call: Call) -> None:
+def test_standard_input(trace, call):
     assert call('replay', '-', stdin=trace.read_bytes()) == call('replay', trace)
     status, out, err = call('replay', '-', '--json', '-', stdin=trace.read_bytes()[:-40])
     assert err.startswith('warning: <stdin>: the summary')
@@ -111,9 +109,7 @@ def no_declaration(path: Path) -> None:
      'it was recorded without a declaration, so there are no jobs: give the GRAPH'),
 ])
 @pytest.mark.parametrize('options', [[], ['--reschedule']])
-def test_what_is_no_trace_is_one_line(
-    content: Any, says: str, options: list[str], tmp_path: Path, call: Call
-) -> None:
+def test_what_is_no_trace_is_one_line(content, says, options, tmp_path, call):
     path = tmp_path / 'bad.mcap'
     if callable(content):
         content(path)
@@ -127,7 +123,7 @@ def test_what_is_no_trace_is_one_line(
     assert not result.exists()
 
 
-def test_a_sink_is_named_as_tables_do_or_by_a_unique_end(call: Call, folder: Path) -> None:
+def test_a_sink_is_named_as_tables_do_or_by_a_unique_end(call, folder):
     Path('g.yaml').write_text("""\
 mddag: 1
 workers: 1
@@ -148,7 +144,7 @@ nodes:
         assert (done.returncode, done.stderr) == (2, f'error: --sink: {says}\n')
 
 
-def test_an_imported_run_is_rescheduled_with_a_graph_only(tmp_path: Path, call: Call) -> None:
+def test_an_imported_run_is_rescheduled_with_a_graph_only(tmp_path, call):
     drive, graph = four_jobs(tmp_path / 'drive.mcap'), tmp_path / 'graph.yaml'
     graph.write_text(SEEN)
     done = call('replay', drive, graph, '--reschedule', '--policy', 'rad', '--workers', 1)

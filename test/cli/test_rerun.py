@@ -20,7 +20,7 @@ NODES = ('--node', 'robot:Tracker', '--node', 'robot:Brake')
 
 
 @pytest.fixture(scope='module')
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drive(tmp_path_factory):
     """Return a folder with the example, and a drive of 5 s."""
     folder = tmp_path_factory.mktemp('rerun')
     for name in ('graph.yaml', 'robot.py'):
@@ -44,11 +44,10 @@ def mddag(
 
 def digest(folder: Path, *args: str, **more: str) -> str:
     done = mddag(folder, 'rerun', 'drive.mcap', *args, '--json', '-', **more)
-    found: str = json.loads(done.stdout)['digest']
-    return found
+    return json.loads(done.stdout)['digest']
 
 
-def test_a_run_and_its_result(drive: Path) -> None:
+def test_a_run_and_its_result(drive):
     done = mddag(
         drive, 'rerun', 'drive.mcap', 'graph.yaml', *NODES, '-o', 'out.mcap', '--trace',
         'run.mcap', '--json', 'result.json')
@@ -65,7 +64,7 @@ def test_a_run_and_its_result(drive: Path) -> None:
     assert 'the same as out.mcap' in same.stdout
 
 
-def test_a_wrong_name_of_a_topic_is_guessed(drive: Path) -> None:
+def test_a_wrong_name_of_a_topic_is_guessed(drive):
     text = (drive / 'robot.py').read_text()
     (drive / 'typo.py').write_text(text.replace('/track', '/trak'))
     done = mddag(drive, 'rerun', 'drive.mcap', 'graph.yaml', '--node', 'typo:Brake', status=2)
@@ -73,7 +72,7 @@ def test_a_wrong_name_of_a_topic_is_guessed(drive: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_each_time_also_next_to_busy_processes(drive: Path) -> None:
+def test_the_same_each_time_also_next_to_busy_processes(drive):
     """Also where seven workers are too few, and with other hashes of strings."""
     text = (drive / 'graph.yaml').read_text()
     (drive / 'overload.yaml').write_text(
@@ -92,7 +91,7 @@ def test_the_same_each_time_also_next_to_busy_processes(drive: Path) -> None:
     assert found != {digest(drive, 'graph.yaml', *NODES)}
 
 
-def test_differences_end_with_status_1(drive: Path, tmp_path: Path) -> None:
+def test_differences_end_with_status_1(drive, tmp_path):
     for name in ('graph.yaml', 'robot.py', 'drive.mcap'):
         shutil.copy(drive / name, tmp_path)
     mddag(tmp_path, 'rerun', 'drive.mcap', 'graph.yaml', *NODES, '-o', 'before.mcap')
@@ -109,7 +108,7 @@ def test_differences_end_with_status_1(drive: Path, tmp_path: Path) -> None:
     mddag(tmp_path, *expect, '--tolerance', '1%')
 
 
-def test_unmodified_programs(drive: Path, tmp_path: Path) -> None:
+def test_unmodified_programs(drive, tmp_path):
     """A talker, and a listener with an executor of its own, started as ros2 run does."""
     graph = str(THIRD_PARTY / 'graph.yaml')
     prefix = str(THIRD_PARTY / 'install')
@@ -140,13 +139,13 @@ MADE = ('rerun', 'drive.mcap', 'graph.yaml', '--node', 'hashes:make', '--json', 
 
 
 @pytest.fixture
-def hashes(drive: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def hashes(drive, monkeypatch):
     monkeypatch.delenv('PYTHONHASHSEED', raising=False)
     (drive / 'hashes.py').write_text(HASHES)
     return drive
 
 
-def test_hashes_are_fixed_however_the_program_is_installed(hashes: Path) -> None:
+def test_hashes_are_fixed_however_the_program_is_installed(hashes):
     """`ros2 run` starts PREFIX/lib/PACKAGE/mddag, which colcon has put there."""
     script = hashes / 'lib' / 'mddag_executor' / 'mddag'
     script.parent.mkdir(parents=True)
@@ -166,9 +165,7 @@ def test_hashes_are_fixed_however_the_program_is_installed(hashes: Path) -> None
     (['-c', 'import sys; from mddag_executor.cli.main import main; sys.exit(main())'],
      'set PYTHONHASHSEED=0'),
 ])
-def test_where_hashes_cannot_be_fixed_that_is_said(
-    hashes: Path, options: list[str], remedy: str
-) -> None:
+def test_where_hashes_cannot_be_fixed_that_is_said(hashes, options, remedy):
     done = subprocess.run(
         [sys.executable, *options, *MADE], cwd=hashes, capture_output=True, text=True,
         check=True, timeout=120)
@@ -190,7 +187,7 @@ def test_where_hashes_cannot_be_fixed_that_is_said(
     (('releases.mcap', 'graph.yaml', '--node', 'robot:Tracker'),
      '/distance, which /tracker:track needs, is not recorded'),
 ])
-def test_bad_input_is_one_line(drive: Path, args: tuple[str, ...], message: str) -> None:
+def test_bad_input_is_one_line(drive, args, message):
     before = sorted(path.name for path in drive.iterdir())
     done = mddag(drive, 'rerun', *args, status=2)
     errors = [line for line in done.stderr.splitlines() if line.startswith('error: ')]

@@ -20,7 +20,6 @@ from mddag_executor.trace import read_events, TraceError, TraceReader
 from msg_graph import load
 import pytest
 
-from ..conftest import Call
 from . import golden
 
 GRAPH = """\
@@ -41,7 +40,7 @@ nodes:
 # --- bad input -----------------------------------------------------------------------------------
 
 
-def test_the_declaration_comes_from_standard_input(graph: Path, mddag: Call) -> None:
+def test_the_declaration_comes_from_standard_input(graph, mddag):
     process = mddag(
         'run', '-', '--synthetic', 'sleep', '--duration', '0.2s', '--json', '-', input=GRAPH)
     assert process.returncode == 0, process.stderr
@@ -51,7 +50,7 @@ def test_the_declaration_comes_from_standard_input(graph: Path, mddag: Call) -> 
 # --- runs ----------------------------------------------------------------------------------------
 
 
-def test_a_synthetic_run_is_counted_measured_and_recorded(graph: Path, mddag: Call) -> None:
+def test_a_synthetic_run_is_counted_measured_and_recorded(graph, mddag):
     process = mddag(
         'run', graph, '--synthetic', 'sleep', '--duration', '2s', '--workers', '3',
         '--trace', 'out.mcap', '--json', 'result.json')
@@ -109,9 +108,7 @@ class Detector(Node):
 """
 
 
-def test_runs_of_undeclared_callbacks_are_those_that_are_listed(
-    folder: Path, mddag: Call
-) -> None:
+def test_runs_of_undeclared_callbacks_are_those_that_are_listed(folder, mddag):
     slow = ROBOT.replace('pass\n', 'time.sleep(0.05)\n')    # so that most images are dropped
     Path('robot.py').write_text(f'import time\n{slow}')
     done = mddag('run', '--node', 'robot:Camera', '--node', 'robot:Detector', '--duration', '1s')
@@ -122,7 +119,7 @@ def test_runs_of_undeclared_callbacks_are_those_that_are_listed(
     assert int(every[0]) == sum(map(int, re.findall(r' (\d+)(?:,|$)', every[1])))
 
 
-def test_three_commands_from_a_robot_to_a_verdict(folder: Path, mddag: Call) -> None:
+def test_three_commands_from_a_robot_to_a_verdict(folder, mddag):
     """Recorded without a declaration, which then comes from the recording."""
     Path('robot.py').write_text(ROBOT)
     done = mddag('run', '--node', 'robot:Camera', '--node', 'robot:Detector', '--duration', '1s',
@@ -148,8 +145,7 @@ def test_three_commands_from_a_robot_to_a_verdict(folder: Path, mddag: Call) -> 
 @pytest.mark.parametrize(('tolerate', 'status'), [('1 of 1000', 1), ('999 of 1000', 0)])
 @pytest.mark.parametrize('processes', ['1', '2'])
 def test_fail_on_miss_judges_by_what_the_declaration_tolerates(
-    graph: Path, mddag: Call, tolerate: str, status: int, processes: str
-) -> None:
+        graph, mddag, tolerate, status, processes):
     """The slow sink misses every deadline; the other one may miss what a busy machine costs."""
     text = graph.read_text().replace('500ms,', '500ms, tolerate: 999 of 1000,')
     graph.write_text(text.replace('10ms,', f'10ms, tolerate: {tolerate},'))
@@ -201,7 +197,7 @@ def recorded_ns() -> int:
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_synthetic_run(graph: Path, number: int) -> None:
+def test_a_signal_ends_a_synthetic_run(graph, number):
     with started(graph) as process:
         # The window begins after the warm-up of 1 s.
         wait_for(process, lambda: recorded_ns() > 2 * 10 ** 9)
@@ -215,7 +211,7 @@ def test_a_signal_ends_a_synthetic_run(graph: Path, number: int) -> None:
     assert 'results due' in out
 
 
-def test_a_signal_that_comes_twice_is_one(graph: Path) -> None:
+def test_a_signal_that_comes_twice_is_one(graph):
     """Who ends a process group sends one, and `ros2 launch` sends its own, too."""
     with started(graph) as process:
         wait_for(process, lambda: bool(releases()))
@@ -229,7 +225,7 @@ def test_a_signal_that_comes_twice_is_one(graph: Path) -> None:
     assert [event['_name'] for event in read_events('out.mcap')].count('mddag:task_set') == 1
 
 
-def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph: Path) -> None:
+def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph):
     with started(graph) as process:
         wait_for(process, lambda: bool(releases()))
         process.send_signal(signal.SIGSTOP)
@@ -263,9 +259,7 @@ def sink(completed: int, late: int = 0, **more: Any) -> dict[str, Any]:
         'response_ns': {'min': 1, 'median': 2_000_000, 'p99': 3_000_000, 'max': 4_000_000}, **more}
 
 
-def test_what_missed_most_comes_first_and_is_red_on_a_terminal(
-    monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_missed_most_comes_first_and_is_red_on_a_terminal(monkeypatch):
     dags = {'one': {'sinks': {'/n:good': sink(10), '/n:some': sink(10, 2)}},
             'two': {'sinks': {'/n:most': sink(10, 9)}}}
     plain = sink_table(dags)
@@ -286,7 +280,7 @@ def test_what_missed_most_comes_first_and_is_red_on_a_terminal(
 @pytest.mark.parametrize(('part', 'whole', 'text'), [
     (0, 0, '-'), (0, 9, '0.00 %'), (9, 9, '100.00 %'), (99_999, 100_000, '99.99 %'),
     (1, 100_000, '0.01 %'), (1, 3, '33.33 %')])
-def test_a_share_is_never_rounded_to_all_or_nothing(part: int, whole: int, text: str) -> None:
+def test_a_share_is_never_rounded_to_all_or_nothing(part, whole, text):
     assert percent(part, whole) == text
 
 
@@ -325,9 +319,7 @@ nodes:
 @pytest.mark.parametrize('spec', [
     'bad:Calibrated', 'bad:Uncalibrated', 'bad:main', 'bad_module:main'])
 @pytest.mark.parametrize('verb', ['run', 'rerun'])
-def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(
-    folder: Path, mddag: Call, verb: str, spec: str
-) -> None:
+def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(folder, mddag, verb, spec):
     Path('n.yaml').write_text(ONE_TIMER)
     Path('bad.py').write_text(BAD_NODES)
     Path('bad_module.py').write_text("open('/calibration/lidar.yaml')\n")
@@ -367,9 +359,7 @@ time.sleep(0.7)  # it is over: nothing more is told
 
 
 @pytest.mark.parametrize(('patience', 'takes', 'times'), [(20.0, 0.0, 0), (0.5, 1.5, 1)])
-def test_an_end_that_takes_too_long_shows_the_stack_of_each_thread(
-    patience: float, takes: float, times: int
-) -> None:
+def test_an_end_that_takes_too_long_shows_the_stack_of_each_thread(patience, takes, times):
     process = subprocess.run(
         [sys.executable, '-c', PROGRAM.format(patience=patience, takes=takes)],
         capture_output=True, text=True, timeout=60, check=True)

@@ -4,19 +4,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import errno
 import json
 import os
-from pathlib import Path
 import resource
 import subprocess
 import sys
-from typing import Any
 
 import pytest
-
-from ..conftest import Call
 
 GRAPH = """\
 mddag: 1
@@ -34,23 +29,23 @@ TIMES = {'lidar': {'/sensing/driver:tick': 2000, '/filter:near': 3500.5, '/filte
 
 
 @pytest.fixture
-def times(tmp_path: Path) -> Path:
+def times(tmp_path):
     path = tmp_path / 'times.json'
     path.write_text(json.dumps(TIMES), encoding='utf-8')
     return path
 
 
 @pytest.fixture
-def result_of(call: Call) -> Callable[..., Any]:
+def result_of(call):
     """Give a function that simulates, without a warning, and returns what is written as JSON."""
-    def simulate(*arguments: object) -> Any:
+    def simulate(*arguments):
         done = call('simulate', *arguments, '--json', '-')
         assert not done.stderr
         return done.result
     return simulate
 
 
-def test_execution_times_from_a_file(result_of: Any, graph: Path, times: Path) -> None:
+def test_execution_times_from_a_file(result_of, graph, times):
     result = result_of(graph, '--duration', '10ms', '--execution-times', times)
     assert result['seed'] is None
     assert result['utilisation'] == pytest.approx((2000 + 3500.5 + 1) / 10_000 / 2)
@@ -60,7 +55,7 @@ def test_execution_times_from_a_file(result_of: Any, graph: Path, times: Path) -
     assert result['dags']['lidar']['sinks']['/filter:far']['response_ns']['max'] == 2_001_000
 
 
-def test_what_is_asked_for_is_done(result_of: Any, graph: Path) -> None:
+def test_what_is_asked_for_is_done(result_of, graph):
     # One worker, 11 ms of work each 10 ms. Job k: tick from 11k, near done at 11k + 3, far at
     # 11k + 11. Late: near from job 3 on (36 ms), far from job 2 on (33 ms).
     plain = result_of(graph, '--workers', 1, '--duration', '100ms')
@@ -84,7 +79,7 @@ def test_what_is_asked_for_is_done(result_of: Any, graph: Path) -> None:
     assert stopped['deadline_missed'] is True
 
 
-def test_a_disk_that_gets_full_leaves_nothing_and_promises_nothing(graph: Path) -> None:
+def test_a_disk_that_gets_full_leaves_nothing_and_promises_nothing(graph):
     done = subprocess.run(
         [sys.executable, '-m', 'mddag_executor', 'simulate', str(graph), '--duration', '20s',
          '--trace', 'out.mcap'], cwd=graph.parent, text=True, capture_output=True, check=False,

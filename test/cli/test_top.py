@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import json
 import os
 from pathlib import Path
@@ -22,7 +21,6 @@ from mddag_executor.report.board import Board, GONE_AFTER_S, tables
 from msg_graph import load
 import pytest
 
-from ..conftest import Call
 from . import golden
 from .test_run import GRAPH
 
@@ -84,9 +82,7 @@ def board_of_autoware(*processes: str) -> Board:
 
 @pytest.mark.parametrize('processes', [('robot/4711',), ('robot/4711', 'robot/4712')])
 @pytest.mark.parametrize('width', [60, 80, 100, 120, 150, 170, 200, 240])
-def test_names_and_verdicts_are_whole_in_every_terminal(
-    width: int, processes: tuple[str, ...]
-) -> None:
+def test_names_and_verdicts_are_whole_in_every_terminal(width, processes):
     statuses = board_of_autoware(*processes).statuses()
     lines = tables(statuses, width).splitlines()
     assert max(map(len, lines)) <= width
@@ -108,7 +104,7 @@ def test_names_and_verdicts_are_whole_in_every_terminal(
 
 
 @pytest.fixture
-def running(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+def running(tmp_path):
     """Run a graph in another process; its diagnostics come every 0.2 s."""
     graph = tmp_path / 'graph.yaml'
     graph.write_text(GRAPH)
@@ -121,7 +117,7 @@ def running(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     assert process.returncode == 0
 
 
-def test_once_shows_another_process(running: Any, mddag: Call):
+def test_once_shows_another_process(running, mddag):
     statuses = mddag('top', '--once', '--json', '-').result['statuses']
     found = {s['name']: s for s in statuses}
     assert set(found) == {'mddag: main', 'mddag: workers'}
@@ -137,7 +133,7 @@ def test_once_shows_another_process(running: Any, mddag: Call):
     assert done.returncode == 0 and done.stdout.count('workers of') >= 2
 
 
-def test_live_in_a_terminal_until_the_user_ends_it(running: Any):
+def test_live_in_a_terminal_until_the_user_ends_it(running):
     pid, terminal = pty.fork()
     if pid == 0:
         os.environ.update(TERM='xterm-256color', COLUMNS='80', LINES='40')
@@ -165,7 +161,7 @@ def test_live_in_a_terminal_until_the_user_ends_it(running: Any):
     assert 'workers of' in text and 'Traceback' not in text
 
 
-def test_no_process_to_hear(call: Call):
+def test_no_process_to_hear(call):
     done = call('top', '--once', '--timeout', '300ms')
     assert done.returncode == 2 and done.stdout == ''
     assert done.stderr.startswith('error: /diagnostics: no executor has published its state')

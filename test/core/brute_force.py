@@ -477,7 +477,7 @@ class BruteForce:
         responses = sorted(self.responses[dag.index, sink])
         response = None
         if responses:
-            def rank(share: Fraction) -> int:
+            def rank(share):
                 return responses[math.ceil(share * len(responses)) - 1] * self.tick
 
             response = {'min': responses[0] * self.tick, 'median': rank(Fraction(1, 2)),

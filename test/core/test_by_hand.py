@@ -57,16 +57,15 @@ def starts(of: Case, horizon: int, **how: Any) -> list[str]:
 
 def sink(of: Case, horizon: int, name: str, **how: Any) -> dict[str, Any]:
     result = of.run(horizon, **how).result()
-    found: dict[str, Any] = next(
+    return next(
         values for dag in result['dags'].values()
         for vertex, values in dag['sinks'].items() if vertex.endswith(f':{name}'))
-    return found
 
 
 # --- order and ties ------------------------------------------------------------------------------
 
 
-def test_rad_goes_by_the_sink_that_comes_first() -> None:
+def test_rad_goes_by_the_sink_that_comes_first():
     """A source that leads to an early sink runs before one with an earlier last deadline."""
     callbacks = [single('lone', 100, 20), source('s', 100), after('s', 'early', 10),
                  after('s', 'late', 90)]
@@ -78,7 +77,7 @@ def test_rad_goes_by_the_sink_that_comes_first() -> None:
 
 
 @pytest.mark.parametrize('policy', ['rad', 'gedf'])
-def test_equal_deadlines_go_by_vertex_then_by_dag(policy: str) -> None:
+def test_equal_deadlines_go_by_vertex_then_by_dag(policy):
     # b, vertex 0 of DAG 1, was released with a, and goes before a2, vertex 1 of DAG 0.
     callbacks = [source('a', 50), after('a', 'a2', 30), single('b', 50, 30)]
     assert starts(case(callbacks, {'a': 1, 'a2': 1, 'b': 1}, policy=policy), 50) == [
@@ -88,7 +87,7 @@ def test_equal_deadlines_go_by_vertex_then_by_dag(policy: str) -> None:
 # --- verdicts ------------------------------------------------------------------------------------
 
 
-def test_what_is_overdue_at_the_horizon_is_late_unless_only_completions_are_judged() -> None:
+def test_what_is_overdue_at_the_horizon_is_late_unless_only_completions_are_judged():
     # a: released at 0 and 10, runs 0 to 8 and 10 to 18; b, later deadline, never runs.
     callbacks = [single('a', 10, 9), single('b', 30, 12)]
     overdue = case(callbacks, {'a': 8, 'b': 5})
@@ -108,7 +107,7 @@ def test_what_is_overdue_at_the_horizon_is_late_unless_only_completions_are_judg
 TWO_SINKS = [source('s', 50), after('s', 'x', 2), after('s', 'y', 40)]
 
 
-def test_a_late_job_goes_on_or_is_aborted() -> None:
+def test_a_late_job_goes_on_or_is_aborted():
     ticks = {'s': 1, 'x': 2, 'y': 1}
     going_on = case(TWO_SINKS, ticks).run(50).result()['dags']['s']
     assert going_on['ends'] == {'completed': 0, 'late': 1, 'aborted': 0, 'expired': 0, 'failed': 0,

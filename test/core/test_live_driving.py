@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from operator import attrgetter, methodcaller
-from typing import Any
 
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -85,7 +84,7 @@ class LiveDriver(RuleBasedStateMachine):
 
     @initialize(task_set=task_sets(max_dags=2, max_callbacks=4, groups=False),
                 workers=st.integers(1, 3), policy=st.sampled_from(sorted(POLICIES)))
-    def start(self, task_set: Any, workers: int, policy: str) -> None:
+    def start(self, task_set, workers, policy):
         self.task_set = task_set
         self.tables = Tables.build(
             task_set, legs=True, groups=False, max_active_jobs=MAX_ACTIVE,
@@ -107,11 +106,11 @@ class LiveDriver(RuleBasedStateMachine):
     # --- what happens ----------------------------------------------------------------------------
 
     @rule(ticks=st.integers(0, 12))
-    def time_passes(self, ticks: int) -> None:
+    def time_passes(self, ticks):
         self.now += ticks * TICK
 
     @rule(data=st.data(), age=st.integers(0, 3), group=st.integers(0, 2))
-    def release(self, data: st.DataObject, age: int, group: int) -> None:
+    def release(self, data, age, group):
         dag = data.draw(st.sampled_from(self.task_set.dags)).index
         index = self.counter[f'dag {dag}']
         self.counter[f'dag {dag}'] += 1
@@ -132,7 +131,7 @@ class LiveDriver(RuleBasedStateMachine):
 
     @precondition(MESSAGES)
     @rule(data=st.data(), group=st.integers(0, 2))
-    def message_arrives(self, data: st.DataObject, group: int) -> None:
+    def message_arrives(self, data, group):
         place = data.draw(st.integers(0, len(self.messages) - 1))
         job, vertex, leg = self.messages.pop(place)
         open_still = (self.state.job_state[job.slot] == OPEN
@@ -146,7 +145,7 @@ class LiveDriver(RuleBasedStateMachine):
             self.undeclared(group)
 
     @rule(group=st.integers(0, 2))
-    def undeclared(self, group: int) -> None:
+    def undeclared(self, group):
         self.counter['undeclared'] += 1
         index = self.counter['undeclared']
         x = undeclared(self.scheduler, index, self.groups[group], self.now)
@@ -165,7 +164,7 @@ class LiveDriver(RuleBasedStateMachine):
         self.runs.append(run)
 
     @rule(worker=st.integers(0, 2), schedule=st.booleans())
-    def dispatch(self, worker: int, schedule: bool) -> None:
+    def dispatch(self, worker, schedule):
         idle = [w for w in range(self.workers) if self.state.worker_x[w] == -1]
         if not idle and not schedule:
             return
@@ -191,7 +190,7 @@ class LiveDriver(RuleBasedStateMachine):
 
     @precondition(methodcaller('with_fate', RUNNING))
     @rule(data=st.data())
-    def complete(self, data: st.DataObject) -> None:
+    def complete(self, data):
         self.complete_one(data.draw(st.sampled_from(self.with_fate(RUNNING))))
 
     def complete_one(self, run: Run) -> None:
@@ -217,7 +216,7 @@ class LiveDriver(RuleBasedStateMachine):
                 in enumerate(legs_of(dag.vertices[after], dag.vertices)) if before == me.index]
 
     @rule(data=st.data())
-    def drop(self, data: st.DataObject) -> None:
+    def drop(self, data):
         fresh = [run for run in self.alive()
                  if run.fate in (WAITING, REFUSED) and not run.began]
         if fresh:
@@ -226,21 +225,21 @@ class LiveDriver(RuleBasedStateMachine):
 
     @precondition(methodcaller('with_fate', RUNNING))
     @rule(data=st.data())
-    def lend(self, data: st.DataObject) -> None:
+    def lend(self, data):
         run = data.draw(st.sampled_from(self.with_fate(RUNNING)))
         self.scheduler.lend(run.x)
         run.lent = True
 
     @precondition(methodcaller('with_fate', RUNNING))
     @rule(data=st.data())
-    def suspend(self, data: st.DataObject) -> None:
+    def suspend(self, data):
         run = data.draw(st.sampled_from(self.with_fate(RUNNING)))
         self.scheduler.suspend(run.x)
         run.fate, run.lent = SUSPENDED, False
 
     @precondition(methodcaller('owners'))
     @rule(data=st.data(), may=st.booleans())
-    def ask(self, data: st.DataObject, may: bool) -> None:
+    def ask(self, data, may):
         run = data.draw(st.sampled_from(self.owners()))
         if may:
             self.scheduler.leave_group(run.x)
@@ -253,7 +252,7 @@ class LiveDriver(RuleBasedStateMachine):
         return [run for run in self.with_fate(RUNNING) if run.group >= 0]
 
     @rule(data=st.data())
-    def resume(self, data: st.DataObject) -> None:
+    def resume(self, data):
         away = self.with_fate(SUSPENDED) + self.with_fate(REFUSED)
         if not away:
             return
@@ -262,14 +261,14 @@ class LiveDriver(RuleBasedStateMachine):
         run.fate = WAITING
 
     @rule()
-    def expire_idle(self) -> None:
+    def expire_idle(self):
         self.scheduler.expire_idle(self.now)
         self.settle()
         assert self.over() == []
 
     @precondition(OPEN_JOBS)
     @rule(data=st.data(), abort=st.booleans())
-    def end_job(self, data: st.DataObject, abort: bool) -> None:
+    def end_job(self, data, abort):
         job = data.draw(st.sampled_from(self.open_jobs()))
         end = ABORTED if abort else EXPIRED
         self.scheduler.give_up(job.slot, end, self.now)
@@ -358,7 +357,7 @@ class LiveDriver(RuleBasedStateMachine):
         return range(base, base + self.tables.n_region[dag])
 
     @invariant()
-    def counts_agree(self) -> None:
+    def counts_agree(self):
         waiting = self.with_fate(WAITING) + self.with_fate(REFUSED)
         assert self.scheduler.queue_length == len(waiting)
         placed = [run for run in self.with_fate(RUNNING) if not run.lent]
@@ -366,14 +365,14 @@ class LiveDriver(RuleBasedStateMachine):
         assert sorted(x for x in self.state.worker_x if x >= 0) == sorted(r.x for r in placed)
 
     @invariant()
-    def groups_are_exclusive(self) -> None:
+    def groups_are_exclusive(self):
         for group in self.groups[1:]:
             holders = [run.x for run in self.alive() if run.owns and run.group == group]
             assert len(holders) <= 1
             assert self.state.group_owner[group] == (holders[0] if holders else -1)
 
     @invariant()
-    def slots_are_accounted_for(self) -> None:
+    def slots_are_accounted_for(self):
         state = self.state
         active = Counter(state.x_slot[run.x] for run in self.alive())
         open_slots = {job.slot for job in self.open_jobs()}
@@ -394,7 +393,7 @@ class LiveDriver(RuleBasedStateMachine):
         assert free == sum(job_state == FREE for job_state in state.job_state)
 
     @invariant()
-    def open_jobs_are_bounded(self) -> None:
+    def open_jobs_are_bounded(self):
         for dag in self.task_set.dags:
             mine = [job for job in self.open_jobs() if job.dag == dag.index]
             assert len(mine) == self.state.n_open[dag.index]

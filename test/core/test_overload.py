@@ -32,7 +32,7 @@ def with_times(case: Case, on_late: Any = None, **more: Any) -> Case:
 
 @examples(300)
 @given(cases(bounds=False, importance=True), st.integers(5, 60))
-def test_demote_without_an_overload_changes_nothing(case: Case, horizon: int) -> None:
+def test_demote_without_an_overload_changes_nothing(case, horizon):
     case = with_times(case)
     run = case.run(horizon)
     assume(not run.tally.missed and demand(case) <= case.workers)
@@ -49,7 +49,7 @@ def demand(case: Case) -> float:
 
 @examples(300)
 @given(cases(importance=True), st.integers(5, 60))
-def test_importance_means_nothing_if_late_jobs_are_not_demoted(case: Case, horizon: int) -> None:
+def test_importance_means_nothing_if_late_jobs_are_not_demoted(case, horizon):
     """They are not under a policy whose keys are no times."""
     by_time = case.policy in ('rad', 'gedf', 'llf')
     important = with_times(case, on_late='continue' if by_time else 'demote')
@@ -60,7 +60,7 @@ def test_importance_means_nothing_if_late_jobs_are_not_demoted(case: Case, horiz
 @examples(300)
 @given(cases(('rad', 'gedf', 'llf'), groups=False, bounds=False, importance=True),
        st.integers(5, 60))
-def test_messages_of_a_callback_keep_their_order(case: Case, horizon: int) -> None:
+def test_messages_of_a_callback_keep_their_order(case, horizon):
     case = replace(with_times(case, on_late='demote'), workers=1, preemptive=False)
     latest: dict[tuple[int, int], int] = {}
     for _, kind, _, dag, vertex, job in case.events(case.run(horizon)):
@@ -71,7 +71,7 @@ def test_messages_of_a_callback_keep_their_order(case: Case, horizon: int) -> No
 
 @examples(300)
 @given(st.lists(st.sampled_from((0, 1, 'run', 'wait')), min_size=4, max_size=40))
-def test_messages_of_each_topic_of_a_sync_keep_their_order(steps: list[int | str]) -> None:
+def test_messages_of_each_topic_of_a_sync_keep_their_order(steps):
     """Also if those of the other topic belong to jobs released earlier or later."""
     scheduler = live(workers=1, on_late='demote')
     jobs = len(steps) + 1
@@ -116,7 +116,7 @@ def results(callbacks: list[dict[str, Any]], ticks: Sequence[int], horizon: int,
     return {name: next(iter(dag['sinks'].values())) for name, dag in dags.items()}
 
 
-def test_late_work_does_not_go_before_what_can_be_in_time() -> None:
+def test_late_work_does_not_go_before_what_can_be_in_time():
     # The heavy one is late from its second job on, and then always has the earlier deadline.
     in_time = {}
     for on_late in ('continue', 'demote'):
@@ -128,7 +128,7 @@ def test_late_work_does_not_go_before_what_can_be_in_time() -> None:
     assert in_time['continue'] < in_time['demote']
 
 
-def test_a_sink_that_can_be_in_time_keeps_its_deadline() -> None:
+def test_a_sink_that_can_be_in_time_keeps_its_deadline():
     # At 10 the source of the second job is too late for near, and not for far.
     callbacks = [
         single('block', 100, 2, execution_time='10us'),  # it goes first
@@ -144,7 +144,7 @@ def test_a_sink_that_can_be_in_time_keeps_its_deadline() -> None:
     assert sinks['/n:near']['response_ns']['max'] == 23 * TICK  # and before this
 
 
-def test_demoted_callbacks_do_not_starve() -> None:
+def test_demoted_callbacks_do_not_starve():
     # The sensor is always late, because the others block it for longer than its deadline.
     callbacks = [single('sensor', 10, 2, execution_time='1us', on_late='demote'),
                  *(single(f'heavy{i}', 40, 80, execution_time='20us', on_late='demote')
@@ -154,7 +154,7 @@ def test_demoted_callbacks_do_not_starve() -> None:
     assert sinks['sensor']['completed'] >= 4000 // (11 * 2 + 20)  # one in 11 deadlines
 
 
-def test_less_important_sinks_are_demoted_first() -> None:
+def test_less_important_sinks_are_demoted_first():
     for preemptive in (True, False):
         in_time = {}
         for importance in ('normal', 'high'):
@@ -168,14 +168,14 @@ def test_less_important_sinks_are_demoted_first() -> None:
         assert in_time['high'] == in_time['normal']  # normal is more than low
 
 
-def test_the_highest_importance_is_never_refused() -> None:
-    def run(**more: Any) -> Any:
+def test_the_highest_importance_is_never_refused():
+    def run(**more):
         return results([single(name, 10, 10, execution_time='8us', on_late='demote', **more)
                         for name in 'ab'], [8, 8], 2000)
     assert run(importance='low') == run(importance='high') == run()
 
 
-def test_late_jobs_of_an_important_sink_refuse_others() -> None:
+def test_late_jobs_of_an_important_sink_refuse_others():
     # There is room for both, but the first has the earlier deadline.
     in_time = {}
     for importance in ('low', 'high'):
@@ -187,8 +187,8 @@ def test_late_jobs_of_an_important_sink_refuse_others() -> None:
     assert in_time['low'] == 0 and in_time['high'] >= 0.97 * 200
 
 
-def test_a_sink_that_tolerates_no_further_miss_goes_first() -> None:
-    def run(**more: Any) -> list[int]:
+def test_a_sink_that_tolerates_no_further_miss_goes_first():
+    def run(**more):
         sinks = results([
             single('plain', 20, 20, execution_time='12us', on_late='demote'),
             single('other', 20, 20, execution_time='12us', on_late='demote', **more)],
@@ -198,7 +198,7 @@ def test_a_sink_that_tolerates_no_further_miss_goes_first() -> None:
     assert other_then > other and plain_then < plain
 
 
-def test_a_backlog_of_a_heavy_callback_leaves_the_others_in_time() -> None:
+def test_a_backlog_of_a_heavy_callback_leaves_the_others_in_time():
     # One interpreter for all; the heavy one has a long deadline, but its late jobs have the first.
     callbacks = [single(name, period, deadline, execution_time=f'{time}us', on_late='demote')
                  for name, period, deadline, time in (
@@ -216,7 +216,7 @@ def test_a_backlog_of_a_heavy_callback_leaves_the_others_in_time() -> None:
 
 
 @pytest.mark.parametrize('extra', [3, 6, 10, 20])
-def test_a_burst_is_worked_off(extra: int) -> None:
+def test_a_burst_is_worked_off(extra):
     """No more is late than with ``continue``, and nothing once there is room for the backlog."""
     periods = {'burst': (20, 40), 'other': (10, 10), 'slow': (60, 60)}
     ticks = (8, 4, 3)
@@ -244,7 +244,7 @@ def test_a_burst_is_worked_off(extra: int) -> None:
     assert max(missed['demote']) < (500 + extra * 8 / (1 - demand(case))) * TICK
 
 
-def test_only_the_newest_is_kept() -> None:
+def test_only_the_newest_is_kept():
     callbacks = [single('slow', 35, 100, execution_time='30us'),
                  single('fast', 10, 200, keep='newest')]
     sinks = results(callbacks, [30, 1], 350)

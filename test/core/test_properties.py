@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -62,7 +61,7 @@ def rad_offset(dag: Dag, index: int) -> int:
 
 @examples(100)
 @given(cases(), st.integers(5, 40))
-def test_every_job_ends_in_exactly_one_way(case: Case, last_release: int) -> None:
+def test_every_job_ends_in_exactly_one_way(case, last_release):
     horizon = last_release * (1 + sum(map(sum, case.ticks)))
     run = case.run(horizon, last_release=last_release)
     dags = case.task_set.dags
@@ -95,7 +94,7 @@ def test_every_job_ends_in_exactly_one_way(case: Case, last_release: int) -> Non
 
 @examples(100)
 @given(cases(overheads=True), st.integers(5, 50))
-def test_whatever_gets_ready_ends_or_is_dropped_or_is_there(case: Case, horizon: int) -> None:
+def test_whatever_gets_ready_ends_or_is_dropped_or_is_there(case, horizon):
     """Also of jobs that are aborted or expire."""
     tables = Tables.build(case.task_set)
     settings = Settings(
@@ -116,7 +115,7 @@ def test_whatever_gets_ready_ends_or_is_dropped_or_is_there(case: Case, horizon:
 
 @examples(100)
 @given(task_sets(max_callbacks=8))
-def test_rad_is_the_least_deadline_of_the_sinks_it_leads_to(task_set: Any) -> None:
+def test_rad_is_the_least_deadline_of_the_sinks_it_leads_to(task_set):
     tables = Tables.build(task_set)
     for dag in task_set.dags:
         brute = [rad_offset(dag, vertex.index) for vertex in dag.vertices]
@@ -149,9 +148,7 @@ def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False
 @pytest.mark.parametrize('policy', POLICIES)
 @examples(100)
 @given(st.data(), st.integers(5, 50), st.sampled_from(['horizon', 'completions']), st.booleans())
-def test_everything_at_once(
-    policy: str, data: st.DataObject, horizon: int, judge: str, stop: bool
-) -> None:
+def test_everything_at_once(policy, data, horizon, judge, stop):
     """Groups, bounds, aborts and overheads, or none of them, as in the paper."""
     with_groups, with_bounds, overheads = (data.draw(st.booleans()) for _ in range(3))
     compare(data.draw(cases((policy,), groups=with_groups, bounds=with_bounds,
@@ -160,7 +157,7 @@ def test_everything_at_once(
 
 @examples(150)
 @given(cases(newest=True), st.integers(5, 30))
-def test_until_all_is_done(case: Case, last_release: int) -> None:
+def test_until_all_is_done(case, last_release):
     """Releases end and the run goes on until nothing is left: every job ends, and only once."""
     work = sum(map(sum, case.ticks))
     brute = compare(case, last_release * (1 + work), last_release=last_release)
@@ -185,7 +182,7 @@ def two_dags() -> TaskSet:
     ])
 
 
-def test_a_sync_has_a_leg_for_each_topic() -> None:
+def test_a_sync_has_a_leg_for_each_topic():
     plain, legs = Tables.build(two_dags()), Tables.build(two_dags(), legs=True)
     assert plain.n_legs == [1] * 8
     assert plain.n_region == [5, 2, 1]
@@ -194,7 +191,7 @@ def test_a_sync_has_a_leg_for_each_topic() -> None:
     assert legs.region_offset == [0, 1, 2, 3, 5, 0, 1, 0]
 
 
-def test_a_sync_has_a_leg_for_each_publisher_of_a_topic() -> None:
+def test_a_sync_has_a_leg_for_each_publisher_of_a_topic():
     tables = Tables.build(declaration([
         {'node': '/n', 'name': 's', 'timer': '10us', 'publishes': ['/s', '/x'], 'dag': 'd'},
         {'node': '/n', 'name': 'x', 'subscription': '/s', 'publishes': ['/x', '/y']},
@@ -204,7 +201,7 @@ def test_a_sync_has_a_leg_for_each_publisher_of_a_topic() -> None:
     assert tables.leg_topic[tables.first_leg[2]:tables.first_leg[3]] == [0, 0, 1]
 
 
-def test_rad_of_a_long_chain_is_found_without_recursion() -> None:
+def test_rad_of_a_long_chain_is_found_without_recursion():
     n = 3_000
     chain = [{'node': '/n', 'name': 'c0', 'timer': '1ms', 'publishes': ['/t0'], 'dag': 'd'}]
     chain += [{'node': '/n', 'name': f'c{i}', 'subscription': f'/t{i - 1}',
@@ -213,7 +210,7 @@ def test_rad_of_a_long_chain_is_found_without_recursion() -> None:
     assert rad_offsets(declaration(chain).dags[0]) == [5_000_000] * n
 
 
-def test_latest_start_by_hand() -> None:
+def test_latest_start_by_hand():
     """The sink with the earlier deadline is not the one that has to start first."""
     tables = Tables.build(declaration([
         {'node': '/n', 'name': 's', 'timer': '90us', 'publishes': ['/s'], 'dag': 'd',
@@ -228,7 +225,7 @@ def test_latest_start_by_hand() -> None:
     assert policy('llf').key(tables, 2, 1_000, 6, 9) == (1_000 + 25 * US, 2, 0, 9)
 
 
-def test_chains_of_equal_deadlines_go_by_period_then_by_dag() -> None:
+def test_chains_of_equal_deadlines_go_by_period_then_by_dag():
     tables = Tables.build(declaration([
         {'node': '/n', 'name': name, 'timer': f'{period}us', 'deadline': '90us', 'dag': name}
         for name, period in (('a', 20), ('b', 10), ('c', 20))]))

@@ -37,7 +37,7 @@ from .task_sets import Case, declaration, examples
 from .test_by_hand import case, single
 
 
-def test_a_job_fails_with_what_fails_of_it() -> None:
+def test_a_job_fails_with_what_fails_of_it():
     """What has a message already runs, and is not judged; nothing is missed twice."""
     scheduler = live()
     slot = start_job(scheduler)
@@ -65,7 +65,7 @@ def aborting() -> TaskSet:
         {'node': '/n', 'name': 'z', 'subscription': '/s', 'deadline': '60us'}])
 
 
-def test_a_blocked_callback_does_not_abort_its_job() -> None:
+def test_a_blocked_callback_does_not_abort_its_job():
     """Only what would go next shows that a job is late; what waits for its group does not."""
     scheduler = live(aborting(), workers=2)
     group = scheduler.new_group()
@@ -82,7 +82,7 @@ def test_a_blocked_callback_does_not_abort_its_job() -> None:
     assert scheduler.decisions()[-1][0] == DROP
 
 
-def test_a_recorded_execution_goes_past_queue_workers_and_groups() -> None:
+def test_a_recorded_execution_goes_past_queue_workers_and_groups():
     scheduler = live(workers=1)
     group = scheduler.new_group()
     busy = undeclared(scheduler, 0, group, 0)
@@ -98,7 +98,7 @@ def test_a_recorded_execution_goes_past_queue_workers_and_groups() -> None:
     assert scheduler.state.x_state[source] != WAITING
 
 
-def test_an_unknown_policy_is_refused_with_the_list() -> None:
+def test_an_unknown_policy_is_refused_with_the_list():
     with pytest.raises(PolicyError, match=r"policy 'edf': .*: choose one of rad, rm, wc, fifo"):
         live(policy_name='edf')
 
@@ -106,7 +106,7 @@ def test_an_unknown_policy_is_refused_with_the_list() -> None:
 # --- workers -------------------------------------------------------------------------------------
 
 
-def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits() -> None:
+def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits():
     scheduler = live(workers=1)
     first, second = scheduler.new_group(), scheduler.new_group()
     running = undeclared(scheduler, 0, second, 0)
@@ -145,7 +145,7 @@ steps = st.lists(st.one_of(
 
 
 @given(steps, st.lists(st.integers(0, 25), min_size=60, max_size=60))
-def test_each_overdue_sink_is_found_once_and_in_time(steps, gaps) -> None:
+def test_each_overdue_sink_is_found_once_and_in_time(steps, gaps):
     scheduler = live(SINKS)
     tables, state = scheduler.tables, scheduler.state
     deadlines = Deadlines(tables, state)
@@ -206,7 +206,7 @@ def scheduler(workers: int = 1) -> Scheduler:
     return Scheduler(tables, workers, 'ros2', propagate=False)
 
 
-def test_dropped_ones_leave_the_queues() -> None:
+def test_dropped_ones_leave_the_queues():
     """Memory is bounded, the length is right, and the entity is polled once for each round."""
     core = scheduler()
     slot = core.release(1, 0, 0, 0)
@@ -223,7 +223,7 @@ def test_dropped_ones_leave_the_queues() -> None:
     assert core.queue_length == 0
 
 
-def test_no_preemption() -> None:
+def test_no_preemption():
     task_set = declaration([single('a', 10)])
     with pytest.raises(PolicyError, match="policy 'ros2': .* preempts no callback: run it"):
         Scheduler(Tables.build(task_set), 1, 'ros2', preemptive=True)
@@ -280,7 +280,7 @@ class Driver:
         self.core.complete(x, self.now)
 
 
-def test_one_that_turns_out_to_wait_gives_the_interpreter_back() -> None:
+def test_one_that_turns_out_to_wait_gives_the_interpreter_back():
     drive = Driver(computing(7))
     holder, held_back = drive.ready(URGENT, holds=True), drive.ready(URGENT, holds=True)
     assert drive.go() == [holder]
@@ -303,9 +303,7 @@ def may_start(core: Scheduler, x: int) -> bool:
 
 @examples(150)
 @given(seed=st.integers(0, 2 ** 32), workers=st.integers(1, 4), groups=st.booleans())
-def test_whatever_happens_the_most_urgent_that_may_start_starts(
-    seed: int, workers: int, groups: bool
-) -> None:
+def test_whatever_happens_the_most_urgent_that_may_start_starts(seed, workers, groups):
     draw = random.Random(seed)
     drive = Driver(computing(workers))
     core, state = drive.core, drive.core.state

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections import deque
 from fractions import Fraction
 import math
-from random import Random
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -51,7 +50,7 @@ def done(vertex: int, job: int, response: int) -> Decision:
     return (SINK_LATE if time > deadline else SINK_IN_TIME, 0, vertex, job, deadline, time)
 
 
-def test_a_tally_of_everything() -> None:
+def test_a_tally_of_everything():
     counts = tally()
     for _ in range(5):
         counts.released(0)
@@ -86,7 +85,7 @@ def test_a_tally_of_everything() -> None:
                                          'max': 20 * US}}}}}}
 
 
-def test_a_bounded_tally_keeps_the_extremes_and_the_last() -> None:
+def test_a_bounded_tally_keeps_the_extremes_and_the_last():
     counts = tally(keep=3)
     counts.add([done(1, job, us * US) for job, us in enumerate((1, 9, 4, 5, 6))])
     sink = counts.result()['dags']['d']['sinks']['/n:x']
@@ -97,7 +96,7 @@ def test_a_bounded_tally_keeps_the_extremes_and_the_last() -> None:
 
 @examples(200)
 @given(st.lists(st.integers(-2 ** 63, 2 ** 63 - 1), max_size=40), st.none() | st.integers(0, 9))
-def test_the_latest_are_as_in_a_deque(values: list[int], keep: int | None) -> None:
+def test_the_latest_are_as_in_a_deque(values, keep):
     latest, expected = Latest(keep), deque[int](maxlen=keep)
     for value in values:
         latest.append(value)
@@ -111,7 +110,7 @@ def test_the_latest_are_as_in_a_deque(values: list[int], keep: int | None) -> No
             latest[beyond]
 
 
-def test_what_exceeds_64_bits_is_the_nearest_within() -> None:
+def test_what_exceeds_64_bits_is_the_nearest_within():
     latest = Latest(2)
     for value in (7, 2 ** 64, -2 ** 64):
         latest.append(value)
@@ -121,12 +120,12 @@ def test_what_exceeds_64_bits_is_the_nearest_within() -> None:
 @examples(200)
 @given(st.lists(st.integers(0, 1000), min_size=1, max_size=400).map(sorted),
        st.sampled_from([(0.0, 0), (0.5, 50), (0.9, 90), (0.95, 95), (0.99, 99), (1.0, 100)]))
-def test_quantiles_are_nearest_ranks(ordered: list[int], share: tuple[float, int]) -> None:
+def test_quantiles_are_nearest_ranks(ordered, share):
     rank = max(1, math.ceil(Fraction(share[1], 100) * len(ordered)))
     assert quantile(ordered, share[0]) == ordered[rank - 1]
 
 
-def test_a_miss_is_counted_whether_it_is_known_before_or_after_the_stop() -> None:
+def test_a_miss_is_counted_whether_it_is_known_before_or_after_the_stop():
     stops = Stops()
     stops.missed(0, 99, 100)      # over before
     stops.missed(50, 100, 350)    # 250 late, and 250 of it stood still
@@ -151,7 +150,7 @@ never = spans.map(lambda s: (*s, -1))
 
 
 @given(st.lists(spans, max_size=5), st.lists(late | never, max_size=10), st.randoms())
-def test_the_order_in_which_they_become_known_does_not_matter(found, misses, random) -> None:
+def test_the_order_in_which_they_become_known_does_not_matter(found, misses, random):
     events = [('stopped', *each) for each in found] + [('missed', *each) for each in misses]
     random.shuffle(events)
     stops = Stops()
@@ -164,7 +163,7 @@ def test_the_order_in_which_they_become_known_does_not_matter(found, misses, ran
         for release, deadline, completed in misses)
 
 
-def test_what_is_kept_is_bounded_and_the_counts_are_whole() -> None:
+def test_what_is_kept_is_bounded_and_the_counts_are_whole():
     stops = Stops()
     for i in range(3 * KEEP_STOPS):
         stops.missed(1000 * i, 1000 * i + 1, 1000 * i + 2)
@@ -182,7 +181,7 @@ def worst_of(missed: list[bool], of: int) -> int:
 
 
 @given(st.lists(st.booleans(), max_size=40), st.integers(2, 12), st.randoms())
-def test_the_worst_window(missed: list[bool], of: int, random: Random) -> None:
+def test_the_worst_window(missed, of, random):
     jobs = [job for job, miss in enumerate(missed) if miss] * 2
     random.shuffle(jobs)
     known = len(jobs) // 2
@@ -197,7 +196,7 @@ def test_the_worst_window(missed: list[bool], of: int, random: Random) -> None:
     assert window.worst == worst_of(missed, of)
 
 
-def test_what_is_long_over_is_forgotten() -> None:
+def test_what_is_long_over_is_forgotten():
     window = MissWindow(10)
     for job in range(0, 100_000, 5):
         window.add(job)

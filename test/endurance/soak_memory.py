@@ -71,7 +71,7 @@ def measure(graph: str, remade: int, seed: int = 0) -> float:
     names = list(nodes.nodes)
     chosen = random.Random(seed)
 
-    def make_again(times: int) -> int:
+    def make_again(times):
         for _ in range(times):
             name = chosen.choice(names)
             nodes.nodes[name].destroy_node()

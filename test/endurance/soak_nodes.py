@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import threading
-from typing import Any
 
 from mddag_executor.executor import current_job
 from mddag_executor.hosting.measure import ExecutionPlan
@@ -55,13 +54,13 @@ class SoakNodes:
             entity.callback = self._watched(entity.callback)
 
     def _watched(self, callback: Callable[..., None]) -> Callable[..., None]:
-        def timer() -> None:
+        def timer():
             run()
 
-        def subscription(message: Any) -> None:
+        def subscription(message):
             run(message)
 
-        def run(*message: Any) -> None:
+        def run(*message):
             with self._lock:
                 self.started += 1
                 raises, self.raise_next = self.raise_next, False

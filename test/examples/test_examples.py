@@ -36,15 +36,14 @@ def run(example: str, *arguments: str | Path) -> str:
 def result(example: str, tmp_path: Path) -> dict[str, Any]:
     """Run an example that is a `mddag run`; return its result."""
     run(example, '--json', tmp_path / 'result.json')
-    found: dict[str, Any] = json.loads((tmp_path / 'result.json').read_text())
-    return found
+    return json.loads((tmp_path / 'result.json').read_text())
 
 
 COMMANDS = {name: (program, file) for name, _, program, file in COMMAND.findall(
     (EXAMPLES / 'README.md').read_text(encoding='utf-8'))}
 
 
-def test_the_readme_has_every_example() -> None:
+def test_the_readme_has_every_example():
     assert sorted(COMMANDS) == NAMES
     for program, file in COMMANDS.values():
         assert (EXAMPLES / file).suffix == {'python': '.py', 'sh': '.sh'}[program]
@@ -53,17 +52,17 @@ def test_the_readme_has_every_example() -> None:
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_every_declaration_is_right(name: str) -> None:
+def test_every_declaration_is_right(name):
     assert msg_graph.load(EXAMPLES / name / 'graph.yaml').dags
 
 
-def test_hello_deadline() -> None:
+def test_hello_deadline():
     printed = re.fullmatch(r'(\d+) images, (\d+) later than 40 ms\n', run('hello_deadline'))
     assert printed is not None
     assert int(printed[1]) >= 29  # of the thirty, one may be open when the future is done
 
 
-def test_sensor_fusion(tmp_path: Path) -> None:
+def test_sensor_fusion(tmp_path):
     found = result('sensor_fusion', tmp_path)
     sinks = found['dags']['fusion']['sinks']
     assert set(sinks) == {'/brake:decide', '/map:update', '/viewer:show'}
@@ -74,7 +73,7 @@ def test_sensor_fusion(tmp_path: Path) -> None:
     assert found['never_ran'] == []
 
 
-def test_overload() -> None:
+def test_overload():
     blocks = run('overload').split('queue of ')
     assert [block.split(':')[0] for block in blocks[1:]] == ['10', '1']
     ends = []
@@ -96,7 +95,7 @@ def test_overload() -> None:
     assert short['perception']['aborted'] < long['perception']['aborted']
 
 
-def test_services_and_actions() -> None:
+def test_services_and_actions():
     service, action, control = run('services_and_actions').splitlines()
     assert service == 'service: calibrated'
     assert action == 'action: [0, 1, 1, 2, 3, 5, 8, 13, 21, 34, 55, 89]'
@@ -107,7 +106,7 @@ def test_services_and_actions() -> None:
     assert int(undeclared) >= 13
 
 
-def test_two_processes(tmp_path: Path) -> None:
+def test_two_processes(tmp_path):
     found = result('two_processes', tmp_path)
     chain = found['dags']['chain']
     assert set(chain['sinks']) == {'/control:step'}
@@ -119,7 +118,7 @@ def test_two_processes(tmp_path: Path) -> None:
     assert '/sensor:read' not in found['callbacks']
 
 
-def test_numpy_pipeline() -> None:
+def test_numpy_pipeline():
     one, right, two, right_too = run('numpy_pipeline').splitlines()
     assert right == right_too == 'the results are right'
     for workers, line in ((1, one), (2, two)):
@@ -131,7 +130,7 @@ def test_numpy_pipeline() -> None:
         assert int(printed[2]) == workers  # with two of them, two filters at once
 
 
-def test_robot() -> None:
+def test_robot():
     *sinks, computing = run('robot').splitlines()
     found = {m[1]: int(m[2]) for m in (re.match(r'(\S+): (\d+) times', s) for s in sinks) if m}
     assert set(found) == {
@@ -141,7 +140,7 @@ def test_robot() -> None:
     assert computing.startswith('computing in Python: /')
 
 
-def test_third_party(tmp_path: Path) -> None:
+def test_third_party(tmp_path):
     output = run('third_party', '--json', tmp_path / 'result.json')
     heard = re.search(r'^heard (\d+) messages$', output, re.MULTILINE)
     assert heard is not None
@@ -153,7 +152,7 @@ def test_third_party(tmp_path: Path) -> None:
         assert 'mddag' not in program.read_text(encoding='utf-8').split('"""', 1)[1]
 
 
-def test_rerun() -> None:
+def test_rerun():
     """A changed constant changes contents, a slower callback only times."""
     _, constant, slower = run('rerun').split(':\n')[1:]
     assert re.findall(r'^(/\w+): (\w+), first', constant, re.MULTILINE) == [('/track', 'content')]

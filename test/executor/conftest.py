@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 import contextlib
 import subprocess
 import sys
@@ -87,12 +87,10 @@ def run_program(
 
 
 @pytest.fixture
-def make_executor(ros_context: Any) -> Iterator[Callable[..., Any]]:
+def make_executor(ros_context):
     """Give a function that makes executors with nodes; they are shut down afterwards."""
     with contextlib.ExitStack() as stack:
-        def make(
-            *args: Any, nodes: Sequence[Node] = (), **kwargs: Any
-        ) -> MultiDeadlineExecutor:
+        def make(*args, nodes=(), **kwargs):
             kwargs.setdefault('context', ros_context)
             executor = MultiDeadlineExecutor(*args, **kwargs)
             stack.callback(executor.shutdown, 5.0)
@@ -103,11 +101,11 @@ def make_executor(ros_context: Any) -> Iterator[Callable[..., Any]]:
 
 
 @pytest.fixture
-def make_node(ros_context: Any) -> Iterator[Callable[..., Node]]:
+def make_node(ros_context):
     """Give a function that makes nodes; they are destroyed afterwards."""
     nodes: list[Node] = []
 
-    def make(name: str = 'node', **kwargs: Any) -> Node:
+    def make(name='node', **kwargs):
         kwargs.setdefault('start_parameter_services', False)
         kwargs.setdefault('enable_rosout', False)
         nodes.append(Node(name, context=ros_context, **kwargs))

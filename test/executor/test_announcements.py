@@ -75,7 +75,7 @@ class Nodes:
                 publisher.publish(Int64(data=self.sent))
 
     def _relay(self, name: str, publisher: Any) -> Callable[[Any], None]:
-        def relay(message: Any) -> None:
+        def relay(message):
             self.ran.setdefault(name, []).append((message.data, current_job()))
             if publisher is not None:
                 publisher.publish(Int64(data=message.data))
@@ -116,8 +116,7 @@ def split(
     {'p1': 'one four', 'p2': 'two three', 'p3': 'five'},  # it leaves and comes back
     {'p1': 'one two', 'p2': 'three four five'},  # one leg is here, and one is not
 ])
-def test_every_job_is_found_by_its_number(
-        make_executor: Any, make_node: Any, processes: dict[str, str]) -> None:
+def test_every_job_is_found_by_its_number(make_executor, make_node, processes):
     nodes, executors = split(make_executor, make_node, **processes)
     releases = {number: job.release_ns for number, job in nodes.ran['one']}
     assert sorted(releases) == list(range(1, JOBS + 1))
@@ -134,8 +133,7 @@ def test_every_job_is_found_by_its_number(
     assert sum(sink['completed'] for sink in last['sinks'].values()) == 2 * JOBS
 
 
-def test_messages_without_announcement_wait_for_a_while_and_are_counted(
-        make_executor: Any, make_node: Any) -> None:
+def test_messages_without_announcement_wait_for_a_while_and_are_counted(make_executor, make_node):
     text = GRAPH + 'processes: {p1: [/one], p2: [/two, /three, /four, /five]}'
     nodes = Nodes(make_node)
     executor = make_executor(loads(text), process='p2')
@@ -156,8 +154,7 @@ def test_messages_without_announcement_wait_for_a_while_and_are_counted(
     assert statistics['unattributed']['unknown'] == 1
 
 
-def test_what_several_processes_publish_on_one_topic_is_a_doubt(
-        make_executor: Any, make_node: Any) -> None:
+def test_what_several_processes_publish_on_one_topic_is_a_doubt(make_executor, make_node):
     text = GRAPH.replace('publishes: [/join_right]', 'publishes: [/join_left]').replace(
         '      - {name: take_too, subscription: /join_right, publishes: [/end]}\n', '')
     text += 'processes: {p1: [/one, /two], p2: [/three, /four, /five]}'
@@ -294,7 +291,7 @@ def test_publications_that_overlap_are_announced_together_when_all_have_returned
         [each.origin.job for each in several])  # type: ignore[union-attr]
     bench.jobs.announce_on({TOPIC})
 
-    def publish(job: int, publisher: int, send: Callable[[], None] = lambda: None) -> None:
+    def publish(job, publisher, send=lambda: None):
         bench.jobs.publish(lambda *_: send(), None, None, bench.publishers[publisher],
                            bench.topic, Origin(0, 0, job, publisher))
 

@@ -32,7 +32,7 @@ nodes:
     node = make_node('source')
     releases: list[int] = []
 
-    def tick() -> None:
+    def tick():
         job = current_job()
         assert job is not None
         releases.append(job.release_ns)
@@ -66,7 +66,7 @@ def test_an_exception_that_is_handled_does_not_end_the_executor(make_executor, k
     """Whether the task fails before its maker awaits it or after (rclpy#1215, #1098)."""
     executor = make_executor()
 
-    async def handle() -> int:
+    async def handle():
         handled = 0
         for _ in range(10):
             task = executor.create_task(kind)
@@ -78,7 +78,7 @@ def test_an_exception_that_is_handled_does_not_end_the_executor(make_executor, k
                 handled += 1
         return handled
 
-    def look() -> str:  # with rclpy's example, in a function
+    def look():  # with rclpy's example, in a function
         task = executor.create_task(kind)
         assert wait_for(task.done)
         try:
@@ -102,7 +102,7 @@ def test_shutdown_from_inside_a_callback(make_executor, make_node, ros_context, 
     executor = make_executor(nodes=[node])
     calls: list[int] = []
 
-    def end() -> None:
+    def end():
         calls.append(1)
         if what == 'context':
             rclpy.shutdown(context=ros_context)

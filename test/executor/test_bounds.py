@@ -86,7 +86,7 @@ def test_few_requests_wait_in_python_and_none_is_lost(make_executor, make_node):
     most: list[int] = []
     executor = make_executor(num_workers=2)
 
-    def answer(request: Any, response: Any) -> Any:
+    def answer(request, response):
         go_on.wait(15.0)
         most.append(sum(
             each['waiting'] for each in executor.statistics()['callbacks'].values()
@@ -114,8 +114,7 @@ def test_few_requests_wait_in_python_and_none_is_lost(make_executor, make_node):
 
 @pytest.mark.parametrize('from_here', [True, False])
 def test_few_messages_of_keep_all_wait_in_python_and_none_is_lost(
-    make_executor, make_node, monkeypatch, from_here,
-):
+        make_executor, make_node, monkeypatch, from_here):
     if not from_here:  # as from another process: a worker takes them
         monkeypatch.setattr(
             'mddag_executor.executor.publishing.replace_delivery', lambda *args: None)
@@ -124,7 +123,7 @@ def test_few_messages_of_keep_all_wait_in_python_and_none_is_lost(
     most: list[int] = []
     executor = make_executor(num_workers=1)
 
-    def hear(message: Header) -> None:
+    def hear(message):
         go_on.wait(15.0)
         most.append(waiting(executor))
         got.append(message.stamp.sec)
@@ -170,7 +169,7 @@ def test_blocked_calls_take_a_bounded_number_of_threads(make_executor, make_node
     count = MOST + 30
     most = MOST + workers
 
-    def ask() -> None:
+    def ask():
         answers.append(client.call(Trigger.Request(), 20.0))
 
     with Spinning(asking):

@@ -52,7 +52,7 @@ def test_rclpy_spin_as_the_global_executor(as_global, make_node, ros_context):
     group = ReentrantCallbackGroup()
     met: list[int] = []
 
-    def meet() -> None:
+    def meet():
         if not met:
             met.append(together.wait(5.0))
             rclpy.try_shutdown(context=ros_context)
@@ -199,7 +199,7 @@ def test_one_of_rclpys_executors_in_the_same_process(make_executor, make_node, r
     to_here = there.create_publisher(Header, '/to_here', DEPTH)
     got: list[int] = []
 
-    def back(message: Header) -> None:
+    def back(message):
         got.append(message.stamp.sec)
         message.stamp.sec += 1
         to_there.publish(message) if message.stamp.sec < 1000 else done.set()
@@ -268,7 +268,7 @@ def test_a_forked_process_disturbs_nothing_and_ends(make_executor, make_node):
     executor = make_executor(num_workers=3, nodes=[node])
     assert wait_for(lambda: publisher.get_subscription_count() == 1)
 
-    def start(target: Any, *args: Any) -> Any:
+    def start(target, *args):
         process = fork.Process(target=target, args=args)
         process.start()
         return process

@@ -14,7 +14,6 @@ from rclpy.action import ActionClient, ActionServer, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import LivelinessPolicy, QoSProfile
@@ -65,17 +64,15 @@ def test_a_lifecycle_node_goes_through_its_transitions(make_executor, make_node,
     other.create_subscription(Header, '/managed', heard.append, 10)
     executor = make_executor(nodes=[managed, other])
 
-    async def go(transition: int) -> str:
+    async def go(transition):
         request = ChangeState.Request(transition=Transition(id=transition))
         assert (await change.call_async(request)).success
-        label: str = (await state.call_async(GetState.Request())).current_state.label
-        return label
+        return (await state.call_async(GetState.Request())).current_state.label
 
-    def now_in(transition: int) -> str:
+    def now_in(transition):
         task = executor.create_task(go(transition))
         assert wait_for(task.done)
-        label: str = task.result()
-        return label
+        return task.result()
 
     with Spinning(executor) as spinning:
         assert change.wait_for_service(5.0) and state.wait_for_service(5.0)
@@ -126,7 +123,7 @@ def test_parameters_through_another_node_of_the_same_executor(make_executor, mak
     client = AsyncParameterClient(other, 'server', callback_group=ReentrantCallbackGroup())
     executor = make_executor(nodes=[node, other])
 
-    async def ask() -> tuple[Any, ...]:
+    async def ask():
         given = await client.set_parameters([Parameter('speed', value=5)])
         names = await client.list_parameters([], 10)
         values = await client.get_parameters(['speed', 'name'])
@@ -158,15 +155,15 @@ def test_entities_that_a_callback_makes_run(make_executor, make_node):
     kept: list[Any] = []
     group = ReentrantCallbackGroup()
 
-    def answer(request: Any, response: Any) -> Any:
+    def answer(request, response):
         ran['request'].append(1)
         return response
 
-    def execute(goal: Any) -> Any:
+    def execute(goal):
         goal.succeed()
         return Fibonacci.Result()
 
-    async def use(publisher: Any, client: Any, actions: Any) -> None:
+    async def use(publisher, client, actions):
         while not (publisher.get_subscription_count() and client.service_is_ready()
                    and actions.server_is_ready()):
             await pause()
@@ -175,13 +172,13 @@ def test_entities_that_a_callback_makes_run(make_executor, make_node):
         goal = await actions.send_goal_async(Fibonacci.Goal())
         ran['result'].append(await goal.get_result_async())
 
-    async def pause() -> None:
+    async def pause():
         future: Future = Future(executor=executor)
         timer = node.create_timer(0.005, lambda: future.set_result(None), group)
         await future
         node.destroy_timer(timer)
 
-    def make() -> None:
+    def make():
         first.cancel()
         node.create_timer(0.005, lambda: ran['timer'].append(1), group)
         node.create_subscription(Header, '/made', ran['message'].append, 10)
@@ -212,7 +209,7 @@ def test_a_cancelled_goal_request_does_not_block_its_callback_group(
     node, ticks = make_node(), []
     answered, cancelled = threading.Event(), threading.Event()
 
-    def accept(_: Any) -> GoalResponse:
+    def accept(_):
         cancelled.wait(15.0)
         answered.set()
         return GoalResponse.ACCEPT
@@ -244,7 +241,7 @@ def test_a_callback_may_destroy_what_it_belongs_to(make_executor, make_node):
             node = make_node()
             calls: list[str] = []
 
-            def heard(_: Header, node: Node = node, calls: list[str] = calls) -> None:
+            def heard(_, node=node, calls=calls):
                 calls.append('message')
                 node.destroy_subscription(next(iter(node.subscriptions)))
                 node.create_timer(0.001, lambda: calls.append('node') or node.destroy_node())
@@ -252,9 +249,7 @@ def test_a_callback_may_destroy_what_it_belongs_to(make_executor, make_node):
             publisher = node.create_publisher(Header, '/topic', 10)
             node.create_subscription(Header, '/topic', heard, 10)
 
-            def tick(
-                node: Node = node, calls: list[str] = calls, publisher: Any = publisher,
-            ) -> None:
+            def tick(node=node, calls=calls, publisher=publisher):
                 calls.append('timer')
                 if publisher.get_subscription_count():
                     node.destroy_timer(next(iter(node.timers)))

@@ -48,8 +48,8 @@ class Chain:
         self.a = self.nodes['source'].create_publisher(Header, '/a', 10)
         self.b = self.nodes['middle'].create_publisher(Header, '/b', 10)
 
-        def body(name: str, publisher: Any = None) -> Any:
-            def run(message: Any = None) -> None:
+        def body(name, publisher=None):
+            def run(message=None):
                 job = current_job()
                 self.jobs[name].append(job)
                 if message is None:
@@ -116,7 +116,7 @@ def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executo
 
 def test_jobs_that_overlap_and_overtake_are_told_apart(make_executor, make_node):
     """Odd jobs' relays take longer than a period, so messages on /b are out of order."""
-    def dawdle() -> None:
+    def dawdle():
         job = current_job()
         assert job is not None
         time.sleep(0.045 if job.job % 2 else 0.001)
@@ -183,7 +183,7 @@ def test_messages_of_another_process_in_the_same_microseconds_are_told_apart(
     node = make_node('own')
     publisher = node.create_publisher(Header, '/a', 10)
 
-    def sink(message: Header) -> None:
+    def sink(message):
         job = 'no job' if current_job() is None else 'a job'
         counts[f'{message.frame_id or "own"}: {job}'] += 1
 
@@ -226,8 +226,7 @@ nodes:
 """
 
 
-def test_sync_completes_with_the_last_leg_and_or_tells_publishers_apart(
-        make_executor, make_node):
+def test_sync_completes_with_the_last_leg_and_or_tells_publishers_apart(make_executor, make_node):
     group = ReentrantCallbackGroup()
     left, worker, join, right = (make_node(n) for n in ('left', 'worker', 'join', 'right'))
     legs: list[Any] = []
@@ -236,7 +235,7 @@ def test_sync_completes_with_the_last_leg_and_or_tells_publishers_apart(
     a2 = right.create_publisher(Header, '/a', 10)
     x, y = (worker.create_publisher(Header, t, 10) for t in ('/x', '/y'))
 
-    def tick() -> None:
+    def tick():
         a1.publish(Header())
         fork.publish(Header())
 
@@ -307,7 +306,7 @@ def test_ready_callbacks_run_in_the_policys_order(make_executor, make_node, poli
     group = ReentrantCallbackGroup()
     publishers = [source.create_publisher(Header, f'/{name}', 10) for name in 'cab']
 
-    def tick() -> None:
+    def tick():
         for ready, publisher in enumerate(publishers, 1):  # they become ready one after the other
             publisher.publish(Header())
             assert wait_for(lambda n=ready: executor.statistics()['queue'] == n)
@@ -353,7 +352,7 @@ def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, r
     """The run was judged by then, and its trace, which must agree, is closed."""
     begun, judged, ended = threading.Event(), threading.Event(), threading.Event()
 
-    def long() -> None:
+    def long():
         begun.set()
         judged.wait(60.0)
         ended.set()

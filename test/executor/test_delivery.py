@@ -54,9 +54,7 @@ def test_the_publishing_thread_takes(make_executor, make_node):
     assert got == ['before', '0', '1', '2']
 
 
-def test_messages_after_a_failed_take_run_in_the_next_spin(
-    make_executor, make_node, monkeypatch
-):
+def test_messages_after_a_failed_take_run_in_the_next_spin(make_executor, make_node, monkeypatch):
     """They arrived together, and no later message announces them."""
     node, got, errors = make_node(), [], [InvalidHandle('once')]
     take_with = compat.message_taker
@@ -101,8 +99,7 @@ rclpy.shutdown()
 
 
 def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
-    make_executor, make_node,
-):
+        make_executor, make_node):
     node, got = make_node('here'), []
     node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 1000)
     publisher = node.create_publisher(Header, '/a', 1000)
@@ -132,7 +129,7 @@ def test_nothing_is_lost_while_publishers_come_and_go(make_executor, make_node):
     executor = make_executor(nodes=[node])
     done = threading.Event()
 
-    def come_and_go() -> None:
+    def come_and_go():
         while not done.is_set():
             foreign = other.create_publisher(Header, '/a', 10)
             time.sleep(0.015)
@@ -161,7 +158,7 @@ def test_several_threads_publish_and_each_ones_order_is_kept(make_executor, make
     publishers = [node.create_publisher(Header, '/a', qos) for _ in range(4)]
     executor = make_executor(nodes=[node])
 
-    def publish(publisher: Any, name: int) -> None:
+    def publish(publisher, name):
         for number in range(200):
             publisher.publish(Header(frame_id=f'{name}:{number}'))
 
@@ -194,14 +191,13 @@ def test_a_message_from_before_the_subscription_comes_first(make_executor, make_
 
 @pytest.mark.parametrize('waits', ['always', 'seldom'])
 def test_work_does_not_wait_for_a_callback_that_goes_on_after_publishing(
-    make_executor, make_node, waits,
-):
+        make_executor, make_node, waits):
     """It waits until its message has been heard: no other thread would start that callback."""
     node, group, heard, waited = make_node(), ReentrantCallbackGroup(), threading.Event(), []
     publisher = node.create_publisher(Header, '/one', 10)
     calls = iter(range(10 ** 6))
 
-    def tick() -> None:
+    def tick():
         heard.clear()
         publisher.publish(Header())
         if waits == 'always' or next(calls) % 10 == 9:
@@ -234,7 +230,7 @@ def test_a_publishing_callback_wakes_the_workers_of_another_executor(ros_context
     publisher = nodes[0].create_publisher(Header, '/a', 100)
     waited = []
 
-    def publish() -> None:
+    def publish():
         before = len(got[1])
         publisher.publish(Header())
         waited.append(wait_for(lambda: len(got[1]) > before or len(waited) >= 5))

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 import time
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints, is_typeddict, Union
@@ -87,7 +86,7 @@ def test_a_source_that_stops_is_stale_until_it_goes_on():
 @pytest.mark.parametrize('wrong', [
     {'warn_ratio': 0.0}, {'warn_ratio': 1.5}, {'error_ratio': -1.0}, {'error_ratio': float('nan')},
     {'warn_burst': 0}, {'window': 0}, {'stale_periods': 0}])
-def test_thresholds_that_make_no_sense(wrong: dict[str, Any]):
+def test_thresholds_that_make_no_sense(wrong):
     with pytest.raises(UsageError, match=next(iter(wrong))):
         Thresholds(**wrong)
 
@@ -198,9 +197,7 @@ def check(value: Any, hint: Any, place: str) -> None:
         assert isinstance(value, hint), f'{place}: {value!r}'
 
 
-def test_statistics_have_the_declared_types(
-    ros_context: Any, make_node: Any, tmp_path: Path
-) -> None:
+def test_statistics_have_the_declared_types(ros_context, make_node, tmp_path):
     trace = tmp_path / 'run.mcap'
     with MultiDeadlineExecutor(
             loads(GRAPH), context=ros_context, trace=trace,

@@ -28,7 +28,7 @@ def of_tasks(executor: Any, node: Any, call: Callable[[int], None]) -> None:
 def of_coroutines(executor: Any, node: Any, call: Callable[[int], None]) -> None:
     waiting: list[int] = []
 
-    async def work(number: int) -> None:
+    async def work(number):
         waiting.append(number)
         call(await futures[number])
 
@@ -51,7 +51,7 @@ def of_subscriptions(executor: Any, node: Any, call: Callable[[int], None]) -> N
 def of_services(executor: Any, node: Any, call: Callable[[int], None]) -> None:
     numbers = iter(range(MANY))
 
-    def answer(request: Any, response: Any) -> Any:
+    def answer(request, response):
         call(next(numbers))
         return response
 
@@ -68,14 +68,13 @@ def of_guards(executor: Any, node: Any, call: Callable[[int], None]) -> None:
 
 
 def of_waitables(executor: Any, node: Any, call: Callable[[int], None]) -> None:
-    def make(ran: Callable[[], None]) -> Callable[[], None]:
-        async def execute(data: int) -> None:
+    def make(ran):
+        async def execute(data):
             ran()
         pulse = Pulse(node, node.default_callback_group)
         pulse.execute = execute  # type: ignore[method-assign]
         node.add_waitable(pulse)
-        trigger: Callable[[], None] = pulse.guard.trigger
-        return trigger
+        return pulse.guard.trigger
     one_by_one(make, call)
 
 
@@ -85,7 +84,7 @@ def one_by_one(
     """Trigger what ``make`` makes of a callback, and again when that has run."""
     done: list[int] = []
 
-    def ran() -> None:
+    def ran():
         call(len(done))
         done.append(1)
 

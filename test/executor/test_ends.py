@@ -48,12 +48,12 @@ def test_spin_ends_with_its_context(way, end, inside, no_thread_leak, monkeypatc
     errors: list[BaseException] = []
     ran = threading.Event()
 
-    def callback() -> None:
+    def callback():
         ran.set()
         if inside:
             ENDS[end](context)
 
-    def spin() -> None:
+    def spin():
         try:
             while way == 'steps':
                 executor.spin_once(0.02)
@@ -84,7 +84,7 @@ def test_spin_ends_with_its_context(way, end, inside, no_thread_leak, monkeypatc
 @pytest.mark.parametrize('kind', [
     SingleThreadedExecutor, MultiThreadedExecutor, MultiDeadlineExecutor])
 def test_spin_returns_when_a_callback_shuts_down_as_rclpy_s_do(
-        kind: Any, ros_context, make_node, capfd) -> None:
+        kind, ros_context, make_node, capfd):
     """Also those that fail meanwhile, just because the context has ended, end nothing."""
     node = make_node()
     publisher = node.create_publisher(Empty, '/topic', 1)
@@ -101,7 +101,7 @@ def test_spin_returns_when_a_callback_shuts_down_as_rclpy_s_do(
 def test_what_the_callback_raises_that_shuts_down_comes_out(make_executor, make_node, ros_context):
     node = make_node()
 
-    def end() -> None:
+    def end():
         rclpy.shutdown(context=ros_context)
         time.sleep(0.05)
         raise SystemExit('done')
@@ -189,19 +189,19 @@ def run(**parts: str) -> None:
 
 
 @pytest.mark.parametrize('spin', [SPIN, STEPS])
-def test_a_program_may_end_while_a_daemon_thread_spins(spin: str) -> None:
+def test_a_program_may_end_while_a_daemon_thread_spins(spin):
     run(spin=spin)
 
 
-def test_a_callback_that_never_ends_does_not_keep_a_program_from_ending() -> None:
+def test_a_callback_that_never_ends_does_not_keep_a_program_from_ending():
     run(spin=SPIN, callback='block')
 
 
-def test_a_program_may_shut_the_executor_down_right_before_it_ends() -> None:
+def test_a_program_may_shut_the_executor_down_right_before_it_ends():
     run(spin=SPIN, end='executor.shutdown(0)')
 
 
-def test_a_forked_child_ends_without_what_the_parent_has() -> None:
+def test_a_forked_child_ends_without_what_the_parent_has():
     # Only what Python does at exit: Fast DDS itself does not survive the end of such a child.
     end = (
         'import atexit, warnings\n'
@@ -319,7 +319,7 @@ def test_a_callback_of_spin_once_may_shut_down(make_executor, make_node):
     node, future, steps, done = make_node(), rclpy.Future(), threading.Event(), []
     executor = make_executor(num_workers=2, nodes=[node])
 
-    def callback() -> None:
+    def callback():
         if steps.is_set():
             done.append(executor.shutdown(5.0))
         elif not future.done():  # a worker may run it again before the spin has ended

@@ -93,7 +93,7 @@ class Driver:
 
 @examples(150)
 @given(cases(policies=PLAIN, groups=False, bounds=False))
-def test_the_same_events_give_the_same_answers_as_the_simulator(case: Case) -> None:
+def test_the_same_events_give_the_same_answers_as_the_simulator(case):
     # A sync is one execution for each message here, and one in all there.
     assume(all(len(v.predecessors) <= 1 for d in case.task_set.dags for v in d.vertices))
     case = Case(case.task_set, case.ticks, case.workers, case.policy, preemptive=False)
@@ -108,7 +108,7 @@ def test_the_same_events_give_the_same_answers_as_the_simulator(case: Case) -> N
 
 @examples(150)
 @given(st.lists(st.booleans() | st.integers(0, 2), max_size=120))
-def test_nothing_waits_that_may_run_during_a_computing_callback(steps: list[bool | int]) -> None:
+def test_nothing_waits_that_may_run_during_a_computing_callback(steps):
     """What computes or does not becomes ready, or a worker ends, as the pool does it."""
     engine = Engine(
         None, 3, 'rad', default_deadline=10 ** 9, max_active_jobs=NEVER, expire_after=NEVER)
@@ -152,13 +152,13 @@ def busy_engine() -> Engine:
     engine = Engine(
         loads(GRAPH), 4, 'rad', default_deadline=10 ** 9, max_active_jobs=64, expire_after=NEVER)
 
-    def entity(group: int = -1, holds: bool = False, depth: int = 0) -> Entity:
+    def entity(group=-1, holds=False, depth=0):
         found = Entity('waitable', None, '/n', None, group, depth, '/t')
         found.kind = SUBSCRIPTION
         found.habit = GilHabit(holds)
         return found
 
-    def ready(which: Entity, count: int) -> None:
+    def ready(which, count):
         for _ in range(count):
             engine.ready(Work(which, print), 0)
 

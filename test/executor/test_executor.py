@@ -31,7 +31,7 @@ def test_subscriptions_of_each_kind(make_executor, make_node):
     node = make_node()
     got: dict[str, list[Any]] = {'plain': [], 'info': [], 'raw': [], 'async': []}
 
-    async def coroutine(message: Header) -> None:
+    async def coroutine(message):
         got['async'].append(message.frame_id)
 
     node.create_subscription(Header, '/plain', lambda m: got['plain'].append(m.frame_id), 10)
@@ -53,7 +53,7 @@ def test_subscriptions_of_each_kind(make_executor, make_node):
 def test_service_and_client_from_a_coroutine(make_executor, make_node):
     node, answers = make_node(), []
 
-    async def answer(request: Any, response: Any) -> Any:
+    async def answer(request, response):
         response.success, response.message = True, 'yes'
         return response
 
@@ -61,7 +61,7 @@ def test_service_and_client_from_a_coroutine(make_executor, make_node):
     client = node.create_client(Trigger, '/ask')
     group = MutuallyExclusiveCallbackGroup()  # a coroutine keeps its group while it waits
 
-    async def ask() -> None:
+    async def ask():
         answers.append((await client.call_async(Trigger.Request())).message)
 
     timer = node.create_timer(0.01, ask, group)
@@ -75,7 +75,7 @@ def test_service_and_client_from_a_coroutine(make_executor, make_node):
 def test_a_callback_that_waits_may_lend_its_worker(make_executor, make_node):
     node, event, seen = make_node(), threading.Event(), []
 
-    def wait() -> None:
+    def wait():
         waiting.cancel()
         with executor.lend():
             seen.append(event.wait(15.0))
@@ -98,7 +98,7 @@ def test_synchronous_calls_from_all_workers_at_once(make_executor, make_node):
         Trigger, '/ask', lambda request, response: response, callback_group=group)
     client = node.create_client(Trigger, '/ask', callback_group=group)
 
-    def ask() -> None:
+    def ask():
         together.wait(5.0)
         answers.append(client.call(Trigger.Request(), timeout_sec=5.0))
 
@@ -118,7 +118,7 @@ def test_tasks_functions_coroutines_and_futures_across_them(make_executor):
     future = Future(executor=executor)
     order = []
 
-    async def waits() -> str:
+    async def waits():
         order.append('waits')
         value = await future
         order.append('has it')
@@ -204,7 +204,7 @@ def test_mutually_exclusive_group_is_kept(make_executor, make_node):
     group, running, most, ran = MutuallyExclusiveCallbackGroup(), [0], [0], []
     lock = threading.Lock()
 
-    def exclusive(message: Header) -> None:
+    def exclusive(message):
         with lock:
             running[0] += 1
             most[0] = max(most[0], running[0])
@@ -239,7 +239,7 @@ def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):
     node, got, gate = make_node(), [], threading.Event()
     group = MutuallyExclusiveCallbackGroup()
 
-    def slow(message: Header) -> None:
+    def slow(message):
         got.append(message.stamp.sec)
         gate.wait(5.0)
 

@@ -32,7 +32,7 @@ def spin_until(executor: Any, condition: Any) -> list[int]:
     """Spin until something is true; return the jobs of which spin raised an exception."""
     caught = []
 
-    def look() -> bool:
+    def look():
         try:
             executor.spin_once(timeout_sec=0.002)
         except Wrong as error:
@@ -59,8 +59,7 @@ def agrees(trace: Path, statistics: dict[str, Any]) -> None:
                 key: value for key, value in counts.items() if key != 'response_ns'}
 
 
-def test_the_job_of_a_callback_that_raises_has_failed(
-        make_executor, make_node, tmp_path: Path) -> None:
+def test_the_job_of_a_callback_that_raises_has_failed(make_executor, make_node, tmp_path):
     misses: list[DeadlineMiss] = []
     chain = Chain(make_node, {'relay': odd_jobs_raise})
     trace = tmp_path / 'run.mcap'
@@ -89,14 +88,13 @@ def test_the_job_of_a_callback_that_raises_has_failed(
     agrees(trace, statistics)
 
 
-def test_what_had_been_published_before_still_runs(
-        make_executor, make_node, tmp_path: Path) -> None:
+def test_what_had_been_published_before_still_runs(make_executor, make_node, tmp_path):
     """The source raises after it has published: its messages are received, and not judged."""
     node, sink = make_node('source'), make_node('sink')
     publisher = node.create_publisher(Header, '/a', 10)
     came: list[int] = []
 
-    def tick() -> None:
+    def tick():
         job = current_job()
         publisher.publish(Header())
         raise Wrong(job.job)
@@ -127,18 +125,18 @@ nodes:
     agrees(trace, statistics)
 
 
-def test_a_listener_may_handle_exceptions_of_callbacks(make_executor, make_node) -> None:
+def test_a_listener_may_handle_exceptions_of_callbacks(make_executor, make_node):
     node, ended = make_node(), []
     numbers = iter(range(1000))
 
-    def tick() -> None:
+    def tick():
         if next(numbers) % 2:
             raise ValueError('odd')
 
-    async def coroutine() -> None:
+    async def coroutine():
         pass
 
-    def note(entity: Any, error: BaseException | None) -> bool:
+    def note(entity, error):
         ended.append((entity, str(error)))
         return error is not None
 
@@ -153,11 +151,11 @@ def test_a_listener_may_handle_exceptions_of_callbacks(make_executor, make_node)
         (timers[0], 'None'), (timers[0], 'odd'), (timers[1], 'None')}
 
 
-def test_a_coroutine_that_raises_after_it_has_waited(make_executor, make_node) -> None:
+def test_a_coroutine_that_raises_after_it_has_waited(make_executor, make_node):
     node = make_node('source')
     ran: list[int] = []
 
-    async def tick() -> None:
+    async def tick():
         job = current_job()
         future = executor.create_task(lambda: None)
         await future

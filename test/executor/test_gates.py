@@ -67,7 +67,7 @@ def test_a_timer_runs_as_often_as_its_group_lets_it(make_executor, node):
     group, ran, ticks = Tokens(3), [], []
     node.create_timer(0.001, lambda: ran.append(len(ticks)), callback_group=group)
 
-    def tick() -> None:
+    def tick():
         ticks.append(1)
         if len(ticks) % 10 == 0:
             group.give()
@@ -91,7 +91,7 @@ def test_messages_that_wait_are_as_many_as_the_qos_says_and_keep_their_order(mak
     publisher = node.create_publisher(Int32, '/gated', 50)
     executor = make_executor(nodes=[node])
 
-    def count(what: str) -> int:
+    def count(what):
         return int(sum(c[what] for name, c in executor.statistics()['callbacks'].items()
                        if name.startswith('/gated: ')))
 
@@ -109,7 +109,7 @@ def test_messages_that_wait_are_as_many_as_the_qos_says_and_keep_their_order(mak
 def test_a_coroutine_ends_when_it_has_run_to_its_end(make_executor, node):
     group, future, steps = AtMost(1), Future(), []
 
-    async def callback(message: Int32) -> None:
+    async def callback(message):
         steps.append(('begins', message.data))
         await future
         steps.append(('ends', message.data))

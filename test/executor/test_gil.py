@@ -67,13 +67,11 @@ class Bodies:
 
 
 @pytest.mark.parametrize('holds, at_once', [('true', 1), ('false', 4)])
-def test_as_many_run_at_once_as_the_declaration_says(
-    make_executor, make_node, holds, at_once,
-):
+def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, holds, at_once):
     node = make_node()
     gate = threading.Barrier(4) if at_once == 4 else None
 
-    def body(name: str) -> None:
+    def body(name):
         if gate is not None:
             gate.wait(20.0)  # passes only when all four are there
         compute(5)
@@ -90,7 +88,7 @@ def test_what_is_held_back_runs_in_the_order_of_deadlines(make_executor, make_no
     node = make_node()
     begun, go_on = threading.Event(), threading.Event()
 
-    def body(name: str) -> None:
+    def body(name):
         if name == 'a' and not begun.is_set():
             begun.set()
             while not go_on.is_set():  # computes
@@ -118,7 +116,7 @@ def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_
     group = ReentrantCallbackGroup()
     node.create_timer(0.001, lambda: ticks.append(None), callback_group=group)
 
-    def capture() -> None:
+    def capture():
         before, end = len(ticks), time.monotonic() + 50.0
         while len(ticks) < before + 3 and len(seen) < 3 and time.monotonic() < end:  # computes
             pass
@@ -144,7 +142,7 @@ def test_who_computes_is_learnt_and_shown(make_executor, make_node):
                       callback_group=ReentrantCallbackGroup())
     executor = make_executor(nodes=[node])
 
-    def found() -> dict[str, tuple[bool, float | None]]:
+    def found():
         return {name: (count['holds_interpreter'], count['interpreter_share'])
                 for name, count in executor.statistics()['callbacks'].items()
                 if count['kind'] == 'timer'}
@@ -242,7 +240,7 @@ class Computing:
 
 
 @pytest.fixture(params=['here', 'elsewhere'])
-def computing(request, make_executor, make_node, monkeypatch) -> Any:
+def computing(request, make_executor, make_node, monkeypatch):
     """Give these callbacks; messages come from threads of this process, or as from elsewhere."""
     if request.param == 'elsewhere':
         monkeypatch.setattr(publishing, 'replace_delivery', lambda *args: None)
@@ -284,7 +282,7 @@ def test_what_cannot_start_is_left_in_the_middleware(computing):
     """While the long one computes for as long as usual, no thread wakes for the patient one."""
     queued: list[int] = []
 
-    def meanwhile() -> bool:
+    def meanwhile():
         queued.append(computing.executor.statistics()['queue'])
         return True
 

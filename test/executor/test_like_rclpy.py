@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
 import threading
 import time
 
@@ -32,7 +31,7 @@ def test_a_coroutine_goes_on_in_the_step_after_its_future_is_done(make_executor)
     executor = make_executor()
     future: Future = Future(executor=executor)
 
-    async def wait() -> str:
+    async def wait():
         await future
         return 'done'
 
@@ -52,7 +51,7 @@ def test_other_callbacks_of_an_awaited_future_run_where_rclpy_runs_them(
         future: Future = Future()
         threads: list[int] = []
 
-        async def wait(future: Future = future) -> None:
+        async def wait(future=future):
             await future
 
         task = executor.create_task(wait)
@@ -79,14 +78,14 @@ def test_a_task_awaits_one_future_after_another(make_executor, mine, generates):
     futures = [executor.create_future() if mine else Future() for _ in range(20)]
     got = []
 
-    async def one_by_one() -> AsyncIterator[int]:
+    async def one_by_one():
         for future in futures:
             yield await future
 
-    async def inner(future: Future) -> None:
+    async def inner(future):
         got.append(await future)
 
-    async def outer() -> str:
+    async def outer():
         if generates:
             async for value in one_by_one():
                 got.append(value)

@@ -109,21 +109,21 @@ def tables(executor: Any) -> dict[str, int]:
 
 
 def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context):
-    def make(name: str) -> Any:  # not by the fixture, which keeps its nodes
+    def make(name):  # not by the fixture, which keeps its nodes
         return Node(name, context=ros_context, enable_rosout=False,
                     start_parameter_services=False)
 
     executor = make_executor(loads(GRAPH))
     made: list[weakref.ref[Any]] = []
 
-    def cycle(times: int) -> None:
+    def cycle(times):
         for _ in range(times):
             brief = Brief(executor, make, made)
             assert wait_for(brief.has_heard, 15.0), spinning.error
             brief.end()
             gc.collect()  # else it depends on how busy the interpreter is
 
-    def nothing_left() -> bool:
+    def nothing_left():
         gc.collect()
         return len(executor._registry.by_id) == 0 and not executor._registry._retired
 
@@ -135,12 +135,12 @@ def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context)
         cycle(CYCLES)
         assert wait_for(nothing_left, 15.0)
 
-        def grown() -> dict[str, tuple[int | None, int]]:
+        def grown():
             return {name: (before.get(name), size) for name, size in tables(executor).items()
                     if size - before.get(name, 0) >= CYCLES // 5}
         assert wait_for(lambda: not grown()), grown()
 
-        def left() -> list[Any]:
+        def left():
             gc.collect()
             return [thing() for thing in made[:-10 * SETTLED] if thing() is not None]
         assert wait_for(lambda: not left()), left()

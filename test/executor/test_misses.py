@@ -100,8 +100,7 @@ class SpinningOn(Spinning):
 @pytest.mark.parametrize(('does', 'workers'), [
     ('0', 7), ('1', 1), ('50', 2), ('raise', 1), ('exit', 7), ('log', 2), ('publish', 1),
     ('call', 1), ('call', 7)])
-def test_the_executor_runs_on_whatever_the_handler_does(
-        ros_context, make_node, does: str, workers: int) -> None:
+def test_the_executor_runs_on_whatever_the_handler_does(ros_context, make_node, does, workers):
     node = make_node('late')
     handler = Handler(does, node)
     ran = Counter[int]()
@@ -129,11 +128,11 @@ def test_the_executor_runs_on_whatever_the_handler_does(
 
 
 def test_callbacks_run_while_the_handler_hangs_and_what_does_not_fit_is_counted(
-        ros_context, make_node, capfd) -> None:
+        ros_context, make_node, capfd):
     """The only worker is free for them, and memory is bounded."""
     go_on, misses = threading.Event(), []
 
-    def hang(miss: DeadlineMiss) -> None:
+    def hang(miss):
         misses.append(miss)
         go_on.wait(60.0)
 
@@ -196,8 +195,7 @@ def judged(dags: dict[str, Any]) -> dict[str, Any]:
         for sink, counts in dag['sinks'].items()}) for name, dag in dags.items()}
 
 
-def test_a_result_that_never_comes_is_a_miss_at_its_deadline(
-        ros_context, make_node, capfd) -> None:
+def test_a_result_that_never_comes_is_a_miss_at_its_deadline(ros_context, make_node, capfd):
     misses: list[DeadlineMiss] = []
     once = Once(make_node, lambda: None, lambda: None)
     executor = MultiDeadlineExecutor(
@@ -221,14 +219,14 @@ def test_a_result_that_never_comes_is_a_miss_at_its_deadline(
         'completed_ns': None}
 
 
-def test_a_callback_that_hangs_is_a_miss_once(ros_context, make_node, tmp_path) -> None:
+def test_a_callback_that_hangs_is_a_miss_once(ros_context, make_node, tmp_path):
     """Known while it hangs, to all who ask; what comes of it later is its verdict."""
     misses: list[DeadlineMiss] = []
     go_on = threading.Event()
     once = Once(make_node, lambda: once.publisher.publish(Header()), lambda: go_on.wait(60.0))
     reported: list[dict[str, str]] = []
 
-    def diagnosed(message: DiagnosticArray) -> None:
+    def diagnosed(message):
         for status in message.status:
             if status.name == 'mddag: once':
                 reported.append({each.key: each.value for each in status.values})
@@ -255,7 +253,7 @@ def test_a_callback_that_hangs_is_a_miss_once(ros_context, make_node, tmp_path) 
     assert judged(replay(trace).result()['dags']) == judged(dags)
 
 
-def test_what_was_reported_is_what_a_replay_judges(ros_context, make_node, tmp_path) -> None:
+def test_what_was_reported_is_what_a_replay_judges(ros_context, make_node, tmp_path):
     """Callbacks end just before and after their deadlines."""
     generator, group = random.Random(1), ReentrantCallbackGroup()
     misses: list[DeadlineMiss] = []
@@ -315,7 +313,7 @@ print(*calls)
 """
 
 
-def test_the_first_miss_is_logged_as_cheaply_as_the_next() -> None:
+def test_the_first_miss_is_logged_as_cheaply_as_the_next():
     """In a fresh process, as the first lookup of rclpy's log fills a cache of Python."""
     out, err = run_program(LOGS_A_MISS)
     assert err.count('1 deadline missed') == 2

@@ -9,9 +9,7 @@ and a coroutine that goes on before is told off.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import inspect
-from typing import Any
 
 import pytest
 from rclpy.task import Future, Task
@@ -34,26 +32,26 @@ from .test_waitables import test_many_goals_at_once  # noqa: F401
 
 
 @pytest.fixture(autouse=True)
-def newer_rclpy(monkeypatch: pytest.MonkeyPatch) -> None:
+def newer_rclpy(monkeypatch):
     """Let futures and tasks do what they do since rclpy 7.1.9."""
     if hasattr(Task, '_add_resume_callback'):
         return
     call_function = Task.__call__
 
-    def wait(self: Any) -> Iterator[Any]:
+    def wait(self):
         if self._pending():
             yield self
         if self._pending():
             raise RuntimeError('it goes on before the future that it awaits is done')
         return self.result()
 
-    def call(self: Any) -> None:
+    def call(self):
         if not inspect.iscoroutine(self._handler):
             call_function(self)
         elif self._pending():
             step(self)
 
-    def step(task: Any) -> None:
+    def step(task):
         try:
             yielded = task._handler.send(None)
         except StopIteration as stop:
@@ -66,7 +64,7 @@ def newer_rclpy(monkeypatch: pytest.MonkeyPatch) -> None:
             else:
                 task._add_resume_callback(yielded, task._executor())
 
-    def resume(self: Any, future: Any, executor: Any) -> None:
+    def resume(self, future, executor):
         future.add_done_callback(lambda _: self())
 
     monkeypatch.setattr(Future, '__await__', wait)

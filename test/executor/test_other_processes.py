@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 import time
 from typing import Any
 
@@ -44,7 +44,7 @@ class Thing:
 @pytest.mark.parametrize('message', [
     b'raw', Thing(), Thing(header=None), Thing(stamp=3.5), Thing(header=Thing(stamp='x')),
     Header(), Thing(stamp=Thing(sec=None, nanosec=1))])
-def test_no_stamp(message: Any):
+def test_no_stamp(message):
     assert header_stamp(message) == -1
 
 
@@ -83,7 +83,7 @@ class Nodes:
         self.raw.publish(message)
 
     def _relay(self, name: str, publisher: Any) -> Callable[[Any], None]:
-        def relay(message: Any) -> None:
+        def relay(message):
             self.jobs.setdefault(name, []).append((current_job(), header_stamp(message)))
             if publisher is not None:
                 publisher.publish(message)
@@ -160,7 +160,7 @@ def test_a_dag_leaves_and_comes_back_to_the_same_job(make_executor, make_node):
 
 
 @pytest.fixture
-def lone(make_executor: Any, make_node: Any) -> Iterator[Any]:
+def lone(make_executor, make_node):
     """Give a spinning executor that has the last two nodes, a publisher on /half, and jobs."""
     nodes = Nodes(make_node)
     executor = make_executor(loads(CHAIN))

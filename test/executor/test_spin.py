@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 import threading
 import time
-from typing import Any
 
 import pytest
 from rclpy.task import Future
@@ -27,12 +26,12 @@ def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
     executor = make_executor(num_workers=1, nodes=[node])
     after: Future = Future(executor=executor)
 
-    def fail(*args: Any) -> None:
+    def fail(*args):
         if not after.done():
             executor.create_task(after.set_result, None)
         raise ZeroDivisionError(kind)
 
-    async def fail_later(*args: Any) -> None:
+    async def fail_later(*args):
         fail()
 
     if kind == 'timer':
@@ -84,7 +83,7 @@ class Turn:
 def test_a_coroutine_that_awaits_something_unknown_is_asked_again(make_executor, stepwise):
     executor, turns = make_executor(), []
 
-    async def work() -> str:
+    async def work():
         for turn in range(5):
             await Turn()
             turns.append(turn)
@@ -137,7 +136,7 @@ def test_every_task_wakes_a_loop_of_spin_once_and_a_spin_after_it(make_executor,
     """Not only the first one: what wakes has to be ready to wake again."""
     executor, ran = make_executor(), [threading.Event() for _ in range(20)]
 
-    def loop() -> None:
+    def loop():
         while not ran[9].is_set():
             executor.spin_once()
         executor.spin_until_future_complete(done, 30.0)
@@ -173,7 +172,7 @@ def test_shutdown_waits_for_a_running_callback(make_executor):
     executor = make_executor()
     begun, done = threading.Event(), []
 
-    def work() -> None:
+    def work():
         begun.set()
         time.sleep(0.2)
         done.append(1)
@@ -192,7 +191,7 @@ def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros
     node, calls = make_node(), []
     done: Future = Future()
 
-    def tick() -> None:
+    def tick():
         calls.append(1)
         if len(calls) > 10 and not done.done():
             done.set_result(None)
@@ -210,7 +209,7 @@ def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros
         executor.spin_until_future_complete(done, 5.0)
     assert done.done() and ros_context.ok()
 
-    def left() -> set[str]:
+    def left():
         names = {thread.name for thread in set(threading.enumerate()) - before}
         if end == 'shutdown':
             return names

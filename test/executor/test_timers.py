@@ -48,7 +48,7 @@ class Stepping(Spinning):
 
 
 @pytest.fixture(params=[Spinning, Stepping], ids=['spin', 'spin_once'])
-def spinning(request: Any) -> Any:
+def spinning(request):
     """Give the ways of spinning."""
     return request.param
 
@@ -73,13 +73,12 @@ def test_a_timer_that_was_cancelled_runs_when_it_is_reset(make_executor, make_no
 
 
 def test_a_timer_that_is_reset_before_it_is_due_never_runs_and_costs_no_memory(
-    make_executor, make_node,
-):
+        make_executor, make_node):
     """A watchdog."""
     node, barked, resets = make_node(), [], []
     watchdog = node.create_timer(60.0, lambda: barked.append(1))
 
-    def feed() -> None:
+    def feed():
         for _ in range(20):
             watchdog.reset()
         resets.append(1)
@@ -213,7 +212,7 @@ def test_periods_before_the_spin_are_no_jobs_and_no_misses(make_executor, make_n
     publisher = node.create_publisher(Header, '/topic', 10)
     node.create_subscription(Header, '/topic', lambda m: None, 10)
 
-    def tick() -> None:
+    def tick():
         ran.append(1)
         publisher.publish(Header())
 
@@ -231,8 +230,7 @@ def test_periods_before_the_spin_are_no_jobs_and_no_misses(make_executor, make_n
 
 @pytest.mark.parametrize('stamp', ['source_timestamp', 'header_stamp'])
 def test_a_message_from_before_the_spin_is_released_when_it_begins(
-    make_executor, make_node, stamp
-):
+        make_executor, make_node, stamp):
     node, got = make_node(), []
     publisher = node.create_publisher(Header, '/topic', 10)
     node.create_subscription(Header, '/topic', got.append, 10)
@@ -250,8 +248,7 @@ def test_a_message_from_before_the_spin_is_released_when_it_begins(
 
 @pytest.mark.parametrize('stamp', ['source_timestamp', 'header_stamp'])
 def test_a_pause_while_a_message_is_taken_does_not_move_its_release(
-    make_executor, make_node, stamp
-):
+        make_executor, make_node, stamp):
     node, got = make_node(), []
     publisher = node.create_publisher(Header, '/topic', 10)
     subscription = node.create_subscription(

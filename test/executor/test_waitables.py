@@ -101,7 +101,7 @@ def test_a_goal_expires_when_its_time_is_over(make_executor, make_node, stepwise
     counting = Counting(node, node, result_timeout=0.2)
     executor = make_executor(nodes=[node])
 
-    def known() -> int:
+    def known():
         return len(counting.server._goal_handles)
 
     for _ in range(2):
@@ -162,7 +162,7 @@ def test_each_trigger_of_a_guard_condition_is_noticed(make_executor, make_node, 
     node = make_node()
     executor = make_executor(nodes=[node])
 
-    def triggered(guard: Any, done: Any) -> None:
+    def triggered(guard, done):
         guard.trigger()
         if stepwise:
             end = time.monotonic() + 15.0
@@ -170,7 +170,7 @@ def test_each_trigger_of_a_guard_condition_is_noticed(make_executor, make_node, 
                 executor.spin_once(5.0)
         assert wait_for(done)
 
-    def rounds() -> None:
+    def rounds():
         for _ in range(5):
             calls: list[int] = []
             guard = node.create_guard_condition(lambda calls=calls: calls.append(1))
@@ -200,7 +200,7 @@ def test_each_trigger_of_a_guard_condition_is_noticed(make_executor, make_node, 
 def test_a_timer_gives_its_info_to_who_asks_for_it(make_executor, make_node):
     node, seen, plain = make_node(), [], []
 
-    def tick(call) -> None:
+    def tick(call):
         seen.append(call)
 
     tick.__annotations__['call'] = compat.TimerInfo

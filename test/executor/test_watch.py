@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
@@ -39,8 +37,7 @@ def add_camera_and_eye(
     return seen
 
 
-def test_what_never_ran_and_is_probably_meant(
-        make_executor: Callable[..., Any], make_node: Callable[..., Node]) -> None:
+def test_what_never_ran_and_is_probably_meant(make_executor, make_node):
     """A namespace more, and a timer of another period; the nodes are gone when it is asked."""
     task_set = loads("""
 mddag: 1
@@ -64,8 +61,7 @@ nodes:
     assert texts['/eye:see'].endswith(": did you mean the node '/robot/eye'?")
 
 
-def test_a_sync_that_never_got_one_of_its_topics(
-        make_executor: Callable[..., Any], make_node: Callable[..., Node], tmp_path: Path) -> None:
+def test_a_sync_that_never_got_one_of_its_topics(make_executor, make_node, tmp_path):
     task_set = loads("""
 mddag: 1
 nodes:
@@ -92,31 +88,31 @@ LEAST_S = 0.3
 
 
 @pytest.fixture(autouse=True)
-def check_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+def check_soon(monkeypatch):
     monkeypatch.setattr('mddag_executor.executor.name_check.LEAST_S', LEAST_S)
 
 
-def test_undeclared_callbacks_have_names(make_executor: Any, make_node: Any) -> None:
+def test_undeclared_callbacks_have_names(make_executor, make_node):
     executor = make_executor()
     node = make_node('robot')
     done: list[str] = []
 
-    def execute(goal: Any) -> Any:
+    def execute(goal):
         goal.succeed()
         return Fibonacci.Result()
 
-    def tick() -> None:
+    def tick():
         publisher.publish(String())
         done.append('tick')
 
-    def hear(message: String) -> None:
+    def hear(message):
         done.append('hear')
 
-    def answer(request: Any, response: Any) -> Any:
+    def answer(request, response):
         done.append('answer')
         return response
 
-    def wake() -> None:
+    def wake():
         done.append('wake')
 
     server = ActionServer(node, Fibonacci, 'count', execute)
@@ -163,17 +159,15 @@ nodes:
     ('camera', 'robot/image', '1 declared callback was found in no node: /detector:detect '
      "(did you mean the topic '/robot/image'?); undeclared callbacks that ran: /detector: hear "
      '(subscription /robot/image): ')])
-def test_a_wrong_name_is_warned_of_once(
-        ros_context: Any, make_node: Any, capfd: Any, node: str, topic: str, expected: str | None
-) -> None:
+def test_a_wrong_name_is_warned_of_once(ros_context, make_node, capfd, node, topic, expected):
     camera, detector = make_node(node), make_node('detector')
     publisher = camera.create_publisher(String, topic, 10)
     heard: list[Any] = []
 
-    def tick() -> None:
+    def tick():
         publisher.publish(String())
 
-    def hear(message: String) -> None:
+    def hear(message):
         heard.append(message)
 
     camera.create_timer(0.05, tick)
@@ -192,8 +186,7 @@ def test_a_wrong_name_is_warned_of_once(
         assert f'camera.yaml: {expected}' in line
 
 
-def test_a_subscription_that_gets_nothing_for_its_qos_is_named(
-        make_executor: Callable[..., Any], make_node: Callable[..., Node]) -> None:
+def test_a_subscription_that_gets_nothing_for_its_qos_is_named(make_executor, make_node):
     source, sink = make_node('source'), make_node('sink')
     publisher = source.create_publisher(
         Header, '/a', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
@@ -210,7 +203,7 @@ nodes:
     executor.add_node(source)
     executor.add_node(sink)
 
-    def callbacks() -> Any:
+    def callbacks():
         return executor.statistics()['callbacks']
 
     with Spinning(executor):

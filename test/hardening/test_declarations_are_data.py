@@ -16,7 +16,7 @@ import msg_graph
 import numpy as np
 import pytest
 
-from ..conftest import Call, Done
+from ..conftest import Done
 
 TOP = Path(__file__).resolve().parents[2]
 AUTOWARE = TOP / 'config' / 'autoware.yaml'
@@ -68,7 +68,7 @@ def refused(done: Done, folder: Path) -> None:
 @pytest.mark.parametrize(('verb', 'name'), [
     (verb, name) for verb in ('check', 'from-caret') for name in HARMFUL
     if (verb, name) not in HARMLESS])
-def test_harmful_yaml_is_refused(call: Call, tmp_path: Path, verb: str, name: str) -> None:
+def test_harmful_yaml_is_refused(call, tmp_path, verb, name):
     (tmp_path / 'graph.yaml').write_text(HARMFUL[name])
     output = ('-o', 'out.yaml') if verb == 'from-caret' else ()
     refused(call('graph', verb, 'graph.yaml', *output, cwd=tmp_path), tmp_path)
@@ -80,7 +80,7 @@ def test_harmful_yaml_is_refused(call: Call, tmp_path: Path, verb: str, name: st
     ('simulate', AUTOWARE, '--execution-times', '/dev/zero'),
     ('replay', '/dev/zero'), ('replay', '/dev/urandom'),
 ], ids=lambda arguments: ' '.join(map(str, arguments[:2])).replace(str(AUTOWARE), ''))
-def test_endless_files(mddag: Call, tmp_path: Path, arguments: tuple[str, ...]) -> None:
+def test_endless_files(mddag, tmp_path, arguments):
     refused(mddag(*arguments, cwd=tmp_path, timeout=30), tmp_path)
 
 
@@ -93,7 +93,7 @@ OUTSIDE, IRREGULAR = 'lies outside of the folder of the first file', 'it is no r
     *((name, '') for name in (
         'sub/../../secret.yaml', '~/secret.yaml', '/dev/zero', '.', '"a\\0b"', '"-"',
         'file:///etc/passwd', '$(HOME)/x', "''", 'null'))])
-def test_includes_stay_in_their_folder(tmp_path: Path, name: str, says: str) -> None:
+def test_includes_stay_in_their_folder(tmp_path, name, says):
     """And what is outside of it is not even looked at."""
     secret = tmp_path / 'secret.yaml'
     secret.write_text('mddag: 1\nnodes: [the secret]\n')
@@ -114,7 +114,7 @@ def test_includes_stay_in_their_folder(tmp_path: Path, name: str, says: str) -> 
     '[' * 200_000, '{"d": ' * 100_000, f'{{"d": {{"/n:x": 1{"0" * 5000}}}}}', 'NaN', '1e999', '',
     '{"control": {"/x:y": "\\u001b[2J"}}', '\ud800'.encode('utf-8', 'replace').decode()],
     ids=range(8))  # pytest 7 would hand the whole text on in the environment
-def test_harmful_tables_of_execution_times(call: Call, tmp_path: Path, text: str) -> None:
+def test_harmful_tables_of_execution_times(call, tmp_path, text):
     (tmp_path / 'times.json').write_text(text)
     done = call('simulate', AUTOWARE, '--execution-times', 'times.json', cwd=tmp_path)
     refused(done, tmp_path)
@@ -128,7 +128,7 @@ class Owner:
 
 
 @pytest.mark.parametrize('key', ['/n:t', 'control', 'x'])
-def test_samples_are_no_pickles(call: Call, tmp_path: Path, key: str) -> None:
+def test_samples_are_no_pickles(call, tmp_path, key):
     (tmp_path / 'graph.yaml').write_text(
         HEAD + 'nodes: [{node: /n, callbacks: [{name: t, timer: 1ms, deadline: 1ms}]}]\n')
     np.savez(tmp_path / 'samples.npz', **{key: np.array([Owner()], dtype=object)})

@@ -22,8 +22,6 @@ from mddag_executor.trace.schema import EVENTS
 import pytest
 import yaml
 
-from ..conftest import Call
-
 TOP = Path(__file__).resolve().parents[2]
 BAG = TOP / 'bags' / 'demo_short.mcap'
 
@@ -59,7 +57,7 @@ KEPT = {('task_set', 'yaml'), ('task_set', 'policy')}
 
 
 @pytest.fixture(scope='module')
-def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trace(tmp_path_factory):
     return with_texts(tmp_path_factory.mktemp('hostile') / 'run.mcap',
                       lambda event, field, number: HOSTILE[number % len(HOSTILE)])
 
@@ -81,7 +79,7 @@ VERBS = {
 
 
 @pytest.mark.parametrize('name', VERBS)
-def test_no_verb_obeys_a_name(call: Call, trace: Path, tmp_path: Path, name: str) -> None:
+def test_no_verb_obeys_a_name(call, trace, tmp_path, name):
     before = {path for path in Path('/tmp').iterdir() if 'mddag-owned' in path.name}
     arguments = [str(trace) if word == 'TRACE' else word for word in VERBS[name]]
     done = call(*arguments, cwd=tmp_path)
@@ -110,7 +108,7 @@ def test_no_verb_obeys_a_name(call: Call, trace: Path, tmp_path: Path, name: str
 
 
 @pytest.mark.parametrize('field', ['yaml', 'policy', 'file'])
-def test_a_hostile_declaration_in_a_trace(tmp_path: Path, field: str) -> None:
+def test_a_hostile_declaration_in_a_trace(tmp_path, field):
     """It is refused in one line, or its name is only a name."""
     for text in HOSTILE:
         judge_with(tmp_path, field, text)
@@ -134,9 +132,7 @@ def judge_with(tmp_path: Path, field: str, text: str) -> None:
 
 
 @pytest.mark.parametrize('include', ['/etc/passwd', 'secret.yaml', '../secret.yaml'])
-def test_a_declaration_in_a_trace_includes_nothing(
-    call: Call, tmp_path: Path, include: str
-) -> None:
+def test_a_declaration_in_a_trace_includes_nothing(call, tmp_path, include):
     (tmp_path / 'secret.yaml').write_text('mddag: 1\nnodes: [this is secret]\n')
     event = next(event for event in read_events(BAG) if event['_name'] == 'mddag:task_set')
     with TraceFile(tmp_path / 'run.mcap') as file:
@@ -153,7 +149,7 @@ def test_a_declaration_in_a_trace_includes_nothing(
 
 @pytest.mark.parametrize('names', [
     ['../secret.mcap'], ['/etc/passwd'], ['sub/../../secret.mcap'], ['\x00'], [5], {}, [[]], None])
-def test_a_bag_names_only_its_own_files(call: Call, tmp_path: Path, names: object) -> None:
+def test_a_bag_names_only_its_own_files(call, tmp_path, names):
     (tmp_path / 'secret.mcap').write_bytes(BAG.read_bytes())
     bag = tmp_path / 'bag'
     bag.mkdir()
@@ -165,10 +161,10 @@ def test_a_bag_names_only_its_own_files(call: Call, tmp_path: Path, names: objec
     harmless(done.stderr)
 
 
-def test_a_flood_of_diagnostics_fills_no_memory() -> None:
+def test_a_flood_of_diagnostics_fills_no_memory():
     board = Board()
 
-    def say(process: str) -> None:
+    def say(process):
         board.take(SimpleNamespace(status=[SimpleNamespace(
             hardware_id=process, name='mddag: d', level=b'\0', message='',
             values=[SimpleNamespace(key='window_missed_ratio', value='0')])]))

@@ -4,10 +4,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 import threading
 import time
-from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.errors import MddagError
@@ -41,9 +39,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(('name', 'value'), WRONG)
-def test_a_wrong_argument_is_named_in_one_line(
-    ros_context: Any, tmp_path: Path, name: str, value: Any
-) -> None:
+def test_a_wrong_argument_is_named_in_one_line(ros_context, tmp_path, name, value):
     trace = tmp_path / 'trace.mcap'
     arguments = {'context': ros_context, 'trace': str(trace), name: value}
     with pytest.raises(MddagError) as caught:
@@ -54,35 +50,35 @@ def test_a_wrong_argument_is_named_in_one_line(
 
 
 @pytest.mark.parametrize('period', ['soon', '', '5', '1 parsec'])
-def test_a_wrong_time_is_a_graph_error(ros_context: Any, period: str) -> None:
+def test_a_wrong_time_is_a_graph_error(ros_context, period):
     for name in ('default_deadline', 'diagnostics_period'):
         with pytest.raises(ValueError, match=f'^{name}: .*(is not a time|unit|time)'):
             MultiDeadlineExecutor(context=ros_context, **{name: period})
 
 
 @pytest.mark.parametrize('graph', ['', 'no/such.yaml', '/', 'a\0b'])
-def test_a_path_that_leads_nowhere(ros_context: Any, graph: str) -> None:
+def test_a_path_that_leads_nowhere(ros_context, graph):
     with pytest.raises(msg_graph.GraphError) as caught:
         MultiDeadlineExecutor(graph, context=ros_context)
     assert str(caught.value).isprintable()
 
 
 @pytest.fixture
-def executor(ros_context: Any) -> Any:
+def executor(ros_context):
     made = MultiDeadlineExecutor(msg_graph.loads(GRAPH), 2, context=ros_context)
     yield made
     assert made.shutdown(5.0)
 
 
 @pytest.fixture
-def node(ros_context: Any) -> Any:
+def node(ros_context):
     made = rclpy.create_node('n', context=ros_context, start_parameter_services=False)
     yield made
     made.destroy_node()
 
 
 @pytest.mark.parametrize('wrong', [None, 5, 'node', object()])
-def test_what_is_no_node(executor: Any, wrong: Any) -> None:
+def test_what_is_no_node(executor, wrong):
     with pytest.raises(TypeError, match='is no node'):
         executor.add_node(wrong)
     assert executor.get_nodes() == []
@@ -90,7 +86,7 @@ def test_what_is_no_node(executor: Any, wrong: Any) -> None:
 
 
 @pytest.mark.parametrize('wrong', ['x', [], {}, 1j])
-def test_a_wrong_timeout_leaves_the_executor_as_it_was(executor: Any, wrong: Any) -> None:
+def test_a_wrong_timeout_leaves_the_executor_as_it_was(executor, wrong):
     with pytest.raises(TypeError):
         executor.spin_once(wrong)
     with pytest.raises(TypeError):
@@ -98,7 +94,7 @@ def test_a_wrong_timeout_leaves_the_executor_as_it_was(executor: Any, wrong: Any
     executor.spin_once(0.0)  # would say that it spins already
 
 
-def test_after_shutdown(executor: Any, node: Any) -> None:
+def test_after_shutdown(executor, node):
     executor.add_node(node)
     assert executor.shutdown(5.0) and executor.shutdown(5.0)
     begin = time.monotonic()
@@ -115,13 +111,13 @@ def test_after_shutdown(executor: Any, node: Any) -> None:
     assert time.monotonic() - begin < 5.0
 
 
-def test_everything_from_many_threads_at_once(executor: Any, ros_context: Any) -> None:
+def test_everything_from_many_threads_at_once(executor, ros_context):
     """Whatever threads do to an executor that spins, it goes on and ends."""
     errors: list[BaseException] = []
     stop = threading.Event()
     ran = []
 
-    def disturb(index: int) -> None:
+    def disturb(index):
         try:
             while not stop.is_set():
                 mine = rclpy.create_node(

@@ -97,14 +97,14 @@ def through_all_verbs(text: str) -> int:
 
 @settings(max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow])
 @given(composed())
-def test_composed(text: str) -> None:
+def test_composed(text):
     through_all_verbs(text)
 
 
 @settings(max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow])
 @given(st.integers(0, 2**31), st.integers(0, 2**31), st.sampled_from(
     ['', 'cut', 'double', 'number', 'word']))
-def test_generated_and_damaged(seed: int, place: int, how: str) -> None:
+def test_generated_and_damaged(seed, place, how):
     status, text = run('generate', '--seed', str(seed), '--dags', '1:3', '--vertices', '1:6',
                        '--utilisation', str(0.1 + seed % 4 / 10), '--workers', '2')
     assert status == 0

@@ -59,7 +59,7 @@ paths:
 
 
 @pytest.fixture(scope='module')
-def runs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Row]]:
+def runs(tmp_path_factory):
     """Give the events of a small run and the first ones of a recorded run, entities and all."""
     folder = tmp_path_factory.mktemp('run')
     (folder / 'graph.yaml').write_text(GRAPH)
@@ -142,7 +142,7 @@ def give(rows: list[Row], seed: int) -> int:
 
 @pytest.mark.filterwarnings('ignore')
 @pytest.mark.parametrize('batch', range(BATCHES))
-def test_events_that_lie(runs: list[list[Row]], batch: int) -> None:
+def test_events_that_lie(runs, batch):
     used = 0
     first = batch * EXAMPLES // BATCHES
     last = (batch + 1) * EXAMPLES // BATCHES
@@ -155,9 +155,7 @@ def test_events_that_lie(runs: list[list[Row]], batch: int) -> None:
 
 
 @pytest.mark.parametrize('period', [2**63 - 1, 86_400_000_000_001, 999, 0, -1, -2**63])
-def test_a_timer_that_no_declaration_could_have(
-    runs: list[list[Row]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, period: int
-) -> None:
+def test_a_timer_that_no_declaration_could_have(runs, tmp_path, monkeypatch, period):
     """Such a period becomes a blank to fill in (seeds 872 and 1152 found a traceback)."""
     monkeypatch.chdir(tmp_path)
     lying = [(name, time, pid, tid, [values[0], period] if name == 'ros2:rcl_timer_init'

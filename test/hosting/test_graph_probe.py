@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 import re
 import threading
 
@@ -13,8 +12,6 @@ from mddag_executor.hosting.graph_probe import draft_of, probe, Seen
 from msg_graph import loads
 from msg_graph.draft import declaration_of, MARK
 import pytest
-from rclpy.context import Context
-from rclpy.node import Node
 from std_msgs.msg import Empty, String
 
 from ..executor.conftest import Spinning, wait_for
@@ -29,7 +26,7 @@ def seen(interval_ms: float) -> Seen:
 
 
 @pytest.fixture
-def system(make_node: Callable[..., Node]) -> Iterator[None]:
+def system(make_node):
     """Give a camera at 50 Hz, what works on its images, and a topic of a type that is nowhere."""
     camera, worker = make_node('camera'), make_node('worker', namespace='/deep')
     images = camera.create_publisher(String, '/image', 10)
@@ -38,7 +35,7 @@ def system(make_node: Callable[..., Node]) -> Iterator[None]:
     worker.create_publisher(Empty, '/never', 10)
     end = threading.Event()
 
-    def run() -> None:
+    def run():
         while not end.wait(0.02):
             images.publish(String(data='x'))
             results.publish(Empty())
@@ -52,8 +49,7 @@ def system(make_node: Callable[..., Node]) -> Iterator[None]:
         thread.join()
 
 
-def test_a_real_system(
-        system: None, make_node: Callable[..., Node], ros_context: Context) -> None:
+def test_a_real_system(system, make_node, ros_context):
     ticks: list[float] = []
     watcher = make_node('watcher')
     with Spinning(MultiDeadlineExecutor(diagnostics_period='100ms', context=ros_context)):

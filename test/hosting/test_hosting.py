@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 import json
 import os
@@ -26,13 +26,12 @@ from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecu
 import rclpy.experimental
 from rclpy.node import Node
 
-from ..conftest import Call
 from .conftest import wait_for
 from .workspace import GRAPH, make_workspace
 
 
 @pytest.fixture
-def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def world(tmp_path, monkeypatch):
     return make_workspace(tmp_path, monkeypatch)
 
 
@@ -88,9 +87,7 @@ def heard(result: dict[str, Any]) -> int:
     ('chat:spins_once_for_ever', 'no longer ok'),
     ('chat:catches_signals', ''),
 ])
-def test_unmodified_programs_run_on_our_executor(
-    world: Path, listener: str, said: str
-) -> None:
+def test_unmodified_programs_run_on_our_executor(world, listener, said):
     result, output = run('chat_nodes/talker', listener, until=has_heard)
     assert heard(result) > 5
     assert result['never_ran'] == []
@@ -112,19 +109,17 @@ def test_unmodified_programs_run_on_our_executor(
         'of the node forty-two', 'of rclpy forty-two', 'step by step forty-two',
         'step by step of rclpy forty-two']),
 ])
-def test_programs_go_on_while_their_callbacks_run(
-    world: Path, specs: str, lines: list[str]
-) -> None:
+def test_programs_go_on_while_their_callbacks_run(world, specs, lines):
     run('chat_nodes/talker', *specs.split(),
         until=lambda: set(lines) <= set(Path('out.txt').read_text().splitlines()))
 
 
-def test_the_run_ends_when_a_callback_shuts_rclpy_down(world: Path) -> None:
+def test_the_run_ends_when_a_callback_shuts_rclpy_down(world):
     _, output = run('chat_nodes/talker', 'chat:shuts_down_in_a_callback')
     assert 'shut down' in output
 
 
-def test_the_run_ends_when_all_programs_have_ended(world: Path) -> None:
+def test_the_run_ends_when_all_programs_have_ended(world):
     _, output = run('chat:never_spins')
     assert 'typed w' in output.splitlines()
 
@@ -137,9 +132,7 @@ def test_the_run_ends_when_all_programs_have_ended(world: Path) -> None:
     ('chat:returns_nothing', 'it ended and neither returned a node nor initialised rclpy'),
     ('chat:needs_two', 'the function requires the arguments one, two'),
 ])
-def test_a_program_that_cannot_start_ends_the_run_with_one_line(
-    world: Path, mddag: Call, spec: str, message: str
-) -> None:
+def test_a_program_that_cannot_start_ends_the_run_with_one_line(world, mddag, spec, message):
     process = mddag('run', 'graph.yaml', '--node', spec, '--trace', 'out.mcap')
     assert process.returncode == 2
     assert process.stderr.startswith(f'error: --node {spec}: {message}')
@@ -147,9 +140,7 @@ def test_a_program_that_cannot_start_ends_the_run_with_one_line(
     assert not Path('out.mcap').exists()
 
 
-def test_an_exception_during_the_run_comes_out_behind_the_summary(
-    world: Path, mddag: Call
-) -> None:
+def test_an_exception_during_the_run_comes_out_behind_the_summary(world, mddag):
     spec, message = 'chat:raises_in_a_callback', 'ZeroDivisionError'
     process = mddag(
         'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '2s')
@@ -160,7 +151,7 @@ def test_an_exception_during_the_run_comes_out_behind_the_summary(
     assert 'results due' in process.stdout
 
 
-def test_exceptions_that_no_spin_waits_for_end_the_run(world: Path, mddag: Call) -> None:
+def test_exceptions_that_no_spin_waits_for_end_the_run(world, mddag):
     process = mddag('run', 'graph.yaml', '--node', 'chat:no_longer_spins', '--duration', '50s')
     assert process.returncode == 70
     assert 'ZeroDivisionError' in process.stderr.splitlines()[-1]
@@ -172,9 +163,7 @@ def test_exceptions_that_no_spin_waits_for_end_the_run(world: Path, mddag: Call)
     ('chat:never_ends', '--node chat:never_ends: its main() has not ended in time'),
     ('chat:blocks_in_a_callback', 'a callback has not ended in time; it is left behind'),
 ])
-def test_what_does_not_end_is_left_behind(
-    world: Path, mddag: Call, spec: str, warning: str
-) -> None:
+def test_what_does_not_end_is_left_behind(world, mddag, spec, warning):
     process = mddag(
         'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '1s')
     assert process.returncode == 0
@@ -182,14 +171,14 @@ def test_what_does_not_end_is_left_behind(
     assert 'results due' in process.stdout
 
 
-def test_what_nodes_print_stays_out_of_the_json(world: Path, mddag: Call) -> None:
+def test_what_nodes_print_stays_out_of_the_json(world, mddag):
     process = mddag('run', 'graph.yaml', '--node', 'chat:prints', '--duration', '0.2s',
                     '--json', '-')
     assert json.loads(process.stdout)['nodes'] == ['chat:prints']
     assert 'not JSON' in process.stderr
 
 
-def test_ros_arguments_reach_the_nodes(world: Path, mddag: Call) -> None:
+def test_ros_arguments_reach_the_nodes(world, mddag):
     (world / 'graph.yaml').write_text(GRAPH.replace('/chatter', '/talk'))
     process = mddag(
         'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', 'chat:Listener',
@@ -199,7 +188,7 @@ def test_ros_arguments_reach_the_nodes(world: Path, mddag: Call) -> None:
 
 
 @pytest.fixture
-def default_context(no_thread_leak: None) -> Iterator[None]:
+def default_context(no_thread_leak):
     """Initialise the default context, in which programs are hosted."""
     rclpy.init()
     yield
@@ -207,7 +196,7 @@ def default_context(no_thread_leak: None) -> Iterator[None]:
 
 
 @pytest.fixture
-def host(default_context: None) -> Iterator[Host]:
+def host(default_context):
     """Give a host whose executor does not spin."""
     with Host() as host:
         host.start(SingleThreadedExecutor(), [])
@@ -215,12 +204,12 @@ def host(default_context: None) -> Iterator[Host]:
     host.executor.shutdown()
 
 
-def test_rclpy_is_as_before_when_the_host_is_left(default_context: None) -> None:
-    def main() -> None:
+def test_rclpy_is_as_before_when_the_host_is_left(default_context):
+    def main():
         rclpy.init()
         signal.signal(signal.SIGUSR1, lambda *_: None)
 
-    def parts() -> list[Any]:
+    def parts():
         context = rclpy.get_default_context()
         return [
             rclpy.shutdown, rclpy.try_shutdown, rclpy.get_global_executor,
@@ -238,7 +227,7 @@ def test_rclpy_is_as_before_when_the_host_is_left(default_context: None) -> None
 
 @pytest.mark.parametrize('kind', [
     SingleThreadedExecutor, MultiThreadedExecutor, rclpy.experimental.EventsExecutor])
-def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host: Host, kind: Any) -> None:
+def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host, kind):
     other = (getattr(rclpy.experimental, kind.__name__) if kind.__name__ == 'EventsExecutor'
              else kind)()
     first, second = Node('first'), Node('second')
@@ -268,14 +257,12 @@ def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host: Host, kind
     ('chat:main', 'chat'),
     ('chat:Listener', 'chat'),
 ])
-def test_what_exists_is_found(world: Path, spec: str, argv0: str) -> None:
+def test_what_exists_is_found(world, spec, argv0):
     program = resolve(spec)
     assert (program.spec, program.argv0) == (spec, argv0.format(world=world))
 
 
-def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(
-    world: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(world, monkeypatch):
     (world / 'mine_argv.py').write_text(
         'import sys\nseen = [*sys.argv]\ndef main():\n    return seen\n')
     monkeypatch.syspath_prepend(world)
@@ -316,7 +303,7 @@ def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(
     ('chat:NoNode', "'NoNode' is a class, but no rclpy node"),
     ('chat:NUMBER', "'NUMBER' is no function and no class, but of type int"),
 ])
-def test_what_does_not_exist_is_said_on_one_line(world: Path, spec: str, message: str) -> None:
+def test_what_does_not_exist_is_said_on_one_line(world, spec, message):
     with pytest.raises(LoadingError) as error:
         resolve(spec)
     text = str(error.value)

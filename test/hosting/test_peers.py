@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 import signal
 import subprocess
 import sys
@@ -40,7 +39,7 @@ def child(body: str) -> list[str]:
     return [sys.executable, '-c', CHILD % body]
 
 
-def test_nodes_are_measured_as_one_run(tmp_path: Path) -> None:
+def test_nodes_are_measured_as_one_run(tmp_path):
     graph = tmp_path / 'graph.yaml'
     graph.write_text(GRAPH + 'processes: {one: [/a], two: [/b]}\n')
     result = measure_peer(
@@ -51,7 +50,7 @@ def test_nodes_are_measured_as_one_run(tmp_path: Path) -> None:
     assert list(result['dags']['/a']['sinks']) == ['/b:s'] and result['callbacks'] > 0
 
 
-def test_what_is_wrong_is_one_line(tmp_path: Path) -> None:
+def test_what_is_wrong_is_one_line(tmp_path):
     (tmp_path / 'bad.yaml').write_text(GRAPH.replace('500ms', '0ms'))
     with pytest.raises(GraphError, match=r'bad.yaml:5: '):
         measure_peer('multi', str(tmp_path / 'bad.yaml'), 2, seconds=1.0, seed=0, utilisation=0.1,
@@ -67,7 +66,7 @@ def test_what_is_wrong_is_one_line(tmp_path: Path) -> None:
     ('os.kill(os.getpid(), 11)', '^it: it crashed with signal 11$'),
     ('os._exit(3)', '^it: it ended with status 3$'),
     ('os._exit(0)', "^it: it ended well but gave no result: b''$")])
-def test_a_crash_says_how(body: str, says: str) -> None:
+def test_a_crash_says_how(body, says):
     with pytest.raises(CrashError, match=says):
         run_child(child(body), 'it', 60.0)
 
@@ -75,7 +74,7 @@ def test_a_crash_says_how(body: str, says: str) -> None:
 @pytest.mark.parametrize('hangs', [
     'threading.Event().wait()',
     'import ctypes; ctypes.PyDLL(None).pause()'])  # with the interpreter: none of it runs any more
-def test_a_child_does_not_outlive_who_wants_its_result(tmp_path: Path, hangs: str) -> None:
+def test_a_child_does_not_outlive_who_wants_its_result(tmp_path, hangs):
     mark = tmp_path / 'pid'
     body = (f'Path({str(mark)!r} + "x").write_text(str(os.getpid())); '
             f'os.rename({str(mark)!r} + "x", {str(mark)!r}); {hangs}')

@@ -23,8 +23,6 @@ from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
 
-from ..conftest import Call
-
 GUESTS = Path(__file__).resolve().parent / 'guests'
 CHAIN = """\
 mddag: 1
@@ -46,7 +44,7 @@ NODES = [argument for name in ('sensor', 'first', 'second', 'last')
 
 
 @pytest.fixture
-def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def world(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
         [str(GUESTS), *filter(None, [os.environ.get('PYTHONPATH')])]))
@@ -98,8 +96,7 @@ def running(*arguments: str) -> Iterator[Running]:
             process.kill()  # its processes end with it
 
 
-def test_synthetic_nodes_in_two_processes_are_measured_as_one_run(
-        world: Path, mddag: Call) -> None:
+def test_synthetic_nodes_in_two_processes_are_measured_as_one_run(world, mddag):
     (world / 'chain.yaml').write_text(CHAIN.replace('60s', '500ms'))
     run = mddag('run', 'chain.yaml', '--synthetic', 'sleep', '--processes', '2',
                 '--duration', '1s', '--trace', 'out.mcap', '--json', 'result.json')
@@ -146,15 +143,15 @@ class Beside:
             self.wait(0.02)
 
 
-def test_processes_start_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_start_together(tmp_path, monkeypatch):
     """However late another process is: it is waited for until its nodes are made, and ready."""
     processes.Part.make(str(tmp_path), CHAIN)
     monkeypatch.setattr(processes.time, 'monotonic_ns', lambda: 5 * 10 ** 9)
     unmatched = ['/half']
     seen = []
 
-    def note(step: str, at: int) -> Callable[[], None]:
-        def write() -> None:
+    def note(step, at):
+        def write():
             seen.append([path.name for path in tmp_path.glob('first.*')])
             (tmp_path / f'second.{step}').write_text(str(at))
         return write
@@ -166,7 +163,7 @@ def test_processes_start_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert session.waited == 2 + processes.LEAD_NS / 1e9
 
 
-def test_what_is_lost_until_processes_have_met_is_of_no_job(world: Path) -> None:
+def test_what_is_lost_until_processes_have_met_is_of_no_job(world):
     (world / 'slow.py').write_text(
         'import time\ntime.sleep(1)\nfrom relay import last, second\n')
     (world / 'graph.yaml').write_text(PROCESSES + CHAIN.replace('60s', '1s').replace(
@@ -183,7 +180,7 @@ def test_what_is_lost_until_processes_have_met_is_of_no_job(world: Path) -> None
     assert live.due > 0
 
 
-def test_programs_run_in_the_process_of_their_nodes(world: Path) -> None:
+def test_programs_run_in_the_process_of_their_nodes(world):
     with running('graph.yaml', *NODES, '--trace', '.') as run:
         run.wait_for((world / 'enough').exists)
         run.process.send_signal(signal.SIGINT)
@@ -199,7 +196,7 @@ def test_programs_run_in_the_process_of_their_nodes(world: Path) -> None:
     assert ran == {'up': {0}, 'down': {0}}
 
 
-def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world: Path) -> None:
+def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
     with running('graph.yaml', *NODES, '--on-exit', 'continue', '--trace', 'out.mcap') as run:
         run.wait_for((world / 'enough').exists)
         os.kill(run.pids()['up'], signal.SIGKILL)
@@ -223,7 +220,7 @@ def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world: Path) ->
     assert sink['completed'] > 0 and set(replayed['callbacks']) >= {'/first:relay', '/last:sink'}
 
 
-def test_an_exception_in_one_ends_the_run_with_its_status(world: Path) -> None:
+def test_an_exception_in_one_ends_the_run_with_its_status(world):
     (world / 'bad.py').write_text(
         'from relay import sensor as good\n'
         'def sensor():\n'

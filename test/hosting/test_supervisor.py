@@ -5,13 +5,11 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 import signal
 import subprocess
 import sys
 import threading
 import time
-from types import FrameType
 from typing import Any
 
 from mddag_executor.hosting import processes as module
@@ -53,7 +51,7 @@ class Case:
 
     def stop_when(self, wanted: str) -> None:
         """Ask for the end as soon as something has been printed."""
-        def wait() -> None:
+        def wait():
             end = time.monotonic() + 60
             while wanted not in self.out.getvalue() and time.monotonic() < end:
                 time.sleep(0.01)
@@ -62,7 +60,7 @@ class Case:
         threading.Thread(target=wait, daemon=True).start()
 
 
-def test_output_has_the_name_of_the_process_before_each_line() -> None:
+def test_output_has_the_name_of_the_process_before_each_line():
     case = Case(True, a='print("one"); print("two", end="")',
                 b='import sys; print("three", file=sys.stderr)')
     assert case.run() == [('a', 0), ('b', 0)]
@@ -71,7 +69,7 @@ def test_output_has_the_name_of_the_process_before_each_line() -> None:
     assert not case.died
 
 
-def test_the_end_of_one_ends_all(tmp_path: Path) -> None:
+def test_the_end_of_one_ends_all(tmp_path):
     mark = tmp_path / 'waits'
     waits = WAITS.replace("print('waits')", f'open({str(mark)!r}, "w").close()')
     ends = f'import os, time\nwhile not os.path.exists({str(mark)!r}): time.sleep(0.01)'
@@ -80,7 +78,7 @@ def test_the_end_of_one_ends_all(tmp_path: Path) -> None:
     assert case.out.getvalue() == '[a] ends\n' and not case.died
 
 
-def test_one_that_dies_is_named_with_what_it_said() -> None:
+def test_one_that_dies_is_named_with_what_it_said():
     case = Case(True, a='raise ValueError("boom")',
                 b='import os, signal; os.kill(os.getpid(), signal.SIGKILL)', c='pass')
     assert dict(case.run()) == {'a': 1, 'b': -signal.SIGKILL, 'c': 0}
@@ -90,7 +88,7 @@ def test_one_that_dies_is_named_with_what_it_said() -> None:
     assert by_name['b'].how == 'was ended by SIGKILL'
 
 
-def test_all_end_when_asked_and_who_does_not_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_end_when_asked_and_who_does_not_is_killed(monkeypatch):
     monkeypatch.setattr(module, 'END_TIMEOUT_S', 0.1)
     deaf = WAITS.replace('lambda *_: end.set()', 'signal.SIG_IGN')
     case = Case(a=deaf)
@@ -103,8 +101,7 @@ def test_all_end_when_asked_and_who_does_not_is_killed(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize('is_deaf', [False, True])
 def test_who_does_not_end_when_the_run_is_over_is_asked_then_killed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_deaf: bool
-) -> None:
+        monkeypatch, tmp_path, is_deaf):
     monkeypatch.setattr(module, 'END_TIMEOUT_S', 0.1)
     mark = tmp_path / 'goes on'
     how = 'signal.SIG_IGN' if is_deaf else 'signal.SIG_DFL'
@@ -120,7 +117,7 @@ def test_who_does_not_end_when_the_run_is_over_is_asked_then_killed(
     assert said[1:] == ['warning: process a has not ended within 0.1 s: it is killed'] * is_deaf
 
 
-def test_it_ends_with_who_started_it(tmp_path: Path) -> None:
+def test_it_ends_with_who_started_it(tmp_path):
     mark = tmp_path / 'pid'
     child = ('import os, sys; from mddag_executor.hosting.processes import belong_to_parent; '
              'belong_to_parent(int(sys.argv[1])); from pathlib import Path; '
@@ -159,7 +156,7 @@ def stop_after(session: Session, steps: int) -> Any:
     """Return a trace function that stops the session, as a signal's handler would, at a step."""
     left = steps
 
-    def trace(frame: FrameType, event: str, _: Any) -> Any:
+    def trace(frame, event, _):
         nonlocal left
         frame.f_trace_opcodes = True
         if event == 'opcode':
@@ -171,7 +168,7 @@ def stop_after(session: Session, steps: int) -> Any:
     return trace
 
 
-def test_a_signal_stops_a_session_wherever_it_interrupts_the_wait() -> None:
+def test_a_signal_stops_a_session_wherever_it_interrupts_the_wait():
     for steps in range(1, DEEPEST):
         stop_at(steps)
 
@@ -180,7 +177,7 @@ def stop_at(steps: int) -> None:
     session = Session(Idle())  # type: ignore[arg-type]
     answers = []
 
-    def wait() -> None:
+    def wait():
         sys.settrace(stop_after(session, steps))
         answers.append(session.wait(0.01))
         sys.settrace(None)

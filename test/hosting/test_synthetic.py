@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 import threading
 import time
-from typing import Any
 
 from mddag_executor.executor import current_job
 from mddag_executor.executor.executor import MultiDeadlineExecutor
@@ -64,12 +63,12 @@ nodes:
 
 
 @pytest.fixture
-def task_set() -> TaskSet:
+def task_set():
     return loads(GRAPH, 'graph.yaml')
 
 
 @pytest.fixture(scope='module')
-def autoware() -> TaskSet:
+def autoware():
     return load(TOP / 'config' / 'autoware.yaml')
 
 
@@ -80,7 +79,7 @@ def drawn(task_set: TaskSet, plan: ExecutionPlan) -> list[list[int]]:
     return [[plan.execution_ns(d.index, v.index) for v in d.vertices] for d in task_set.dags]
 
 
-def test_scaling_gives_the_utilisation_asked_for(autoware: TaskSet) -> None:
+def test_scaling_gives_the_utilisation_asked_for(autoware):
     workers = 7
     plan = ExecutionPlan(autoware, 1, 0.6, workers)
     total = sum(plan.execution_ns(v.dag, v.index) / autoware.dags[v.dag].period_ns
@@ -93,7 +92,7 @@ def test_scaling_gives_the_utilisation_asked_for(autoware: TaskSet) -> None:
     assert max(ratios) == pytest.approx(min(ratios), rel=1e-4)  # one factor for all
 
 
-def test_the_critical_path_tells_what_is_infeasible() -> None:
+def test_the_critical_path_tells_what_is_infeasible():
     text = """
 mddag: 1
 nodes:
@@ -114,11 +113,11 @@ nodes:
 # --- emulation -----------------------------------------------------------------------------------
 
 
-def test_spinning_takes_cpu_of_its_own_thread_only() -> None:
+def test_spinning_takes_cpu_of_its_own_thread_only():
     emulate = spinner()
     taken = []
 
-    def spin() -> None:
+    def spin():
         start = time.thread_time_ns()
         emulate(30 * MS)
         taken.append(time.thread_time_ns() - start)
@@ -134,7 +133,7 @@ def test_spinning_takes_cpu_of_its_own_thread_only() -> None:
 # --- nodes ---------------------------------------------------------------------------------------
 
 
-def test_nodes_have_exactly_what_is_declared(task_set: TaskSet, ros_context: Any) -> None:
+def test_nodes_have_exactly_what_is_declared(task_set, ros_context):
     workload = SyntheticWorkload(task_set, ExecutionPlan(task_set), context=ros_context)
     nodes = {node.get_fully_qualified_name(): node for node in workload.nodes}
     assert set(nodes) == {c.node for c in task_set.callbacks}
@@ -165,7 +164,7 @@ def test_nodes_have_exactly_what_is_declared(task_set: TaskSet, ros_context: Any
     workload.destroy()
 
 
-def test_every_release_reaches_every_sink(task_set: TaskSet, ros_context: Any) -> None:
+def test_every_release_reaches_every_sink(task_set, ros_context):
     executor = MultiDeadlineExecutor(task_set, context=ros_context)
     workload = SyntheticWorkload(
         task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
@@ -209,7 +208,7 @@ SINGLE = ('mddag: 1\nnodes:\n  - node: /a\n    callbacks: '
           '[{name: a, timer: 100ms, deadline: 150ms, execution_time: 10ms}]\n')
 
 
-def test_every_nominal_release_whose_deadline_lies_in_the_window_is_due() -> None:
+def test_every_nominal_release_whose_deadline_lies_in_the_window_is_due():
     task_set = loads(SINGLE)
     ledger = Ledger(task_set)
     first = 1_700_000_000 * 1000 * MS

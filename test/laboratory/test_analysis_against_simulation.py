@@ -149,14 +149,14 @@ def check_border(seed: int, dags: int, workers: int, name: str, one: bool) -> No
         check_holds(task_set, verdict, workers, rng)
 
 
-def test_no_verdict_is_contradicted_by_a_run() -> None:
+def test_no_verdict_is_contradicted_by_a_run():
     check_random_set()
     check_border()
     # Each test has been on trial, and not just silent.
     assert min(held.values()) >= 5, held
 
 
-def test_rad_holds_wherever_any_policy_does() -> None:
+def test_rad_holds_wherever_any_policy_does():
     for seed in range(60):
         dags, workers = 1 + seed % 3, 1 + seed % 4
         text = random_graph(seed, True, dags, 0.3 * workers / dags)

@@ -40,7 +40,7 @@ def verdicts(text: str, workers: int, budget: str = 'max') -> dict[str, Verdict]
     return {verdict.name: verdict for verdict in found}
 
 
-def test_a_path_that_is_too_long() -> None:
+def test_a_path_that_is_too_long():
     found = verdicts(FORK.replace('deadline: 3ms', 'deadline: 2.9ms'), 8)
     assert found['longest path'].verdict == FAILS
     assert found['longest path'].figure == '3ms of 2.9ms at /n: /n:x'
@@ -48,7 +48,7 @@ def test_a_path_that_is_too_long() -> None:
     assert all(v.verdict == NOTHING for v in found.values() if v.kind == 'sufficient')
 
 
-def test_demand() -> None:
+def test_demand():
     found = verdicts(timers('10ms 1ms 1ms', '10ms 1ms 1ms'), 1)
     assert found['utilisation'].verdict == HOLDS
     assert found['demand bound'].verdict == FAILS
@@ -59,7 +59,7 @@ def test_demand() -> None:
     assert verdicts(FORK, 1)['demand bound'].verdict == HOLDS
 
 
-def test_only_rad_puts_the_urgent_first() -> None:
+def test_only_rad_puts_the_urgent_first():
     found = verdicts(timers('100ms 14ms 2ms', '100ms 100ms 4ms', '100ms 100ms 3ms'), 1)
     assert found['response time, any policy'].verdict == NOTHING
     bound = found['response time, RAD without preemption']
@@ -77,7 +77,7 @@ def test_only_rad_puts_the_urgent_first() -> None:
     ('deadline: 50ms', 'deadline: 99ms', None),
     ('name: t,', 'name: t, max_active_jobs: 1,', None),
 ])
-def test_assumptions(right: str, wrong: str, reason: str | None) -> None:
+def test_assumptions(right, wrong, reason):
     text = FORK.replace('deadline: 3ms', 'deadline: 45ms')
     found = verdicts(text.replace(right, wrong), 2)
     for verdict in found.values():
@@ -88,7 +88,7 @@ def test_assumptions(right: str, wrong: str, reason: str | None) -> None:
         assert found['response time, any policy'].verdict == HOLDS
 
 
-def test_without_preemption_less_is_proven() -> None:
+def test_without_preemption_less_is_proven():
     text = timers('100ms 5.999ms 2ms', '100ms 100ms 4ms')
     times, late = [[2 * MS], [4 * MS]], [100, 0]  # ns after the blocking one
     assert missed(loads(text), times, 'rad', False, 1, late)

@@ -27,17 +27,17 @@ def experiment(**changes: object) -> Experiment:
         loads(GRAPH), ('rad',), workers=1, duration_ns=200_000_000), **changes)
 
 
-def test_scaled() -> None:
+def test_scaled():
     assert scaled(loads(GRAPH), 'max', 1.5) == {
         '/n:x': 3_000_000, '/n:y': 15_000_000, '/n:z': 1_500_000}
     assert scaled(loads(GRAPH), 'max', 1e-9)['/n:x'] == 1_000
 
 
-def test_a_callback_that_is_several_sinks() -> None:
+def test_a_callback_that_is_several_sinks():
     assert scaled(loads(SHARED), 'max', 2.0) == {'/n:s': 8_000_000}
 
 
-def test_search_finds_the_tightest_scale() -> None:
+def test_search_finds_the_tightest_scale():
     """The scale is good, one that is 1 % smaller is not; what is reported had no part in it."""
     found = search(experiment(seed=3), 0.9, 'mean', runs=200)
     assert found.deadlines == scaled(loads(GRAPH), 'mean', found.scale)
@@ -54,7 +54,7 @@ def test_search_finds_the_tightest_scale() -> None:
     assert low <= found.check.ratio <= high
 
 
-def test_scale_by_hand() -> None:
+def test_scale_by_hand():
     """
     One callback alone, always 2 ms: just its critical path is enough, and nothing less.
 
@@ -81,20 +81,20 @@ nodes:
     assert 1.5 <= found.scale <= 1.5 * (1 + PRECISION)
 
 
-def test_overload_reaches_nothing() -> None:
+def test_overload_reaches_nothing():
     busy = loads(GRAPH.replace('timer: 10ms', 'timer: 1ms'))
     with pytest.raises(UsageError, match='no scale with deadlines up to half of a run '):
         search(experiment(task_set=busy), 0.9, runs=50)
 
 
 @pytest.mark.parametrize('target', [0.001, 0.5, 0.9, 0.95, 0.99, 0.999])
-def test_least_runs(target: float) -> None:
+def test_least_runs(target):
     runs = least_runs(target)
     assert wilson(runs, runs)[0] >= target
     assert runs == 1 or wilson(runs - 1, runs - 1)[0] < target
 
 
-def test_targets_that_cannot_be_shown() -> None:
+def test_targets_that_cannot_be_shown():
     with pytest.raises(UsageError, match='0.99: 50 runs cannot show it: give --runs 381'):
         search(experiment(), 0.99, runs=50)
     for target in (0.0, 1.0, 1.5, float('nan')):

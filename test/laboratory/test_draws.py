@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -34,7 +33,7 @@ nodes:
 
 
 @pytest.fixture
-def task_set() -> TaskSet:
+def task_set():
     """Give two DAGs of two vertices each, which share the callback c."""
     return loads(GRAPH, 'graph.yaml')
 
@@ -49,9 +48,7 @@ def table(values: list[int], percent: list[float]) -> TaskSet:
 @given(st.lists(st.integers(1, 10 ** 9), min_size=1, max_size=6),
        st.lists(st.floats(0, 100), min_size=6, max_size=6, unique=True),
        st.integers(0, 2 ** 64 - 1))
-def test_tables_are_drawn_as_one_by_one(
-    values: list[int], percent: list[float], seed: int
-) -> None:
+def test_tables_are_drawn_as_one_by_one(values, percent, seed):
     """The columns hold to the bit what ExecutionTime.draw gives for the same numbers."""
     quantiles = sorted(values)
     task_set = table(quantiles, sorted(percent)[:len(quantiles)])
@@ -95,9 +92,7 @@ GOOD = {'/n:a': [1], '/n:b': [1], '/n:c': [1]}
     (npz(**{**GOOD, '/n:b': [1, float('nan')]}), 'a value of /n:b is negative or no number'),
     (npz(**{**GOOD, '/n:b': [10 ** 18]}), 'a value of /n:b is negative or no number of ns'),
 ])
-def test_bad_samples(
-    task_set: TaskSet, tmp_path: Path, content: bytes, problem: str
-) -> None:
+def test_bad_samples(task_set, tmp_path, content, problem):
     path = tmp_path / 'samples.npz'
     path.write_bytes(content)
     with pytest.raises(InputError) as caught:
@@ -106,7 +101,7 @@ def test_bad_samples(
     assert '\n' not in str(caught.value)
 
 
-def test_utilisation_and_bound(task_set: TaskSet) -> None:
+def test_utilisation_and_bound(task_set):
     """By hand: periods 10 and 20 ms, both sinks with a deadline of 4 ms."""
     ms = 1_000_000
     times = np.array([
@@ -117,7 +112,7 @@ def test_utilisation_and_bound(task_set: TaskSet) -> None:
     assert feasible(task_set, times, 2, 3 * ms).all()  # no deadline within
 
 
-def test_bound_by_demand() -> None:
+def test_bound_by_demand():
     """Deadlines of 40 ms: within 100 ms are those of 7 jobs of one DAG and 4 of the other."""
     ms = 1_000_000
     task_set = loads(GRAPH.replace('4ms', '40ms'), 'graph.yaml')
@@ -130,18 +125,18 @@ def test_bound_by_demand() -> None:
 @pytest.mark.parametrize(('utilisation', 'centre'), [
     (0.0, 0.5), (0.5, 0.5), (0.52499, 0.5), (0.5251, 0.55), (0.5749, 0.55), (0.5751, 0.6),
     (0.7, 0.7), (0.92501, 0.95), (0.97499, 0.95), (0.97501, 1.0), (1.0, 1.0), (3.0, 1.0)])
-def test_bins(utilisation: float, centre: float) -> None:
+def test_bins(utilisation, centre):
     assert BINS[bins_of(np.array([utilisation]))[0]] == centre
 
 
-def test_wilson_covers_the_truth() -> None:
+def test_wilson_covers_the_truth():
     """Of many samples about 95 % have the true ratio in their interval."""
     drawn = np.random.Generator(np.random.Philox(1)).binomial(60, 0.9, 4000)
     covered = [low <= 0.9 <= high for low, high in (wilson(int(k), 60) for k in drawn)]
     assert 0.92 < np.mean(covered) < 0.98
 
 
-def test_acceptance() -> None:
+def test_acceptance():
     bins = np.array([0, 0, 2, 2, 2, 10])
     accepted = np.array([True, True, True, False, False, False])
     found = Acceptance(bins, accepted)
@@ -156,9 +151,7 @@ LIMITS = st.lists(st.floats(0.01, 2.0), min_size=1, max_size=30)
 
 @given(limits=LIMITS, part=st.floats(0.0, 1.0), seed=st.integers(0, 10 ** 6))
 @example(limits=[0.375, 0.390625, 0.5, 0.5, 0.5, 0.015625], part=0.5, seed=42)
-def test_dirichlet_rescale_keeps_sum_and_bounds(
-    limits: list[float], part: float, seed: int
-) -> None:
+def test_dirichlet_rescale_keeps_sum_and_bounds(limits, part, seed):
     total = sum(limits) * part
     shares = dirichlet_rescale(Dice(str(seed)), total, limits)
     assert sum(shares) == pytest.approx(total, abs=1e-8)
@@ -167,7 +160,7 @@ def test_dirichlet_rescale_keeps_sum_and_bounds(
 
 
 @pytest.mark.parametrize('total', [0.7, 1.2, 1.5, 1.9, 2.6])
-def test_dirichlet_rescale_is_as_uniform_as_throwing_away(total: float) -> None:
+def test_dirichlet_rescale_is_as_uniform_as_throwing_away(total):
     """Quantiles of the largest of three shares are those of UUniFast-Discard."""
     dice = Dice('uniform')
     count, limits = 4000, [1.0, 1.0, 1.0]
@@ -193,7 +186,7 @@ def test_dirichlet_rescale_is_as_uniform_as_throwing_away(total: float) -> None:
 
 @pytest.mark.parametrize('limits', [[1.0, 0.0, 1.0], [1.0, 1e-12, 1.0], [0.0, 0.5], [1.0, 1e-5]])
 @pytest.mark.parametrize('part', [0.1, 0.49, 0.9, 1.0])
-def test_dirichlet_rescale_with_no_room_for_one(limits: list[float], part: float) -> None:
+def test_dirichlet_rescale_with_no_room_for_one(limits, part):
     total = part * sum(limits)
     for seed in range(10):
         shares = dirichlet_rescale(Dice(str(seed)), total, limits)

@@ -10,14 +10,12 @@ execution times drawn from the measured values.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 import logging
 import math
 import os
 from pathlib import Path
 import signal
-from typing import Any
 
 from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.acceptance import Evaluation, WIDE_BINS
@@ -31,7 +29,7 @@ from mddag_executor.simulate import (
     Settings,
     simulate,
 )
-from msg_graph import load, loads, TaskSet
+from msg_graph import load, loads
 import numpy as np
 import pytest
 import yaml
@@ -62,13 +60,13 @@ nodes:
 
 
 @pytest.fixture(scope='module')
-def autoware() -> TaskSet:
+def autoware():
     """Give the paper's workload."""
     return load(CONFIG / 'autoware.yaml')
 
 
 @pytest.fixture
-def small() -> TaskSet:
+def small():
     """Give a task set of two callbacks."""
     return loads(SMALL, 'small.yaml')
 
@@ -76,7 +74,7 @@ def small() -> TaskSet:
 @NEEDS_NUMBA
 @pytest.mark.slow
 @pytest.mark.timeout(400)
-def test_the_paper_s_figure(autoware: TaskSet) -> None:
+def test_the_paper_s_figure(autoware):
     """
     Every bin agrees with the reference within four standard deviations of the difference.
 
@@ -98,7 +96,7 @@ def test_the_paper_s_figure(autoware: TaskSet) -> None:
     assert bound is not None and abs(bound - (1 - .104)) < 0.02
 
 
-def test_verdicts_are_those_of_simulate(autoware: TaskSet) -> None:
+def test_verdicts_are_those_of_simulate(autoware):
     experiment = Experiment(autoware, ('rad', 'wc'), duration_ns=500_000_000, seed=3)
     outcome = evaluate(experiment, 8, compiled=False)
     draws = Draws(autoware, 3).times(0, 8)
@@ -116,7 +114,7 @@ def test_verdicts_are_those_of_simulate(autoware: TaskSet) -> None:
 @pytest.mark.parametrize('judge', ['completions', 'horizon'])
 @pytest.mark.parametrize('change', [
     {}, {'group': 'g'}, {'holds_interpreter': True}, {'on_late': 'abort'}])
-def test_no_policy_exceeds_the_bound(judge: str, change: dict[str, object]) -> None:
+def test_no_policy_exceeds_the_bound(judge, change):
     count = {True: 0, False: 0}
     for seed in range(12):
         options = Options(
@@ -138,7 +136,7 @@ def test_no_policy_exceeds_the_bound(judge: str, change: dict[str, object]) -> N
     assert min(count.values()) > 0      # it says something
 
 
-def test_by_hand(small: TaskSet) -> None:
+def test_by_hand(small):
     """At 16 ms slow does not fit next to two fast ones; only that matters for preemptive rad."""
     outcome = evaluate(Experiment(small, ('rad',), workers=1, duration_ns=10 ** 9), 40)
     lengths = Draws(small, 0).times(0, 40)[:, 1]
@@ -158,14 +156,14 @@ def same(first: Evaluation, second: Evaluation) -> bool:
                for name in ('done', 'accepted', 'possible', 'utilisation'))
 
 
-def test_processes_change_nothing(autoware: TaskSet) -> None:
+def test_processes_change_nothing(autoware):
     experiment = Experiment(autoware, ('rad', 'fifo'), duration_ns=300_000_000, seed=5)
     alone = evaluate(experiment, 24, compiled=False)
     assert same(alone, evaluate(experiment, 24, jobs=3, compiled=False))
     assert not same(alone, evaluate(replace(experiment, seed=6), 24, compiled=False))
 
 
-def test_several_task_sets(small: TaskSet) -> None:
+def test_several_task_sets(small):
     """Each has its own draws and workers; chunks may reach over several; processes, too."""
     base = Experiment(small, ('rad', 'fifo'), workers=1, duration_ns=200_000_000, seed=1)
     other = loads(SMALL.replace('2500us', '4500us'), 'other.yaml')
@@ -187,9 +185,9 @@ def test_several_task_sets(small: TaskSet) -> None:
     assert sum(each['accepted']['rad'] for each in graphs) == outcome.accepted[0].sum()
 
 
-def test_interrupted(small: TaskSet) -> None:
+def test_interrupted(small):
     """What is done is kept, and is what a whole evaluation would have had there."""
-    def stop(done: int) -> None:
+    def stop(done):
         if done > 5:
             raise KeyboardInterrupt
 
@@ -208,13 +206,13 @@ def test_interrupted(small: TaskSet) -> None:
     (10 ** 12, 0, 'runs: 1000000000000 is too many: give at most 10000000, and evaluate more'),
     (1, 2 ** 40, 'first run: 1099511627776 is out of range'),
 ])
-def test_bad_input(small: TaskSet, runs: int, first: int, problem: str) -> None:
+def test_bad_input(small, runs, first, problem):
     with pytest.raises(UsageError) as caught:
         evaluate(Experiment(small), runs, first_run=first)
     assert str(caught.value).startswith(problem)
 
 
-def test_ranges_of_runs_make_up_the_whole(small: TaskSet) -> None:
+def test_ranges_of_runs_make_up_the_whole(small):
     experiments = [Experiment(small, ('rad', 'fifo'), workers=1, duration_ns=200_000_000, seed=s)
                    for s in (1, 2)]
     whole = evaluate(experiments, 30).result()
@@ -222,7 +220,7 @@ def test_ranges_of_runs_make_up_the_whole(small: TaskSet) -> None:
              for first, runs in ((0, 11), (11, 19))]
     assert [part['first_run'] for part in parts] == [0, 11]
 
-    def total(of: str) -> list[int]:
+    def total(of):
         return [sum(each) for each in zip(*(part['policies'][of]['accepted'] for part in parts))]
 
     assert {name: total(name) for name in ('rad', 'fifo')} == {
@@ -241,7 +239,7 @@ EXPERIMENT = Experiment(
 
 
 @pytest.fixture(scope='module')
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def cluster(tmp_path_factory):
     """Give a cluster of two worker processes."""
     import dask
     folder = str(tmp_path_factory.mktemp('dask'))
@@ -252,12 +250,12 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 @pytest.mark.timeout(120)
-def test_the_outcome_is_that_of_this_machine(cluster: Any) -> None:
+def test_the_outcome_is_that_of_this_machine(cluster):
     """Also if a worker is killed: its runs are made again."""
     victim = next(iter(cluster.workers.values())).process.pid
     killed = []
 
-    def kill(done: int) -> None:
+    def kill(done):
         if not killed and done > 20:
             killed.append(victim)
             os.kill(victim, signal.SIGKILL)
@@ -269,7 +267,7 @@ def test_the_outcome_is_that_of_this_machine(cluster: Any) -> None:
         EXPERIMENT, 300, first_run=7, compiled=False, jobs=2))
 
 
-def test_an_address_without_a_scheduler() -> None:
+def test_an_address_without_a_scheduler():
     for address in ('tcp://127.0.0.1:1', 'nonsense'):
         with pytest.raises(UsageError) as caught:
             evaluate(EXPERIMENT, 2, dask=address)

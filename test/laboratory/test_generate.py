@@ -56,7 +56,7 @@ def made(options: Options) -> tuple[str, TaskSet] | None:
 
 @settings(max_examples=150)
 @given(options=any_options())
-def test_every_task_set_is_what_was_asked_for(options: Options) -> None:
+def test_every_task_set_is_what_was_asked_for(options):
     found = made(options)
     if found is None:
         return
@@ -86,7 +86,7 @@ def test_every_task_set_is_what_was_asked_for(options: Options) -> None:
 @settings(max_examples=60)
 @given(count=st.integers(1, 40), part=st.floats(0, 1), edges=st.floats(0, 1), ors=st.floats(0, 1),
        seed=st.integers(0, 10 ** 6))
-def test_shapes(count: int, part: float, edges: float, ors: float, seed: int) -> None:
+def test_shapes(count, part, edges, ors, seed):
     sinks = 1 + round(part * max(0, count - 2))
     shape = draw_shape(Dice(str(seed)), count, sinks, edges, ors)
     leads_on = {before for each in shape.predecessors for before in each}
@@ -114,13 +114,13 @@ def test_shapes(count: int, part: float, edges: float, ors: float, seed: int) ->
     ({'periods_ns': (5,)}, '--periods 5: it is out of range: '),
     ({'workers': 0}, '--workers 0: it is out of range: '),
 ])
-def test_impossible(change: dict[str, object], problem: str) -> None:
+def test_impossible(change, problem):
     with pytest.raises(UsageError) as caught:
         generate(replace(Options(), **change))  # type: ignore[arg-type]
     assert str(caught.value).startswith(problem)
 
 
-def test_proportional() -> None:
+def test_proportional():
     task_set = loads(GRAPH)
     # To x it is 2 ms, to y 1 ms + 9 ms.
     assert proportional(task_set, 'max') == {
@@ -130,5 +130,5 @@ def test_proportional() -> None:
         proportional(task_set, 'median')
 
 
-def test_a_callback_that_is_several_sinks() -> None:
+def test_a_callback_that_is_several_sinks():
     assert proportional(loads(SHARED), 'max') == {'/n:s': 20_000_000}

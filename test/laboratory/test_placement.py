@@ -39,7 +39,7 @@ def placed(task_set: TaskSet, n: int, *milliseconds: float, **rules: object) -> 
     return [set(process.nodes) for process in placing.processes(placing.place())]
 
 
-def test_the_largest_load_is_the_least_there_can_be() -> None:
+def test_the_largest_load_is_the_least_there_can_be():
     times = (30, 25, 20, 18, 12, 9, 7)
     found = placed(workload(*times), 2, *times)
     loads_ = [sum(times[int(node[2:])] for node in nodes) for nodes in found]
@@ -49,7 +49,7 @@ def test_the_largest_load_is_the_least_there_can_be() -> None:
     assert max(loads_) == best
 
 
-def test_nodes_that_exchange_many_messages_stay_together() -> None:
+def test_nodes_that_exchange_many_messages_stay_together():
     tasks = loads("""
 mddag: 1
 nodes:
@@ -62,7 +62,7 @@ nodes:
     assert [p.nodes for p in placing.processes(placing.place())] == [('/a', '/c'), ('/b', '/d')]
 
 
-def test_nodes_that_publish_one_topic_stay_together() -> None:
+def test_nodes_that_publish_one_topic_stay_together():
     tasks = loads("""
 mddag: 1
 nodes:
@@ -96,26 +96,25 @@ def missed(text: str, processes: tuple[Process, ...], cpus: int | None, *ms: int
     return total(tally.result()['dags']).missed
 
 
-def test_one_process_computes_in_one_callback_at_a_time() -> None:
+def test_one_process_computes_in_one_callback_at_a_time():
     assert missed(TWO, ALL, 2, 30, 30) == 10
     assert missed(TWO, EACH, 2, 30, 30) == 0
     assert missed(TWO, EACH, 1, 30, 30) > 0  # they share the CPU
     assert missed(TWO, EACH, None, 30, 30) == 0
 
 
-def test_what_leaves_its_process_takes_longer() -> None:
-    def response(processes: tuple[Process, ...]) -> int:
+def test_what_leaves_its_process_takes_longer():
+    def response(processes):
         tally = Predictor(loads(CHAIN), 7, 2, 'rad', 1000 * MS).predict(
             processes, [[2 * MS, 3 * MS]])
-        found: int = tally.result()['dags']['/a']['sinks']['/b:t']['response_ns']['max']
-        return found
+        return tally.result()['dags']['/a']['sinks']['/b:t']['response_ns']['max']
 
     costs = Costs()
     assert response(ALL) == 5 * MS + 2 * CALLBACK_NS + PUBLISH_NS + costs.timer_ns
     assert response(EACH) == response(ALL) + costs.send_ns + costs.message_ns
 
 
-def test_a_timer_is_noticed_a_switch_interval_later_where_a_callback_computes() -> None:
+def test_a_timer_is_noticed_a_switch_interval_later_where_a_callback_computes():
     urgent = """
 mddag: 1
 nodes:
@@ -123,7 +122,7 @@ nodes:
   - {node: /b, callbacks: [{name: t, timer: 10ms, deadline: 10ms, holds_interpreter: false}]}
 """
 
-    def responses(processes: tuple[Process, ...]) -> tuple[int, int]:
+    def responses(processes):
         dags = Predictor(loads(urgent), 7, 3, 'rad', 1000 * MS).predict(
             processes, [[50 * MS], [MS]]).result()['dags']
         long, short = (dags[name]['sinks'][f'{name}:t']['response_ns']['max']
@@ -146,7 +145,7 @@ def several(*times: int) -> tuple[TaskSet, list[list[int]]]:
     return loads('mddag: 1\nnodes:\n' + '\n'.join(lines)), [[ms * MS] for ms in times]
 
 
-def test_simulation_finds_what_loads_do_not_show() -> None:
+def test_simulation_finds_what_loads_do_not_show():
     # by load alone the two urgent ones may well share a process
     task_set, times = several(30, 30, 30, 30)
     placing = Placing(task_set, 2, times)
@@ -160,7 +159,7 @@ def test_simulation_finds_what_loads_do_not_show() -> None:
     assert place[0] != place[1] and calls and tried >= max(calls)
 
 
-def test_a_few_tries_are_enough_to_stop() -> None:
+def test_a_few_tries_are_enough_to_stop():
     task_set, times = several(90, 90, 90, 90)
     placing = Placing(task_set, 2, times)
     predictor = Predictor(task_set, 7, 2, 'rad', 300 * MS)
@@ -169,7 +168,7 @@ def test_a_few_tries_are_enough_to_stop() -> None:
     assert tried == 5
 
 
-def test_together_and_apart() -> None:
+def test_together_and_apart():
     times = (50, 50, 10, 10)
     tasks = workload(*times)
     assert {'/n0', '/n1'} <= placed(tasks, 2, *times, together=[('/n0', '/n1')])[0]
@@ -188,13 +187,13 @@ def test_together_and_apart() -> None:
         placed(tasks, 5, *times)
 
 
-def test_one_node_too_many_to_keep_apart_is_found_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_node_too_many_to_keep_apart_is_found_at_once(monkeypatch):
     """Which of the empty processes a node comes into does not matter: no search through all."""
     times = (10.0,) * 11
     tried = 0
     cost = Placing._cost
 
-    def counted(self: Placing, place: dict[int, int]) -> tuple[float, float]:
+    def counted(self, place):
         nonlocal tried
         tried += 1
         assert tried < 1000

@@ -19,7 +19,7 @@ TOP = Path(__file__).resolve().parent.parent.parent
 
 
 @pytest.fixture
-def launch_file() -> ModuleType:
+def launch_file():
     spec = importlib.util.spec_from_file_location(
         'run_launch', TOP / 'launch' / 'run.launch.py')
     assert spec is not None and spec.loader is not None
@@ -30,15 +30,14 @@ def launch_file() -> ModuleType:
 
 def command(launch_file: ModuleType, **given: str) -> list[str]:
     assert set(given) <= set(launch_file.ARGUMENTS)
-    made: list[str] = launch_file.command({**dict.fromkeys(launch_file.ARGUMENTS, ''), **given})
-    return made
+    return launch_file.command({**dict.fromkeys(launch_file.ARGUMENTS, ''), **given})
 
 
-def test_nothing_given_leaves_all_options_out(launch_file: ModuleType) -> None:
+def test_nothing_given_leaves_all_options_out(launch_file):
     assert command(launch_file) == ['run']
 
 
-def test_nodes_and_ros_arguments_are_words(launch_file: ModuleType) -> None:
+def test_nodes_and_ros_arguments_are_words(launch_file):
     made = command(launch_file, nodes="a/b 'c/d --rate 2'", ros_args='-r x:=y', workers='3')
     assert made == ['run', '--node', 'a/b', '--node', 'c/d --rate 2', '--workers', '3',
                     '--ros-args', '-r', 'x:=y']
@@ -46,7 +45,7 @@ def test_nodes_and_ros_arguments_are_words(launch_file: ModuleType) -> None:
         command(launch_file, nodes="'a/b")
 
 
-def test_every_argument_is_an_option_that_mddag_run_has(launch_file: ModuleType) -> None:
+def test_every_argument_is_an_option_that_mddag_run_has(launch_file):
     given = {'graph': 'graph.yaml', 'nodes': '', 'policy': 'gedf', 'workers': '2',
              'trace': 'run.mcap', 'processes': '2', 'duration': '2s', 'synthetic': 'spin',
              'utilisation': '0.5', 'seed': '4', 'fail_on_miss': 'true', 'ros_args': '-r a:=b'}

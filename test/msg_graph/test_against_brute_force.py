@@ -81,7 +81,7 @@ def provenance(dag: Dag, places: dict[str, int]) -> list[Vertex]:
     """Return the DAG's vertices by index, each written as what it is."""
     found: dict[int, Vertex] = {}
 
-    def write(index: int) -> Vertex:
+    def write(index):
         if index not in found:
             vertex = dag.vertices[index]
             found[index] = (
@@ -149,7 +149,7 @@ def check_same(tasks: TaskSet, specs: list[Spec]) -> None:
 
 @settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
 @given(declarations())
-def test_same_as_by_definition(specs: list[Spec]) -> None:
+def test_same_as_by_definition(specs):
     text = yaml.safe_dump(as_yaml(specs))
     broken = all_violations(specs)
     try:

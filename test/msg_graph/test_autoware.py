@@ -12,7 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from msg_graph import load, model, TaskSet
+from msg_graph import load, model
 import pytest
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
@@ -21,16 +21,16 @@ MS = 1_000_000
 
 
 @pytest.fixture(scope='module')
-def autoware() -> TaskSet:
+def autoware():
     return load(CONFIG / 'autoware.yaml')
 
 
 @pytest.fixture(scope='module')
-def multi() -> TaskSet:
+def multi():
     return load(CONFIG / 'autoware_multi.yaml')
 
 
-def test_the_graph_is_that_of_the_facts(autoware: TaskSet) -> None:
+def test_the_graph_is_that_of_the_facts(autoware):
     tasks = autoware
     assert [dag.name for dag in tasks.dags] == list(DAGS)
     assert (len(tasks.dags), len(tasks.vertices), len(tasks.callbacks)) == (11, 86, 84)
@@ -56,13 +56,13 @@ def test_the_graph_is_that_of_the_facts(autoware: TaskSet) -> None:
         assert {len(time.percent) for time in times if time} == {29}
 
 
-def test_load_is_that_of_the_paper(autoware: TaskSet) -> None:
+def test_load_is_that_of_the_paper(autoware):
     """On seven cores the mean load is about that of the paper's most frequent runs, 0.7."""
     shares = [model.load_of(dag) for dag in autoware.dags]
     assert sum(share for share in shares if share) / 7 == pytest.approx(0.729, abs=0.001)
 
 
-def test_only_deadlines_differ(autoware: TaskSet, multi: TaskSet) -> None:
+def test_only_deadlines_differ(autoware, multi):
     assert multi.queue_edges == autoware.queue_edges
     assert multi.paths == autoware.paths
     for one, other in zip(autoware.dags, multi.dags):
@@ -73,7 +73,7 @@ def test_only_deadlines_differ(autoware: TaskSet, multi: TaskSet) -> None:
                 w.name, w.predecessors, w.callback.execution_time)
 
 
-def test_the_reference_system_as_described() -> None:
+def test_the_reference_system_as_described():
     task_set = load(CONFIG / 'reference_system.yaml')
     callbacks = task_set.callbacks
     assert len({callback.node for callback in callbacks}) == 24

@@ -47,11 +47,11 @@ def kinds(found: list[Drift]) -> list[tuple[str, str]]:
 
 
 @given(jobs=st.integers(0, 400))
-def test_nothing_is_said_of_what_is_as_declared(jobs: int) -> None:
+def test_nothing_is_said_of_what_is_as_declared(jobs):
     assert drift(TASKS, observed(jobs)) == []
 
 
-def test_a_topic_that_is_not_declared() -> None:
+def test_a_topic_that_is_not_declared():
     seen = observed()
     seen.publishes['/b:w'] = {'/q\x1b', '/p', '/parameter_events'}
     found = drift(TASKS, seen)
@@ -64,7 +64,7 @@ def test_a_topic_that_is_not_declared() -> None:
 
 @pytest.mark.parametrize(('factor', 'said'), [
     (1.19, False), (1.21, True), (0.81, False), (0.79, True)])
-def test_the_rate_of_a_source(factor: float, said: bool) -> None:
+def test_the_rate_of_a_source(factor, said):
     seen = observed()
     seen.releases['/a:t'] = Releases(50, 0, round(49 * 10 * MS * factor))
     found = drift(TASKS, seen)
@@ -75,7 +75,7 @@ def test_the_rate_of_a_source(factor: float, said: bool) -> None:
 
 
 @pytest.mark.parametrize(('got', 'said'), [(60, False), (62, True), (39, False), (38, True)])
-def test_the_rate_of_messages(got: int, said: bool) -> None:
+def test_the_rate_of_messages(got, said):
     seen = observed()
     seen.got['/b:m'] = got
     found = drift(TASKS, seen)
@@ -84,7 +84,7 @@ def test_the_rate_of_messages(got: int, said: bool) -> None:
         assert found[0].text == f'/b:m got {got} messages, and by the declaration 50 were due'
 
 
-def test_a_callback_that_never_ran_is_the_reason_for_those_after_it() -> None:
+def test_a_callback_that_never_ran_is_the_reason_for_those_after_it():
     seen = observed()
     for key in ('/b:m', '/b:s', '/b:e'):
         seen.ran[key] = seen.got[key] = 0
@@ -93,7 +93,7 @@ def test_a_callback_that_never_ran_is_the_reason_for_those_after_it() -> None:
     assert kinds(drift(TASKS, seen)) == [('never ran', '/b:s'), ('never ran', '/b:e')]
 
 
-def test_a_sync_that_never_got_one_of_its_topics() -> None:
+def test_a_sync_that_never_got_one_of_its_topics():
     seen = observed()
     seen.came = {'/b:s': {'/x', '/z'}}
     assert drift(TASKS, seen) == []
@@ -105,7 +105,7 @@ def test_a_sync_that_never_got_one_of_its_topics() -> None:
         "/b:s never got a message of /z in 0.500 s: did you mean the topic '/zz'?")
 
 
-def test_a_short_run_says_nothing_of_what_never_ran() -> None:
+def test_a_short_run_says_nothing_of_what_never_ran():
     seen = Observed(duration_ns=24 * MS)
     assert drift(TASKS, seen) == []
     seen.duration_ns = 25 * MS
@@ -114,7 +114,7 @@ def test_a_short_run_says_nothing_of_what_never_ran() -> None:
     assert kinds(drift(TASKS, seen)) == [('never ran', '/a:t'), ('never ran', '/a:y')]
 
 
-def test_what_may_run_in_another_process() -> None:
+def test_what_may_run_in_another_process():
     text = TASKS.text.replace('dag: y}', 'dag: y, release_from: header_stamp}')
     seen = observed()
     seen.ran['/b:w'] = seen.got['/b:w'] = seen.ran['/b:e'] = seen.got['/b:e'] = 0
@@ -145,7 +145,7 @@ def key(callback: object) -> str | None:
     return None if callback is None else callback.key  # type: ignore[attr-defined, no-any-return]
 
 
-def test_alike_ones_are_handed_out_in_order() -> None:
+def test_alike_ones_are_handed_out_in_order():
     binder = Binder(BOUND)
     assert [key(binder.bind(Entity('/a', 'subscription', '/x'))) for _ in range(4)] == [
         '/a:s0', '/a:j0', '/a:s1', None]
@@ -156,7 +156,7 @@ def test_alike_ones_are_handed_out_in_order() -> None:
     assert key(binder.bind(Entity('/b', 'subscription', '/x'))) == '/b:s'
 
 
-def test_a_sync_is_bound_by_each_leg() -> None:
+def test_a_sync_is_bound_by_each_leg():
     binder = Binder(BOUND)
     assert key(binder.bind(Entity('/a', 'subscription', '/y'))) == '/a:j0'
     assert binder.bind(Entity('/a', 'subscription', '/y')) is None
@@ -164,7 +164,7 @@ def test_a_sync_is_bound_by_each_leg() -> None:
     assert key(binder.bind(Entity('/a', 'subscription', '/x'))) == '/a:j0'
 
 
-def test_periods_may_be_rounded() -> None:
+def test_periods_may_be_rounded():
     binder = Binder(BOUND)
     assert key(binder.bind(Entity('/b', 'timer', '', 33_333_333))) == '/b:t'
     assert is_period(33_333_333, 33_300_000) and is_period(16_666_666, 16_700_000)
@@ -174,7 +174,7 @@ def test_periods_may_be_rounded() -> None:
     assert key(binder.bind(Entity('/a', 'timer', '', 9_999_999))) == '/a:t0'
 
 
-def test_every_callback_can_be_bound_once() -> None:
+def test_every_callback_can_be_bound_once():
     binder = Binder(BOUND)
     assert binder.unbound() == list(BOUND.callbacks)
     for callback in reversed(BOUND.callbacks):
@@ -208,8 +208,7 @@ def test_every_callback_can_be_bound_once() -> None:
     ('/b:s', Entity('/robot/b', 'subscription', '/y'), None),
     ('/b:s', Entity('/robot/b', 'service', '/x'), None),
 ])
-def test_a_namespace_more_or_another_period_is_probably_meant(
-        callback: str, seen: Entity, question: str | None) -> None:
+def test_a_namespace_more_or_another_period_is_probably_meant(callback, seen, question):
     assert meant(BOUND.callback(callback), [Entity('/other', seen.kind, '/z', 1000), seen]) \
         == question
 
@@ -222,5 +221,5 @@ def test_a_namespace_more_or_another_period_is_probably_meant(
     ('std::_Bind<void (Ping::*(Ping*))()>', '/n: timer 1s'),
     ('', '/n: timer 1s'),
 ])
-def test_undeclared_ones_are_called_by_node_and_function(symbol: str, name: str) -> None:
+def test_undeclared_ones_are_called_by_node_and_function(symbol, name):
     assert entity_name('/n', symbol, 'timer 1s') == name

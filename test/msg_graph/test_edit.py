@@ -38,7 +38,7 @@ nodes:
 """
 
 
-def test_only_the_values_change() -> None:
+def test_only_the_values_change():
     task_set = loads(TEXT)
     new = {'/n:x': 1_234_000, '/n:y': 2_000_000_000, '/n:z': 3_141}
     result = deadlines_in_text(task_set, TEXT, new)
@@ -49,7 +49,7 @@ def test_only_the_values_change() -> None:
     assert without_lines(after) == without_lines(with_deadlines(task_set, new))
 
 
-def test_missing_deadlines() -> None:
+def test_missing_deadlines():
     text = TEXT.replace(', deadline: 5 ms', '').replace('      deadline: "50ms"   # quoted\n', '')
     text = text.replace('      deadline: 7ms\n', '')
     with pytest.raises(GraphError, match='no deadline'):
@@ -73,7 +73,7 @@ def test_missing_deadlines() -> None:
     TEXT.replace('subscription: /a, deadline: 5 ms', 'subscription: /q'),
     'a: &a [*a]\n',
 ])
-def test_other_errors_are_told_as_they_are(text: str) -> None:
+def test_other_errors_are_told_as_they_are(text):
     with pytest.raises(GraphError) as first:
         loads(text, 'g.yaml')
     with pytest.raises(GraphError) as caught:
@@ -81,7 +81,7 @@ def test_other_errors_are_told_as_they_are(text: str) -> None:
     assert str(caught.value) == str(first.value)
 
 
-def test_shared_values_are_refused() -> None:
+def test_shared_values_are_refused():
     """Two deadlines that are one in the text cannot differ."""
     text = TEXT.replace('"50ms"', '&d 50ms').replace('7ms', '*d')
     with pytest.raises(GraphError, match='without a change of its meaning'):
@@ -100,7 +100,7 @@ nodes:
 """
 
 
-def test_nodes_that_no_process_names_run_in_the_first() -> None:
+def test_nodes_that_no_process_names_run_in_the_first():
     tasks = loads(HEAD + 'processes:\n  one: [/c]\n  two: [/b]\n')
     assert tasks.processes == (Process('one', ('/a', '/c')), Process('two', ('/b',)))
     assert [tasks.process_of(n) for n in ('/a', '/b', '/unknown')] == ['one', 'two', 'one']
@@ -115,19 +115,19 @@ def test_nodes_that_no_process_names_run_in_the_first() -> None:
     ([f'  one: [/a, /a] {MARK}'], 'is listed twice'),
     ([f'  one: /a {MARK}'], 'write a list'),
 ])
-def test_errors(lines: list[str], says: str) -> None:
+def test_errors(lines, says):
     found = error(HEAD + 'processes:\n' + '\n'.join(lines))
     assert says in str(found)
 
 
-def test_a_process_has_a_node() -> None:
+def test_a_process_has_a_node():
     found = error(HEAD + f'processes: {MARK}\n  one: [/a, /b, /c]\n  two: []')
     assert "no node runs in process 'two'" in str(found)
 
 
 @pytest.mark.parametrize('before', ['', 'processes: {old: [/a]}\n', 'processes:\n  old: [/b]\n'])
 @pytest.mark.parametrize('after', ['', 'workers: 3\n'])
-def test_processes_are_written_again(before: str, after: str) -> None:
+def test_processes_are_written_again(before, after):
     tasks = loads(HEAD + before + after)
     placed = with_processes(tasks, (Process('x', ('/c', '/b')), Process('1', ('/a',))))
     assert placed.text == HEAD + after + "processes:\n  x: [/b, /c]\n  '1': [/a]\n"
@@ -137,13 +137,13 @@ def test_processes_are_written_again(before: str, after: str) -> None:
     assert again.dags == placed.dags
 
 
-def test_a_text_in_which_processes_cannot_stand_is_refused() -> None:
+def test_a_text_in_which_processes_cannot_stand_is_refused():
     flow = '{mddag: 1, nodes: [{node: /a, callbacks: [{name: a, timer: 1ms, deadline: 1ms}]}]}'
     with pytest.raises(GraphError, match='cannot be changed'):
         with_processes(loads(flow), (Process('x', ('/a',)),))
 
 
-def test_a_file_of_its_own() -> None:
+def test_a_file_of_its_own():
     tasks = loads(HEAD)
     for head in ('', HEAD):
         assert load_processes(head + 'processes: {x: [/b]}', 'p.yaml', tasks) == (

@@ -62,7 +62,7 @@ def accepted(text: str) -> str:
     return re.sub(rf'^( +)# (\w+: .*# {MARK})', r'\1\2', text, flags=re.MULTILINE)
 
 
-def test_a_chain() -> None:
+def test_a_chain():
     text = declaration_from_caret(CHAIN, 'arch.yaml')
     with pytest.raises(GraphError) as caught:
         loads(text)
@@ -89,7 +89,7 @@ def test_a_chain() -> None:
     assert f'# {MARK}: path open: which callbacks? /a' in text
 
 
-def test_an_unknown_publisher_is_a_blank_on_each_callback_that_may() -> None:
+def test_an_unknown_publisher_is_a_blank_on_each_callback_that_may():
     text = declaration_from_caret(
         HEAD + node('/a', 'timer 1000000', 'timer 2000000', extra=publishes('/x', 'UNDEFINED'))
         + node('/b', 'subscription /x'), 'arch.yaml')
@@ -99,7 +99,7 @@ def test_an_unknown_publisher_is_a_blank_on_each_callback_that_may() -> None:
     assert text.count(f'{MARK}: if it is a sink') == 2
 
 
-def test_message_contexts_become_queue_edges() -> None:
+def test_message_contexts_become_queue_edges():
     contexts = """\
   subscribes:
   - {topic_name: /x, callback_name: /b/callback_0}
@@ -148,7 +148,7 @@ nodes:
 """
 
 
-def test_a_file_of_2021() -> None:
+def test_a_file_of_2021():
     text = declaration_from_caret(OF_2021, 'arch.yaml')
     assert (f'# {MARK}: path lost: which callbacks? /a:timer_callback_0 -> /b:gone'
             in text.splitlines())
@@ -173,14 +173,14 @@ def test_a_file_of_2021() -> None:
     (HEAD + node('/a', 'timer 5').replace('timer_callback', 'magic'), "'magic' is not known"),
     (HEAD + node('/a', 'timer 5').replace('/callback_0', '/c 0'), 'no name for a callback'),
 ])
-def test_what_is_no_architecture_file(text: str, problem: str) -> None:
+def test_what_is_no_architecture_file(text, problem):
     with pytest.raises(GraphError, match=re.escape(problem)) as caught:
         declaration_from_caret(text, 'arch.yaml')
     assert str(caught.value).startswith('arch.yaml')
     assert '\n' not in str(caught.value)
 
 
-def test_blanks_and_errors_that_are_not_of_them() -> None:
+def test_blanks_and_errors_that_are_not_of_them():
     text = """\
 mddag: 1
 nodes:

@@ -113,7 +113,7 @@ def plain(task_set: TaskSet) -> TaskSet:
             for dag in task_set.dags))
 
 
-def test_it_is_what_one_file_would_be(tmp_path: Path) -> None:
+def test_it_is_what_one_file_would_be(tmp_path):
     task_set = load(write(tmp_path, top=TOP, parts__sensor=SENSOR))
     assert plain(task_set) == plain(loads(ONE_FILE))
     read = task_set.callback('/front/left/driver:read')
@@ -121,21 +121,21 @@ def test_it_is_what_one_file_would_be(tmp_path: Path) -> None:
     assert task_set.callback('/fuse:a').file is None
 
 
-def test_the_text_needs_no_other_file(tmp_path: Path) -> None:
+def test_the_text_needs_no_other_file(tmp_path):
     task_set = load(write(tmp_path, top=TOP, parts__sensor=SENSOR))
     again = loads(task_set.text)
     assert plain(again) == plain(task_set)
     assert load(tmp_path / 'top.yaml').text == task_set.text
 
 
-def test_the_flat_text_keeps_every_key(tmp_path: Path) -> None:
+def test_the_flat_text_keeps_every_key(tmp_path):
     from .test_schema import GRAPH
     task_set = load(write(tmp_path, top=GRAPH.replace('workers: 3', 'workers: 3\narguments: {}')))
     assert 'arguments' not in task_set.text
     assert plain(loads(task_set.text)) == plain(loads(GRAPH)) == plain(task_set)
 
 
-def test_includes_within_includes(tmp_path: Path) -> None:
+def test_includes_within_includes(tmp_path):
     task_set = load(write(
         tmp_path, top='mddag: 1\ninclude: [{file: a/mid.yaml, namespace: /x, '
         'remap: {/in/inner: /far/inner}, set: {p: 30ms}}]\n',
@@ -176,8 +176,7 @@ def test_includes_within_includes(tmp_path: Path) -> None:
     ('    remap: {/cropped: /behind, /shared: /twist}', '    remap: [1]', 'top.yaml:10',
      "'remap' is no mapping"),
 ])
-def test_errors_name_their_file(
-        tmp_path: Path, wrong: str, right: str, place: str, problem: str) -> None:
+def test_errors_name_their_file(tmp_path, wrong, right, place, problem):
     assert wrong in TOP + SENSOR
     top = write(tmp_path, top=TOP.replace(wrong, right),
                 parts__sensor=SENSOR.replace(wrong, right))
@@ -189,7 +188,7 @@ def test_errors_name_their_file(
     assert all('\n' not in text for text in texts)
 
 
-def test_errors_of_several_files_come_together(tmp_path: Path) -> None:
+def test_errors_of_several_files_come_together(tmp_path):
     top = write(tmp_path, top=TOP.replace('deadline: 90ms', 'deadline: 90'),
                 parts__sensor=SENSOR.replace('subscription: /raw', 'subscription: raw'))
     with pytest.raises(GraphError) as caught:
@@ -198,7 +197,7 @@ def test_errors_of_several_files_come_together(tmp_path: Path) -> None:
         ('sensor.yaml', 13), ('sensor.yaml', 13), ('top.yaml', 18)]
 
 
-def test_cycles(tmp_path: Path) -> None:
+def test_cycles(tmp_path):
     top = write(tmp_path, top='mddag: 1\ninclude: [a.yaml]\n', a='mddag: 1\ninclude: [b.yaml]\n',
                 b='mddag: 1\n\ninclude: [a.yaml]\n')
     with pytest.raises(GraphError, match=re.escape('include each other in a cycle')) as caught:
@@ -209,7 +208,7 @@ def test_cycles(tmp_path: Path) -> None:
         load(top)
 
 
-def test_too_many(tmp_path: Path) -> None:
+def test_too_many(tmp_path):
     files = {f'f{i}': f'mddag: 1\ninclude: [{", ".join([f"f{i + 1}.yaml"] * 8)}]\n'
              for i in range(6)}
     with pytest.raises(GraphError, match='are included'):
@@ -217,7 +216,7 @@ def test_too_many(tmp_path: Path) -> None:
                    f6='mddag: 1\narguments: {}\n'))
 
 
-def test_values_do_not_explode(tmp_path: Path) -> None:
+def test_values_do_not_explode(tmp_path):
     files = {f'f{i}': f'mddag: 1\narguments: {{a: }}\ninclude: [{{file: f{i + 1}.yaml, '
                       'set: {a: $(a)$(a)$(a)}}]\n' for i in range(14)}
     with pytest.raises(GraphError, match='this value is too long'):
@@ -226,7 +225,7 @@ def test_values_do_not_explode(tmp_path: Path) -> None:
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damaged_files_give_errors_and_nothing_else(tmp_path: Path, data: st.DataObject) -> None:
+def test_damaged_files_give_errors_and_nothing_else(tmp_path, data):
     texts = []
     for text in (TOP, SENSOR):
         for _ in range(data.draw(st.integers(0, 2))):
@@ -245,7 +244,7 @@ def test_damaged_files_give_errors_and_nothing_else(tmp_path: Path, data: st.Dat
         assert plain(loads(task_set.text)) == plain(task_set)
 
 
-def test_those_of_an_included_file_do_not_count(tmp_path: Path) -> None:
+def test_those_of_an_included_file_do_not_count(tmp_path):
     (tmp_path / 'inner.yaml').write_text(TWO + 'processes: {inner: [/a], other: [/b]}\n')
     top = tmp_path / 'top.yaml'
     top.write_text('mddag: 1\ninclude: [inner.yaml]\n')

@@ -54,7 +54,7 @@ paths:
 """
 
 
-def test_every_key() -> None:
+def test_every_key():
     tasks = loads(EVERYTHING, 'all.yaml')
     assert (tasks.workers, tasks.file, tasks.text) == (7, 'all.yaml', EVERYTHING)
     frame, call, settings, tick, show = tasks.callbacks
@@ -93,7 +93,7 @@ def test_every_key() -> None:
 
 
 @pytest.mark.parametrize('count', [2, 28, 29, 30])
-def test_quantiles_without_shares_are_evenly_spaced(count: int) -> None:
+def test_quantiles_without_shares_are_evenly_spaced(count):
     numbers = ', '.join(str(100 * i / (count - 1)) for i in range(count))
     tasks = graph(f"""
         - node: /a
@@ -128,7 +128,7 @@ HEAD = 'nodes:\n- node: /a\n  callbacks:\n  - {name: t, timer: 1ms, deadline: 1m
     (f'mddag: 1\nworkers: seven {MARK}\n' + HEAD, 'write an integer'),
     (f'mddag: 1\nworkers: {"9" * 5000} {MARK}\n' + HEAD, 'write an integer'),
 ])
-def test_head(text: str, says: str) -> None:
+def test_head(text, says):
     # Without a line of its own to blame, the mapping that lacks something starts at the top.
     if MARK not in text:
         text = text.replace('\n', f' {MARK}\n', 1)
@@ -145,7 +145,7 @@ def test_head(text: str, says: str) -> None:
     (f'node: {MARK}', ["'node' has no value"]),
     (f'nod: /a {MARK}', ["unknown key 'nod': did you mean 'node'?"]),
 ])
-def test_node_names(entry: str, says: list[str]) -> None:
+def test_node_names(entry, says):
     nodes_error(
         f'- {entry}\n  callbacks:\n  - {{name: t, timer: 1ms, deadline: 1ms}}\n', *says)
 
@@ -237,12 +237,12 @@ def test_node_names(entry: str, says: list[str]) -> None:
     (['name: t', 'timer: 1ms', f'dag: a@b {MARK}'], ['no name for a DAG']),
     (['name: t', 'timer: 1ms', f'dag: [a] {MARK}'], ["'dag': is a list"]),
 ])
-def test_callback_entries(entries: list[str], says: list[str]) -> None:
+def test_callback_entries(entries, says):
     lines = '\n'.join(f'    {entry}' for entry in entries)
     nodes_error(f'- node: /a\n  callbacks:\n  - {lines[4:]}\n', *says)
 
 
-def test_overload_keys() -> None:
+def test_overload_keys():
     tasks = loads("""
         mddag: 1
         nodes:
@@ -288,11 +288,11 @@ paths:
      f'- name: p {MARK}\n  callbacks: ["/a:t", "/a:s"]', "path 'p': this name is taken"),
     (f'- p {MARK}', "path 1 is the text 'p'"),
 ])
-def test_paths(text: str, says: str) -> None:
+def test_paths(text, says):
     assert says in str(error(PATHS + text + '\n'))
 
 
-def test_paths_run_over_trigger_and_queue_edges() -> None:
+def test_paths_run_over_trigger_and_queue_edges():
     tasks = loads(PATHS + """
   - {name: variable, callbacks: ['/a:t', '/a:s', '/a:u']}
   - {name: take, callbacks: ['/a:t', '/a:u']}

@@ -27,14 +27,14 @@ def distribution(ns: list[int], percent: list[float]) -> ExecutionTime:
     return ExecutionTime(tuple(ns), tuple(percent))
 
 
-def test_draws_between_the_quantiles() -> None:
+def test_draws_between_the_quantiles():
     time = distribution([100, 200, 400], [0.0, 50.0, 100.0])
     assert [time.draw(u) for u in (0.0, 0.25, 0.5, 0.75, 1.0)] == [100, 150, 200, 300, 400]
     assert time.mean_ns == 225
 
 
 @pytest.mark.parametrize('u', [-0.1, 1.1, float('nan'), float('inf')])
-def test_draws_only_from_shares(u: float) -> None:
+def test_draws_only_from_shares(u):
     with pytest.raises(ValueError):
         distribution([1, 2], [0.0, 100.0]).draw(u)
 
@@ -42,7 +42,7 @@ def test_draws_only_from_shares(u: float) -> None:
 @given(
     st.lists(st.tuples(st.integers(0, 10 ** 9), st.floats(0, 100)), min_size=1, max_size=9,
              unique_by=lambda pair: pair[1]))
-def test_mean_is_that_of_the_draws(pairs: list[tuple[int, float]]) -> None:
+def test_mean_is_that_of_the_draws(pairs):
     percent = sorted(share for _, share in pairs)
     time = distribution(sorted(ns for ns, _ in pairs), percent)
     steps = 2_000
@@ -53,7 +53,7 @@ def test_mean_is_that_of_the_draws(pairs: list[tuple[int, float]]) -> None:
     assert abs(sum(drawn) / steps - time.mean_ns) <= 1 + spread * len(pairs) / steps
 
 
-def test_unknown_where_an_execution_time_is_missing() -> None:
+def test_unknown_where_an_execution_time_is_missing():
     dag = graph("""
         - node: /n
           callbacks:
@@ -85,7 +85,7 @@ def weighted(draw: st.DrawFn) -> tuple[Dag, list[int]]:
 
 
 @given(weighted())
-def test_path_lengths_are_those_of_all_paths(case: tuple[Dag, list[int]]) -> None:
+def test_path_lengths_are_those_of_all_paths(case):
     dag, weights = case
     best = 0
     for length in range(len(dag.vertices)):
@@ -112,7 +112,7 @@ def test_path_lengths_are_those_of_all_paths(case: tuple[Dag, list[int]]) -> Non
     ('86400s', 86_400_000_000_000),
     ('0.1s', 100_000_000),
 ])
-def test_reads_times(text: str, ns: int) -> None:
+def test_reads_times(text, ns):
     assert parse_duration(text) == ns
 
 
@@ -144,7 +144,7 @@ def test_reads_times(text: str, ns: int) -> None:
     ('1\nms', 'is not a time'),
     ('9' * 100 + 's', 'is not a time'),
 ])
-def test_refuses_the_rest(text: str, says: str) -> None:
+def test_refuses_the_rest(text, says):
     with pytest.raises(DurationError) as caught:
         parse_duration(text)
     assert says in str(caught.value)
@@ -154,7 +154,7 @@ def test_refuses_the_rest(text: str, says: str) -> None:
 
 
 @given(st.text())
-def test_text_is_a_time_or_a_duration_error(text: str) -> None:
+def test_text_is_a_time_or_a_duration_error(text):
     try:
         assert 1_000 <= parse_duration(text) <= 86_400 * 10 ** 9
     except DurationError as error:
@@ -165,18 +165,18 @@ def test_text_is_a_time_or_a_duration_error(text: str) -> None:
     (0, '0ns'), (999, '999ns'), (1_000, '1us'), (1_500, '1.5us'), (100_000_000, '100ms'),
     (1_234_567, '1.235ms'), (60_000_000_000, '60s'), (-1_500_000, '-1.5ms'),
 ])
-def test_formats_times(ns: int, text: str) -> None:
+def test_formats_times(ns, text):
     assert format_duration(ns) == text
 
 
 @given(st.integers(1, 86_400_000))
-def test_format_reads_back(us: int) -> None:
+def test_format_reads_back(us):
     exact = parse_duration(f'{us}us')
     assert abs(parse_duration(format_duration(exact)) - exact) <= exact * 0.0005
 
 
 @pytest.mark.parametrize('ns', [-1, -2**63, DAY + 1, 2**63 - 1])
-def test_what_no_declaration_can_say_has_an_exact_text_too(ns: int) -> None:
+def test_what_no_declaration_can_say_has_an_exact_text_too(ns):
     """Traces say such things; the reader of the text then says what is wrong."""
     assert exact_duration(ns) == f'{ns}ns'
 
@@ -184,6 +184,6 @@ def test_what_no_declaration_can_say_has_an_exact_text_too(ns: int) -> None:
 @pytest.mark.parametrize(('ns', 'text'), [
     (1, '1ns'), (999, '999ns'), (1_000, '1us'), (1_001, '1.001us'), (1_234_567, '1234.567us'),
     (1_234_000, '1.234ms'), (1_500_000_000, '1.5s'), (DAY, '86400s')])
-def test_exact_ones_are_short(ns: int, text: str) -> None:
+def test_exact_ones_are_short(ns, text):
     assert exact_duration(ns) == text
     assert parse_duration(text, minimum_ns=1) == ns

@@ -10,7 +10,6 @@ from msg_graph import GraphError, GraphErrors, loads
 from msg_graph.errors import MOST_ERRORS
 import pytest
 
-from ..conftest import Call
 from .helpers import graph, MARK, nodes_error
 
 T = '{name: t, timer: 10ms, publishes: [/a]}'
@@ -80,12 +79,12 @@ T = '{name: t, timer: 10ms, publishes: [/a]}'
       f'{{name: u, timer: 10ms, deadline: 1ms}} {MARK}'],
      "callback '/n:u': its DAG has the name '/n/u', as that of '/n:t': give it another one"),
 ])
-def test_each_rule(callbacks: list[str], says: str) -> None:
+def test_each_rule(callbacks, says):
     lines = [line if line.startswith('  ') else f'- {line}' for line in callbacks]
     nodes_error('- node: /n\n  callbacks:\n' + textwrap.indent('\n'.join(lines), '  '), says)
 
 
-def test_all_cycles_are_told() -> None:
+def test_all_cycles_are_told():
     with pytest.raises(GraphErrors) as caught:
         graph("""
             - node: /n
@@ -101,7 +100,7 @@ def test_all_cycles_are_told() -> None:
         '/n:a -> /n:b -> /n:a', '/n:c -> /n:d -> /n:c', '/n:e -> /n:e']
 
 
-def test_long_cycle_is_not_spelt_out() -> None:
+def test_long_cycle_is_not_spelt_out():
     text = '- node: /n\n  callbacks:\n'
     for i in range(500):
         mark = MARK if i == 0 else ''
@@ -122,7 +121,7 @@ def doubling(levels: int) -> str:
     return text + f'  - {{name: end, subscription: /t{levels}, deadline: 1s}}\n'
 
 
-def test_or_must_not_explode() -> None:
+def test_or_must_not_explode():
     assert len(loads(doubling(5)).vertices) == 1 + 2 + 4 + 8 + 16 + 32 + 32
     for levels in (16, 60, 2_000):
         with pytest.raises(GraphError) as caught:
@@ -132,7 +131,7 @@ def test_or_must_not_explode() -> None:
         assert caught.value.line is not None
 
 
-def test_edges_must_not_explode() -> None:
+def test_edges_must_not_explode():
     text = 'mddag: 1\nnodes:\n- node: /n\n  callbacks:\n'
     text += '  - {name: t, timer: 10ms, publishes: [/t, /v]}\n'
     for i in range(1_100):
@@ -202,21 +201,21 @@ def found(text: str) -> GraphErrors:
     (GRAPH, [(7, 'in a cycle'), (5, 'deadline but is no sink'), (6, 'has no deadline'),
              (9, 'has no deadline'), (11, 'no trigger or queue edge leads')]),
 ])
-def test_every_error_of_a_stage(text: str, expected: list[tuple[int, str]]) -> None:
+def test_every_error_of_a_stage(text, expected):
     errors = found(text).errors
     assert [error.line for error in errors] == [line for line, _ in expected]
     for error, (_, problem) in zip(errors, expected):
         assert problem in error.problem
 
 
-def test_a_file_full_of_errors() -> None:
+def test_a_file_full_of_errors():
     lines = [f'      - {{nme: c{i}, subscription: /topic_{i}, publishes: [/t{i}]}}'
              for i in range(1_000)]
     text = '\n'.join(['mddag: 1', 'nodes:', '  - node: /n', '    callbacks:', *lines])
     assert len(found(text).errors) == len(found(text.replace('nme', 'name')).errors) == MOST_ERRORS
 
 
-def test_the_program_says_where_it_stops(call: Call) -> None:
+def test_the_program_says_where_it_stops(call):
     lines = [f'      - {{name: c{i}, timer: 10}}' for i in range(200)]
     text = '\n'.join(['mddag: 1', 'nodes:', '  - node: /n', '    callbacks:', *lines])
     done = call('graph', 'check', '-', stdin=text)

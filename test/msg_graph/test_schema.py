@@ -41,16 +41,16 @@ def errors(text: str) -> list[str]:
     return [error.message for error in validator.iter_errors(yaml.safe_load(text))]
 
 
-def test_it_is_a_schema() -> None:
+def test_it_is_a_schema():
     jsonschema.Draft7Validator.check_schema(schema())
 
 
 @pytest.mark.parametrize('name', ['autoware.yaml', 'autoware_multi.yaml'])
-def test_what_ships_is_valid(name: str) -> None:
+def test_what_ships_is_valid(name):
     assert errors((CONFIG / name).read_text(encoding='utf-8')) == []
 
 
-def test_a_declaration_with_every_key_is_valid() -> None:
+def test_a_declaration_with_every_key_is_valid():
     msg_graph.loads(GRAPH)
     assert errors(GRAPH) == []
     words = GRAPH.replace('{', ' ').replace(',', ' ').split()
@@ -59,7 +59,7 @@ def test_a_declaration_with_every_key_is_valid() -> None:
     assert {f'{key}:' for key in keys} - {'arguments:', 'include:'} <= set(words)
 
 
-def test_a_declaration_of_several_files_is_valid() -> None:
+def test_a_declaration_of_several_files_is_valid():
     text = """\
 mddag: 1
 arguments: {period: 10ms, workers: }
@@ -105,7 +105,7 @@ nodes:
     ("'/n:x'", "'/n'"),
     (", '/n:x'", ''),
 ])
-def test_both_refuse(right: str, wrong: str) -> None:
+def test_both_refuse(right, wrong):
     text = GRAPH.replace(right, wrong, 1)
     assert text != GRAPH
     with pytest.raises(GraphError):

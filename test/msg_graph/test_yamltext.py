@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from msg_graph import GraphError, load, loads, yamltext
 import pytest
 import yaml
@@ -22,7 +20,7 @@ nodes:
 
 
 @pytest.fixture(params=['CSafeLoader', 'SafeLoader'], autouse=True)
-def loader(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def loader(request, monkeypatch):
     """Run every test with libyaml and without."""
     monkeypatch.setattr(yamltext, '_LOADER', getattr(yaml, request.param))
 
@@ -31,7 +29,7 @@ def loader(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
     ('', 'empty'), ('# nothing\n', 'empty'), ('---\n', 'empty'), ('\ufeff', 'empty'),
     (f'hello {MARK}', 'not a declaration'), (f'- a {MARK}\n- b', 'not a declaration'),
     (f"'' {MARK}", 'not a declaration')])
-def test_no_declaration(text: str, says: str) -> None:
+def test_no_declaration(text, says):
     assert says in str(error(text))
 
 
@@ -43,7 +41,7 @@ def test_no_declaration(text: str, says: str) -> None:
     f'mddag: 1\na: b: c {MARK}',
     f'%YAML 7.0 {MARK}\n---\nmddag: 1',
 ])
-def test_not_yaml(text: str) -> None:
+def test_not_yaml(text):
     with pytest.raises(GraphError) as caught:
         loads(text, 'g.yaml')
     assert 'not YAML' in str(caught.value)
@@ -51,7 +49,7 @@ def test_not_yaml(text: str) -> None:
     assert 1 <= caught.value.line <= text.count('\n') + 2
 
 
-def test_bytes() -> None:
+def test_bytes():
     assert len(loads(SMALL.encode()).dags) == 1
     assert len(loads(b'\xef\xbb\xbf' + SMALL.encode()).dags) == 1
     with pytest.raises(GraphError, match=r'g:2: byte 9 is not UTF-8'):
@@ -71,17 +69,17 @@ def test_bytes() -> None:
     (f'mddag: 1\n--- {MARK}\nmddag: 1\n', 'second YAML document'),
     (f'mddag: 1\n<<: {{}} {MARK}\n', "unknown key '<<'"),
 ])
-def test_yaml_that_is_refused(text: str, says: str) -> None:
+def test_yaml_that_is_refused(text, says):
     assert says in str(error(text))
 
 
 @pytest.mark.parametrize('opening', ['[', '{a: ', '- ', '- - ? '])
-def test_nesting_is_bounded(opening: str) -> None:
+def test_nesting_is_bounded(opening):
     with pytest.raises(GraphError, match='nesting|a key is'):
         loads('mddag: 1\nnodes:\n  ' + opening * 100_000)
 
 
-def test_aliases_do_not_explode() -> None:
+def test_aliases_do_not_explode():
     text = 'a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n'
     for i in range(1, 30):
         text += f'a{i}: &a{i} [{", ".join([f"*a{i - 1}"] * 10)}]\n'
@@ -89,7 +87,7 @@ def test_aliases_do_not_explode() -> None:
         loads(text, 'g')
 
 
-def test_size_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_size_is_bounded(tmp_path, monkeypatch):
     big = SMALL + '#' * (16 * 1024 * 1024)
     for given in (big, big.encode()):
         with pytest.raises(GraphError, match='larger than 16 MiB'):
@@ -104,7 +102,7 @@ def test_size_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(loads(SMALL).dags) == 1
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_files_that_cannot_be_read(tmp_path):
     for path, problem in ((tmp_path / 'none.yaml', 'no such file or directory: check the path'),
                           (tmp_path, 'the file cannot be read (')):
         with pytest.raises(GraphError) as caught:
@@ -115,7 +113,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         load('nul\x00byte')
 
 
-def test_scalars_are_as_written() -> None:
+def test_scalars_are_as_written():
     """Words that YAML 1.1 takes for truth values, dates or numbers are names like any other."""
     tasks = loads("""\
 mddag: 1

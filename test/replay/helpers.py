@@ -275,7 +275,7 @@ class VirtualRun:
             self.file.flush()
 
     def _release(self, dag: int, release: int) -> Callable[[int], None]:
-        def action(now: int) -> None:
+        def action(now):
             job = self._jobs[dag]
             self._jobs[dag] += 1
             slot = self.scheduler.release(dag, job, release, now)
@@ -313,7 +313,7 @@ class VirtualRun:
     def _message(
         self, slot: int, dag: int, job: int, vertex: int, leg: int
     ) -> Callable[[int], None]:
-        def action(now: int) -> None:
+        def action(now):
             state = self.scheduler.state
             if (state.job_dag[slot] != dag or state.job_index[slot] != job
                     or state.job_state[slot] != OPEN):

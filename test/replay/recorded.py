@@ -145,7 +145,7 @@ class Recorded:
         message = self._next_message
         stamp = time + 10 * US if stamp is None else stamp
 
-        def add(name: str, after: int, *fields: int) -> None:
+        def add(name, after, *fields):
             self.add(name, time + after * US, tid, *fields, pid=pid)
 
         if style in ('tracing', 'cyclone'):

@@ -16,7 +16,6 @@ from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
-from ..conftest import Call
 from ..replay.helpers import (
     begin_trace,
     declarations,
@@ -34,9 +33,7 @@ from ..replay.helpers import (
        st.sampled_from(['rad', 'fifo', 'rm']), st.integers(1, 25))
 @settings(max_examples=150)
 @example(SMALL, 1, 2, 'rad', 8)
-def test_replay_counts_what_the_driver_counted(
-    text: str, seed: int, workers: int, policy: str, longest: int
-) -> None:
+def test_replay_counts_what_the_driver_counted(text, seed, workers, policy, longest):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'run.mcap')
         run = VirtualRun(path, loads(text, 'g.yaml'), seed, workers, policy,
@@ -58,7 +55,7 @@ def test_replay_counts_what_the_driver_counted(
     assert result['worker_use']['use'] <= 1
 
 
-def test_breakdowns_add_up_to_the_response_times(tmp_path: Path) -> None:
+def test_breakdowns_add_up_to_the_response_times(tmp_path):
     run = VirtualRun(tmp_path / 'a.mcap', small(), 3, duration=1000 * MS)
     result = replay(tmp_path / 'a.mcap').result()
     total = 0
@@ -113,7 +110,7 @@ def job_of_the_camera(job: int, at: int) -> list[tuple[object, ...]]:
     ]
 
 
-def test_a_job_to_the_millisecond(tmp_path: Path) -> None:
+def test_a_job_to_the_millisecond(tmp_path):
     """A run written by hand: verdicts, times and chain are those that can be read off."""
     path = write(tmp_path / 'a.mcap', *job_of_the_camera(0, 10),
                  ('shutdown', 110, 1, START_TIME + 110 * MS))
@@ -142,7 +139,7 @@ def test_a_job_to_the_millisecond(tmp_path: Path) -> None:
     assert result['dags']['/imu']['jobs'] == 0
 
 
-def test_the_chain_goes_through_the_leg_that_came_last(tmp_path: Path) -> None:
+def test_the_chain_goes_through_the_leg_that_came_last(tmp_path):
     """It was waited for, also where the vertex before it ended sooner than the other's did."""
     path = write(
         tmp_path / 'a.mcap',
@@ -160,7 +157,7 @@ def test_the_chain_goes_through_the_leg_that_came_last(tmp_path: Path) -> None:
     assert worst['executing_ns'] == 6 * MS
 
 
-def test_a_sink_may_complete_before_what_started_it(tmp_path: Path) -> None:
+def test_a_sink_may_complete_before_what_started_it(tmp_path):
     """A callback that publishes early still runs when its successor has completed."""
     path = write(
         tmp_path / 'a.mcap',
@@ -200,7 +197,7 @@ nodes:
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_vertices_are_found_by_name(tmp_path: Path, seed: int) -> None:
+def test_vertices_are_found_by_name(tmp_path, seed):
     """Another order of DAGs, vertices and legs changes no verdict."""
     path = tmp_path / 'a.mcap'
     run = VirtualRun(path, small(), seed)
@@ -219,7 +216,7 @@ def test_vertices_are_found_by_name(tmp_path: Path, seed: int) -> None:
             assert breakdown['mean']['unknown_ns'] == 0
 
 
-def test_vertices_of_shared_callbacks_are_found(tmp_path: Path) -> None:
+def test_vertices_of_shared_callbacks_are_found(tmp_path):
     """A callback of two DAGs is called ``@dag``; with other DAG names, or one DAG, it is found."""
     text = """\
 mddag: 1
@@ -247,7 +244,7 @@ nodes:
     assert alone.result()['undeclared']['executions'] > 0  # /c:cb of DAG two
 
 
-def test_callbacks_that_the_trace_lacks(tmp_path: Path) -> None:
+def test_callbacks_that_the_trace_lacks(tmp_path):
     path = tmp_path / 'a.mcap'
     VirtualRun(path, small())
     more = SMALL + """\
@@ -272,7 +269,7 @@ nodes:
         replay(path, loads(other, 'other.yaml'))
 
 
-def test_a_killed_run_is_judged_at_its_last_instant(tmp_path: Path) -> None:
+def test_a_killed_run_is_judged_at_its_last_instant(tmp_path):
     path = write(tmp_path / 'a.mcap', *job_of_the_camera(0, 10),
                  ('job_release', 60, 2, 0, 1, START_TIME + 60 * MS),
                  ('job_release', 70, 2, 1, 0, START_TIME + 70 * MS),
@@ -289,7 +286,7 @@ def test_a_killed_run_is_judged_at_its_last_instant(tmp_path: Path) -> None:
     assert [s['overdue'] for s in (*camera.values(), *imu.values())] == [1, 1, 1]
 
 
-def test_misses_that_are_not_those_recorded_are_said(tmp_path: Path) -> None:
+def test_misses_that_are_not_those_recorded_are_said(tmp_path):
     path = write(
         tmp_path / 'a.mcap', *job_of_the_camera(0, 10),
         ('deadline', 26, 2, 0, 4, 0, START_TIME + 24 * MS, START_TIME + 25 * MS),
@@ -305,7 +302,7 @@ def test_misses_that_are_not_those_recorded_are_said(tmp_path: Path) -> None:
     ('', 'it was recorded without a declaration'),
     ('nonsense', r'the declaration that it was recorded with is wrong \(small.yaml'),
 ])
-def test_a_trace_without_a_usable_declaration(tmp_path: Path, text: str, says: str) -> None:
+def test_a_trace_without_a_usable_declaration(tmp_path, text, says):
     path = write(tmp_path / 'a.mcap', text=text)
     with pytest.raises(ReplayError, match=f'a.mcap: {says}'):
         replay(path)
@@ -314,7 +311,7 @@ def test_a_trace_without_a_usable_declaration(tmp_path: Path, text: str, says: s
 
 
 @pytest.mark.parametrize('skip', [0, 100 * MS])
-def test_verdicts_begin_when_all_programs_have_started(tmp_path: Path, skip: int) -> None:
+def test_verdicts_begin_when_all_programs_have_started(tmp_path, skip):
     path = tmp_path / 'a.mcap'
     VirtualRun(path, small(), 4, duration=400 * MS)
     events = list(TraceReader(path).events(sorted=True))
@@ -342,9 +339,7 @@ nodes:
 
 
 @pytest.mark.parametrize('seconds', [50, 70, 4_000])
-def test_a_callback_that_runs_for_minutes_is_counted_and_judged(
-    seconds: int, tmp_path: Path, call: Call
-) -> None:
+def test_a_callback_that_runs_for_minutes_is_counted_and_judged(seconds, tmp_path, call):
     path, second = tmp_path / 'run.mcap', 1_000 * MS
     with begin_trace(path, SLOW, workers=2) as file:
         file.add('job_release', START_TIME, 1, 1, 0, 0, START_TIME)
@@ -385,8 +380,8 @@ nodes:
 
 
 @pytest.mark.parametrize('key', ['on_miss:', '"on_miss":', "'on_miss' :"])
-def test_a_recorded_declaration_may_have_the_key_of_version_1(key: str) -> None:
-    def read(text: str) -> object:
+def test_a_recorded_declaration_may_have_the_key_of_version_1(key):
+    def read(text):
         return declared(
             Head(0, text, 'graph.yaml', 'rad', 7, 100_000_000, 64, False), 'run.mcap').dags
 

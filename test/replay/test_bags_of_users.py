@@ -24,8 +24,6 @@ import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
-from ..conftest import Call
-
 MS = 1_000_000
 BEGIN = 1_732_166_766_000_000_000
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -85,7 +83,7 @@ def definition(kind: str) -> str:
 def with_rosbags(
     storage: StoragePlugin, compression: CompressionMode = CompressionMode.NONE, version: int = 9
 ) -> Callable[[Path, Messages], None]:
-    def write(path: Path, given: Messages) -> None:
+    def write(path, given):
         writer = Writer(path, version=version, storage_plugin=storage)     # type: ignore[arg-type]
         writer.set_compression(compression, CompressionFormat.ZSTD)
         with writer:
@@ -98,7 +96,7 @@ def with_rosbags(
 
 def with_mcap(**options: Any) -> Callable[[Path, Messages], None]:
     """Write as rosbag2_storage_mcap does with one of its presets, without metadata.yaml."""
-    def write(path: Path, given: Messages) -> None:
+    def write(path, given):
         path.mkdir()
         with open(path / f'{path.name}_0.mcap', 'wb') as file:
             writer = McapWriter(file, **options)
@@ -141,7 +139,7 @@ GRAPH = 'mddag: 1\nnodes:\n  - node: /all\n    callbacks:\n' + ''.join(
 
 
 @pytest.fixture
-def graph(tmp_path: Path) -> Path:
+def graph(tmp_path):
     path = tmp_path / 'graph.yaml'
     path.write_text(GRAPH)
     return path
@@ -149,7 +147,7 @@ def graph(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize('split', [False, True], ids=['one file', '-b'])
 @pytest.mark.parametrize('kind', BAGS)
-def test_each_kind_of_bag(tmp_path: Path, graph: Path, kind: str, split: bool, call: Call) -> None:
+def test_each_kind_of_bag(tmp_path, graph, kind, split, call):
     bag, write = tmp_path / 'drive', BAGS[kind]
     if split:
         join(bag, [parted(tmp_path / f'part{i}', write, i) for i in range(2)])

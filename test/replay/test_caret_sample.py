@@ -14,7 +14,7 @@ from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.paths import Paths
 from mddag_executor.replay.run import open_recording
 from mddag_executor.trace import import_ctf
-from msg_graph import loads, TaskSet
+from msg_graph import loads
 import pytest
 
 from .cases_by_hand import slow_cases
@@ -61,7 +61,7 @@ paths:
 
 
 @pytest.fixture(scope='module')
-def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trace(tmp_path_factory):
     path = tmp_path_factory.mktemp('caret') / 'sample.mcap'
     imported = import_ctf(SESSION, path)
     assert (imported.events, imported.warnings) == (2880, [])
@@ -69,7 +69,7 @@ def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope='module')
-def graph() -> TaskSet:
+def graph():
     return loads(GRAPH, 'sample.yaml')
 
 
@@ -81,7 +81,7 @@ def rows(name: str) -> Iterator[tuple[int | None, ...]]:
             yield tuple(int(cell) if cell else None for cell in line)
 
 
-def test_path(trace: Path, graph: TaskSet) -> None:
+def test_path(trace, graph):
     columns = [flow.columns for flow in flows(Paths(open_recording(trace, graph)))]
     found = [(c[0][0], c[1][1], c[1][0], c[2][1], c[3][0], c[4][1], c[5][0], c[6][1])
              for c in columns]
@@ -89,7 +89,7 @@ def test_path(trace: Path, graph: TaskSet) -> None:
     expected = [tuple(row[i] for i in (0, 3, 4, 7, 8, 11, 12, 15))
                 for row in rows('demo_target_path.csv')]
 
-    def order(row: tuple[int | None, ...]) -> list[int]:
+    def order(row):
         return [time or 0 for time in row]
 
     assert sorted(found, key=order) == sorted(expected, key=order)
@@ -99,7 +99,7 @@ def test_path(trace: Path, graph: TaskSet) -> None:
     assert slow_cases(records) == response
 
 
-def test_the_replay_says_the_same(trace: Path, graph: TaskSet) -> None:
+def test_the_replay_says_the_same(trace, graph):
     outcome = replay(trace, graph)
     assert outcome.warnings == []
     result = outcome.result()
@@ -117,7 +117,7 @@ def test_the_replay_says_the_same(trace: Path, graph: TaskSet) -> None:
         '/drive_node': 49, '/sensor_dummy_node': 49, '/timer_driven_node': 49}
 
 
-def test_without_a_graph(trace: Path) -> None:
+def test_without_a_graph(trace):
     result: dict[str, Any] = replay(trace).result()
     assert (result['dags'], result['paths'], result['warnings']) == ({}, {}, [])
     assert sum(use['executions'] for use in result['recorded_callbacks'].values()) == 480
@@ -129,7 +129,7 @@ def test_without_a_graph(trace: Path) -> None:
         latencies[0], latencies[-1])
 
 
-def test_rescheduled(trace: Path, graph: TaskSet) -> None:
+def test_rescheduled(trace, graph):
     result = reschedule(trace, graph, policy='rad', workers=12).result()
     sink = result['dags']['/timer_driven_node']['sinks']['/actuator_dummy_node:callback_0']
     recorded = replay(trace, graph).result()['dags']['/timer_driven_node']['sinks'][

@@ -40,7 +40,7 @@ def check(recording: Recording, skip: int = 0) -> None:
        st.sampled_from([0, 70 * MS]))
 @settings(max_examples=100)
 @example(SMALL, 1, 2, 8, 0)
-def test_verdicts_of_any_run(text: str, seed: int, workers: int, longest: int, skip: int) -> None:
+def test_verdicts_of_any_run(text, seed, workers, longest, skip):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'run.mcap')
         VirtualRun(path, loads(text, 'g.yaml'), seed, workers, longest=longest * MS,
@@ -54,13 +54,13 @@ def test_verdicts_of_any_run(text: str, seed: int, workers: int, longest: int, s
             check(other, skip)
 
 
-def test_verdicts_of_a_bag() -> None:
+def test_verdicts_of_a_bag():
     check(open_recording(BAGS / 'demo_short.mcap'))
 
 
 @given(st.integers(0, 2**32), st.data())
 @settings(max_examples=100)
-def test_verdicts_of_any_tables(seed: int, data: st.DataObject) -> None:
+def test_verdicts_of_any_tables(seed, data):
     """Tables that no executor records: ends and completions in any order, twice, or of no job."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'run.mcap')
@@ -101,15 +101,13 @@ COLUMNS = ['kind', 'dag', 'sink', 'job', 'release', 'deadline', 'completed']
 
 
 def verdicts(replay: Replay) -> list[Any]:
-    found: list[Any] = sorted(replay.judged.verdicts[COLUMNS].tolist())
-    return found
+    return sorted(replay.judged.verdicts[COLUMNS].tolist())
 
 
 def links(table: Table, column: str, other: Table, *names: str) -> list[Any]:
     """Return the rows that a column refers to."""
     rows = table[column]
-    found: list[Any] = other[list(names)][rows[rows >= 0]].tolist()
-    return found
+    return other[list(names)][rows[rows >= 0]].tolist()
 
 
 def chains_of(jobs: list[dict[str, Any]]) -> list[Any]:
@@ -159,9 +157,7 @@ def check_rows(whole: Recording, part: Recording, begin: int, end: int) -> None:
        st.lists(st.integers(1, 150), max_size=3, unique=True))
 @settings(max_examples=60)
 @example(SMALL + PATHS, 1, 2, 20, [40, 90])
-def test_parts_of_any_run(
-    text: str, seed: int, workers: int, longest: int, borders: list[int]
-) -> None:
+def test_parts_of_any_run(text, seed, workers, longest, borders):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'run.mcap')
         VirtualRun(path, loads(text, 'g.yaml'), seed, workers, longest=longest * MS,
@@ -172,7 +168,7 @@ def test_parts_of_any_run(
     check_parts(recording, [0, *inner, 2 ** 62])
 
 
-def test_parts_of_a_bag() -> None:
+def test_parts_of_a_bag():
     recording = open_recording(BAGS / 'demo_short.mcap')
     check_parts(recording, [0, 200 * MS, 210 * MS, 900 * MS, 1400 * MS, 2 ** 62])
     part = recording.cut(200 * MS, 500 * MS)
@@ -180,7 +176,7 @@ def test_parts_of_a_bag() -> None:
         recording.executions) / 2
 
 
-def test_ranges_that_cannot_be() -> None:
+def test_ranges_that_cannot_be():
     recording = open_recording(BAGS / 'demo_short.mcap')
     for begin, end in ((-1, 5), (5, 5)):
         with pytest.raises(ValueError, match='is no range of time'):
@@ -189,7 +185,7 @@ def test_ranges_that_cannot_be() -> None:
         recording.cut(10 ** 12, 2 ** 62)
 
 
-def test_a_recording_in_a_program(tmp_path: Path) -> None:
+def test_a_recording_in_a_program(tmp_path):
     recording = open_recording(BAGS / 'demo_short.mcap')
     graph = tmp_path / 'graph.yaml'
     graph.write_text(recording.task_set.text)

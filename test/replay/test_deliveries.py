@@ -45,9 +45,7 @@ nodes:
     (0, 0, 0), (700_000, 0, 0), (0, 300_000, 0), (700_000, 300_000, 0),
     # published 3 ms before the end: the next one runs at the same time, on the other worker
     (700_000, 300_000, 3 * MS)])
-def test_overheads_are_measured_and_reproduced(
-    tmp_path: Path, delay: int, wake: int, early: int
-) -> None:
+def test_overheads_are_measured_and_reproduced(tmp_path, delay, wake, early):
     path = tmp_path / 'a.mcap'
     record(path, delay, wake, early)
     outcome = reschedule(path)
@@ -68,7 +66,7 @@ def test_overheads_are_measured_and_reproduced(
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_the_prediction_of_a_virtual_run(tmp_path: Path, seed: int) -> None:
+def test_the_prediction_of_a_virtual_run(tmp_path, seed):
     """One DAG, workers enough, nothing lost: the same response times."""
     path = tmp_path / 'a.mcap'
     alone = loads(SMALL[:SMALL.index('  - node: /imu')], 'alone.yaml')

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -40,7 +39,7 @@ def of(
     return [float(each) for each in np.round(found / 1e6, 1)]
 
 
-def test_two_that_held_it_at_the_same_time() -> None:
+def test_two_that_held_it_at_the_same_time():
     # they took turns, the first one had the first
     assert of((0, 19, 10, 1), (0, 20, 10, 1)) == [10, 10]
     # one was overtaken by another
@@ -49,12 +48,12 @@ def test_two_that_held_it_at_the_same_time() -> None:
     assert of((0, 13, 10, 1), (2, 6, 3, 2)) == [13, 6]
 
 
-def test_what_the_machine_does_not_explain_is_its_own() -> None:
+def test_what_the_machine_does_not_explain_is_its_own():
     assert of((0, 20, 10, 1), (30, 20, 20, 1)) == [20, 20]
     assert of((0, 20, -1, 0), (0, 20, 10, 0)) == [20, 20]
 
 
-def test_one_that_waits_got_the_lock_late() -> None:
+def test_one_that_waits_got_the_lock_late():
     # it needs the lock for 0.3 ms when it goes on
     waits = (0, 6, 0.4, 0)
     assert of(waits, (4, 20, 19.7, 1)) == [5, 19.7]
@@ -62,7 +61,7 @@ def test_one_that_waits_got_the_lock_late() -> None:
     assert of(waits, (4, 20, 20, 1), here=[1, 2]) == [6, 20]
 
 
-def test_cpus_that_were_busy() -> None:
+def test_cpus_that_were_busy():
     assert of((0, 17, 10, 0), (0, 20, 10, 0), cpus=1) == approx([10, 10], abs=1.2)
     assert of((0, 20, 10, 0), (0, 20, 10, 0), cpus=3) == [20, 20]
     assert of((0, 20, 10, 0), (0, 20, 10, 0)) == [20, 20]
@@ -72,9 +71,7 @@ def test_cpus_that_were_busy() -> None:
 @given(st.lists(st.tuples(
     st.integers(0, 10), st.integers(0, 10), st.integers(-1, 10), st.integers(0, 2)),
     min_size=1, max_size=20), st.integers(0, 3), st.integers(1, 30))
-def test_never_longer_and_alone_never_less_than_it_computed(
-    ran: list[Ran], cpus: int, window: int
-) -> None:
+def test_never_longer_and_alone_never_less_than_it_computed(ran, cpus, window):
     """Also where the windows part what runs."""
     with MonkeyPatch.context() as patch:
         patch.setattr(module, 'WINDOW', window)
@@ -115,12 +112,12 @@ def late(n_workers: int, *executions: Execution, holding: Sequence[int] = ()) ->
     # an unknown worker is not waited for
     (1, [(-1, None, 0, 0, 400), (-1, None, 100, 430, 500)], [0, 330]),
 ])
-def test_by_hand(workers: int, executions: list[Execution], expected: list[int]) -> None:
+def test_by_hand(workers, executions, expected):
     assert late(workers, *executions) == expected
 
 
 @given(st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), max_size=20))
-def test_a_schedule_without_overhead_has_none(jobs: list[tuple[int, int]]) -> None:
+def test_a_schedule_without_overhead_has_none(jobs):
     free = [0, 0, 0]
     executions = []
     for ready, takes in sorted(jobs):  # first come, first served
@@ -131,7 +128,7 @@ def test_a_schedule_without_overhead_has_none(jobs: list[tuple[int, int]]) -> No
     assert late(3, *executions) == [0] * len(jobs)
 
 
-def test_waiting_for_what_computes_is_not_late() -> None:
+def test_waiting_for_what_computes_is_not_late():
     """Three that compute, one after the other; a fourth overtakes; one that only waits."""
     ms = 1_000_000
     overtakes, first, second, _, third = range(5)
@@ -148,7 +145,7 @@ SPANS = st.lists(st.tuples(st.integers(0, 10 ** 13), st.integers(0, 10 ** 11)), 
 
 
 @given(SPANS)
-def test_no_time_is_lost_and_steps_are_few(spans: list[tuple[int, int]]) -> None:
+def test_no_time_is_lost_and_steps_are_few(spans):
     starts = np.array([start for start, _ in spans], dtype=np.int64)
     took = np.array([each for _, each in spans], dtype=np.int64)
     result = PoolUse(starts, starts + took).result()
@@ -160,7 +157,7 @@ def test_no_time_is_lost_and_steps_are_few(spans: list[tuple[int, int]]) -> None
         assert result['step_ns'] % STEP == 0
 
 
-def test_waits_for_the_group() -> None:
+def test_waits_for_the_group():
     groups = Entities(by_address=True)
     groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 50, 'mutually_exclusive'))
     groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 60, 'reentrant'))
@@ -179,7 +176,7 @@ def test_waits_for_the_group() -> None:
     assert group_waits(recording).tolist() == [0, 6, 0, 10, 0]
 
 
-def test_what_computed_and_held_the_interpreter(tmp_path: Path) -> None:
+def test_what_computed_and_held_the_interpreter(tmp_path):
     """Executions whose CPU time is not recorded are left out."""
     path, text = tmp_path / 'a.mcap', 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, ' \
         'timer: 100ms, deadline: 50ms}]}]'

@@ -18,7 +18,6 @@ from mddag_executor.replay.causes import CAUSES, REMEDIES
 from msg_graph import loads, TaskSet
 import pytest
 
-from ..conftest import Call
 from .helpers import (
     add_execution,
     begin_trace,
@@ -181,7 +180,7 @@ def explained(path: Path, task_set: TaskSet | None = None) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize('cause', list(PLANS))
-def test_the_right_cause_is_told(cause: str, tmp_path: Path) -> None:
+def test_the_right_cause_is_told(cause, tmp_path):
     declaration, plan = PLANS[cause]
     path = tmp_path / 'run.mcap'
     Planned(path, loads(declaration, 'g.yaml'), **plan)
@@ -209,7 +208,7 @@ def test_the_right_cause_is_told(cause: str, tmp_path: Path) -> None:
           suppress_health_check=[HealthCheck.function_scoped_fixture])
 @example(903, 2)    # the release after that of a job that failed was skipped
 @given(st.integers(0, 10 ** 6), st.sampled_from([1, 2, 4]))
-def test_all_misses_of_any_run_are_explained(tmp_path: Path, seed: int, workers: int) -> None:
+def test_all_misses_of_any_run_are_explained(tmp_path, seed, workers):
     path = tmp_path / 'run.mcap'
     run = VirtualRun(path, small(), seed, workers, duration=400 * MS,
                      chances=Chances(undeclared=1))
@@ -224,7 +223,7 @@ def test_all_misses_of_any_run_are_explained(tmp_path: Path, seed: int, workers:
                 assert each['ns'] <= workers * (job['until_ns'] - job['release_ns'])
 
 
-def test_what_people_see(tmp_path: Path, call: Call) -> None:
+def test_what_people_see(tmp_path, call):
     declaration, plan = PLANS['waited']
     path, page = tmp_path / 'run.mcap', tmp_path / 'run.html'
     Planned(path, loads(declaration, 'g.yaml'), **plan)
@@ -259,9 +258,7 @@ nodes:
 
 
 @pytest.mark.parametrize('cause', ['waited', 'machine'])
-def test_misses_of_one_cause_have_it_however_long_the_run_is(
-    cause: str, tmp_path: Path, call: Call
-) -> None:
+def test_misses_of_one_cause_have_it_however_long_the_run_is(cause, tmp_path, call):
     # every minute the short one waits 50 ms for the only worker, or for the machine to go on
     path = tmp_path / 'run.mcap'
     minutes = 60
@@ -300,9 +297,7 @@ nodes:
 
 
 @pytest.mark.parametrize(('worker', 'cause'), [(-1, 'machine'), (0, 'waited')])
-def test_a_callback_that_has_lent_its_worker_keeps_none_busy(
-    worker: int, cause: str, tmp_path: Path, call: Call
-) -> None:
+def test_a_callback_that_has_lent_its_worker_keeps_none_busy(worker, cause, tmp_path, call):
     # the one waits for the answer to a service call; the other starts 300 ms after it is ready
     path = tmp_path / 'run.mcap'
     with begin_trace(path, LENT) as file:
@@ -322,7 +317,7 @@ def test_a_callback_that_has_lent_its_worker_keeps_none_busy(
         assert job['parts'][0]['behind'] == behind
 
 
-def test_an_undeclared_callback_may_hold_the_interpreter(tmp_path: Path, call: Call) -> None:
+def test_an_undeclared_callback_may_hold_the_interpreter(tmp_path, call):
     # one of two workers runs it: the other worker's callback cannot begin before it ends; its next
     # release is skipped
     path = tmp_path / 'run.mcap'
@@ -354,7 +349,7 @@ def test_an_undeclared_callback_may_hold_the_interpreter(tmp_path: Path, call: C
         'replay', path, '--reschedule').stdout
 
 
-def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path: Path, call: Call) -> None:
+def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path, call):
     # /image has another name in the node
     path = tmp_path / 'run.mcap'
     with begin_trace(path, SYNC) as file:
@@ -378,7 +373,7 @@ def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path: Path, call: Call
     assert 'lost: /image' in call('explain', path, '--job', '3').stdout
 
 
-def test_only_misses_in_stops_are_said_to_be_in_them(tmp_path: Path, call: Call) -> None:
+def test_only_misses_in_stops_are_said_to_be_in_them(tmp_path, call):
     # each job's callback starts 20 ms after it was ready, with an idle worker; the machine stood
     # still twice in that of one job, and once in that of another
     path = tmp_path / 'run.mcap'
@@ -407,7 +402,7 @@ def test_only_misses_in_stops_are_said_to_be_in_them(tmp_path: Path, call: Call)
         assert line.endswith(' s), 7 machine')
 
 
-def test_what_an_overload_takes_from_less_important_sinks(tmp_path: Path, call: Call) -> None:
+def test_what_an_overload_takes_from_less_important_sinks(tmp_path, call):
     graph, trace = tmp_path / 'g.yaml', tmp_path / 'run.mcap'
     graph.write_text("""\
 mddag: 1

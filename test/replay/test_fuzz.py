@@ -169,7 +169,7 @@ def never_above(result: dict[str, Any], whole: dict[str, Any]) -> None:
 
 
 @pytest.fixture(scope='module')
-def sound(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, dict[str, Any]]:
+def sound(tmp_path_factory):
     """Give a trace of several chunks, and what it says."""
     path = tmp_path_factory.mktemp('fuzz') / 'sound.mcap'
     VirtualRun(path, small(), 2, duration=60 * MS, flush_every=20)
@@ -195,7 +195,7 @@ def attempt(path: Path, read: Callable[[Path], Any], seed: int) -> Any:
 
 
 @pytest.fixture(autouse=True)
-def bounded_memory() -> Iterator[None]:
+def bounded_memory():
     """Fail where the fuzzed readers took much memory, or all there is."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     yield
@@ -204,7 +204,7 @@ def bounded_memory() -> Iterator[None]:
 
 
 @pytest.mark.timeout(180 + 2 * LONG_S)
-def test_damaged_files(sound: tuple[bytes, dict[str, Any]], tmp_path: Path) -> None:
+def test_damaged_files(sound, tmp_path):
     """What is counted is right, or less is and that is said."""
     data, whole = sound
     path = tmp_path / 'a.mcap'
@@ -231,7 +231,7 @@ def test_damaged_files(sound: tuple[bytes, dict[str, Any]], tmp_path: Path) -> N
 
 
 @pytest.mark.timeout(180 + 2 * LONG_S)
-def test_changes_under_a_right_crc(sound: tuple[bytes, dict[str, Any]], tmp_path: Path) -> None:
+def test_changes_under_a_right_crc(sound, tmp_path):
     """Such a file says what it says; it must not break anything."""
     data, _ = sound
     path = tmp_path / 'a.mcap'
@@ -250,9 +250,7 @@ def test_changes_under_a_right_crc(sound: tuple[bytes, dict[str, Any]], tmp_path
 @pytest.mark.parametrize(('storage', 'compression'), [
     (StoragePlugin.MCAP, CompressionMode.STORAGE), (StoragePlugin.SQLITE3, None),
     (StoragePlugin.SQLITE3, CompressionMode.FILE)])
-def test_damaged_bags(
-    tmp_path: Path, storage: StoragePlugin, compression: CompressionMode | None
-) -> None:
+def test_damaged_bags(tmp_path, storage, compression):
     """Arrivals are those of the sound bag, or an error or a warning says what is missing."""
     path = write_bag(tmp_path / 'bag', storage, compression)
     file = next(p for p in path.iterdir() if p.name != 'metadata.yaml')

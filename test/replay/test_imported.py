@@ -40,12 +40,12 @@ N = 5
 
 
 @pytest.fixture
-def graph() -> TaskSet:
+def graph():
     return loads(GRAPH, 'graph.yaml')
 
 
 @pytest.fixture
-def recorded(tmp_path: Path) -> Recorded:
+def recorded(tmp_path):
     """
     Give a recording of `N` jobs of 40 ms each, in two processes.
 
@@ -93,7 +93,7 @@ def result_of(path: Path, graph: TaskSet) -> tuple[dict[str, Any], list[str]]:
 TWO = ['2 processes ran callbacks, each with workers of its own: 6 threads are taken together']
 
 
-def test_jobs_responses_and_where_the_time_went(recorded: Recorded, graph: TaskSet) -> None:
+def test_jobs_responses_and_where_the_time_went(recorded, graph):
     result, warnings = result_of(recorded.write(), graph)
     assert warnings == TWO
     camera = result['dags']['/camera']
@@ -120,7 +120,7 @@ def test_jobs_responses_and_where_the_time_went(recorded: Recorded, graph: TaskS
     assert use['waiting_group_ns'] == N * ((21 - 19) * MS - 10 * US)
 
 
-def test_the_path(recorded: Recorded, graph: TaskSet) -> None:
+def test_the_path(recorded, graph):
     path = result_of(recorded.write(), graph)[0]['paths']['seen']
     assert path['hops'] == ['trigger', 'trigger', 'variable']
     # published at 9 ms after k * 100 ms, kept at 47 ms after it, planned with 50 ms after it, and
@@ -133,7 +133,7 @@ def test_the_path(recorded: Recorded, graph: TaskSet) -> None:
     assert path['reaction_time']['max'] == age[0] + 100 * MS
 
 
-def test_a_job_whose_message_was_lost_has_expired(recorded: Recorded, graph: TaskSet) -> None:
+def test_a_job_whose_message_was_lost_has_expired(recorded, graph):
     """A message that was not received is the robot's fault, whatever else comes from outside."""
     recorded.run(PLAN, 5, 3000 * MS, 3001 * MS)
     recorded.run(GRAB, 1, 2007 * MS, 2009 * MS)
@@ -146,7 +146,7 @@ def test_a_job_whose_message_was_lost_has_expired(recorded: Recorded, graph: Tas
         N, 1, 0)
 
 
-def test_nothing_is_judged_without_links(recorded: Recorded, graph: TaskSet) -> None:
+def test_nothing_is_judged_without_links(recorded, graph):
     stamps = [place for place, name in enumerate(recorded.names()) if 'bind' in name]
     result, warnings = result_of(recorded.write(but=stamps), graph)
     camera = result['dags']['/camera']
@@ -158,9 +158,7 @@ def test_nothing_is_judged_without_links(recorded: Recorded, graph: TaskSet) -> 
     assert not [line for line in warnings if 'is not in it' in line]
 
 
-def test_whatever_event_is_lost_no_job_is_late_or_expired(
-    recorded: Recorded, graph: TaskSet
-) -> None:
+def test_whatever_event_is_lost_no_job_is_late_or_expired(recorded, graph):
     recorded.run(PLAN, 5, 3000 * MS, 3001 * MS)
     recorded.run(GRAB, 1, 3007 * MS, 3008 * MS)
     for tid in (2, 3, 4, 9):    # some other callback: what has no end does not run until the end
@@ -177,9 +175,7 @@ def test_whatever_event_is_lost_no_job_is_late_or_expired(
                 assert sink['late'] == 0, (lost, name, recorded.names()[lost])
 
 
-def test_what_the_tracer_discarded_is_not_held_against_a_job(
-    recorded: Recorded, graph: TaskSet
-) -> None:
+def test_what_the_tracer_discarded_is_not_held_against_a_job(recorded, graph):
     """From 200 to 300 ms nothing is recorded; the jobs before and after are judged."""
     recorded.add('mddag:lost', 300 * MS, 0, 50)
     recorded.run(PLAN, 5, 3000 * MS, 3001 * MS)
@@ -192,7 +188,7 @@ def test_what_the_tracer_discarded_is_not_held_against_a_job(
     assert [line for line in warnings if line.startswith('the tracer discarded 50 events')]
 
 
-def test_late_and_off_the_grid(tmp_path: Path) -> None:
+def test_late_and_off_the_grid(tmp_path):
     graph = loads('mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n'
                   '      - {name: t, timer: 10ms, deadline: 5ms}\n', 'graph.yaml')
     r = Recorded(tmp_path / 'timer.mcap')
@@ -228,9 +224,7 @@ nodes:
     ('header_stamp', 30 * MS, 75 * MS, False), ('header_stamp', 0, 15 * MS, True),
     # of a simulated clock, say
     ('header_stamp', 12_000 * MS - BEGIN, 15 * MS, True)])
-def test_releases_of_messages(
-    tmp_path: Path, release_from: str, stated: int, response: int, said: bool
-) -> None:
+def test_releases_of_messages(tmp_path, release_from, stated, response, said):
     r = Recorded(tmp_path / 'source.mcap')
     r.node(1, '/n')
     r.node(2, '/driver')
@@ -246,7 +240,7 @@ def test_releases_of_messages(
         'away: /n:s (header_stamp)'] if said else [])
 
 
-def test_matching_by_order_and_period(tmp_path: Path) -> None:
+def test_matching_by_order_and_period(tmp_path):
     graph = loads("""\
 mddag: 1
 nodes:
@@ -271,7 +265,7 @@ nodes:
         '1 timer with another period than declared: /n:c (33ms instead of 30ms)']
 
 
-def test_reschedule_keeps_releases_times_and_groups(recorded: Recorded, graph: TaskSet) -> None:
+def test_reschedule_keeps_releases_times_and_groups(recorded, graph):
     path = recorded.write()
     found = reschedule(path, graph, policy='rad', workers=6, overheads=False)
     sink = found.result()['dags']['/camera']['sinks']['/fuse:join']
@@ -283,16 +277,14 @@ def test_reschedule_keeps_releases_times_and_groups(recorded: Recorded, graph: T
         reschedule(path)
 
 
-def test_a_graph_without_the_namespace_gets_a_question(recorded: Recorded) -> None:
+def test_a_graph_without_the_namespace_gets_a_question(recorded):
     other = loads('mddag: 1\nnodes:\n  - node: /robot/fuse\n    callbacks:\n'
                   '      - {name: t, timer: 50ms, deadline: 5ms}\n', 'x.yaml')
     with pytest.raises(ReplayError, match="/robot/fuse:t: did you mean the node '/fuse'\\?$"):
         replay(recorded.write(), other)
 
 
-def test_cut_anywhere_it_says_something_or_judges_what_is_there(
-    recorded: Recorded, graph: TaskSet
-) -> None:
+def test_cut_anywhere_it_says_something_or_judges_what_is_there(recorded, graph):
     total = len(recorded.names())
     whole, _ = result_of(recorded.write(), graph)
     for stop in range(0, total, 7):
@@ -352,9 +344,7 @@ def _shuffled(events: list[tuple[Any, ...]], rng: random.Random) -> Iterator[tup
 
 
 @pytest.mark.parametrize('first', range(0, SEEDS, 20))
-def test_anything_in_it(
-    recorded: Recorded, graph: TaskSet, tmp_path: Path, first: int
-) -> None:
+def test_anything_in_it(recorded, graph, tmp_path, first):
     source = recorded.write()
     replayed = 0
     for seed in range(first, first + 20):

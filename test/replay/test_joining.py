@@ -15,8 +15,6 @@ from mddag_executor.replay.clocks import offsets
 from mddag_executor.trace import TraceFile
 import pytest
 
-from ..conftest import Call
-
 MS = 1_000_000
 BASE = 10 ** 18
 GRAPH = """
@@ -88,12 +86,11 @@ class Trace:
 
 
 def sink(result: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = result['dags']['chain']['sinks']['/b:take']
-    return found
+    return result['dags']['chain']['sinks']['/b:take']
 
 
 @pytest.mark.parametrize('late', [0, 7 * MS])
-def test_a_job_goes_on_in_the_other_trace(tmp_path: Path, late: int) -> None:
+def test_a_job_goes_on_in_the_other_trace(tmp_path, late):
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1, late)
     for i, takes in enumerate((2, 2, 7)):
         release = i * 10 * MS
@@ -137,9 +134,7 @@ def two_machines(folder: Path, late: int, back: bool = True, stranger: bool = Fa
 
 
 @pytest.mark.parametrize('late', [0, 3 * MS, -3 * MS, 40_000 * MS, -40_000 * MS])
-def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(
-    tmp_path: Path, late: int, call: Call
-) -> None:
+def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(tmp_path, late, call):
     paths = two_machines(tmp_path, late)
     result = replay(paths).result()
     warning, = result['warnings']
@@ -157,14 +152,14 @@ def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(
         reversed_paths)['response_ns']['max'] == 10 * MS - 100_000
 
 
-def test_clocks_are_taken_as_they_are_where_messages_go_one_way(tmp_path: Path) -> None:
+def test_clocks_are_taken_as_they_are_where_messages_go_one_way(tmp_path):
     warning, = replay(two_machines(tmp_path, 0, back=False)).warnings
     assert 'is assumed to be synchronised: give --offset down=TIME' in warning
     warning, = replay(two_machines(tmp_path, 5 * MS, back=False)).warnings
     assert 'come there 4.600 ms before they are sent: give --offset down=TIME' in warning
 
 
-def test_one_machine_has_one_clock_whatever_it_was_set_to(tmp_path: Path) -> None:
+def test_one_machine_has_one_clock_whatever_it_was_set_to(tmp_path):
     up = Trace(tmp_path, 'up', 0, boot='one')
     down = Trace(tmp_path, 'down', 1, 3600_000 * MS, boot='one')
     up.runs(0, MS)
@@ -180,9 +175,7 @@ def test_one_machine_has_one_clock_whatever_it_was_set_to(tmp_path: Path) -> Non
     (['across=1ms'], 'there is no trace of across: name one of up, down'),
     (['up=1ms'], "up is on the first trace's machine"),
 ])
-def test_offsets_that_cannot_be_are_one_line(
-    tmp_path: Path, call: Call, offsets: list[str], message: str
-) -> None:
+def test_offsets_that_cannot_be_are_one_line(tmp_path, call, offsets, message):
     paths = two_machines(tmp_path, 0)
     run = call('replay', *paths, *(f'--offset={each}' for each in offsets))
     assert run.returncode == 2 and message in run.stderr and run.stderr.count('\n') == 1
@@ -190,8 +183,7 @@ def test_offsets_that_cannot_be_are_one_line(
     assert one.returncode == 2 and 'one trace has one clock' in one.stderr
 
 
-def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(
-        tmp_path: Path) -> None:
+def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(tmp_path):
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
     for i in range(4):
         up.runs(i * 10 * MS, i * 10 * MS + MS)
@@ -205,8 +197,7 @@ def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(
     assert (verdicts.due, verdicts.in_time, verdicts.late) == (4, 1, 3)
 
 
-def test_who_is_started_again_or_never_judged_keeps_no_job_from_being_judged(
-        tmp_path: Path) -> None:
+def test_who_is_started_again_or_never_judged_keeps_no_job_from_being_judged(tmp_path):
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
     again = Trace(tmp_path, 'down.2', 1, begin=30 * MS, judges_from=45 * MS)
     killed = Trace(tmp_path, 'other', 1, judges_from=NEVER - BASE)
@@ -228,7 +219,7 @@ nodes:
 
 
 @pytest.fixture
-def two(tmp_path: Path) -> list[str]:
+def two(tmp_path):
     """Return the traces of two processes that compute for 5 ms at the same time."""
     paths = []
     for dag, name in enumerate(('up', 'down')):
@@ -239,9 +230,7 @@ def two(tmp_path: Path) -> list[str]:
     return paths
 
 
-def test_each_process_has_its_workers_and_interpreter_again(
-    two: list[str], tmp_path: Path, call: Call
-) -> None:
+def test_each_process_has_its_workers_and_interpreter_again(two, tmp_path, call):
     outcome = reschedule(two)
     assert [(p.name, p.nodes) for p in outcome.processes] == [('up', ('/a',)), ('down', ('/b',))]
     assert (outcome.workers, outcome.settings.workers) == (4, 2) and not outcome.tally.missed
@@ -260,7 +249,7 @@ def test_each_process_has_its_workers_and_interpreter_again(
     assert '9 late' in call('replay', *two, tmp_path / 'graph.yaml', '--reschedule').stdout
 
 
-def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path: Path, call: Call) -> None:
+def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path, call):
     for folder, takes in (('before', 2), ('after', 7)):
         (tmp_path / folder).mkdir()
         up, down = Trace(tmp_path / folder, 'up', 0), Trace(tmp_path / folder, 'down', 1)
@@ -281,7 +270,7 @@ def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path: Path, call: Call) -> 
     assert refused.returncode == 2 and 'another declaration' in refused.stderr
 
 
-def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, call: Call) -> None:
+def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path, call):
     trace = Trace(tmp_path, 'whole', 0, graph=TWO)
     for i in range(9):
         for trace.dag in range(2):
@@ -301,15 +290,13 @@ def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path: Path, call: Call) 
     (['--reschedule', '--policy', 'ros2'], 'polling is known of one process only'),
     (['--reschedule', '--preemptive'], 'preemption is known of one process only'),
 ])
-def test_bad_placements_are_one_line(
-    two: list[str], call: Call, arguments: list[str], message: str
-) -> None:
+def test_bad_placements_are_one_line(two, call, arguments, message):
     run = call('replay', *two, *arguments)
     assert (run.returncode, run.stdout) == (2, '')
     assert message in run.stderr and run.stderr.count('\n') == 1
 
 
-def test_traces_of_different_runs_are_refused(tmp_path: Path) -> None:
+def test_traces_of_different_runs_are_refused(tmp_path):
     up = Trace(tmp_path, 'up', 0).end(MS)
     other = Trace(tmp_path, 'other', 0, graph=GRAPH.replace('8ms', '9ms')).end(MS)
     with pytest.raises(ReplayError, match='another declaration than'):
@@ -321,7 +308,7 @@ def test_traces_of_different_runs_are_refused(tmp_path: Path) -> None:
         replay([up, empty])
 
 
-def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path: Path, call: Call) -> None:
+def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path, call):
     paths = {}
     for run, begin in (('one', 0), ('two', 200 * MS)):
         for vertex, name in enumerate(('up', 'down')):
@@ -351,7 +338,7 @@ def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path: Path, call:
         replay([twin.end(50 * MS), paths['one', 'up'], long.path])
 
 
-def test_the_command_takes_several_traces(tmp_path: Path, call: Call) -> None:
+def test_the_command_takes_several_traces(tmp_path, call):
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
     up.runs(0, MS)
     down.runs(0, 3 * MS)
@@ -369,7 +356,7 @@ def test_the_command_takes_several_traces(tmp_path: Path, call: Call) -> None:
     assert refused.returncode == 2 and 'standard input' in refused.stderr
 
 
-def test_processes_of_containers_may_have_the_same_numbers(tmp_path: Path, call: Call) -> None:
+def test_processes_of_containers_may_have_the_same_numbers(tmp_path, call):
     found = []
     for pids in ((101, 102), (7, 7)):
         traces = [Trace(tmp_path, name, vertex, pid=pid)
@@ -388,7 +375,7 @@ def test_processes_of_containers_may_have_the_same_numbers(tmp_path: Path, call:
     assert same == apart
 
 
-def test_machines_are_compared_by_way_of_others_and_by_what_is_given() -> None:
+def test_machines_are_compared_by_way_of_others_and_by_what_is_given():
     # 1 is 10 ahead of 0, and 2 is 100 ahead of 1; from 2 to 0 messages go one way only
     ways = {(0, 1): 14, (1, 0): -4, (1, 2): 103, (2, 1): -97, (2, 0): -50}
     assert offsets({1, 2}, ways, {}) == {0: (0, 0), 1: (9, 5), 2: (109, 8)}

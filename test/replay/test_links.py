@@ -44,7 +44,7 @@ def linked(path: Path) -> tuple[Links, list[str]]:
 
 
 @pytest.fixture
-def recorded(tmp_path: Path) -> Recorded:
+def recorded(tmp_path):
     """Give a recording of a camera with a timer and a detector with a subscription."""
     recorded = Recorded(tmp_path / 'recorded.mcap')
     recorded.node(1, '/camera')
@@ -57,7 +57,7 @@ def recorded(tmp_path: Path) -> Recorded:
 
 @pytest.mark.parametrize('publish, receive', [
     ('caret', 'caret'), ('hook', 'august_2021'), *((style, 'take') for style in STYLES)])
-def test_messages_between_threads(recorded: Recorded, publish: str, receive: str) -> None:
+def test_messages_between_threads(recorded, publish, receive):
     for k in range(3):
         at = (k + 1) * 100 * MS
         recorded.run(CAMERA, 1, at, at + 3 * MS)
@@ -76,7 +76,7 @@ def test_messages_between_threads(recorded: Recorded, publish: str, receive: str
     assert got.published_at[0] == ('/image', 100 * MS + sent)
 
 
-def test_the_subscriber_may_be_faster_than_the_tracer(recorded: Recorded) -> None:
+def test_the_subscriber_may_be_faster_than_the_tracer(recorded):
     recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
     stamp = recorded.publish(IMAGE, 1, 101 * MS)
     # before the stamp is recorded, 20 us after the publication
@@ -86,7 +86,7 @@ def test_the_subscriber_may_be_faster_than_the_tracer(recorded: Recorded) -> Non
     assert warnings == []
 
 
-def test_a_lost_take_of_august_2021_links_nothing(recorded: Recorded) -> None:
+def test_a_lost_take_of_august_2021_links_nothing(recorded):
     """The message's address is used again, so what was taken before is not what is dispatched."""
     for at in (100 * MS, 200 * MS):
         recorded.run(CAMERA, 1, at, at + 3 * MS)
@@ -102,8 +102,7 @@ def test_a_lost_take_of_august_2021_links_nothing(recorded: Recorded) -> None:
 
 @pytest.mark.parametrize('dispatch', [
     ('ros2:dispatch_intra_process_subscription_callback', 0), ('ros2:dispatch_intra_process',)])
-def test_messages_within_a_process_by_address(
-        recorded: Recorded, dispatch: tuple[str | int, ...]) -> None:
+def test_messages_within_a_process_by_address(recorded, dispatch):
     name, *rest = dispatch
     recorded.subscription(13, 2, '/image', within=14)
     for at, original in ((100 * MS, 0x500), (200 * MS, 0x500)):     # the address is used again
@@ -119,7 +118,7 @@ def test_messages_within_a_process_by_address(
         (label, at + 2 * MS + 1, at + MS) for at in (100 * MS, 200 * MS)]
 
 
-def test_messages_within_a_process_by_buffer_and_index(recorded: Recorded) -> None:
+def test_messages_within_a_process_by_buffer_and_index(recorded):
     label = '/detector subscription /image'
     for k in range(4):
         at = (k + 1) * 100 * MS
@@ -139,7 +138,7 @@ def test_messages_within_a_process_by_buffer_and_index(recorded: Recorded) -> No
     assert warnings == []
 
 
-def test_overwritten_messages_are_said(recorded: Recorded) -> None:
+def test_overwritten_messages_are_said(recorded):
     for at, overwritten in ((100 * MS, 0), (200 * MS, 1)):
         recorded.run(CAMERA, 1, at, at + 3 * MS)
         recorded.add('ros2:rclcpp_intra_publish', at + MS, 1, IMAGE, 0x500)
@@ -151,7 +150,7 @@ def test_overwritten_messages_are_said(recorded: Recorded) -> None:
     assert warnings == ['1 message overwritten in a ring buffer, never taken: /image (1)']
 
 
-def test_a_callback_inside_another(recorded: Recorded) -> None:
+def test_a_callback_inside_another(recorded):
     recorded.timer(13, 2, 10 * MS)
     recorded.run(CAMERA, 1, 100 * MS, 130 * MS)
     recorded.run(13, 1, 110 * MS, 120 * MS)
@@ -162,7 +161,7 @@ def test_a_callback_inside_another(recorded: Recorded) -> None:
     assert warnings == []
 
 
-def test_addresses_are_used_again(recorded: Recorded) -> None:
+def test_addresses_are_used_again(recorded):
     recorded.node(3, '/late', time=400 * MS)
     recorded.timer(DETECT, 3, 20 * MS, time=401 * MS)       # the address of the detector's
     recorded.run(DETECT, 1, 300 * MS, 301 * MS)
@@ -176,7 +175,7 @@ def test_addresses_are_used_again(recorded: Recorded) -> None:
     assert [each[0] for each in got.published_at] == ['/image', '/other']
 
 
-def test_processes_have_addresses_of_their_own(recorded: Recorded) -> None:
+def test_processes_have_addresses_of_their_own(recorded):
     recorded.node(1, '/other', pid=2)
     recorded.subscription(CAMERA, 1, '/image', pid=2)       # the camera's address
     recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
@@ -188,7 +187,7 @@ def test_processes_have_addresses_of_their_own(recorded: Recorded) -> None:
     assert warnings == []
 
 
-def test_same_stamps_on_other_topics_and_on_the_same(recorded: Recorded) -> None:
+def test_same_stamps_on_other_topics_and_on_the_same(recorded):
     recorded.publisher(101, 1, '/other')
     recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
     recorded.publish(IMAGE, 1, 101 * MS, stamp=50)
@@ -204,7 +203,7 @@ def test_same_stamps_on_other_topics_and_on_the_same(recorded: Recorded) -> None
                         '/detector subscription /image (1)']
 
 
-def test_what_was_initialised_before_the_recording(tmp_path: Path) -> None:
+def test_what_was_initialised_before_the_recording(tmp_path):
     recorded = Recorded(tmp_path / 'late.mcap')
     recorded.node(1, '/camera')
     # CARET repeats it, with the time on the monotonic clock, which is 7 s behind
@@ -221,7 +220,7 @@ def test_what_was_initialised_before_the_recording(tmp_path: Path) -> None:
     assert (drafted.node, drafted.period_ns) == ('/camera', 100 * MS)
 
 
-def test_any_lost_event_is_said_or_changes_nothing(recorded: Recorded) -> None:
+def test_any_lost_event_is_said_or_changes_nothing(recorded):
     """Leave out each event once: no link may be another one, and what is missing is said."""
     for k in range(3):
         at = (k + 1) * 100 * MS

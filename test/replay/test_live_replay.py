@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 import threading
 import time
 from typing import Any
@@ -51,14 +50,14 @@ def build_nodes(context: Any) -> list[Any]:
     from std_msgs.msg import Header
     nodes: dict[str, Node] = {}
 
-    def node(name: str) -> Node:
+    def node(name):
         return nodes.setdefault(name, Node(
             name, context=context, start_parameter_services=False, enable_rosout=False))
 
-    def publisher(name: str, topic: str) -> Any:
+    def publisher(name, topic):
         return node(name).create_publisher(Header, topic, 10)
 
-    def subscribe(name: str, topic: str, callback: Any) -> None:
+    def subscribe(name, topic, callback):
         node(name).create_subscription(
             Header, topic, callback, 10, callback_group=ReentrantCallbackGroup())
 
@@ -67,18 +66,18 @@ def build_nodes(context: Any) -> list[Any]:
     boxes, flat = publisher('left', '/boxes'), publisher('right', '/flat')
     twist, odometry = publisher('imu', '/twist'), publisher('filter', '/odometry')
 
-    def grab() -> None:
+    def grab():
         nonlocal count
         count += 1
         message = Header(frame_id=str(count))
         image.publish(message)
         info.publish(message)
 
-    def detect(message: Any) -> None:
+    def detect(message):
         time.sleep(0.002)
         boxes.publish(message)
 
-    async def rectify(message: Any) -> None:
+    async def rectify(message):
         """Wait for something once in a while, without a worker."""
         if int(message.frame_id) % 5 == 0:
             future: Any = Future()
@@ -86,11 +85,11 @@ def build_nodes(context: Any) -> list[Any]:
             await future
         flat.publish(message)
 
-    def join(message: Any) -> None:
+    def join(message):
         if int(message.frame_id) % 7 == 0:
             time.sleep(0.015)
 
-    def use(message: Any) -> None:
+    def use(message):
         if int(message.frame_id) % 9 == 0:
             time.sleep(0.007)
         odometry.publish(message)
@@ -122,7 +121,7 @@ def spinning(executor: Any) -> Iterator[None]:
         assert not thread.is_alive()
 
 
-def test_replay_counts_what_the_executor_counted(ros_context: Any, tmp_path: Path) -> None:
+def test_replay_counts_what_the_executor_counted(ros_context, tmp_path):
     from mddag_executor import MultiDeadlineExecutor
     path = tmp_path / 'live.mcap'
     executor = MultiDeadlineExecutor(
@@ -173,9 +172,7 @@ def test_replay_counts_what_the_executor_counted(ros_context: Any, tmp_path: Pat
         assert dag['jobs'] == live['dags'][name]['jobs']
 
 
-def test_what_is_late_when_it_arrives_is_aborted_after_its_release(
-    ros_context: Any, tmp_path: Path
-) -> None:
+def test_what_is_late_when_it_arrives_is_aborted_after_its_release(ros_context, tmp_path):
     from mddag_executor import MultiDeadlineExecutor
     from rclpy.node import Node
     from std_msgs.msg import Header
@@ -210,9 +207,7 @@ nodes:
         '/late:cb']['aborted']
 
 
-def test_requests_that_arrive_together_are_recorded_one_by_one(
-    ros_context: Any, tmp_path: Path
-) -> None:
+def test_requests_that_arrive_together_are_recorded_one_by_one(ros_context, tmp_path):
     from mddag_executor import MultiDeadlineExecutor, open_recording
     from rclpy.node import Node
     from rclpy.task import Future
@@ -223,7 +218,7 @@ def test_requests_that_arrive_together_are_recorded_one_by_one(
     node = Node('node', context=ros_context, start_parameter_services=False, enable_rosout=False)
     ran, done = [], Future()
 
-    def serve(request: Any, response: Any) -> Any:
+    def serve(request, response):
         ran.append(request)
         if len(ran) == 5:
             done.set_result(None)
@@ -233,7 +228,7 @@ def test_requests_that_arrive_together_are_recorded_one_by_one(
     client = node.create_client(Empty, '/serve')
     assert client.wait_for_service(5.0)
 
-    def call() -> None:
+    def call():
         timer.cancel()
         for _ in range(5):
             client.call_async(Empty.Request())
@@ -253,7 +248,7 @@ def test_requests_that_arrive_together_are_recorded_one_by_one(
 
 @pytest.mark.slow
 @pytest.mark.parametrize('cause', ['waited', 'group', 'machine', 'lost'])
-def test_the_cause_of_most_misses(cause: str, tmp_path: Path) -> None:
+def test_the_cause_of_most_misses(cause, tmp_path):
     for misses in (9, 36):  # a busy machine has stops of its own, so that fewer are made
         trace = tmp_path / f'{misses}.mcap'
         record(cause, trace, misses, scale=3.0)

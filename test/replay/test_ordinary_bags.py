@@ -23,8 +23,6 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import get_typestore, Stores
 import zstandard
 
-from ..conftest import Call
-
 MS = 1_000_000
 BEGIN = 1_732_166_766_000_000_000
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -74,11 +72,10 @@ def write_bag(
 
 
 def responses(outcome: Reschedule, dag: str, sink: str) -> dict[str, int]:
-    found: dict[str, int] = outcome.result()['dags'][dag]['sinks'][sink]['response_ns']
-    return found
+    return outcome.result()['dags'][dag]['sinks'][sink]['response_ns']
 
 
-def test_the_schedule_is_that_of_the_core(tmp_path: Path) -> None:
+def test_the_schedule_is_that_of_the_core(tmp_path):
     """On one worker scans and timer get into each other's way."""
     outcome = reschedule_bag(write_bag(tmp_path / 'bag'), loads(GRAPH, 'g.yaml'), workers=1)
     first = [(time - BEGIN, vertex) for time, kind, _, _, vertex, _ in outcome.log
@@ -97,7 +94,7 @@ def test_the_schedule_is_that_of_the_core(tmp_path: Path) -> None:
     assert seeds[0] == seeds[1] != seeds[2]
 
 
-def test_stamps_that_can_not_be_are_said(tmp_path: Path) -> None:
+def test_stamps_that_can_not_be_are_said(tmp_path):
     stamps = [BEGIN + i * 100 * MS for i in range(10)]
     stamps[3] = 0
     stamps[4] += 50 * MS
@@ -116,7 +113,7 @@ def test_stamps_that_can_not_be_are_said(tmp_path: Path) -> None:
     assert 'without a publication time' in outcome.warnings[0]
 
 
-def test_what_is_not_in_the_bag_is_said(tmp_path: Path) -> None:
+def test_what_is_not_in_the_bag_is_said(tmp_path):
     path = write_bag(tmp_path / 'bag')
     text = GRAPH + """\
   - node: /camera
@@ -141,7 +138,7 @@ nodes:
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
-def test_several_files(tmp_path: Path, storage: StoragePlugin) -> None:
+def test_several_files(tmp_path, storage):
     """As `ros2 bag record --max-bag-size` splits; one may be missing, or metadata.yaml."""
     suffix = 'db3' if storage == StoragePlugin.SQLITE3 else 'mcap'
     path = tmp_path / 'drive'
@@ -192,7 +189,7 @@ def killed_recorder(folder: Path, source: Path) -> Path:
     return file
 
 
-def test_the_write_ahead_log_belongs_to_a_bag(tmp_path: Path, call: Call) -> None:
+def test_the_write_ahead_log_belongs_to_a_bag(tmp_path, call):
     """Whether the file is named or its folder; the user's files stay as they are."""
     whole = write_bag(tmp_path / 'bag', StoragePlugin.SQLITE3)
     file = killed_recorder(tmp_path / 'killed', whole)
@@ -214,7 +211,7 @@ def test_the_write_ahead_log_belongs_to_a_bag(tmp_path: Path, call: Call) -> Non
     'rosbag2_bagfile_information: {relative_file_paths: []}',
     'rosbag2_bagfile_information: {relative_file_paths: [1]}', '\x00', '[' * 5000,
     '!!python/object:os.system x'])
-def test_wrong_metadata(tmp_path: Path, text: str) -> None:
+def test_wrong_metadata(tmp_path, text):
     path = write_bag(tmp_path / 'bag')
     (path / 'metadata.yaml').write_text(text)
     with pytest.raises(BagError) as caught:
@@ -223,7 +220,7 @@ def test_wrong_metadata(tmp_path: Path, text: str) -> None:
     assert '\n' not in str(caught.value)
 
 
-def test_hostile_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_files(tmp_path, monkeypatch):
     monkeypatch.setattr(bags, '_SPARE', 1 << 20)
     bomb = tmp_path / 'bomb.db3.zstd'
     packer = zstandard.ZstdCompressor().compressobj()
@@ -249,7 +246,7 @@ def test_hostile_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         Bag(tmp_path / 'folder', {'/points'})
 
 
-def test_on_the_command_line(tmp_path: Path, call: Call) -> None:
+def test_on_the_command_line(tmp_path, call):
     path = write_bag(tmp_path / 'bag')
     graph = tmp_path / 'g.yaml'
     graph.write_text(BY_HEADER)
@@ -275,7 +272,7 @@ def test_on_the_command_line(tmp_path: Path, call: Call) -> None:
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
-def test_a_relative_topic_is_that_below_the_root(tmp_path: Path, storage: StoragePlugin) -> None:
+def test_a_relative_topic_is_that_below_the_root(tmp_path, storage):
     relative = write_bag(tmp_path / 'relative', storage, topic='points')
     absolute = write_bag(tmp_path / 'absolute', storage)
     outcomes = [reschedule_bag(bag, loads(GRAPH)) for bag in (relative, absolute)]
@@ -284,7 +281,7 @@ def test_a_relative_topic_is_that_below_the_root(tmp_path: Path, storage: Storag
     assert Bag(relative, ['/points']).topics == {'/points', '/chatter'}
 
 
-def test_a_folder_says_what_is_in_it(tmp_path: Path) -> None:
+def test_a_folder_says_what_is_in_it(tmp_path):
     """A folder with a trace of this executor is no bag, and an empty one is nothing."""
     (tmp_path / 'run').mkdir()
     with TraceFile(tmp_path / 'run' / 'a.mcap') as file:

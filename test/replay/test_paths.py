@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from hypothesis import given
@@ -21,7 +20,6 @@ from msg_graph import loads
 import numpy as np
 import pytest
 
-from ..conftest import Call
 from .cases_by_hand import slow_cases
 from .flows import flows
 from .recorded import BEGIN, Recorded
@@ -116,7 +114,7 @@ class Driver:
                 for flow in flows(self.paths)]
 
 
-def test_a_flow_over_trigger_variable_and_topic() -> None:
+def test_a_flow_over_trigger_variable_and_topic():
     d = Driver()
     assert [hop.kind for hop in d.paths.hops[0]] == ['trigger', 'variable', 'topic', 'trigger']
     a = d.run('/a:send', 0)
@@ -142,7 +140,7 @@ def test_a_flow_over_trigger_variable_and_topic() -> None:
     assert (whole.begin, whole.end) == (0, 33)
 
 
-def test_a_recorded_take_says_more_than_the_latest() -> None:
+def test_a_recorded_take_says_more_than_the_latest():
     d = Driver()
     messages = []
     for k in range(2):
@@ -173,7 +171,7 @@ paths:
 """
 
 
-def test_the_other_leg_of_a_sync_may_publish() -> None:
+def test_the_other_leg_of_a_sync_may_publish():
     d = Driver(SYNC)
     left = d.run('/s:left', 0)
     l_message = d.send('/s:left', left, '/l', 1)
@@ -184,7 +182,7 @@ def test_the_other_leg_of_a_sync_may_publish() -> None:
     assert d.starts() == [[1, 2, 7]]
 
 
-def test_publications_outside_of_executions() -> None:
+def test_publications_outside_of_executions():
     d = Driver(SYNC)
     left = d.run('/s:left', 0)
     d.end('/s:left', left, 1)
@@ -216,7 +214,7 @@ def told(records: list[Record]) -> dict[str, Any]:
 
 
 @given(st.one_of(RECORDS, LONG))
-def test_cases(records: list[Record]) -> None:
+def test_cases(records):
     found = told(records)
     every = {**found['response_time'], 'data_age': found['data_age']}
     expected = {case: [time for _, time in responses]
@@ -230,7 +228,7 @@ def test_cases(records: list[Record]) -> None:
     assert found['reaction_time'] == found['response_time']['worst_with_external_latency']
 
 
-def test_response_times_of_some_flows() -> None:
+def test_response_times_of_some_flows():
     # 10 -> 30; 20 is overtaken; 40 -> 70; 50 is lost; 60 -> 90, and 60 -> 120 again
     found = told([(10, 30), (20, None), (40, 70), (50, None), (60, 90), (60, 120)])
     cases = found['response_time']
@@ -243,7 +241,7 @@ def test_response_times_of_some_flows() -> None:
 
 
 @given(st.lists(st.integers(-2**62, 2**62) | st.integers(-5000, 5000), max_size=60))
-def test_a_spread(times: list[int]) -> None:
+def test_a_spread(times):
     assert spread(np.array(times, dtype=np.int64)) == statistics(times)
 
 
@@ -264,7 +262,7 @@ paths:
 
 
 @pytest.fixture
-def simulated(tmp_path: Path, call: Call) -> Path:
+def simulated(tmp_path, call):
     graph = tmp_path / 'graph.yaml'
     graph.write_text(GRAPH_OWN)
     trace = tmp_path / 'run.mcap'
@@ -273,7 +271,7 @@ def simulated(tmp_path: Path, call: Call) -> Path:
     return trace
 
 
-def test_a_simulated_trace(simulated: Path) -> None:
+def test_a_simulated_trace(simulated):
     path = replay(simulated).result()['paths']['kept']
     assert path['hops'] == ['trigger', 'variable']
     # sent 1 ms after each 100 ms, used with 50 and 100 ms after it; what is sent last is not used
@@ -289,7 +287,7 @@ def test_a_simulated_trace(simulated: Path) -> None:
     assert path['whole']['data_age']['min'] == 51 * MS
 
 
-def test_a_coroutine_is_one_execution(tmp_path: Path) -> None:
+def test_a_coroutine_is_one_execution(tmp_path):
     r = Recorded(tmp_path / 'coroutine.mcap')
     r.add('mddag:task_set', 0, 1, GRAPH_OWN, 'g.yaml', 'rad', 2, 100 * MS, 0, False)
     r.node(1, '/a')

@@ -26,7 +26,6 @@ from mddag_executor.trace import TraceFile
 from msg_graph import loads
 import pytest
 
-from ..conftest import Call
 from ..replay.helpers import (
     add_execution,
     begin_trace,
@@ -63,7 +62,7 @@ def write_two(path: Path) -> None:
         task_set, load, Settings(workers=2, duration_ns=20 * MS), log=True))
 
 
-def test_policy_workers_and_preemption_are_those_asked_for(tmp_path: Path) -> None:
+def test_policy_workers_and_preemption_are_those_asked_for(tmp_path):
     path = tmp_path / 'a.mcap'
     write_two(path)
     same = reschedule(path)
@@ -83,7 +82,7 @@ def test_policy_workers_and_preemption_are_those_asked_for(tmp_path: Path) -> No
     assert fifo['utilisation'] == pytest.approx(16 / 20)
 
 
-def test_another_declaration_schedules_again(tmp_path: Path) -> None:
+def test_another_declaration_schedules_again(tmp_path):
     """Deadlines, order of DAGs and callback groups are those of the declaration given."""
     path = tmp_path / 'a.mcap'
     write_two(path)
@@ -107,7 +106,7 @@ def write_with_groups(path: Path, text: str, *shared: str) -> None:
     """Record two overlapping jobs of two callbacks, and the callback groups that they had."""
     kind = 'mutually_exclusive' if shared else 'reentrant'
     with TraceFile(path, overwrite=True) as file:
-        def add(name: str, ms: int, *fields: object, vtid: int = 5) -> None:
+        def add(name, ms, *fields, vtid=5):
             file.add(name, START_TIME + ms * MS, VPID, vtid, *fields)
 
         add('task_set', -1, text, 'g.yaml', 'rad', 2, 100 * MS, 64, False)
@@ -139,7 +138,7 @@ nodes:
 """
 
 
-def test_recorded_callback_groups_are_kept(tmp_path: Path) -> None:
+def test_recorded_callback_groups_are_kept(tmp_path):
     write_with_groups(tmp_path / 'a.mcap', TIMER_AND_MESSAGE, 'shared')
     apart = reschedule(tmp_path / 'a.mcap')
     assert starts(apart.log) == [(0, 0, 1, 0), (5, 0, 0, 0)]
@@ -152,7 +151,7 @@ def test_recorded_callback_groups_are_kept(tmp_path: Path) -> None:
     assert starts(parted.log) == [(0, 0, 1, 0), (0, 1, 0, 0)]
 
 
-def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path: Path) -> None:
+def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path):
     path = tmp_path / 'a.mcap'
     text = TWO.replace('timer: 100ms,', 'timer: 100ms, execution_time: 7ms,')
     with TraceFile(path, overwrite=True) as file:
@@ -177,7 +176,7 @@ def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path:
         reschedule(path, loads(TWO, 'g.yaml'))
 
 
-def test_pieces_are_added_up_and_legs_are_not(tmp_path: Path) -> None:
+def test_pieces_are_added_up_and_legs_are_not(tmp_path):
     """A coroutine's pauses are no execution; a leg that completes nothing loads the workers."""
     text = """\
 mddag: 1
@@ -189,13 +188,13 @@ nodes:
 """
     path = tmp_path / 'a.mcap'
     with TraceFile(path, overwrite=True) as file:
-        def piece(vertex: int, ready: int, start: int, end: int) -> None:
+        def piece(vertex, ready, start, end):
             file.add('dispatch', START_TIME + start * MS, VPID, 8, 9, 0, vertex, 0, 0,
                      START_TIME + ready * MS, 0)
             file.add('callback_start', START_TIME + start * MS, VPID, 8, 9, False)
             file.add('callback_end', START_TIME + end * MS, VPID, 8, 9)
 
-        def complete(vertex: int, end: int, whole: bool, leg: int) -> None:
+        def complete(vertex, end, whole, leg):
             file.add('complete', START_TIME + end * MS, VPID, 8, 9, 0, vertex, 0, whole,
                      START_TIME + end * MS, leg)
 
@@ -222,7 +221,7 @@ nodes:
     assert (breakdown['suspended_ns'], breakdown['executing_ns']) == (18 * MS, 5 * MS + 6 * MS)
 
 
-def test_settings_that_can_not_be(tmp_path: Path) -> None:
+def test_settings_that_can_not_be(tmp_path):
     path = tmp_path / 'a.mcap'
     write_two(path)
     with pytest.raises(PolicyError, match="policy 'best'"):
@@ -241,7 +240,7 @@ def test_settings_that_can_not_be(tmp_path: Path) -> None:
         replay(path).result()
 
 
-def test_a_preemptive_run_stays_one(tmp_path: Path) -> None:
+def test_a_preemptive_run_stays_one(tmp_path):
     text = """\
 mddag: 1
 workers: 1
@@ -299,7 +298,7 @@ def responses(path: Path, **how: Any) -> list[float]:
             for sink in dag['sinks'].values() if sink['response_ns'] is not None]
 
 
-def test_what_computes_without_the_interpreter_shares_the_cpus(tmp_path: Path) -> None:
+def test_what_computes_without_the_interpreter_shares_the_cpus(tmp_path):
     path = tmp_path / 'a.mcap'
     of_python(path, [(0, 0, 12, 12, False), (1, 0, 12, 12, False)])
     assert responses(path) == [12, 12]
@@ -310,7 +309,7 @@ def test_what_computes_without_the_interpreter_shares_the_cpus(tmp_path: Path) -
     assert responses(path, cpus=2) == [12, 12]
 
 
-def test_what_is_declared_counts_more_than_what_was_recorded(tmp_path: Path) -> None:
+def test_what_is_declared_counts_more_than_what_was_recorded(tmp_path):
     path = tmp_path / 'a.mcap'
     of_python(path, [(0, 0, 10, 10, False), (1, 0, 10, 10, False)])
     recorded = replay(path).task_set.text
@@ -338,13 +337,11 @@ nodes:
     [], ['--workers', '1'], ['--preemptive'], ['--cpus', '1'], ['--overheads', 'none'],
     ['--processes', '2']])
 @pytest.mark.parametrize('computes', [False, True])
-def test_what_was_not_published_is_not_published_again(
-    options: list[str], computes: bool, tmp_path: Path, call: Call
-) -> None:
+def test_what_was_not_published_is_not_published_again(options, computes, tmp_path, call):
     # /detect finds an object in every third image; the other jobs expire
     path, jobs = tmp_path / 'run.mcap', 40
     with begin_trace(path, SELDOM, workers=2) as file:
-        def ran(start: int, end: int, dag: int, vertex: int, **more: int) -> None:
+        def ran(start, end, dag, vertex, **more):
             computed = (end - start, True) if computes else ()
             add_execution(file, start, end, dag, vertex, job, computed=computed, **more)
 
@@ -377,7 +374,7 @@ def test_what_was_not_published_is_not_published_again(
         pytest.approx((40 * 7 + 14) * MS)
 
 
-def test_what_would_have_been_with_demote(tmp_path: Path, call: Call) -> None:
+def test_what_would_have_been_with_demote(tmp_path, call):
     """The recorded execution times say what is too much; nothing is declared."""
     graph, trace, times = (tmp_path / name for name in ('g.yaml', 'run.mcap', 'times.json'))
     graph.write_text("""\
@@ -398,9 +395,7 @@ nodes:
     assert in_time['continue'] < 20 and in_time['demote'] >= 99
 
 
-def test_timers_that_were_noticed_late_because_no_worker_was_idle_are_noticed_with_more(
-    tmp_path: Path
-) -> None:
+def test_timers_that_were_noticed_late_because_no_worker_was_idle_are_noticed_with_more(tmp_path):
     graph = """\
 mddag: 1
 nodes:

@@ -27,7 +27,7 @@ BAGS = TOP / 'bags'
 DEMO = BAGS / 'demo_short.mcap'
 
 
-def test_every_trace_is_told_of_in_the_readme() -> None:
+def test_every_trace_is_told_of_in_the_readme():
     text = (BAGS / 'README.md').read_text(encoding='utf-8')
     assert [path.name for path in BAGS.glob('*.mcap') if f'`{path.name}`' not in text] == []
     assert 100_000 < DEMO.stat().st_size < 600_000
@@ -39,7 +39,7 @@ def counted(result: dict[str, Any]) -> dict[str, Any]:
             for name, dag in result['dags'].items()}
 
 
-def test_the_demo_under_the_shipped_declarations() -> None:
+def test_the_demo_under_the_shipped_declarations():
     """The declarations may change; as long as they have these callbacks they can judge."""
     recorded = replay(DEMO)
     assert recorded.warnings == []
@@ -48,7 +48,7 @@ def test_the_demo_under_the_shipped_declarations() -> None:
         assert counted(replay(DEMO, task_set).result()) == counted(recorded.result())
 
 
-def test_the_demo_rescheduled() -> None:
+def test_the_demo_rescheduled():
     """As recorded one job was late, for overheads; four workers would not have been enough."""
     same = reschedule(DEMO)
     assert sum(sink.late for sink in same.tally.sinks.values()) == 1
@@ -71,7 +71,7 @@ RESCHEDULED = '--reschedule --workers 1 --policy fifo --overheads none --skip 50
 
 
 @pytest.fixture(autouse=True)
-def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def files(tmp_path, monkeypatch):
     """Make the recordings that are not in the repository."""
     monkeypatch.chdir(tmp_path)
     Path('demo.mcap').symlink_to(BAGS_EXPECTED / 'demo_short.mcap')
@@ -94,7 +94,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ('virtual_run_other_declaration', 'v7.mcap other0.yaml'),
     ('ordinary_bag', 'bag_mcap bagh.yaml --reschedule --workers 1 --policy rm --preemptive '
      '--overheads 1ms --skip 200ms')])
-def test_the_result_is_that_of_version_1(name: str, arguments: str) -> None:
+def test_the_result_is_that_of_version_1(name, arguments):
     assert program.main(['replay', *arguments.split(), '--json', 'found.json']) == 0
     expected = json.loads((EXPECTED / f'{name}.json').read_text())
     found = json.loads(Path('found.json').read_text())

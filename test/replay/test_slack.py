@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 import re
 
 from mddag_executor.replay import reschedule
@@ -13,7 +12,6 @@ from mddag_executor.replay import slack as module
 from mddag_executor.replay.slack import find_slack, Problem, Search
 import pytest
 
-from ..conftest import Call
 from .helpers import (
     add_execution,
     begin_trace,
@@ -39,7 +37,7 @@ nodes:
 
 
 @pytest.mark.parametrize('recorded', [False, True])
-def test_by_hand(recorded: bool, tmp_path: Path, call: Call) -> None:
+def test_by_hand(recorded, tmp_path, call):
     graph, trace = tmp_path / 'g.yaml', tmp_path / 't.mcap'
     graph.write_text(BY_HAND)
     call('simulate', graph, '--trace', trace, '--duration', '1s')
@@ -56,7 +54,7 @@ def test_by_hand(recorded: bool, tmp_path: Path, call: Call) -> None:
     assert result['left_out'] == []
 
 
-def test_what_misses_already_is_left_out(tmp_path: Path, call: Call) -> None:
+def test_what_misses_already_is_left_out(tmp_path, call):
     graph = tmp_path / 'g.yaml'
     graph.write_text(BY_HAND.replace('deadline: 8ms', 'deadline: 2ms').replace(
         'alone, timer: 100ms, deadline: 100ms', 'alone, timer: 100ms, deadline: 5ms'))
@@ -69,8 +67,7 @@ def test_what_misses_already_is_left_out(tmp_path: Path, call: Call) -> None:
 
 
 def test_a_sink_that_misses_some_deadlines_has_the_factor_at_which_it_misses_another(
-    tmp_path: Path, call: Call
-) -> None:
+        tmp_path, call):
     # /some takes 10 ms, but in two jobs more than its deadline; /every is always late
     path = tmp_path / 'run.mcap'
     graph = """\
@@ -106,7 +103,7 @@ nodes:
     assert re.search(r'some:run +90 ms +-5 ms +- ', out)
 
 
-def test_where_nothing_was_due_nothing_is_proven(tmp_path: Path, call: Call) -> None:
+def test_where_nothing_was_due_nothing_is_proven(tmp_path, call):
     graph = tmp_path / 'g.yaml'
     graph.write_text(BY_HAND)
     arguments = 'slack', graph, '--duration', '1us'
@@ -117,7 +114,7 @@ def test_where_nothing_was_due_nothing_is_proven(tmp_path: Path, call: Call) -> 
     assert err.startswith(f'error: {graph}: no job was due at any sink')
 
 
-def test_what_people_see(tmp_path: Path, call: Call) -> None:
+def test_what_people_see(tmp_path, call):
     graph, page = tmp_path / 'g.yaml', tmp_path / 's.html'
     graph.write_text(BY_HAND)
     status, out, _ = call('slack', graph, '--fail-under', 3, '--report', page)
@@ -134,9 +131,7 @@ def test_what_people_see(tmp_path: Path, call: Call) -> None:
 
 
 @pytest.mark.parametrize('seed', [3, 4])
-def test_windows_find_what_plain_bisection_finds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int
-) -> None:
+def test_windows_find_what_plain_bisection_finds(tmp_path, monkeypatch, seed):
     path = tmp_path / 'run.mcap'
     VirtualRun(path, small(), seed, duration=500 * MS, longest=2 * MS,
                chances=Chances(0, 0, 0, 0, 0, 0, 0))

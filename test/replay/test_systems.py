@@ -81,7 +81,7 @@ def trace(path: Path, events: Iterable[tuple[object, ...]]) -> Path:
 
 
 @pytest.fixture
-def recorded(tmp_path: Path) -> Path:
+def recorded(tmp_path):
     """Give a trace of two timers, of which the second publishes, and of two subscriptions."""
     events = head()
     for k in range(20):
@@ -94,7 +94,7 @@ def recorded(tmp_path: Path) -> Path:
     return trace(tmp_path / 'r.mcap', events)
 
 
-def test_from_a_trace(recorded: Path) -> None:
+def test_from_a_trace(recorded):
     text = declaration_of(System(recorded).draft())
     assert f'# From the trace {recorded}.' in text
     accepted = re.sub(rf'^( +)# (\w+: .*# {MARK})', r'\1\2', text, flags=re.MULTILINE)
@@ -120,7 +120,7 @@ def test_from_a_trace(recorded: Path) -> None:
     assert 'get_parameters' not in text and 'parameter_events' not in text
 
 
-def test_subscriptions_that_may_be_a_sync_have_a_comment() -> None:
+def test_subscriptions_that_may_be_a_sync_have_a_comment():
     """One source leads to /left and /right, another one to /other."""
     timer, hear = 'timer', 'subscription'
     text = declaration_of(Draft('a test', [
@@ -136,7 +136,7 @@ def test_subscriptions_that_may_be_a_sync_have_a_comment() -> None:
         '      # If these are one sync, declare one callback: sync: [/left, /right]']
 
 
-def test_names_periods_and_what_no_one_declares(tmp_path: Path) -> None:
+def test_names_periods_and_what_no_one_declares(tmp_path):
     """Functions give names, periods are as people write them, lifecycle services are left out."""
     symbols = {1: 'robot.Cam.grab', 2: 'robot.make.<locals>.<lambda>', 3: 'robot.Cam.grab',
                4: 'std::_Bind<void (Node::*(Node*))()>'}
@@ -164,7 +164,7 @@ def test_names_periods_and_what_no_one_declares(tmp_path: Path) -> None:
     assert 'transition_event' not in text
 
 
-def test_measures_for_an_architecture_file(recorded: Path) -> None:
+def test_measures_for_an_architecture_file(recorded):
     system, counts = System(recorded), []
     text = declaration_from_caret(
         ARCHITECTURE, 'arch.yaml', lambda draft: counts.append(system.measure(draft)))
@@ -177,13 +177,13 @@ def test_measures_for_an_architecture_file(recorded: Path) -> None:
     assert text.index('callback_1') < text.index('publishes: [/x]\n')
 
 
-def test_what_is_no_system(tmp_path: Path) -> None:
+def test_what_is_no_system(tmp_path):
     path = trace(tmp_path / 'e.mcap', [('callback_start', 1, 1, 5, False)])
     with pytest.raises(InputError, match='no timer, subscription or service of a node'):
         System(path)
 
 
-def test_a_recorded_declaration_gives_names_and_deadlines() -> None:
+def test_a_recorded_declaration_gives_names_and_deadlines():
     bag = BAGS / 'demo_short.mcap'
     system = System(bag, 'bag')
     assert system.task_set is not None
@@ -197,7 +197,7 @@ def test_a_recorded_declaration_gives_names_and_deadlines() -> None:
     assert MARK not in text.split('mddag: 1')[1]
 
 
-def test_drift_of_an_imported_recording(recorded: Path) -> None:
+def test_drift_of_an_imported_recording(recorded):
     text = """\
 mddag: 1
 nodes:
@@ -220,7 +220,7 @@ nodes:
     assert (found[1].declared, found[1].observed) == (15 * MS, 10 * MS)
 
 
-def test_a_warm_up_does_not_count_for_rates(tmp_path: Path) -> None:
+def test_a_warm_up_does_not_count_for_rates(tmp_path):
     path = tmp_path / 'run.mcap'
     with begin_trace(path, """\
 mddag: 1

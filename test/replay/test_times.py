@@ -65,9 +65,7 @@ def rescheduled(path: Path, graph: str = GRAPH) -> Reschedule:
 
 @pytest.mark.parametrize('storage', STORAGES)
 @pytest.mark.parametrize('odd', [2**62, 2**63 - 1])
-def test_a_message_at_a_time_that_cannot_be(
-    tmp_path: Path, storage: StoragePlugin, odd: int
-) -> None:
+def test_a_message_at_a_time_that_cannot_be(tmp_path, storage, odd):
     whole = arrivals()
     sound = rescheduled(scans(tmp_path / 'sound', whole[:20] + whole[21:], storage))
     whole[20] = odd
@@ -80,14 +78,14 @@ def test_a_message_at_a_time_that_cannot_be(
 @given(PLACE, BITS, st.sampled_from(STORAGES))
 @example(N - 1, 45, StoragePlugin.MCAP)
 @settings(max_examples=60, deadline=None)
-def test_any_bit_of_a_bag(place: int, bit: int, storage: StoragePlugin) -> None:
+def test_any_bit_of_a_bag(place, bit, storage):
     flipped = arrivals()
     flipped[place] = (flipped[place] ^ 1 << bit) & 2**63 - 1
     with tempfile.TemporaryDirectory() as folder:
         rescheduled(scans(Path(folder, 'bag'), flipped, storage))
 
 
-def test_a_pause_has_no_jobs_of_timers(tmp_path: Path) -> None:
+def test_a_pause_has_no_jobs_of_timers(tmp_path):
     later = [time + 3600 * S for time in arrivals()]
     outcome = rescheduled(scans(tmp_path / 'paused', arrivals()[:20] + later[20:]))
     assert outcome.warnings == []
@@ -119,7 +117,7 @@ def sizes(result: dict[str, Any]) -> list[int]:
 
 
 @pytest.mark.parametrize('kind', ['own', 'imported'])
-def test_any_bit_of_a_trace(tmp_path: Path, kind: str) -> None:
+def test_any_bit_of_a_trace(tmp_path, kind):
     sound, odd = tmp_path / 'sound.mcap', tmp_path / 'odd.mcap'
     graph = None
     if kind == 'own':
@@ -140,7 +138,7 @@ def test_any_bit_of_a_trace(tmp_path: Path, kind: str) -> None:
         assert len(outcome.log) <= 2 * len(whole.log), seed
 
 
-def test_an_event_at_the_end_of_all_times(tmp_path: Path) -> None:
+def test_an_event_at_the_end_of_all_times(tmp_path):
     """The run ends before the time that means never, so the scheduler's does."""
     path = tmp_path / 'a.mcap'
     with TraceFile(path) as file:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from itertools import groupby
 import json
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -30,7 +29,6 @@ from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
-from ..conftest import Call
 from .helpers import add_execution
 
 MS = 1_000_000
@@ -57,12 +55,11 @@ def sink_of(missed: list[bool]) -> dict[str, Any]:
     tally.add(reversed(decisions))      # jobs may complete out of order
     result = tally.result()
     tally.add_bursts(result['dags'])
-    found: dict[str, Any] = result['dags']['/n']['sinks']['/n:a']
-    return found
+    return result['dags']['/n']['sinks']['/n:a']
 
 
 @given(st.lists(st.booleans(), max_size=30))
-def test_without_a_tolerance_each_miss_counts(missed: list[bool]) -> None:
+def test_without_a_tolerance_each_miss_counts(missed):
     sink = sink_of(missed)
     runs = [len(list(run)) for miss, run in groupby(missed) if miss]
     assert sink['longest_burst'] == max(runs, default=0)
@@ -72,7 +69,7 @@ def test_without_a_tolerance_each_miss_counts(missed: list[bool]) -> None:
 
 
 @given(st.lists(st.integers(0, 30)))
-def test_the_longest_burst(numbers: list[int]) -> None:
+def test_the_longest_burst(numbers):
     there = ''.join('x' if number in numbers else ' ' for number in range(31))
     assert longest_run(numbers) == max(map(len, there.split()), default=0)
 
@@ -80,7 +77,7 @@ def test_the_longest_burst(numbers: list[int]) -> None:
 HOSTILE = 'a"]]><&\'\x00\x1b[2J\n\ud800\uffff\u202e</testcase>'
 
 
-def test_junit_with_hostile_names() -> None:
+def test_junit_with_hostile_names():
     sinks = {HOSTILE: sink_of([True] * 3), 'good': sink_of([False]), 'none': sink_of([])}
     result = {'dags': {HOSTILE: {'sinks': sinks}}, 'duration_ns': 30 * MS, 'policy': 'rad',
               'workers': 2, 'preemptive': False, 'rescheduled': False, 'warnings': [HOSTILE]}
@@ -103,7 +100,7 @@ def test_junit_with_hostile_names() -> None:
 
 
 @pytest.fixture
-def trace(tmp_path: Path) -> Path:
+def trace(tmp_path):
     """Give a trace of ten jobs, of which the third and the fourth are late."""
     path = tmp_path / 'run.mcap'
     with TraceFile(path) as file:
@@ -123,8 +120,7 @@ def trace(tmp_path: Path) -> Path:
     ('2 of 3', 2, True), ('1 of 2', 2, False), ('2 of 100', 2, True), ('1 of 3', 2, False)])
 @pytest.mark.parametrize('mode', [[], ['--reschedule']])
 def test_the_declaration_says_what_a_sink_tolerates(
-    trace: Path, tmp_path: Path, tolerate: str, worst: int, kept: bool, mode: list[str], call: Call
-) -> None:
+        trace, tmp_path, tolerate, worst, kept, mode, call):
     graph, out = tmp_path / 'g.yaml', tmp_path / 'out.xml'
     graph.write_text(GRAPH.replace('8ms}', f'8ms, tolerate: {tolerate}}}'))
     arguments = 'replay', trace, graph, *mode, '--fail-on-miss'
@@ -147,7 +143,7 @@ def test_the_declaration_says_what_a_sink_tolerates(
     assert sink['tolerate'] == {'misses': misses, 'of': of, 'worst': worst}
 
 
-def test_a_simulation_respects_it(tmp_path: Path, call: Call) -> None:
+def test_a_simulation_respects_it(tmp_path, call):
     graph = tmp_path / 'g.yaml'
     late = GRAPH.replace('8ms}', '8ms, execution_time: 9ms}')
     for tolerate, status in (('', 1), (', tolerate: 9 of 10', 1), (', tolerate: 10 of 11', 0)):
@@ -156,7 +152,7 @@ def test_a_simulation_respects_it(tmp_path: Path, call: Call) -> None:
         assert done.returncode == status and (' 10 of 11 ' in done.stdout or status)
 
 
-def test_annotations_with_hostile_names() -> None:
+def test_annotations_with_hostile_names():
     dags = {'d': {'sinks': {HOSTILE: sink_of([True]), 'none': sink_of([])}}}
     broken = not_tolerated(dags)
     bad, none = annotation_lines(dags, broken, 'a,b:c%.yaml')
@@ -167,9 +163,7 @@ def test_annotations_with_hostile_names() -> None:
                     'no job of it was due')
 
 
-def test_a_failed_job_is_told_wherever_verdicts_are(
-    trace: Path, tmp_path: Path, call: Call
-) -> None:
+def test_a_failed_job_is_told_wherever_verdicts_are(trace, tmp_path, call):
     """The first job's callback raised, in a run that was in time but for the third and fourth."""
     failed, out = tmp_path / 'failed.mcap', tmp_path / 'out.xml'
     with TraceFile(failed) as file:
@@ -199,7 +193,7 @@ def test_a_failed_job_is_told_wherever_verdicts_are(
 
 
 @pytest.mark.parametrize('mode', [[], ['--reschedule']])
-def test_a_warm_up_is_left_out(trace: Path, tmp_path: Path, mode: list[str], call: Call) -> None:
+def test_a_warm_up_is_left_out(trace, tmp_path, mode, call):
     """The jobs 2 and 3, released 20 ms and 30 ms after the first, are the late ones."""
     for skip, due, late in (('0', 10, 2), ('20ms', 8, 2), ('20001us', 7, 1), ('31ms', 6, 0)):
         arguments = 'replay', trace, *mode, '--skip', skip
@@ -220,9 +214,7 @@ def test_a_warm_up_is_left_out(trace: Path, tmp_path: Path, mode: list[str], cal
 
 
 @pytest.mark.parametrize('mode', [[], ['--reschedule']])
-def test_where_nothing_was_due_nothing_is_proven(
-    trace: Path, tmp_path: Path, mode: list[str], call: Call
-) -> None:
+def test_where_nothing_was_due_nothing_is_proven(trace, tmp_path, mode, call):
     """A run of the declaration's nodes in which no job came is no run that held its deadlines."""
     empty, out = tmp_path / 'empty.mcap', tmp_path / 'out.xml'
     with TraceFile(empty) as file:
@@ -242,9 +234,7 @@ def test_where_nothing_was_due_nothing_is_proven(
     assert json.loads(call(*arguments, '--json', '-').stdout)['never_due'] == ['/n:a']
 
 
-def test_a_run_in_which_nothing_was_due_is_no_better(
-    trace: Path, tmp_path: Path, call: Call
-) -> None:
+def test_a_run_in_which_nothing_was_due_is_no_better(trace, tmp_path, call):
     empty = tmp_path / 'empty.mcap'
     with TraceFile(empty) as file:
         file.add('task_set', 0, 1, 1, GRAPH, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
@@ -261,6 +251,6 @@ def test_a_run_in_which_nothing_was_due_is_no_better(
     (['--junit', '/gone/out.xml'], 'there is no directory /gone'),
     (['--junit', '-', '--json', '-'], 'can be only one of json and junit'),
 ])
-def test_wrong_options(trace: Path, options: list[str], says: str, call: Call) -> None:
+def test_wrong_options(trace, options, says, call):
     status, out, err = call('replay', trace, *options)
     assert (status, out, err.count('\n')) == (2, '', 1) and says in err

@@ -83,7 +83,7 @@ class Run:
 
 
 @pytest.fixture
-def run(tmp_path: Path, call: Call) -> Run:
+def run(tmp_path, call):
     return Run(tmp_path, call)
 
 
@@ -101,7 +101,7 @@ def undeclared(source: Path, target: Path) -> str:
     return text
 
 
-def test_the_same_run_gets_the_same_verdicts(tmp_path: Path, call: Call) -> None:
+def test_the_same_run_gets_the_same_verdicts(tmp_path, call):
     trace, graph = tmp_path / 'run.mcap', tmp_path / 'graph.yaml'
     graph.write_text(undeclared(DEMO, trace))
     declared = call('replay', DEMO, '--json', '-').result
@@ -128,7 +128,7 @@ def test_the_same_run_gets_the_same_verdicts(tmp_path: Path, call: Call) -> None
                 assert abs(mean['release_lag_ns'] - wanted['release_lag_ns']) < MS
 
 
-def test_other_verbs_take_it(run: Run, call: Call) -> None:
+def test_other_verbs_take_it(run, call):
     for job in range(5):
         at = job * 100 * MS
         run.runs(GRAB, at, at, at + 2 * MS, at + MS)
@@ -143,7 +143,7 @@ def test_other_verbs_take_it(run: Run, call: Call) -> None:
     assert (sink['completed'], sink['late']) == (5, 1)
 
 
-def test_messages_of_others_are_of_no_job(run: Run) -> None:
+def test_messages_of_others_are_of_no_job(run):
     # another process publishes while nothing of this one is being sent, or while /camera still
     # runs: its own message has been taken then
     for job in range(4):
@@ -163,7 +163,7 @@ def test_messages_of_others_are_of_no_job(run: Run) -> None:
 
 
 @pytest.mark.parametrize('in_order', [True, False])
-def test_who_published_is_never_guessed(in_order: bool, run: Run) -> None:
+def test_who_published_is_never_guessed(in_order, run):
     # both publish on one topic while both run; messages are taken later
     for job in range(3):
         at = job * 100 * MS
@@ -186,7 +186,7 @@ def test_who_published_is_never_guessed(in_order: bool, run: Run) -> None:
         assert '6 jobs' in ' '.join(result['warnings'])
 
 
-def test_the_pieces_of_a_coroutine_are_one_execution(run: Run) -> None:
+def test_the_pieces_of_a_coroutine_are_one_execution(run):
     # /detect awaits something for 30 ms, in every second job for 50 ms
     for job in range(4):
         at, rest = job * 100 * MS, (50 if job % 2 else 30) * MS
@@ -205,7 +205,7 @@ def test_the_pieces_of_a_coroutine_are_one_execution(run: Run) -> None:
     assert result['warnings'] == []
 
 
-def test_a_request_is_released_when_it_was_ready_also_for_a_coroutine(run: Run) -> None:
+def test_a_request_is_released_when_it_was_ready_also_for_a_coroutine(run):
     run.graph.write_text(GRAPH + """\
   - node: /detect
     callbacks: [{name: ask, service: /ask, period: 1s, deadline: 20ms}]
@@ -220,7 +220,7 @@ def test_a_request_is_released_when_it_was_ready_also_for_a_coroutine(run: Run) 
     assert (sink['response_ns']['min'], sink['response_ns']['max']) == (2 * MS, 21 * MS)
 
 
-def test_timers_are_released_on_their_grid_if_they_keep_to_one(run: Run) -> None:
+def test_timers_are_released_on_their_grid_if_they_keep_to_one(run):
     # /camera's timer is noticed 30 ms late once; /radar's is reset all the time
     for job in range(6):
         at, late = job * 100 * MS, 30 * MS * (job == 2)
@@ -238,7 +238,7 @@ def test_timers_are_released_on_their_grid_if_they_keep_to_one(run: Run) -> None
     assert '6 executions of timers off the grid' in warning and '/radar timer' in warning
 
 
-def test_a_job_that_is_open_at_the_end_is_judged_by_that(run: Run) -> None:
+def test_a_job_that_is_open_at_the_end_is_judged_by_that(run):
     run.runs(GRAB, 0, 0, 2 * MS, MS)
     run.add('drop', 3 * MS, 1, RUN, -1, -1, -1, 'qos_depth')
     result = run.result(80 * MS)
@@ -247,7 +247,7 @@ def test_a_job_that_is_open_at_the_end_is_judged_by_that(run: Run) -> None:
     assert result['dropped'] == {'qos_depth': 1}
 
 
-def test_without_a_graph_it_says_how_to_get_a_verdict(run: Run, call: Call) -> None:
+def test_without_a_graph_it_says_how_to_get_a_verdict(run, call):
     run.result(10 * MS)
     for verb in ('replay', 'explain', 'slack'):
         status, _, errors = call(verb, run.path)

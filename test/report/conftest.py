@@ -4,10 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import os
 import shutil
-from typing import Any
 
 import pytest
 
@@ -24,7 +22,7 @@ PATIENCE_S = 60.0
 
 
 @pytest.fixture(scope='module')
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def browser(tmp_path_factory):
     webdriver = pytest.importorskip('selenium.webdriver', reason='selenium is not installed')
     from selenium.webdriver.chrome.service import Service
     options = webdriver.ChromeOptions()

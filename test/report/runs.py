@@ -49,10 +49,10 @@ def by_hand(
     :param extra_ms: how much longer the last callback takes.
     """
     with TraceFile(path, overwrite=True) as file:
-        def add(name: str, ms: int, *fields: Any) -> None:
+        def add(name, ms, *fields):
             file.add(name, START + ms * MS, 1, 9, *fields)
 
-        def run(vertex: int, job: int, ready: int, start: int, end: int) -> None:
+        def run(vertex, job, ready, start, end):
             add('dispatch', start, vertex + 1, 0, vertex, job, vertex, START + ready * MS, 0)
             add('callback_start', start, vertex + 1, False)
             add('callback_end', end, vertex + 1)

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import csv
 import json
-from pathlib import Path
 from typing import Any
 
 from mddag_executor.cli import main as program
@@ -24,7 +23,7 @@ FILTER = '/filter_node:callback_0'
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Give a folder with all that the program makes of the recording."""
     path = tmp_path_factory.mktemp('caret')
     trace, graph = path / 'sample.mcap', path / 'graph.yaml'
@@ -42,7 +41,7 @@ def filter_times() -> list[tuple[int, int]]:
     return [(start or 0, end or 0) for start, end in rows('cb_filter_node_callback_0.csv')]
 
 
-def test_the_result_says_what_caret_says(folder: Path) -> None:
+def test_the_result_says_what_caret_says(folder):
     result = json.loads((folder / 'result.json').read_text())
     assert (result['warnings'], result['drift']) == ([], [])
     use = result['callbacks'][FILTER]
@@ -56,7 +55,7 @@ def test_the_result_says_what_caret_says(folder: Path) -> None:
             len(times), times[0], times[-1], round(sum(times) / len(times))), case
 
 
-def test_exports_have_carets_callback_times(folder: Path) -> None:
+def test_exports_have_carets_callback_times(folder):
     with (folder / 'executions.csv').open(newline='') as stream:
         table = [(int(row['start_ns']), int(row['end_ns'])) for row in csv.DictReader(stream)
                  if row['vertex'] == FILTER]
@@ -69,7 +68,7 @@ def test_exports_have_carets_callback_times(folder: Path) -> None:
     ) == filter_times()
 
 
-def test_perfetto_has_carets_callback_times(folder: Path) -> None:
+def test_perfetto_has_carets_callback_times(folder):
     module = pytest.importorskip(
         'perfetto.protos.perfetto.trace.perfetto_trace_pb2', reason='perfetto is not installed')
     trace: Any = module.Trace()

@@ -8,7 +8,6 @@ from collections import Counter
 import csv
 import io
 from pathlib import Path
-from typing import Any
 
 from mddag_executor.replay import replay
 from mddag_executor.report.export import _harmless, write
@@ -29,7 +28,7 @@ def read_csv(data: bytes) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(data.decode(), newline='')))
 
 
-def test_csv_is_harmless(tmp_path: Path) -> None:
+def test_csv_is_harmless(tmp_path):
     path = runs.by_hand(tmp_path / 'run.mcap', hostile=True)
     data = exported(path, 'csv')
     assert b'\x1b' not in data
@@ -39,14 +38,14 @@ def test_csv_is_harmless(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('jobs', [False, True])
-def test_parquet_and_csv_hold_the_same(jobs: bool) -> None:
+def test_parquet_and_csv_hold_the_same(jobs):
     parquet = pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
     table = parquet.read_table(io.BytesIO(exported(DEMO, 'parquet', jobs)))
     rows = read_csv(exported(DEMO, 'csv', jobs))
     assert table.column_names == list(rows[0])
     assert table.num_rows == len(rows) > 500
 
-    def plain(value: Any) -> str:
+    def plain(value):
         if isinstance(value, bool):
             return str(value).lower()
         if isinstance(value, float):
@@ -57,7 +56,7 @@ def test_parquet_and_csv_hold_the_same(jobs: bool) -> None:
         assert {key: plain(value) for key, value in ours.items()} == theirs
 
 
-def test_the_rows_are_those_of_the_replay() -> None:
+def test_the_rows_are_those_of_the_replay():
     outcome = replay(DEMO)
     result = outcome.result()
     jobs = read_csv(exported(DEMO, 'csv', jobs=True))

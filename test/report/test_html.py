@@ -61,7 +61,7 @@ def report(path: Path) -> Page:
     return Page(file.getvalue().decode())
 
 
-def test_what_is_in_the_file_is_what_ran(tmp_path: Path) -> None:
+def test_what_is_in_the_file_is_what_ran(tmp_path):
     prepared = prepare(html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap'))))
     found = prepared.executions
     assert prepared.origin == runs.START + 10 * runs.MS
@@ -77,7 +77,7 @@ def test_what_is_in_the_file_is_what_ran(tmp_path: Path) -> None:
     assert prepared.marks['x'] == pytest.approx([0.030])
 
 
-def test_a_page_needs_nothing_but_itself(tmp_path: Path) -> None:
+def test_a_page_needs_nothing_but_itself(tmp_path):
     page = report(runs.by_hand(tmp_path / 'run.mcap'))
     assert any(tag == 'script' for tag, _ in page.elements)
     for tag, attributes in page.elements:
@@ -89,7 +89,7 @@ def test_a_page_needs_nothing_but_itself(tmp_path: Path) -> None:
     assert 'url(' not in style and '@import' not in style
 
 
-def test_hostile_names_stay_text(tmp_path: Path) -> None:
+def test_hostile_names_stay_text(tmp_path):
     page = report(runs.by_hand(tmp_path / 'run.mcap', hostile=True))
     assert not [tag for tag, _ in page.elements if tag == 'img']
     shown = runs.HOSTILE.rpartition('/')[2].replace('\x1b', '\\x1b')
@@ -100,7 +100,7 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
 
 
 @given(st.text())
-def test_json_and_cells_hold_any_text(text: str) -> None:
+def test_json_and_cells_hold_any_text(text):
     encoded = json_for_html({'x': text})
     assert json.loads(encoded) == {'x': text}
     assert not re.search('[<>&]', encoded)
@@ -109,7 +109,7 @@ def test_json_and_cells_hold_any_text(text: str) -> None:
     assert len(label(text, 20)) <= 20
 
 
-def test_a_run_without_anything_has_a_report_too() -> None:
+def test_a_run_without_anything_has_a_report_too():
     task_set = runs.autoware()
     load, run = runs.simulated(task_set, ms=1, workers=1)
     data = html.of_run(task_set, load._replace(times=[], dags=[], jobs=[]), run)
@@ -123,7 +123,7 @@ MS = runs.MS
 
 
 @pytest.fixture
-def result(tmp_path: Path) -> dict[str, Any]:
+def result(tmp_path):
     return replay(runs.by_hand(tmp_path / 'run.mcap')).result()
 
 
@@ -132,7 +132,7 @@ def changed(result: dict[str, Any], **sink: Any) -> dict[str, Any]:
     return {**result, 'dags': {'/driver': {'sinks': {'/filter:run': {**before, **sink}}}}}
 
 
-def test_a_run_is_no_worse_than_itself(result: dict[str, Any]) -> None:
+def test_a_run_is_no_worse_than_itself(result):
     difference = compare(result, result, 0.0)
     sink = difference['dags']['/driver']['sinks']['/filter:run']
     assert sink['a'] == sink['b'] and set(sink['change_ns'].values()) == {0}
@@ -150,13 +150,11 @@ def test_a_run_is_no_worse_than_itself(result: dict[str, Any]) -> None:
     ({'response_ns': {'min': 1, 'median': 2, 'p99': 11 * MS + 1, 'max': 12 * MS}}, 0.1, True),
     ({'response_ns': {'min': 1, 'median': 2, 'p99': 9 * MS, 'max': 12 * MS}}, 0.0, False),
     ({'response_ns': None}, 0.0, False)])
-def test_what_is_worse(
-    result: dict[str, Any], sink: dict[str, Any], tolerance: float | None, worse: bool
-) -> None:
+def test_what_is_worse(result, sink, tolerance, worse):
     assert compare(result, changed(result, **sink), tolerance)['worse'] is worse
 
 
-def test_what_only_one_run_has(result: dict[str, Any], tmp_path: Path) -> None:
+def test_what_only_one_run_has(result, tmp_path):
     graph = runs.GRAPH.replace('deadline: 8ms', 'deadline: 5ms').replace('name: whole', 'name: w')
     other = replay(runs.by_hand(tmp_path / 'other.mcap'), msg_graph.loads(graph)).result()
     difference = compare(result, other)

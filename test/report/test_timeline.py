@@ -4,9 +4,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 from mddag_executor.recording import tables
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
@@ -29,9 +26,7 @@ from ..report import runs
 
 @pytest.mark.parametrize(('policy', 'preemptive', 'utilisation', 'seed'), [
     ('rad', False, 0.95, 0), ('rad', True, 1.2, 1), ('fifo', False, 1.3, 2), ('rm', True, 0.9, 3)])
-def test_a_schedule_is_told_as_its_trace_says(
-    policy: str, preemptive: bool, utilisation: float, seed: int, tmp_path: Path
-) -> None:
+def test_a_schedule_is_told_as_its_trace_says(policy, preemptive, utilisation, seed, tmp_path):
     task_set = runs.autoware()
     load, run = runs.simulated(
         task_set, policy=policy, preemptive=preemptive, utilisation=utilisation, seed=seed)
@@ -71,9 +66,7 @@ def same_tables(ours: Recording, theirs: Recording, times: int = 1) -> None:
 @pytest.mark.parametrize(('settings', 'utilisation'), [
     ({'policy': 'rad'}, 0.95), ({'policy': 'rad', 'preemptive': True}, 1.2),
     ({'policy': 'fifo'}, 1.4), ({'policy': 'rad', 'stop_at_first_miss': True}, 1.5)])
-def test_a_schedule_and_its_trace_have_the_same_tables(
-    settings: dict[str, Any], utilisation: float, tmp_path: Path
-) -> None:
+def test_a_schedule_and_its_trace_have_the_same_tables(settings, utilisation, tmp_path):
     task_set = runs.autoware()
     load, run = runs.simulated(task_set, utilisation=utilisation, **settings)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
@@ -83,7 +76,7 @@ def test_a_schedule_and_its_trace_have_the_same_tables(
     same_tables(seen, open_recording(tmp_path / 'run.mcap'))
 
 
-def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path: Path) -> None:
+def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path):
     task_set = msg_graph.loads(
         runs.GRAPH.replace('deadline: 8ms', 'deadline: 8ms, execution_time: 30ms')
         .replace('timer: 10ms', 'timer: 10ms, execution_time: 1ms, max_active_jobs: 2'), 'g.yaml')
@@ -98,7 +91,7 @@ def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize('workers', [2, 7])
-def test_a_rescheduled_run_has_the_verdicts_of_its_report(workers: int) -> None:
+def test_a_rescheduled_run_has_the_verdicts_of_its_report(workers):
     outcome = reschedule(runs.CONFIG.parent / 'bags' / 'demo_short.mcap', workers=workers)
     data = html.of_outcome(outcome)
     assert data.tally.result()['dags'] == outcome.tally.result()['dags']
@@ -109,7 +102,7 @@ def test_a_rescheduled_run_has_the_verdicts_of_its_report(workers: int) -> None:
         assert 0 <= theirs - ours < 200 * runs.MS   # what still ran at the end is no execution yet
 
 
-def test_a_bag_has_the_verdicts_of_its_report(tmp_path: Path) -> None:
+def test_a_bag_has_the_verdicts_of_its_report(tmp_path):
     task_set = msg_graph.loads(BY_HEADER.replace('20ms', '13ms'), 'g.yaml')
     outcome = reschedule_bag(write_bag(tmp_path / 'bag'), task_set)
     data = html.of_outcome(outcome)
@@ -146,7 +139,7 @@ def ran(*executions: tuple[int, int, int, int, int], end: int = 10 ** 6) -> Time
     return Timeline(recording, Judged(recording), most=100, block=10)
 
 
-def test_detail_is_bounded_and_keeps_the_misses() -> None:
+def test_detail_is_bounded_and_keeps_the_misses():
     us = 1000
     timeline = ran(*((1, 0, i, 100 * us * i, 100 * us * i + (70 if i in (333, 777) else 50) * us)
                      for i in range(1000)))

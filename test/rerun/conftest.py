@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from std_msgs.msg import Header
 
@@ -13,13 +11,13 @@ from .helpers import GRAPH, MS, write_bag
 
 
 @pytest.fixture
-def bag(tmp_path: Path) -> str:
+def bag(tmp_path):
     return write_bag(tmp_path / 'in.mcap', [
         (i * 100 * MS, '/points', Header(frame_id=str(i))) for i in range(20)])
 
 
 @pytest.fixture
-def graph(tmp_path: Path) -> Path:
+def graph(tmp_path):
     path = tmp_path / 'graph.yaml'
     path.write_text(GRAPH)
     return path

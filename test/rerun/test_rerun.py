@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 import random
 import threading
 from typing import Any
@@ -71,7 +70,7 @@ def published(result: Result, topic: str) -> list[tuple[float, Any]]:
             for each in result.outputs if each.topic == topic]
 
 
-def test_nodes_run_in_virtual_time(bag: str, graph: Path) -> None:
+def test_nodes_run_in_virtual_time(bag, graph):
     result = rerun(bag, graph, [Filter, Sink])
     filtered = published(result, '/filtered')
     assert [time for time, _ in filtered] == [100.0 * i + 10 for i in range(20)]
@@ -84,13 +83,13 @@ def test_nodes_run_in_virtual_time(bag: str, graph: Path) -> None:
     assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (20, 0, 15 * MS)
 
 
-def test_the_same_again_and_with_other_workers(bag: str, graph: Path) -> None:
+def test_the_same_again_and_with_other_workers(bag, graph):
     first = rerun(bag, graph, [Filter, Sink])
     assert rerun(bag, graph, [Filter, Sink]).digest == first.digest
     assert rerun(bag, graph, [Filter, Sink], workers=7).digest == first.digest
 
 
-def test_outputs_are_a_bag_that_others_read(bag: str, graph: Path, tmp_path: Path) -> None:
+def test_outputs_are_a_bag_that_others_read(bag, graph, tmp_path):
     from rosbags.highlevel import AnyReader
     out = tmp_path / 'out.mcap'
     result = rerun(bag, graph, [Filter, Sink], output=out)
@@ -102,7 +101,7 @@ def test_outputs_are_a_bag_that_others_read(bag: str, graph: Path, tmp_path: Pat
     assert_same(result, out)
 
 
-def test_the_trace_replays(bag: str, graph: Path, tmp_path: Path) -> None:
+def test_the_trace_replays(bag, graph, tmp_path):
     trace = tmp_path / 'run.mcap'
     result = rerun(bag, graph, [Filter, Sink], trace=trace)
     again = replay(trace)
@@ -114,7 +113,7 @@ def test_the_trace_replays(bag: str, graph: Path, tmp_path: Path) -> None:
     assert sink['response_ns'] == mine['sinks']['/sink:take']['response_ns']
 
 
-def test_recorded_times_come_from_a_trace(bag: str, graph: Path, tmp_path: Path) -> None:
+def test_recorded_times_come_from_a_trace(bag, graph, tmp_path):
     trace = tmp_path / 'run.mcap'
     rerun(bag, graph, [Filter, Sink], trace=trace)
     graph.write_text(GRAPH.replace('10ms', '30ms'))
@@ -134,7 +133,7 @@ class Early(Durations):
 
 
 @pytest.mark.parametrize('cpus', [None, 2])
-def test_what_was_published_early_leaves_early(bag: str, graph: Path, cpus: int | None) -> None:
+def test_what_was_published_early_leaves_early(bag, graph, cpus):
     recording = MessageBag(bag)
     assert recording.start is not None and recording.end is not None
     source = RerunInput('bag', recording.start, recording.end, recording, Early(
@@ -149,7 +148,7 @@ def test_what_was_published_early_leaves_early(bag: str, graph: Path, cpus: int 
 # --- timers, seeds, what is kept -----------------------------------------------------------------
 
 def node_with(function: Callable[[Node], None], name: str = 'filter') -> Callable[[], Node]:
-    def make() -> Node:
+    def make():
         node = rclpy.create_node(name)
         function(node)
         return node
@@ -157,13 +156,13 @@ def node_with(function: Callable[[Node], None], name: str = 'filter') -> Callabl
     return make
 
 
-def test_timers_fire_at_their_virtual_times(bag: str, graph: Path) -> None:
+def test_timers_fire_at_their_virtual_times(bag, graph):
     seen: list[float] = []
 
-    def fill(node: Node) -> None:
+    def fill(node):
         node.create_subscription(Header, '/points', lambda message: None, 10)
 
-        def tick() -> None:
+        def tick():
             seen.append((node.get_clock().now().nanoseconds - START) / MS)
             if len(seen) == 3:
                 timer.timer_period_ns = 500 * MS
@@ -171,7 +170,7 @@ def test_timers_fire_at_their_virtual_times(bag: str, graph: Path) -> None:
                 timer.cancel()
                 node.create_timer(0.3, again)
 
-        def again() -> None:
+        def again():
             seen.append(-(node.get_clock().now().nanoseconds - START) / MS)
 
         timer = node.create_timer(0.03, tick)
@@ -180,10 +179,10 @@ def test_timers_fire_at_their_virtual_times(bag: str, graph: Path) -> None:
     assert seen == [30, 60, 90, 120, 620, -920, -1220, -1520, -1820]
 
 
-def test_random_numbers_are_those_of_the_seed(bag: str, graph: Path) -> None:
+def test_random_numbers_are_those_of_the_seed(bag, graph):
     seen: list[float] = []
 
-    def fill(node: Node) -> None:
+    def fill(node):
         node.create_subscription(
             Header, '/points', lambda message: seen.append(random.random()), 10)
 
@@ -203,12 +202,10 @@ def seeded(function: Callable[[], None]) -> float:
     lambda: numpy.random.default_rng().random(),
     lambda: numpy.random.RandomState().random_sample(),
 ])
-def test_generators_without_a_seed_get_one(
-    bag: str, graph: Path, draw: Callable[[], float]
-) -> None:
+def test_generators_without_a_seed_get_one(bag, graph, draw):
     seen: list[float] = []
 
-    def fill(node: Node) -> None:
+    def fill(node):
         node.create_subscription(Header, '/points', lambda message: seen.append(draw()), 10)
 
     for seed in (1, 1, 2):
@@ -219,7 +216,7 @@ def test_generators_without_a_seed_get_one(
     assert draw() not in seen  # it is as before
 
 
-def test_nothing_happens_in_a_pause_of_the_recording(tmp_path: Path, graph: Path) -> None:
+def test_nothing_happens_in_a_pause_of_the_recording(tmp_path, graph):
     """The machine got its time when the robot was running already, 300 days later."""
     later = 300 * 24 * 3600 * 1000
     bag = write_bag(tmp_path / 'in.mcap', [
@@ -228,11 +225,11 @@ def test_nothing_happens_in_a_pause_of_the_recording(tmp_path: Path, graph: Path
     ticks: list[float] = []
     woken: list[float] = []
 
-    def fill(node: Node) -> None:
-        def now() -> float:
+    def fill(node):
+        def now():
             return (node.get_clock().now().nanoseconds - START) / MS
 
-        def sleep() -> None:
+        def sleep():
             for _ in range(3):
                 node.get_clock().sleep_for(Duration(seconds=4))
                 woken.append(now())
@@ -250,23 +247,23 @@ def test_nothing_happens_in_a_pause_of_the_recording(tmp_path: Path, graph: Path
         f'{bag}: timers do not fire in 1 pause of over a minute without any message']
 
 
-def test_a_message_is_as_it_was_published(bag: str, graph: Path) -> None:
+def test_a_message_is_as_it_was_published(bag, graph):
     """Who publishes may change a message afterwards, and who receives it has one of his own."""
     seen: list[str] = []
 
-    def publishing(node: Node) -> None:
+    def publishing(node):
         publisher = node.create_publisher(String, '/names', 10)
         message = String()
 
-        def take(header: Header) -> None:
+        def take(header):
             message.data = header.frame_id
             publisher.publish(message)
             message.data = 'changed'
 
         node.create_subscription(Header, '/points', take, 10)
 
-    def taking(node: Node) -> None:
-        def take(message: String) -> None:
+    def taking(node):
+        def take(message):
             seen.append(message.data)
             message.data = 'mine'
 
@@ -277,14 +274,14 @@ def test_a_message_is_as_it_was_published(bag: str, graph: Path) -> None:
     assert seen == [str(i) for i in range(20) for _ in range(2)]
 
 
-def test_late_subscriptions_get_what_is_latched(bag: str, graph: Path) -> None:
+def test_late_subscriptions_get_what_is_latched(bag, graph):
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     seen: list[str] = []
 
-    def fill(node: Node) -> None:
+    def fill(node):
         node.create_publisher(String, '/map', latched).publish(String(data='a map'))
 
-        def take(message: Header) -> None:
+        def take(message):
             if message.frame_id == '3':
                 node.create_subscription(String, '/map', lambda m: seen.append(m.data), latched)
                 node.create_subscription(String, '/map', lambda m: seen.append('?'), 10)
@@ -297,9 +294,7 @@ def test_late_subscriptions_get_what_is_latched(bag: str, graph: Path) -> None:
 
 # --- comparing -----------------------------------------------------------------------------------
 
-def test_a_changed_constant_is_found(
-    bag: str, graph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_changed_constant_is_found(bag, graph, tmp_path, monkeypatch):
     out = tmp_path / 'out.mcap'
     rerun(bag, graph, [Filter, Sink], output=out)
     monkeypatch.setattr(f'{__name__}.GAIN', 2.0001)
@@ -315,8 +310,8 @@ def test_a_changed_constant_is_found(
 # --- what goes wrong -----------------------------------------------------------------------------
 
 
-def test_a_circle_that_takes_no_time(bag: str, graph: Path) -> None:
-    def fill(node: Node) -> None:
+def test_a_circle_that_takes_no_time(bag, graph):
+    def fill(node):
         publisher = node.create_publisher(Header, '/round', 10)
         node.create_subscription(Header, '/round', publisher.publish, 10)
         node.create_subscription(Header, '/points', publisher.publish, 10)

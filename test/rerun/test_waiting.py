@@ -61,7 +61,7 @@ def run_filter(
     """Rerun the node; return what it noted."""
     nodes: list[Filter] = []
 
-    def make() -> Node:
+    def make():
         node = Filter(take)
         fill(node)
         nodes.append(node)
@@ -75,7 +75,7 @@ def server(answers_after_ms: float | None = None) -> Node:
     """Return a node with a service, which takes its time with a rate."""
     node = rclpy.create_node('server')
 
-    def answer(request: Any, response: Any) -> Any:
+    def answer(request, response):
         if answers_after_ms is not None:
             node.get_clock().sleep_for(Duration(nanoseconds=round(answers_after_ms * MS)))
         response.message = 'hello'
@@ -85,8 +85,8 @@ def server(answers_after_ms: float | None = None) -> Node:
     return node
 
 
-def test_a_service_answers_in_virtual_time(bag: str, graph: Path) -> None:
-    def take(node: Filter, number: int) -> None:
+def test_a_service_answers_in_virtual_time(bag, graph):
+    def take(node, number):
         if number == 3:
             client = node.create_client(Trigger, '/greet')
             assert client.wait_for_service(timeout_sec=1.0)
@@ -98,8 +98,8 @@ def test_a_service_answers_in_virtual_time(bag: str, graph: Path) -> None:
     assert seen == [(317.0, 'hello')]
 
 
-def test_a_synchronous_call_lends_its_worker(bag: str, graph: Path) -> None:
-    def take(node: Filter, number: int) -> None:
+def test_a_synchronous_call_lends_its_worker(bag, graph):
+    def take(node, number):
         if number == 3:
             client = node.create_client(Trigger, '/greet')
             node.note(client.call(Trigger.Request()).message)
@@ -109,10 +109,10 @@ def test_a_synchronous_call_lends_its_worker(bag: str, graph: Path) -> None:
     assert not result.warnings
 
 
-def test_ros_arguments(bag: str, graph: Path) -> None:
+def test_ros_arguments(bag, graph):
     seen: list[Any] = []
 
-    def main() -> None:
+    def main():
         rclpy.init()
         node = rclpy.create_node('filtre')
         node.declare_parameter('gain', 0)
@@ -126,8 +126,8 @@ def test_ros_arguments(bag: str, graph: Path) -> None:
     assert len(seen) == 21
 
 
-def test_coroutines(bag: str, graph: Path) -> None:
-    async def take(node: Filter, number: int) -> None:
+def test_coroutines(bag, graph):
+    async def take(node, number):
         if number in (3, 4):
             client = node.create_client(Trigger, '/greet')
             answer = await client.call_async(Trigger.Request())
@@ -137,8 +137,8 @@ def test_coroutines(bag: str, graph: Path) -> None:
     assert seen == [(460.0, 'hello 3'), (610.0, 'hello 4')]
 
 
-def test_rates_and_clocks_sleep_in_virtual_time(bag: str, graph: Path) -> None:
-    def take(node: Filter, number: int) -> None:
+def test_rates_and_clocks_sleep_in_virtual_time(bag, graph):
+    def take(node, number):
         if number == 2:
             rate = node.create_rate(100.0)
             rate.sleep()
@@ -150,13 +150,13 @@ def test_rates_and_clocks_sleep_in_virtual_time(bag: str, graph: Path) -> None:
     assert seen == [(210.0, 'rate'), (710.0, 'clock')]
 
 
-def test_threads_of_nodes_are_in_virtual_time_too(bag: str, graph: Path) -> None:
-    def fill(node: Filter) -> None:
+def test_threads_of_nodes_are_in_virtual_time_too(bag, graph):
+    def fill(node):
         numbers = queue.Queue[int]()
         node.numbers = numbers  # type: ignore[attr-defined]
         publisher = node.create_publisher(String, '/doubled', 10)
 
-        def work() -> None:
+        def work():
             while True:
                 number = numbers.get()
                 node.get_clock().sleep_for(Duration(seconds=0.005))
@@ -169,7 +169,7 @@ def test_threads_of_nodes_are_in_virtual_time_too(bag: str, graph: Path) -> None
         pool = ThreadPoolExecutor(2)
         threading.Thread(target=work, daemon=True).start()
 
-    def take(node: Filter, number: int) -> None:
+    def take(node, number):
         node.numbers.put(number)  # type: ignore[attr-defined]
 
     seen, result = run_filter(bag, graph, take, fill=fill)
@@ -184,7 +184,7 @@ def fibonacci() -> Node:
     """Return a node with an action that feeds back each 10 ms, and may be cancelled."""
     node = rclpy.create_node('fibonacci')
 
-    def execute(goal: Any) -> Any:
+    def execute(goal):
         sequence = [0, 1]
         for _ in range(goal.request.order):
             node.get_clock().sleep_for(Duration(nanoseconds=10 * MS))
@@ -202,8 +202,8 @@ def fibonacci() -> Node:
     return node
 
 
-def test_an_action(bag: str, graph: Path) -> None:
-    async def take(node: Filter, number: int) -> None:
+def test_an_action(bag, graph):
+    async def take(node, number):
         if number == 3:
             assert node.client.wait_for_server(1.0)  # type: ignore[attr-defined]
             goal = await node.client.send_goal_async(  # type: ignore[attr-defined]
@@ -213,7 +213,7 @@ def test_an_action(bag: str, graph: Path) -> None:
             answer = await goal.get_result_async()
             node.note((answer.status, list(answer.result.sequence)))
 
-    def fill(node: Filter) -> None:
+    def fill(node):
         node.client = ActionClient(node, Fibonacci, 'fibonacci')  # type: ignore[attr-defined]
 
     for _ in range(2):
@@ -226,10 +226,10 @@ def test_an_action(bag: str, graph: Path) -> None:
 
 # --- programs ------------------------------------------------------------------------------------
 
-def test_a_program_with_a_loop_of_its_own(bag: str, graph: Path) -> None:
+def test_a_program_with_a_loop_of_its_own(bag, graph):
     seen: Seen = []
 
-    def main() -> None:
+    def main():
         rclpy.init()
         node = Filter(lambda node, number: node.note(number) if number % 5 == 0 else None)
         thread = threading.Thread(target=rclpy.spin, args=(node,), daemon=True)
@@ -253,8 +253,8 @@ def test_a_program_with_a_loop_of_its_own(bag: str, graph: Path) -> None:
 # --- clocks --------------------------------------------------------------------------------------
 
 
-def test_who_waits_by_looking_at_the_time_all_the_time(bag: str, graph: Path) -> None:
-    def take(node: Filter, number: int) -> None:
+def test_who_waits_by_looking_at_the_time_all_the_time(bag, graph):
+    def take(node, number):
         if number == 2:
             begin = time.monotonic()
             while time.monotonic() < begin + 0.02:
@@ -269,8 +269,8 @@ def test_who_waits_by_looking_at_the_time_all_the_time(bag: str, graph: Path) ->
     assert seen == [(220.0, 'time'), (230.0, 'clock')]
 
 
-def test_what_is_not_the_same_each_time_is_warned_of(bag: str, graph: Path) -> None:
-    def take(node: Filter, number: int) -> None:
+def test_what_is_not_the_same_each_time_is_warned_of(bag, graph):
+    def take(node, number):
         time.time()
         time.sleep(0.0)
 
@@ -281,7 +281,7 @@ def test_what_is_not_the_same_each_time_is_warned_of(bag: str, graph: Path) -> N
     assert all(warning.startswith(f'{__file__}:') for warning in result.warnings)
 
 
-def test_simulated_time_is_that_of_the_recording(tmp_path: Path, graph: Path) -> None:
+def test_simulated_time_is_that_of_the_recording(tmp_path, graph):
     """The clock of the simulator went half as fast as real time."""
     messages = sorted([
         *((i * 100 * MS, '/points', Header(frame_id=str(i))) for i in range(10)),
@@ -290,8 +290,8 @@ def test_simulated_time_is_that_of_the_recording(tmp_path: Path, graph: Path) ->
     bag = write_bag(tmp_path / 'in.mcap', messages)
     seen: list[float] = []
 
-    def make() -> Node:
-        def take(node: Filter, number: int) -> None:
+    def make():
+        def take(node, number):
             seen.append(node.get_clock().now().nanoseconds / MS)
             if number == 2:
                 node.get_clock().sleep_for(Duration(seconds=0.1))
@@ -304,18 +304,18 @@ def test_simulated_time_is_that_of_the_recording(tmp_path: Path, graph: Path) ->
     assert seen[1:6] == [5050, 5100, 5150, -5200, 5200]
 
 
-def test_who_is_there_is_known_at_once(bag: str, graph: Path) -> None:
-    def fill(node: Filter) -> None:
+def test_who_is_there_is_known_at_once(bag, graph):
+    def fill(node):
         node.create_publisher(String, '/names', 10)
         node.note(node.count_publishers('/points'))
 
-    def take(node: Filter, number: int) -> None:
+    def take(node, number):
         if number == 1:
             node.note(dict(node.get_topic_names_and_types())['/names'])
             node.note((node.count_publishers('names'), node.count_subscribers('/names'),
                        node.get_node_names()))
 
-    def other() -> Node:
+    def other():
         node = rclpy.create_node('other')
         node.create_subscription(String, '/names', lambda message: None, 10)
         return node
@@ -358,8 +358,7 @@ def compute_for_ever() -> None:
     (sleep_for_ever, 'blocking'), (read_for_ever, 'blocking'), (pass_on_for_ever, 'blocking'),
     (compute_for_ever, 'computing')])
 def test_a_thread_that_keeps_virtual_time_from_passing_is_named(
-    tmp_path: Path, bag: str, graph: Path, function: Callable[[], None], what: str
-) -> None:
+        tmp_path, bag, graph, function, what):
     """In a process of its own: the thread never ends."""
     text = '\n'.join((
         'from contextlib import suppress', 'import queue', 'import socket', 'import threading',

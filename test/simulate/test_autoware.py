@@ -71,7 +71,7 @@ PAPER: dict[tuple[int, str], tuple[int | None, list[int]]] = {
 
 
 @pytest.mark.parametrize(('seed', 'policy'), PAPER)
-def test_the_paper_s_program_gives_the_same(seed: int, policy: str) -> None:
+def test_the_paper_s_program_gives_the_same(seed, policy):
     task_set = autoware()
     times = [[-(-time // 1000) * 1000 for time in row]
              for row in draw_execution_times(task_set, seed)]

@@ -62,14 +62,14 @@ def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False
 @pytest.mark.parametrize('policy', POLICIES)
 @examples(300)
 @given(st.data(), st.integers(5, 60))
-def test_the_paper_s_model(policy: str, data: st.DataObject, horizon: int) -> None:
+def test_the_paper_s_model(policy, data, horizon):
     compare(data.draw(cases((policy,), groups=False, bounds=False)), horizon)
 
 
 @examples(1000)
 @given(EVERY_RULE, st.integers(5, 60), st.sampled_from(['horizon', 'completions']),
        st.booleans())
-def test_everything_at_once(case: Case, horizon: int, judge: str, stop: bool) -> None:
+def test_everything_at_once(case, horizon, judge, stop):
     """Groups, bounds, aborts and overheads too."""
     compare(case, horizon, judge, stop)
 
@@ -97,7 +97,7 @@ def with_everything(load_: Load, tables: Tables, chances: random.Random) -> Load
     costs = [chances.randint(0, 9) * TICK * SLOW + chances.randint(0, 3) for _ in vertices]
     computes, sends, stops = (chances.random() < 0.7 for _ in range(3))
 
-    def some(values: list[int], weights: list[int]) -> list[int]:
+    def some(values, weights):
         return chances.choices(values, weights, k=len(costs))
 
     load_ = load_._replace(
@@ -123,9 +123,7 @@ def with_everything(load_: Load, tables: Tables, chances: random.Random) -> Load
 
 @examples(800)
 @given(EVERY_RULE, st.integers(5, 60), st.booleans(), st.integers(0, 2 ** 32))
-def test_machine_messages_and_processes(
-    case: Case, horizon: int, stop: bool, seed: int
-) -> None:
+def test_machine_messages_and_processes(case, horizon, stop, seed):
     chances = random.Random(seed)
     one = case.preemptive or POLICIES[case.policy].polling
     settings = replace(
@@ -141,7 +139,7 @@ def test_machine_messages_and_processes(
 
 
 @pytest.mark.parametrize('compiled', [False, True])
-def test_a_short_wait_for_the_interpreter_is_no_reason_to_overtake(compiled: bool) -> None:
+def test_a_short_wait_for_the_interpreter_is_no_reason_to_overtake(compiled):
     tables = Tables.build(declaration([
         {'node': '/n', 'name': name, 'timer': '1s', 'deadline': deadline, 'dag': name}
         for name, deadline in (('heavy', '200ms'), ('urgent', '100ms'))]))
@@ -153,7 +151,7 @@ def test_a_short_wait_for_the_interpreter_is_no_reason_to_overtake(compiled: boo
 
 @examples(15)
 @given(cases(overheads=True, importance=True, max_callbacks=12))
-def test_long_runs(case: Case) -> None:
+def test_long_runs(case):
     """Overload for long: slots, queues and stale entries grow and are swept."""
     compare(case, 1500)
 
@@ -161,9 +159,7 @@ def test_long_runs(case: Case) -> None:
 @examples(150)
 @given(st.lists(EVERY_RULE, min_size=1, max_size=1), st.integers(5, 60),
        st.sampled_from(['horizon', 'completions']), st.data())
-def test_runs_do_not_disturb_one_another(
-    one: list[Case], horizon: int, judge: str, data: st.DataObject
-) -> None:
+def test_runs_do_not_disturb_one_another(one, horizon, judge, data):
     """Several runs in one memory give the verdicts that each gives alone."""
     case = one[0]
     settings = settings_of(case, horizon, judge, True)
@@ -177,7 +173,7 @@ def test_runs_do_not_disturb_one_another(
 
 
 @pytest.mark.parametrize('policy', ['rad', 'fifo', 'ros2'])
-def test_autoware(policy: str) -> None:
+def test_autoware(policy):
     task_set = load(CONFIG / 'autoware_multi.yaml')
     times = Draws(task_set, 11).times(0, 3).tolist()
     row = times[2]
@@ -196,7 +192,7 @@ def python(*lines: str, **environment: str) -> str:
     return done.stdout.strip()
 
 
-def test_nothing_is_compiled_at_import() -> None:
+def test_nothing_is_compiled_at_import():
     assert python(
         'import sys',
         'import mddag_executor.simulate.compiled, mddag_executor.laboratory.evaluate',
@@ -204,9 +200,9 @@ def test_nothing_is_compiled_at_import() -> None:
 
 
 @pytest.mark.slow
-def test_compiled_code_is_kept_until_a_source_changes(tmp_path: Path) -> None:
+def test_compiled_code_is_kept_until_a_source_changes(tmp_path):
     """The hash of the sources decides, not only the file that numba checks."""
-    def hits_and_misses(*change: str) -> str:
+    def hits_and_misses(*change):
         return python(
             'from mddag_executor.simulate import compiled', *change,
             'entry = compiled.entry_points()["free_run"]',

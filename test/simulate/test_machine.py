@@ -90,12 +90,12 @@ def in_ms(found: Sequence[tuple[int, int]]) -> list[tuple[float, float]]:
     return [(start / MS, end / MS) for start, end in found]
 
 
-def test_one_after_the_other_where_none_is_more_urgent() -> None:
+def test_one_after_the_other_where_none_is_more_urgent():
     jobs = of_ms(Job(0, 50, 4, True), Job(0, 50, 3, True), Job(1, 90, 2, True), Job(1, 99, 2))
     assert in_ms(times(jobs, 4)) == [(0, 4), (4, 7), (7, 9), (1, 3)]
 
 
-def test_one_that_is_more_urgent_overtakes_and_they_take_turns() -> None:
+def test_one_that_is_more_urgent_overtakes_and_they_take_turns():
     """It starts at 2, has the lock from 3 to 4, 5 to 6 and 7 to 8; the other one meanwhile."""
     jobs = of_ms(Job(0, 100, 10, True), Job(2, 16, 3, True))
     assert in_ms(times(jobs, 2)) == [(0, 13), (2, 8)]
@@ -117,7 +117,7 @@ nodes:
 """
 
 
-def test_declared_holders_in_the_simulator() -> None:
+def test_declared_holders_in_the_simulator():
     worst = []
     for holds, cpus in (('false', None), ('true', None), ('false', 1)):
         task_set = loads(HOLDERS.replace('H', holds), 'g.yaml')
@@ -279,9 +279,7 @@ def some_jobs(draw: st.DrawFn) -> list[Job]:
 
 @examples(400)
 @given(some_jobs(), st.integers(1, 4), st.integers(1, 4), st.booleans(), st.booleans())
-def test_as_the_model_that_goes_by_ticks(
-    jobs: list[Job], workers: int, cpus: int, python: bool, divided: bool
-) -> None:
+def test_as_the_model_that_goes_by_ticks(jobs, workers, cpus, python, divided):
     with pytest.MonkeyPatch.context() as patch:
         for name, ticks in (('SWITCH_NS', SWITCH), ('SLICE_NS', SLICE), ('TAIL_NS', TAIL)):
             patch.setattr(machine, name, ticks)
@@ -328,7 +326,7 @@ def responses_of(
 
 
 @pytest.mark.parametrize('compiled', [False, True])
-def test_what_comes_is_noticed_by_a_thread_that_takes_no_worker(compiled: bool) -> None:
+def test_what_comes_is_noticed_by_a_thread_that_takes_no_worker(compiled):
     if compiled:
         pytest.importorskip('numba')
     ran = responses_of(loads(CHAIN), [[2 * MS, MS]], compiled)
@@ -346,7 +344,7 @@ def test_what_comes_is_noticed_by_a_thread_that_takes_no_worker(compiled: bool) 
     assert [(d[2], d[5]) for d in ran.decisions if d[2] >= 0] == [(1, arrived + MS)]
 
 
-def test_a_computing_callback_is_stopped_while_a_timer_is_noticed() -> None:
+def test_a_computing_callback_is_stopped_while_a_timer_is_noticed():
     ran = responses_of(loads(BOTH), [[80 * MS], [MS]])
     ends = {(int(e[4]), int(e[5])): int(e[0]) for e in ran.log if e[1] == END}
     # a switch interval until the intake gets the lock; then the urgent one waits for it as long
@@ -355,7 +353,7 @@ def test_a_computing_callback_is_stopped_while_a_timer_is_noticed() -> None:
     assert ends[0, 0] == 300_001 + MS + 80 * MS + 300_000 + MS
 
 
-def test_a_skipped_job_is_skipped_and_a_failed_one_fails() -> None:
+def test_a_skipped_job_is_skipped_and_a_failed_one_fails():
     task_set = loads(CHAIN)
     for fate, decided in ((SKIPPED, 0), (FAILS, 1)):
         ran = responses_of(task_set, [[2 * MS, MS]], fates=[fate, RUNS])

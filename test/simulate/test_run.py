@@ -50,7 +50,7 @@ def two_dags(**more: Any) -> TaskSet:
 # --- loads ---------------------------------------------------------------------------------------
 
 
-def test_a_source_may_get_ready_after_its_release() -> None:
+def test_a_source_may_get_ready_after_its_release():
     """As with a header stamp: the deadline counts from the release."""
     load = Load([5 * US], [0], [0], [2 * US, 2 * US], [0, 2], [0, 0], releases=[1])
     run = simulate(two_dags(), load, Settings(workers=1, duration_ns=100 * US))
@@ -64,7 +64,7 @@ def test_a_source_may_get_ready_after_its_release() -> None:
         'completed_ns': 9 * US + 2}
 
 
-def test_a_bound_for_all_dags_and_one_of_its_own() -> None:
+def test_a_bound_for_all_dags_and_one_of_its_own():
     task_set = two_dags(max_active_jobs=3)
     load = periodic_load(task_set, [[1, 900 * US], [900 * US, 1]], 100 * US)
     settings = Settings(workers=2, duration_ns=100 * US)
@@ -86,7 +86,7 @@ def test_a_bound_for_all_dags_and_one_of_its_own() -> None:
     ({'policy': 'edf'}, "policy 'edf': .*: choose one of rad, rm"),
     ({'dispatch_overhead_ns': -1}, 'overhead'), ({'switch_overhead_ns': -1}, 'overhead'),
 ])
-def test_settings_that_make_no_sense(setting: dict[str, Any], says: str) -> None:
+def test_settings_that_make_no_sense(setting, says):
     from mddag_executor.errors import MddagError
     load = periodic_load(two_dags(), [[1, 1], [1, 1]], US)
     with pytest.raises(MddagError, match=says) as error:
@@ -96,7 +96,7 @@ def test_settings_that_make_no_sense(setting: dict[str, Any], says: str) -> None
 
 @pytest.mark.parametrize(('policy', 'own'), [
     ('rad', True), ('rm', True), ('gedf', True), ('wc', False), ('fifo', False)])
-def test_a_policy_has_its_own_mode(policy: str, own: bool) -> None:
+def test_a_policy_has_its_own_mode(policy, own):
     load = periodic_load(two_dags(), [[1, 1], [1, 1]], US)
     assert Settings(policy=policy).preemptive is False
     for asked, got in ((None, own), (True, True), (False, False)):
@@ -106,13 +106,13 @@ def test_a_policy_has_its_own_mode(policy: str, own: bool) -> None:
 
 # --- execution times -----------------------------------------------------------------------------
 
-def test_a_seed_draws_the_same_for_ever() -> None:
+def test_a_seed_draws_the_same_for_ever():
     """The draw is part of results that people publish: it must not change."""
     assert draw_execution_times(two_dags(), 1) == [[2_000, 2_695], [2_528, 1_000]]
     assert draw_execution_times(two_dags(), 2) == [[2_000, 2_896], [1_113, 1_000]]
 
 
-def test_utilisation_and_its_scaling() -> None:
+def test_utilisation_and_its_scaling():
     times = [[2_000, 3_000], [1_000, 1_000]]
     assert utilisation(two_dags(), times, 2) == pytest.approx(0.5)
     scaled = scale_execution_times(two_dags(), times, 2, 0.25)
@@ -153,7 +153,7 @@ nodes:
 
 
 @pytest.fixture(scope='module')
-def trace() -> Iterator[Path]:
+def trace():
     with tempfile.TemporaryDirectory() as folder:
         yield Path(folder, 'run.mcap')
 
@@ -169,9 +169,7 @@ def record(case: Case, horizon: int, trace: Path, **how: Any) -> SimulatedRun:
 @example(case=TWO_SINKS_AT_ONCE, horizon=5, stop=False)
 @example(case=DROPPED_LAST, horizon=12, stop=False)
 @given(case=cases(overheads=True, newest=True), horizon=st.integers(5, 50), stop=st.booleans())
-def test_the_replayer_counts_the_same(
-    trace: Path, case: Case, horizon: int, stop: bool
-) -> None:
+def test_the_replayer_counts_the_same(trace, case, horizon, stop):
     """Also with aborts, expiries, preemptions and groups; nothing contradicts anything."""
     run = record(case, horizon, trace)
     replayed = replay(trace)
@@ -206,7 +204,7 @@ def executions(log: Sequence[LogEntry]) -> Iterator[tuple[int, LogEntry]]:
 
 @examples(100)
 @given(case=cases(), last_release=st.integers(5, 25))
-def test_rescheduled_alike_it_runs_alike(trace: Path, case: Case, last_release: int) -> None:
+def test_rescheduled_alike_it_runs_alike(trace, case, last_release):
     """
     Of runs that end with everything done: elsewhere not all execution times are known.
 
@@ -233,9 +231,7 @@ def test_rescheduled_alike_it_runs_alike(trace: Path, case: Case, last_release: 
 
 
 @pytest.mark.parametrize(('holds', 'cpus'), [('true', None), ('true', 2), ('false', 1)])
-def test_what_shared_cpus_or_the_interpreter_does_so_again(
-    trace: Path, holds: str, cpus: int | None
-) -> None:
+def test_what_shared_cpus_or_the_interpreter_does_so_again(trace, holds, cpus):
     """The long one is overtaken; what it waited for the other one is taken back."""
     task_set = loads(f"""\
 mddag: 1

@@ -53,7 +53,7 @@ def entries(event: EventType) -> st.SearchStrategy[tuple[Any, ...]]:
 
 def sample(event: EventType, number: int) -> tuple[Any, ...]:
     """Return one recording of an event, different for each number."""
-    def value(kind: str, place: int) -> Any:
+    def value(kind, place):
         if kind == 'string':
             return f'/höhe/{number}-{place}'
         if kind == 'bool':

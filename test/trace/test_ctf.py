@@ -13,7 +13,6 @@ from typing import NoReturn
 from mddag_executor.trace import ctf, import_ctf, read_events, TraceError, TraceReader
 import pytest
 
-from ..conftest import Call
 from ..replay.test_caret_sample import CARET
 from ..trace.ctf_session import CLOCK_OFFSET, session
 
@@ -32,7 +31,7 @@ def imported(folder: Path, tmp_path: Path) -> Path:
 
 
 @bt2
-def test_events_of_several_processes_come_in_the_order_of_time(tmp_path: Path) -> None:
+def test_events_of_several_processes_come_in_the_order_of_time(tmp_path):
     session(tmp_path / 's/ust/pid/a', [START, END], [
         (0, 10, 100, 101, 'talker', 2**64 - 1, 1), (1, 40, 100, 101, 'renamed', 2**64 - 1)])
     session(tmp_path / 's/ust/pid/b', [END, START, BIND], [
@@ -41,7 +40,7 @@ def test_events_of_several_processes_come_in_the_order_of_time(tmp_path: Path) -
     result = import_ctf(tmp_path / 's', tmp_path / 'out.mcap')
     assert (result.events, result.processes, result.warnings) == (5, {100, 200}, [])
 
-    def event(name: str, time: int, pid: int, tid: int, procname: str, **fields: int) -> object:
+    def event(name, time, pid, tid, procname, **fields):
         return {'_name': name, '_timestamp': CLOCK_OFFSET + time, '_vpid': pid, '_vtid': tid,
                 '_procname': procname, **fields}
 
@@ -57,7 +56,7 @@ def test_events_of_several_processes_come_in_the_order_of_time(tmp_path: Path) -
 
 
 @bt2
-def test_unknown_events_keep_all_fields(tmp_path: Path) -> None:
+def test_unknown_events_keep_all_fields(tmp_path):
     kind = ('my-app:frame', [('timestamp', 'i64'), ('ratio', 'f64'), ('label', 'str'),
                              ('small', 'u8'), ('box', 'i32[4]'), ('points', 'f64[]')])
     folder = session(tmp_path / 's', [kind], [
@@ -76,7 +75,7 @@ def test_unknown_events_keep_all_fields(tmp_path: Path) -> None:
 
 
 @bt2
-def test_providers_that_replay_does_not_know_are_named(tmp_path: Path, call: Call) -> None:
+def test_providers_that_replay_does_not_know_are_named(tmp_path, call):
     written = ('dds:write', [('writer', 'u64'), ('timestamp', 'i64')])
     hook = ('ros2_hook:dds_write', [('message_addr', 'u64')])
     app = ('my_app:frame', [('number', 'u64')])
@@ -92,7 +91,7 @@ def test_providers_that_replay_does_not_know_are_named(tmp_path: Path, call: Cal
 
 
 @bt2
-def test_one_event_with_other_fields_in_another_process(tmp_path: Path) -> None:
+def test_one_event_with_other_fields_in_another_process(tmp_path):
     session(tmp_path / 's/a', [('ros2_caret:dds_write', [('message', 'u64')])],
             [(0, 10, 1, 1, 'old', 11)])
     session(tmp_path / 's/b', [('ros2_caret:dds_write',
@@ -107,7 +106,7 @@ def test_one_event_with_other_fields_in_another_process(tmp_path: Path) -> None:
 
 
 @bt2
-def test_discarded_events_are_counted(tmp_path: Path) -> None:
+def test_discarded_events_are_counted(tmp_path):
     folder = session(tmp_path / 's', [END], [(0, time, 1, 1, 'p', 3) for time in range(10)],
                      discarded=17)
     result = import_ctf(folder, tmp_path / 'out.mcap')
@@ -118,7 +117,7 @@ def test_discarded_events_are_counted(tmp_path: Path) -> None:
 
 
 @bt2
-def test_events_without_contexts(tmp_path: Path) -> None:
+def test_events_without_contexts(tmp_path):
     folder = session(tmp_path / 's', [END], [(0, 1, 0, 0, '', 3)], context=False)
     result = import_ctf(folder, tmp_path / 'out.mcap')
     assert 'vpid and vtid' in result.warnings[0]
@@ -126,7 +125,7 @@ def test_events_without_contexts(tmp_path: Path) -> None:
 
 
 @bt2
-def test_damage_is_one_error(tmp_path: Path) -> None:
+def test_damage_is_one_error(tmp_path):
     folder = session(tmp_path / 's', [END], [(0, time, 1, 1, 'p', 3) for time in range(10)])
     stream = folder / 'channel_0'
     whole = stream.read_bytes()
@@ -143,7 +142,7 @@ def test_damage_is_one_error(tmp_path: Path) -> None:
         import_ctf(folder, tmp_path / 'out.mcap')
 
 
-def test_cut_metadata_is_found_before_babeltrace_reads_it(tmp_path: Path) -> None:
+def test_cut_metadata_is_found_before_babeltrace_reads_it(tmp_path):
     head = struct.pack('<I16sIII5B', 0x75D11D57, b'', 0, 1000 * 8, 4096 * 8, 0, 0, 0, 1, 8)
     for data, what in ((head + bytes(3000), 'is cut at byte 3037'), (head[:20], 'is cut'),
                        (head[:24] + bytes(13), 'is damaged'), (b'', 'is empty')):
@@ -171,8 +170,7 @@ EVENTS = [['ready', '2'], ['class', 0, 'ros2:callback_end', [['callback', 'uint6
     ([*EVENTS, ['error', 'because']], '', r'cannot be read \(because\)'),
     ([['missing', 'no module']], '', 'are not installed: apt install python3-bt2'),
 ])
-def test_a_helper_that_fails(rows: list[object], then: str, what: str, tmp_path: Path,
-                             monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_helper_that_fails(rows, then, what, tmp_path, monkeypatch):
     helper = tmp_path / 'helper.py'
     helper.write_text(HELPER.format(rows=rows, then=then))
     (tmp_path / 'metadata').write_text('/* CTF 1.8 */')
@@ -191,7 +189,7 @@ class Plain(pickle.Unpickler):
 
 @bt2
 @pytest.mark.skipif(not CARET.is_dir(), reason='the sample recording is not here')
-def test_events_of_a_real_recording_equal_what_caret_made_of_them(tmp_path: Path) -> None:
+def test_events_of_a_real_recording_equal_what_caret_made_of_them(tmp_path):
     path = imported(CARET / 'end_to_end_sample', tmp_path)
     with open(CARET / 'end_to_end_sample' / 'caret_converted', 'rb') as file:
         expected = Plain(file).load()

@@ -36,7 +36,7 @@ HEADER_END = 8 + 9 + 4 + len('ros2') + 4 + len('mddag_executor')
 
 
 @pytest.fixture(scope='module')
-def sample(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[list[Any]]]:
+def sample(tmp_path_factory):
     """Return a finished file and what was recorded in each of its chunks."""
     path = tmp_path_factory.mktemp('sample') / 'a.mcap'
     recorded = [helpers.sample(EVENTS[KINDS[number // 2 % len(KINDS)]], number)
@@ -75,7 +75,7 @@ def check(path: Path, data: bytes, chunks: list[list[Any]]) -> int:
     return results[0]
 
 
-def test_cut_at_every_byte(tmp_path: Path, sample: Any) -> None:
+def test_cut_at_every_byte(tmp_path, sample):
     data, chunks = sample
     path = tmp_path / 'a.mcap'
     ends = [end for opcode, _, end in records_of(data) if opcode == Opcode.CHUNK]
@@ -88,7 +88,7 @@ def test_cut_at_every_byte(tmp_path: Path, sample: Any) -> None:
             assert len(read(path)[1]) == 1      # that something is missing is always said
 
 
-def test_warnings_have_counts(tmp_path: Path, sample: Any) -> None:
+def test_warnings_have_counts(tmp_path, sample):
     data, _ = sample
     path = tmp_path / 'a.mcap'
     chunk = [(start, end) for opcode, start, end in records_of(data) if opcode == Opcode.CHUNK][2]
@@ -123,7 +123,7 @@ def flips(data: bytes, count: int, seed: int) -> Iterator[tuple[int, bytes]]:
         yield position, bytes(changed)
 
 
-def test_flipped_bits(tmp_path: Path, sample: Any) -> None:
+def test_flipped_bits(tmp_path, sample):
     data, chunks = sample
     path = tmp_path / 'a.mcap'
     in_summary = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
@@ -137,7 +137,7 @@ def test_flipped_bits(tmp_path: Path, sample: Any) -> None:
             assert len(read(path)[1]) == 1          # the summary's CRC
 
 
-def test_a_lost_chunk_is_noticed(tmp_path: Path, sample: Any) -> None:
+def test_a_lost_chunk_is_noticed(tmp_path, sample):
     """A chunk turned into a record of unknown kind would be passed over but for its indexes."""
     data, _ = sample
     path = tmp_path / 'a.mcap'
@@ -162,7 +162,7 @@ def test_a_lost_chunk_is_noticed(tmp_path: Path, sample: Any) -> None:
             'says that it holds 4 chunks') in warnings[0]
 
 
-def test_what_is_no_file(tmp_path: Path) -> None:
+def test_what_is_no_file(tmp_path):
     os.mkfifo(tmp_path / 'pipe')
     for path in (tmp_path / 'pipe', '/dev/zero'):
         with pytest.raises(TraceError, match='is no file: give the .mcap file itself'):
@@ -191,7 +191,7 @@ def test_what_is_no_file(tmp_path: Path) -> None:
     (['ust/uid/1/metadata'], "is a folder that LTTng recorded to: make a trace of it with 'mddag "
      "import ctf'"),
 ])
-def test_a_folder_says_what_is_in_it(tmp_path: Path, files: list[str], says: str) -> None:
+def test_a_folder_says_what_is_in_it(tmp_path, files, says):
     for name in files:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
@@ -208,8 +208,7 @@ def spans(data: bytes) -> list[tuple[int, int]]:
 
 
 @pytest.mark.parametrize('number', range(len(SIZES)))
-def test_a_chunk_that_was_cut_out_or_doubled_is_noticed(
-        tmp_path: Path, sample: Any, number: int) -> None:
+def test_a_chunk_that_was_cut_out_or_doubled_is_noticed(tmp_path, sample, number):
     data, chunks = sample
     path = tmp_path / 'a.mcap'
     start, end = spans(data)[number]
@@ -222,7 +221,7 @@ def test_a_chunk_that_was_cut_out_or_doubled_is_noticed(
         assert 'the summary at the end is damaged' in warnings[0]
 
 
-def test_a_file_that_goes_away_or_shrinks(tmp_path: Path, sample: Any) -> None:
+def test_a_file_that_goes_away_or_shrinks(tmp_path, sample):
     data, chunks = sample
     path = tmp_path / 'a.mcap'
     path.write_bytes(data)
@@ -281,7 +280,7 @@ def hostile() -> dict[str, bytes]:
     claims = b'\x28\xb5\x2f\xfd\xe0' + (1 << 40).to_bytes(8, 'little') + b'\1\0\0'
     good = definitions() + message(bytes(8))
 
-    def one(content: bytes, **changes: Any) -> bytes:
+    def one(content, **changes):
         packed = zstandard.compress(content)
         return chunk(packed, size=len(content), crc=zlib.crc32(content), **changes)
     return {
@@ -359,7 +358,7 @@ print(round(mddag_executor.memory.peak_memory_mb()))
 
 
 @pytest.mark.parametrize('finished', [False, True])
-def test_hostile_lengths(tmp_path: Path, finished: bool) -> None:
+def test_hostile_lengths(tmp_path, finished):
     start = records.MAGIC + records.record(Opcode.HEADER, prefixed(b'ros2') * 2)
     end = (records.record(Opcode.DATA_END, bytes(4))
            + records.record(Opcode.FOOTER, bytes(20)) + records.MAGIC) if finished else b''
@@ -383,7 +382,7 @@ def test_hostile_lengths(tmp_path: Path, finished: bool) -> None:
     {'summary_start': 2**63}, {'summary_start': 2**40}, {'summary_start': 1},
     {'length': 2**63}, {'crc': 1},
 ])
-def test_hostile_footers(tmp_path: Path, sample: Any, change: dict[str, int]) -> None:
+def test_hostile_footers(tmp_path, sample, change):
     data, chunks = sample
     path = tmp_path / 'a.mcap'
     start, = struct.unpack_from('<Q', data, len(data) - 28)

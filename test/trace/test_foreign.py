@@ -62,8 +62,7 @@ def write_with_mcap(path: Path, recorded: list[tuple[Any, ...]], **options: Any)
      'use_statistics': False, 'use_summary_offsets': False, 'index_types': IndexType.NONE},
 ], ids=str)
 @pytest.mark.parametrize('in_time_order', [False, True])
-def test_files_by_the_mcap_package(tmp_path: Path, options: dict[str, Any],
-                                   in_time_order: bool) -> None:
+def test_files_by_the_mcap_package(tmp_path, options, in_time_order):
     path = tmp_path / 'a.mcap'
     recorded = mixture(300)
     write_with_mcap(path, recorded, **options)
@@ -100,15 +99,14 @@ HEAD = ENCAPSULATION + struct.pack('<qii', 1, 2, 3)
     (PREAMBLE + 'uint64 callback', HEAD + struct.pack('<Q4x', 9),
      ('ros2:callback_end', 1, 2, 3, 9)),
 ])
-def test_other_fields_than_the_table(tmp_path: Path, schema: str, data: bytes,
-                                     expected: tuple[Any, ...]) -> None:
+def test_other_fields_than_the_table(tmp_path, schema, data, expected):
     path = tmp_path / 'a.mcap'
     write_one(path, schema, data)
     assert read(path) == ([expected], [])
     assert read(path, in_time_order=True) == ([expected], [])
 
 
-def test_an_event_that_is_not_in_the_table(tmp_path: Path) -> None:
+def test_an_event_that_is_not_in_the_table(tmp_path):
     path = tmp_path / 'a.mcap'
     write_one(path, PREAMBLE + 'uint8[] gid\nstring[2] names\nfloat32 f\n',
               HEAD + b'\2\0\0\0\x07\x08\0\0' + b'\2\0\0\0a\0\0\0' + b'\2\0\0\0b\0\0\0'
@@ -137,8 +135,7 @@ def test_an_event_that_is_not_in_the_table(tmp_path: Path) -> None:
     ({'schema': PREAMBLE + 'string more', 'data': HEAD}, 'unpack_from requires'),
     ({'schema': PREAMBLE + 'string more', 'data': HEAD + b'\xff\xff\xff\xff'}, 'longer than'),
 ])
-def test_events_that_cannot_be_decoded_are_counted(
-        tmp_path: Path, options: dict[str, Any], reason: str) -> None:
+def test_events_that_cannot_be_decoded_are_counted(tmp_path, options, reason):
     path = tmp_path / 'a.mcap'
     write_one(path, **{'data': HEAD + bytes(8), 'repeat': 5, **options})
     for in_time_order in (False, True):
@@ -152,7 +149,7 @@ def test_events_that_cannot_be_decoded_are_counted(
         assert list(read_events(path)) == []
 
 
-def test_names_select(tmp_path: Path) -> None:
+def test_names_select(tmp_path):
     path = tmp_path / 'a.mcap'
     recorded = mixture(300)
     write_chunks(path, [recorded[:100], recorded[100:]])
@@ -168,7 +165,7 @@ def test_names_select(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('seed', range(20))
 @pytest.mark.parametrize('finish', [True, False])
-def test_any_disorder_is_put_into_order(tmp_path: Path, seed: int, finish: bool) -> None:
+def test_any_disorder_is_put_into_order(tmp_path, seed, finish):
     """Also of chunks whose definitions stand in a chunk that starts later."""
     random_ = random.Random(seed)
     path = tmp_path / 'a.mcap'

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 import struct
 from typing import Any
 
@@ -46,7 +45,7 @@ ANY_EVENTS = st.lists(st.sampled_from(list(EVENTS.values())).flatmap(entries), m
 @settings(max_examples=150, deadline=None,
           suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(recorded=ANY_EVENTS)
-def test_every_value_comes_back(tmp_path: Path, recorded: list[tuple[Any, ...]]) -> None:
+def test_every_value_comes_back(tmp_path, recorded):
     path = tmp_path / 'a.mcap'
     half = len(recorded) // 2
     write_chunks(path, [recorded[:half], recorded[half:]])
@@ -59,7 +58,7 @@ def test_every_value_comes_back(tmp_path: Path, recorded: list[tuple[Any, ...]])
     assert read(path, in_time_order=True) == (by_time, [])
 
 
-def test_dicts_for_caret(tmp_path: Path) -> None:
+def test_dicts_for_caret(tmp_path):
     path = tmp_path / 'a.mcap'
     with TraceFile(path) as file:
         file.add('callback_end', 20, 1, 2, 77)
@@ -71,7 +70,7 @@ def test_dicts_for_caret(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('seeking', [True, False])
-def test_mcap_reads_it(tmp_path: Path, seeking: bool) -> None:
+def test_mcap_reads_it(tmp_path, seeking):
     path = tmp_path / 'a.mcap'
     recorded = mixture(200)
     write_chunks(path, [recorded[:50], recorded[50:]])
@@ -95,7 +94,7 @@ def test_mcap_reads_it(tmp_path: Path, seeking: bool) -> None:
     assert found == read_back(recorded)
 
 
-def test_mcap_agrees_with_the_summary(tmp_path: Path) -> None:
+def test_mcap_agrees_with_the_summary(tmp_path):
     path = tmp_path / 'a.mcap'
     recorded = mixture(300)
     recorded[0], recorded[99] = recorded[99], recorded[0]       # out of order within a chunk
@@ -125,7 +124,7 @@ def test_mcap_agrees_with_the_summary(tmp_path: Path) -> None:
                 2, 'little')
 
 
-def test_rosbags_reads_it(tmp_path: Path) -> None:
+def test_rosbags_reads_it(tmp_path):
     path = tmp_path / 'a.mcap'
     recorded = mixture(200)
     write_chunks(path, [recorded[:50], recorded[50:]])
@@ -142,7 +141,7 @@ def test_rosbags_reads_it(tmp_path: Path) -> None:
     assert found == read_back(recorded)
 
 
-def test_events_beyond_the_table(tmp_path: Path) -> None:
+def test_events_beyond_the_table(tmp_path):
     path = tmp_path / 'a.mcap'
     extra = [
         # as CARET records a tracepoint of ros2 again, with one field more
@@ -175,7 +174,7 @@ def test_events_beyond_the_table(tmp_path: Path) -> None:
             'mddag_trace/msg/RmwPublisherInit', 'mddag_trace/msg/RclPublish'}
 
 
-def test_add_refuses_what_it_cannot_write(tmp_path: Path) -> None:
+def test_add_refuses_what_it_cannot_write(tmp_path):
     path = tmp_path / 'a.mcap'
     with TraceFile(path) as file:
         file.add('callback_end', 1, 2, 3, 4)
@@ -191,7 +190,7 @@ def test_add_refuses_what_it_cannot_write(tmp_path: Path) -> None:
     assert [event[1] for event in events] == [1, 2] and not warnings
 
 
-def test_an_empty_trace(tmp_path: Path) -> None:
+def test_an_empty_trace(tmp_path):
     path = tmp_path / 'a.mcap'
     with TraceFile(path):
         pass
@@ -201,7 +200,7 @@ def test_an_empty_trace(tmp_path: Path) -> None:
         assert list(make_reader(stream, validate_crcs=True).iter_messages()) == []
 
 
-def test_a_block_left_by_an_exception_gives_the_file_up(tmp_path: Path) -> None:
+def test_a_block_left_by_an_exception_gives_the_file_up(tmp_path):
     path = tmp_path / 'a.mcap'
     with pytest.raises(KeyError), TraceFile(path) as file:
         file.add('callback_end', 1, 2, 3, 4)
@@ -212,7 +211,7 @@ def test_a_block_left_by_an_exception_gives_the_file_up(tmp_path: Path) -> None:
     assert len(warnings) == 1 and 'without a finish record' in warnings[0]
 
 
-def test_optional_fields_of_older_files(tmp_path: Path) -> None:
+def test_optional_fields_of_older_files(tmp_path):
     """What versions before 1.1 wrote of a completion is read with the fields that came later."""
     path = tmp_path / 'a.mcap'
     now = EVENTS['mddag:complete']
@@ -274,7 +273,7 @@ def test_a_file_is_the_same_either_way(tmp_path_factory, entries, flush_at):
 @pytest.mark.parametrize('bad', [
     (EXECUTION, START, 1), (PUBLICATION, START, 1, 'text', 2), (PUBLICATION,),
     (EXECUTION, START, 1, -1, 0, 0, 0, 0, 0, 0, 0, 0, True, 0, 0, False)])
-def test_a_bad_entry_costs_its_events_only(tmp_path: Path, bad) -> None:
+def test_a_bad_entry_costs_its_events_only(tmp_path, bad):
     path = tmp_path / 'a.mcap'
     with TraceWriter(path, flush_interval_s=0.01) as writer:
         writer.record('callback_end', START, 1, 7)
@@ -299,7 +298,7 @@ def messages(draw: Any) -> tuple[list[str], list[Any]]:
 
 @settings(max_examples=300, deadline=None)
 @given(messages())
-def test_any_flat_message_is_as_rosbags_encodes_it(message: tuple[list[str], list[Any]]) -> None:
+def test_any_flat_message_is_as_rosbags_encodes_it(message):
     names, fields = message
     types = [FieldType.parse(name) for name in names]
     data = cdr.ENCAPSULATION + cdr.encode(types, fields)
@@ -319,7 +318,7 @@ def test_any_flat_message_is_as_rosbags_encodes_it(message: tuple[list[str], lis
     assert not any(their_data[len(data):])
 
 
-def test_text_without_a_valid_encoding_does_not_fail() -> None:
+def test_text_without_a_valid_encoding_does_not_fail():
     types = [FieldType('string')]
     assert cdr.decode(types, cdr.encode(types, ('a\udc80',))) == ('a\\udc80',)
     assert cdr.decode(types, b'\x03\0\0\0\xff\xfe\0') == ('\\xff\\xfe',)
@@ -334,12 +333,12 @@ def test_text_without_a_valid_encoding_does_not_fail() -> None:
     ('string[]', b'\xff\xff\xff\xff' + bytes(60)),
     ('float64[100000000000]', bytes(64)),
 ])
-def test_lengths_beyond_the_data_are_refused(kind: str, data: bytes) -> None:
+def test_lengths_beyond_the_data_are_refused(kind, data):
     with pytest.raises((ValueError, struct.error)):
         cdr.decode([FieldType.parse(kind)], data)
 
 
-def test_ros2msg() -> None:
+def test_ros2msg():
     text = ('# a comment\nint32 LEVEL=5\nstring NAME = "a # b"\n\nuint8[<=4] few   # bounded\n'
             'string<=10 name "x"\nfloat64[2] pair [0.0, 1.0]\n' + '=' * 80
             + '\nMSG: other/Type\nint32 x\n')
@@ -352,7 +351,7 @@ def test_ros2msg() -> None:
             cdr.parse_ros2msg(bad)
 
 
-def test_values_that_do_not_fit_are_refused() -> None:
+def test_values_that_do_not_fit_are_refused():
     for kind, value in (('uint64', -1), ('int32', 2**31), ('int64', 'x'), ('string', 5),
                         ('uint8[2]', (1,)), ('int32', None)):
         with pytest.raises((ValueError, TypeError, AttributeError, struct.error)):

@@ -30,7 +30,7 @@ def wait_for_file(path: Path, size: int) -> None:
         time.sleep(0.005)
 
 
-def test_it_records(tmp_path: Path) -> None:
+def test_it_records(tmp_path):
     path = tmp_path / 'a.mcap'
     recorded = mixture(1000)
     with TraceWriter(path) as writer:
@@ -44,7 +44,7 @@ def test_it_records(tmp_path: Path) -> None:
     assert writer.dropped == 1
 
 
-def test_a_live_trace_is_readable(tmp_path: Path) -> None:
+def test_a_live_trace_is_readable(tmp_path):
     path = tmp_path / 'a.mcap'
     recorded = mixture(100)
     with TraceWriter(path, flush_interval_s=FAST) as writer:
@@ -61,11 +61,11 @@ def test_a_live_trace_is_readable(tmp_path: Path) -> None:
         assert len(warnings) == 1 and 'without a finish record' in warnings[0]
 
 
-def test_every_event_is_in_the_file_or_counted(tmp_path: Path) -> None:
+def test_every_event_is_in_the_file_or_counted(tmp_path):
     path = tmp_path / 'a.mcap'
     writer = TraceWriter(path, capacity=500, flush_interval_s=0.001)
 
-    def run() -> None:
+    def run():
         for number in range(20_000):
             writer.record('callback_end', START + number, 1, number)
 
@@ -82,8 +82,7 @@ def test_every_event_is_in_the_file_or_counted(tmp_path: Path) -> None:
     assert there + lost == 80_000
 
 
-def test_what_cannot_be_written_costs_nothing_else(
-        tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_cannot_be_written_costs_nothing_else(tmp_path, caplog):
     path = tmp_path / 'a.mcap'
     bad: list[tuple[Any, ...]] = [
         ('nonsense', START, 1, 2), ('callback_end', START, 1), ('callback_end', START, 1, -1),
@@ -107,7 +106,7 @@ def test_what_cannot_be_written_costs_nothing_else(
 
 
 @pytest.mark.parametrize('name', ['missing/a.mcap', '.', 'a\0b'])
-def test_a_path_that_cannot_be_written(tmp_path: Path, name: str) -> None:
+def test_a_path_that_cannot_be_written(tmp_path, name):
     with pytest.raises(TraceError, match='cannot be written') as caught:
         TraceWriter(str(tmp_path / name))
     assert '\n' not in str(caught.value)
@@ -115,7 +114,7 @@ def test_a_path_that_cannot_be_written(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.skipif(not os.path.exists('/dev/full'), reason='needs /dev/full')
-def test_a_full_disk_at_the_start() -> None:
+def test_a_full_disk_at_the_start():
     threads = threading.active_count()
     with pytest.raises(TraceError, match='/dev/full: writing failed .*No space left'):
         TraceWriter('/dev/full')
@@ -138,7 +137,7 @@ while True:
 
 
 @pytest.mark.parametrize('seconds', [1.1])
-def test_a_killed_process_loses_at_most_the_last_second(tmp_path: Path, seconds: float) -> None:
+def test_a_killed_process_loses_at_most_the_last_second(tmp_path, seconds):
     path = tmp_path / 'a.mcap'
     with subprocess.Popen([sys.executable, '-c', KILLED, str(path)],
                           stdout=subprocess.PIPE) as child:
@@ -183,7 +182,7 @@ print(number + 10, writer.dropped)
 """
 
 
-def test_a_disk_that_gets_full(tmp_path: Path) -> None:
+def test_a_disk_that_gets_full(tmp_path):
     path = tmp_path / 'a.mcap'
     output = run_child(LIMITED, path).splitlines()
     assert output[0] == (f'{path}: writing failed ({os.strerror(errno.EFBIG)}): what was written '
@@ -221,13 +220,13 @@ writer.close()
 """
 
 
-def test_a_forgotten_writer_completes_its_file_at_exit(tmp_path: Path) -> None:
+def test_a_forgotten_writer_completes_its_file_at_exit(tmp_path):
     run_child(FORGOTTEN, tmp_path / 'a.mcap')
     events, warnings = read(tmp_path / 'a.mcap')
     assert len(events) == 1 and not warnings
 
 
-def test_a_forked_child_leaves_the_file_alone(tmp_path: Path) -> None:
+def test_a_forked_child_leaves_the_file_alone(tmp_path):
     run_child(FORKED, tmp_path / 'a.mcap')
     events, warnings = read(tmp_path / 'a.mcap')
     assert [event[1] for event in events] == [1, 3] and not warnings

@@ -11,7 +11,7 @@ that never ended shows as well: it has only begun.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import json
 import os
 from pathlib import Path
@@ -26,7 +26,7 @@ from mddag_executor.executor.compat import BareTask
 from mddag_executor.executor.due import Muting
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, TASK
-from mddag_executor.executor.jobs import Jobs, Origin, Publication, PublisherState, Topic
+from mddag_executor.executor.jobs import Jobs, Origin
 from mddag_executor.executor.loop import EventLoop
 from mddag_executor.executor.sources import Source
 from mddag_executor.executor.timers import TimerQueue, TimerSource
@@ -44,7 +44,7 @@ silent = threading.local()
 
 
 def mutation(meaning: str) -> Callable[[Callable[[], None]], Callable[[], None]]:
-    def enter(function: Callable[[], None]) -> Callable[[], None]:
+    def enter(function):
         MUTATIONS[function.__name__] = function
         MEANING[function.__name__] = meaning
         return function
@@ -61,8 +61,8 @@ def replace(owner: Any, name: str, make: Callable[[Any], Any]) -> None:
 
 @mutation('Callbacks of one mutually exclusive group run at once.')
 def groups_ignored() -> None:
-    def make(init: Any) -> Any:
-        def broken(self: Entity, *args: Any) -> None:
+    def make(init):
+        def broken(self, *args):
             init(self, *args)
             self.group = -1
         return broken
@@ -76,8 +76,8 @@ def rad_is_fifo() -> None:
 
 @mutation("All messages wait that come, however many the queue's depth allows.")
 def depth_not_kept() -> None:
-    def make(message: Any) -> Any:
-        def broken(self: Engine, work: Work, *args: Any) -> None:
+    def make(message):
+        def broken(self, work, *args):
             work.entity.depth = 0
             message(self, work, *args)
         return broken
@@ -89,8 +89,8 @@ def depth_not_kept() -> None:
 def every_twentieth_lost() -> None:
     seen: Counter[str] = Counter()
 
-    def make(step: Any) -> Any:
-        def broken(self: Work, *args: Any) -> Any:
+    def make(step):
+        def broken(self, *args):
             if self.coroutine is None:
                 seen[self.entity.kind] += 1
                 if seen[self.entity.kind] % 20 == 0:
@@ -105,8 +105,8 @@ def every_twentieth_lost() -> None:
 def every_twentieth_response_lost() -> None:
     count = 0
 
-    def make(complete: Any) -> Any:
-        def broken(*args: Any) -> None:
+    def make(complete):
+        def broken(*args):
             nonlocal count
             count += 1
             if count % 20:
@@ -117,8 +117,8 @@ def every_twentieth_response_lost() -> None:
 
 @mutation('What was left in the middleware since enough waits is never collected.')
 def rest_not_collected() -> None:
-    def make(collect: Any) -> Any:
-        def broken(self: Source, left: int = 0) -> None:
+    def make(collect):
+        def broken(self, left=0):
             collect(self, left)
             self.entity.collect_more = None
         return broken
@@ -142,8 +142,8 @@ def resets_of_timers_not_noticed() -> None:
 
 @mutation('While one worker runs something, no other one waits for what arrives.')
 def one_worker_at_a_time() -> None:
-    def make(admit: Any) -> Any:
-        def broken(self: WorkerPool) -> None:
+    def make(admit):
+        def broken(self):
             if len(self._parked) == len(self._threads) or self._closed:
                 admit(self)
         return broken
@@ -175,8 +175,8 @@ def coroutines_not_resumed() -> None:
 
 @mutation("A coroutine never goes on that yields without awaiting one of rclpy's futures.")
 def unknown_waits_not_resumed() -> None:
-    def mutant(settle: Any) -> Any:
-        def settle_end(self: WorkerPool, work: Any, outcome: Any) -> None:
+    def mutant(settle):
+        def settle_end(self, work, outcome):
             if isinstance(outcome, (type(None), BaseException, Future)):
                 settle(self, work, outcome)
 
@@ -192,15 +192,15 @@ def tasks_go_on_by_themselves() -> None:
 
 @mutation('What a callback raises does not come out of spin.')
 def exceptions_swallowed() -> None:
-    def broken(self: Any, error: BaseException) -> None:
+    def broken(self, error):
         self._at_once.ring()
     executor.MultiDeadlineExecutor._fail = broken  # type: ignore[method-assign]
 
 
 @mutation('What fails while something is taken does not come out of spin.')
 def exceptions_of_takes_swallowed() -> None:
-    def make(init: Any) -> Any:
-        def broken(self: Any, *args: Any) -> None:
+    def make(init):
+        def broken(self, *args):
             init(self, *args[:-1], lambda error: None)
         return broken
     for kind in (Source, WaitableSource, WaitSetThread):
@@ -209,8 +209,8 @@ def exceptions_of_takes_swallowed() -> None:
 
 @mutation('A task of a spinning executor is there, and no thread notices.')
 def create_task_does_not_wake_workers() -> None:
-    def make(report: Any) -> Any:
-        def broken(self: WorkerPool, event: Any, *args: Any) -> None:
+    def make(report):
+        def broken(self, event, *args):
             if event == self.engine.ready and args[0].entity.kind == TASK:
                 with self.lock:
                     event(*args, self.tick())
@@ -231,11 +231,11 @@ def add_node_does_not_wake() -> None:
 
 
 def _wakes_no_thread(owner: Any, name: str) -> None:
-    def make_deaf(wake: Any) -> Any:
+    def make_deaf(wake):
         return lambda self: None if getattr(silent, 'on', False) else wake(self)
 
-    def make(method: Any) -> Any:
-        def broken(*args: Any, **kwargs: Any) -> Any:
+    def make(method):
+        def broken(*args, **kwargs):
             before, silent.on = getattr(silent, 'on', False), True
             try:
                 return method(*args, **kwargs)
@@ -248,7 +248,7 @@ def _wakes_no_thread(owner: Any, name: str) -> None:
 
 @mutation('A shutdown ends no worker thread, and says that it has.')
 def shutdown_leaves_workers() -> None:
-    def broken(self: WorkerPool, timeout: float | None) -> bool:
+    def broken(self, timeout):
         self.pause()
         return True
     WorkerPool.close = broken  # type: ignore[method-assign]
@@ -264,8 +264,8 @@ def shutdown_leaves_wait_set() -> None:
 
 @mutation("A job's release is when its timer was looked at, and not when it was due.")
 def release_is_when_noticed() -> None:
-    def make(fire: Any) -> Any:
-        def broken(self: TimerQueue) -> Any:
+    def make(fire):
+        def broken(self):
             for work, _, *missed in fire(self):
                 yield work, time.monotonic_ns(), *missed
         return broken
@@ -274,8 +274,8 @@ def release_is_when_noticed() -> None:
 
 @mutation('A message belongs to the oldest open job that still waits for one like it.')
 def messages_go_to_the_oldest_job() -> None:
-    def make(start: Any) -> Any:
-        def broken(self: Engine, work: Work, origin: Origin, now: int) -> Any:
+    def make(start):
+        def broken(self, work, origin, now):
             target = work.entity.targets.get(origin.vertex)
             state = self.scheduler.state
             waits = []
@@ -294,25 +294,21 @@ def messages_go_to_the_oldest_job() -> None:
 
 @mutation('A message belongs to the job before that of its publication.')
 def messages_go_to_the_job_before() -> None:
-    def make(publish: Any) -> Any:
+    def make(publish):
         before: dict[str, Origin] = {}
 
-        def broken(
-            self: Jobs, send: Any, publisher: Any, msg: Any, state: PublisherState, topic: Topic,
-            origin: Origin,
-        ) -> Publication:
+        def broken(self, send, publisher, msg, state, topic, origin):
             origin, before[state.topic] = before.get(state.topic, origin), origin
-            publication: Publication = publish(
+            return publish(
                 self, send, publisher, msg, state, topic, origin)
-            return publication
         return broken
     replace(Jobs, 'publish', make)
 
 
 @mutation('A sink that completes after its deadline counts as completed only.')
 def late_sinks_counted_in_time() -> None:
-    def make(done: Any) -> Any:
-        def broken(self: tally.SinkTally, response: int, late: bool) -> None:
+    def make(done):
+        def broken(self, response, late):
             done(self, response, False)
         return broken
     replace(tally.SinkTally, 'done', make)
@@ -320,8 +316,8 @@ def late_sinks_counted_in_time() -> None:
 
 @mutation('A job of which a sink was late counts as one that completed in time.')
 def late_jobs_counted_in_time() -> None:
-    def make(add: Any) -> Any:
-        def broken(self: tally.Tally, decisions: Any) -> None:
+    def make(add):
+        def broken(self, decisions):
             add(self, [
                 (kind, dag, vertex, job, COMPLETED if kind == JOB_END and end == LATE else end,
                  when) for kind, dag, vertex, job, end, when in decisions])
@@ -349,7 +345,7 @@ def pytest_runtest_logstart(nodeid: str) -> None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: Any) -> Iterator[Any]:
+def pytest_runtest_makereport(item, call):
     phase = yield
     if phase.failed or phase.when == 'call':
         note(test=item.nodeid, when=phase.when, outcome=outcome_of(phase, call),

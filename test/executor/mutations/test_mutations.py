@@ -184,9 +184,7 @@ def result(report: Path, output: str) -> Result:
 
 
 @pytest.fixture(scope='module')
-def results(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Result]:
+def results(request, tmp_path_factory):
     """Give the results of all cases that were asked for."""
     cases = [item.callspec.params['case'] for item in request.session.items
              if item.path == Path(__file__) and hasattr(item, 'callspec')]
@@ -197,16 +195,14 @@ def results(
         return dict(zip((case.mutation for case in cases), found))
 
 
-def test_all_of_them_pass_while_nothing_is_broken(tmp_path: Path) -> None:
+def test_all_of_them_pass_while_nothing_is_broken(tmp_path):
     tests = list(dict.fromkeys(test for case in CASES for test in case.tests))
     result = run(tmp_path, '', tests)
     assert result.of('passed') == set(result.tests) == set(tests), result.output
 
 
 @pytest.mark.parametrize('case', CASES, ids=lambda case: case.mutation)
-def test_a_broken_executor_is_noticed(
-    case: Case, results: dict[str, Result]
-) -> None:
+def test_a_broken_executor_is_noticed(case, results):
     result = results[case.mutation]
     noticed = result.of('assertion') if case.at_once else result.of('assertion', 'error')
     hung = result.of('hung')

@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 import time
-from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -20,7 +19,7 @@ def _relay(name: str, topic: str, *publishes: str, takes: float = 0.0) -> Node:
     node = Node(name, start_parameter_services=False, enable_rosout=False)
     publishers = [node.create_publisher(Header, t, 50) for t in publishes]
 
-    def on_message(message: Any) -> None:
+    def on_message(message):
         time.sleep(takes)
         for publisher in publishers:
             publisher.publish(Header(stamp=message.stamp, frame_id=name))
@@ -36,7 +35,7 @@ def sensor() -> Node:
     publisher = node.create_publisher(Header, '/raw', 50)
     wanted = int(os.environ.get('RELAY_SUBSCRIBERS', '1'))
 
-    def tick() -> None:
+    def tick():
         if publisher.get_subscription_count() >= wanted:
             publisher.publish(Header(stamp=node.get_clock().now().to_msg()))
 
@@ -59,7 +58,7 @@ def last() -> list[Node]:
     node = _relay('last', '/whole', takes=float(os.environ.get('RELAY_TAKES', '0')))
     counts = [0]
 
-    def on_message(message: Any) -> None:
+    def on_message(message):
         counts[0] += 1
         if counts[0] == ENOUGH:
             Path(os.environ['RELAY_MARK']).touch()
