@@ -51,7 +51,6 @@ test: env
 
 # The tests that run ROS, in an environment with ROS 2 Kilted instead of Jazzy.
 LIVE_TESTS := test/executor test/hosting test/rerun test/examples test/hardening/test_misuse.py \
-	test/replay/test_live_replay.py \
 	$(addprefix test/cli/test_,$(addsuffix .py,demo graph_systems rerun run top))
 
 # With another rclpy than the index has: RCLPY is a folder with its package rclpy/, the extension

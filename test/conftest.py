@@ -139,7 +139,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 ROS = (
     'executor', 'hosting', 'benchmarks', 'launch', 'examples', 'hardening/test_misuse.py',
     'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph_systems.py',
-    'replay/test_live_replay.py', 'test_docs.py')
+    'test_docs.py')
 
 # One process compiles the core, which takes half a minute the first time.
 COMPILE = ('simulate/test_compiled.py', 'laboratory/test_evaluate.py')

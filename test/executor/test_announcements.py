@@ -4,13 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.executor import current_job
 from mddag_executor.executor.jobs import (
     Announced,
     Jobs,
@@ -23,9 +21,10 @@ from mddag_executor.executor.jobs import (
 import msg_graph
 from msg_graph import loads
 import pytest
-from std_msgs.msg import Int64, UInt8MultiArray
+from std_msgs.msg import Header, UInt8MultiArray
 
 from .conftest import is_idle, Spinning, wait_for
+from .declared import Declared
 
 PERIOD_NS = 20_000_000
 JOBS = 30
@@ -35,9 +34,9 @@ nodes:
   - node: /one
     callbacks: [{name: tick, timer: 20ms, publishes: [/left, /right], dag: main}]
   - node: /two
-    callbacks: [{name: relay, subscription: /left, publishes: [/join_left]}]
+    callbacks: [{name: two, subscription: /left, publishes: [/join_left]}]
   - node: /three
-    callbacks: [{name: relay, subscription: /right, publishes: [/join_right]}]
+    callbacks: [{name: three, subscription: /right, publishes: [/join_right]}]
   - node: /four
     callbacks:
       - {name: take, subscription: /join_left, publishes: [/end]}
@@ -45,54 +44,16 @@ nodes:
   - node: /five
     callbacks: [{name: sink, subscription: /end, deadline: 60s}]
 """
-EDGES = [('two', '/left', '/join_left'), ('three', '/right', '/join_right'),
-         ('four', '/join_left', '/end'), ('four', '/join_right', '/end'), ('five', '/end', None)]
-
-
-class Nodes:
-    """The nodes of GRAPH; each passes on a number, and notes it with the job it ran as."""
-
-    def __init__(self, make_node: Any) -> None:
-        self.nodes = {name: make_node(name) for name in ('one', 'two', 'three', 'four', 'five')}
-        self.ran: dict[str, list[tuple[int, Any]]] = {}
-        self.sent = 0
-        one = self.nodes['one']
-        self.sources = [one.create_publisher(Int64, topic, 100) for topic in ('/left', '/right')]
-        self.publishers = list(self.sources)
-        for name, topic, to in EDGES:
-            publisher = self.nodes[name].create_publisher(Int64, to, 100) if to else None
-            self.nodes[name].create_subscription(
-                Int64, topic, self._relay(f'{name} {topic}', publisher), 100)
-            if publisher is not None:
-                self.publishers.append(publisher)
-        self.timer = one.create_timer(PERIOD_NS / 1e9, self._tick, autostart=False)
-
-    def _tick(self) -> None:
-        if self.sent < JOBS:
-            self.sent += 1
-            self.ran.setdefault('one', []).append((self.sent, current_job()))
-            for publisher in self.sources:
-                publisher.publish(Int64(data=self.sent))
-
-    def _relay(self, name: str, publisher: Any) -> Callable[[Any], None]:
-        def relay(message):
-            self.ran.setdefault(name, []).append((message.data, current_job()))
-            if publisher is not None:
-                publisher.publish(Int64(data=message.data))
-        return relay
-
-    def connected(self) -> bool:
-        return all(p.get_subscription_count() for p in self.publishers)
 
 
 def split(
     make_executor: Any, make_node: Any, **processes: str
-) -> tuple[Nodes, dict[str, Any]]:
-    """Run JOBS jobs over several executors; return the nodes, and the executors by process."""
+) -> tuple[Declared, dict[str, Any]]:
+    """Run JOBS jobs or more over several executors; return nodes and executors by process."""
     text = GRAPH + 'processes:\n' + ''.join(
         f'  {name}: [{", ".join("/" + node for node in nodes.split())}]\n'
         for name, nodes in processes.items())
-    nodes = Nodes(make_node)
+    nodes = Declared(make_node, GRAPH, reentrant=False)
     executors = {name: make_executor(loads(text), process=name) for name in processes}
     for name, here in processes.items():
         for node in here.split():
@@ -100,15 +61,13 @@ def split(
     with ExitStack() as stack:
         for executor in executors.values():
             stack.enter_context(Spinning(executor))
-        assert wait_for(nodes.connected)
-        assert wait_for(lambda: not any(e.unmatched() for e in executors.values()))
-        nodes.timer.reset()
-        executors[next(iter(processes))].wake()
-        for each in executors.values():
-            each.wake()
-        assert wait_for(lambda: len(nodes.ran.get('five /end', ())) >= 2 * JOBS)
-        nodes.timer.cancel()
-        assert wait_for(lambda: all(map(is_idle, executors.values())))
+        assert wait_for(lambda: nodes.connected()
+                        and not any(e.unmatched() for e in executors.values()))
+        nodes.start(*executors.values())
+        assert wait_for(lambda: len(nodes.ran['sink']) >= 2 * JOBS)
+        nodes.cancel()
+        assert wait_for(lambda: len(nodes.ran['sink']) == 2 * len(nodes.ran['tick'])
+                        and all(map(is_idle, executors.values())))
     return nodes, executors
 
 
@@ -118,27 +77,25 @@ def split(
 ])
 def test_every_job_is_found_by_its_number(make_executor, make_node, processes):
     nodes, executors = split(make_executor, make_node, **processes)
-    releases = {number: job.release_ns for number, job in nodes.ran['one']}
-    assert sorted(releases) == list(range(1, JOBS + 1))
+    releases = {number: job.release_ns for number, job in nodes.jobs_of_numbers('tick').items()}
     for name, ran in nodes.ran.items():
-        for number, job in ran:
-            assert job is not None, (name, number)
+        for each in ran:
+            assert each.job is not None, (name, each)
             # each process has a trace clock of its own
-            assert abs(job.release_ns - releases[number]) < PERIOD_NS / 2, (name, number)
+            assert abs(each.job.release_ns - releases[each.number]) < PERIOD_NS / 2, (name, each)
     for executor in executors.values():
         statistics = executor.statistics()
         assert statistics['undeclared'] == 0
         assert statistics['unattributed'] == {'unknown': 0, 'doubtful': 0}
     last = executors[list(processes)[-1]].statistics()['dags']['main']
-    assert sum(sink['completed'] for sink in last['sinks'].values()) == 2 * JOBS
+    assert sum(sink['completed'] for sink in last['sinks'].values()) == 2 * len(releases)
 
 
 def test_messages_without_announcement_wait_for_a_while_and_are_counted(make_executor, make_node):
     text = GRAPH + 'processes: {p1: [/one], p2: [/two, /three, /four, /five]}'
-    nodes = Nodes(make_node)
-    executor = make_executor(loads(text), process='p2')
-    executor.add_node(nodes.nodes['two'])
-    stranger = make_node('stranger').create_publisher(Int64, '/left', 10)
+    nodes = Declared(make_node, GRAPH)
+    executor = make_executor(loads(text), process='p2', nodes=[nodes.nodes['two']])
+    stranger = make_node('stranger').create_publisher(Header, '/left', 10)
     noise = make_node('noise').create_publisher(
         UInt8MultiArray, executor._announcements.subscriptions[0].topic_name, 10)
     with Spinning(executor):
@@ -146,11 +103,11 @@ def test_messages_without_announcement_wait_for_a_while_and_are_counted(make_exe
         assert wait_for(lambda: noise.get_subscription_count() == 1)
         for rubbish in (b'', b'x' * 3, b'\xff' * 80, b'\0' * 80):
             noise.publish(UInt8MultiArray(data=rubbish))
-        stranger.publish(Int64(data=1))
-        assert wait_for(lambda: len(nodes.ran.get('two /left', ())) == 1)
-    assert nodes.ran['two /left'] == [(1, None)]
+        stranger.publish(Header(frame_id='1'))
+        assert wait_for(lambda: nodes.ran['two'])
+    assert nodes.jobs_of_numbers('two') == {1: None}
     statistics = executor.statistics()
-    assert statistics['callbacks']['/two:relay']['unattributed'] == 1
+    assert statistics['callbacks']['/two:two']['unattributed'] == 1
     assert statistics['unattributed']['unknown'] == 1
 
 
@@ -158,16 +115,15 @@ def test_what_several_processes_publish_on_one_topic_is_a_doubt(make_executor, m
     text = GRAPH.replace('publishes: [/join_right]', 'publishes: [/join_left]').replace(
         '      - {name: take_too, subscription: /join_right, publishes: [/end]}\n', '')
     text += 'processes: {p1: [/one, /two], p2: [/three, /four, /five]}'
-    nodes = Nodes(make_node)
-    executor = make_executor(loads(text), process='p2')
-    for name in ('three', 'four', 'five'):
-        executor.add_node(nodes.nodes[name])
-    publisher = make_node('p').create_publisher(Int64, '/join_left', 10)
+    nodes = Declared(make_node, text)
+    executor = make_executor(
+        loads(text), process='p2', nodes=[nodes.nodes[name] for name in ('three', 'four', 'five')])
+    publisher = make_node('p').create_publisher(Header, '/join_left', 10)
     with Spinning(executor):
         assert wait_for(lambda: publisher.get_subscription_count() == 1)
-        publisher.publish(Int64(data=1))
-        assert wait_for(lambda: len(nodes.ran.get('four /join_left', ())) == 1)
-    assert nodes.ran['four /join_left'] == [(1, None)]
+        publisher.publish(Header(frame_id='1'))
+        assert wait_for(lambda: nodes.ran['take'])
+    assert nodes.jobs_of_numbers('take') == {1: None}
     assert executor.statistics()['unattributed'] == {'unknown': 0, 'doubtful': 1}
 
 

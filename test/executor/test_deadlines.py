@@ -11,7 +11,6 @@ import threading
 import time
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from mddag_executor import DeadlineMiss
 from mddag_executor.executor import current_job
 from mddag_executor.executor.work import Work
@@ -21,6 +20,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 
 from .conftest import is_idle, Spinning, wait_for
+from .declared import Declared
 
 CHAIN = """
 mddag: 1
@@ -36,49 +36,6 @@ nodes:
 """
 
 
-class Chain:
-    """CHAIN's nodes; bodies may be replaced; keeps the jobs, and those not of the message."""
-
-    def __init__(self, make_node: Any, bodies: dict[str, Any] | None = None) -> None:
-        bodies = bodies or {}
-        self.jobs: dict[str, list[Any]] = {n: [] for n in ('tick', 'relay', 'early', 'last')}
-        self.wrong: list[Any] = []
-        self.group = ReentrantCallbackGroup()
-        self.nodes = {n: make_node(n) for n in ('source', 'middle', 'sink')}
-        self.a = self.nodes['source'].create_publisher(Header, '/a', 10)
-        self.b = self.nodes['middle'].create_publisher(Header, '/b', 10)
-
-        def body(name, publisher=None):
-            def run(message=None):
-                job = current_job()
-                self.jobs[name].append(job)
-                if message is None:
-                    message = Header(stamp=Time(sec=job.job))
-                elif job is not None and job.job != message.stamp.sec:
-                    self.wrong.append((name, job, message))
-                bodies.get(name, lambda: None)()
-                if publisher is not None:
-                    publisher.publish(message)
-            return run
-        self.timer = self.nodes['source'].create_timer(
-            0.02, body('tick', self.a), self.group, autostart=False)
-        for node, name, topic, publisher in (
-            ('middle', 'relay', '/a', self.b), ('middle', 'early', '/a', None),
-            ('sink', 'last', '/b', None),
-        ):
-            self.nodes[node].create_subscription(
-                Header, topic, body(name, publisher), 10, callback_group=self.group)
-
-    def start(self, executor: Any) -> None:
-        """Add the nodes; start when all are connected."""
-        for node in self.nodes.values():
-            executor.add_node(node)
-        assert wait_for(lambda: self.a.get_subscription_count() == 2
-                        and self.b.get_subscription_count() == 1)
-        self.timer.reset()
-        executor.wake()
-
-
 def sinks(executor: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for dag in executor.statistics()['dags'].values():
@@ -87,21 +44,20 @@ def sinks(executor: Any) -> dict[str, Any]:
 
 
 def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executor, make_node):
-    chain = Chain(make_node)
+    chain = Declared(make_node, CHAIN)
     executor = make_executor(loads(CHAIN))
     with Spinning(executor):
         chain.start(executor)
-        assert wait_for(lambda: len(chain.jobs['last']) >= 20)
-        chain.timer.cancel()
-        assert wait_for(lambda: len(chain.jobs['last']) == len(chain.jobs['tick']))
+        assert wait_for(lambda: len(chain.ran['last']) >= 20)
+        chain.cancel()
+        assert wait_for(lambda: len(chain.ran['last']) == len(chain.ran['tick']))
     # They may overlap, so the lists need not be in their order.
-    ran = sorted(j.job for j in chain.jobs['tick'])
+    jobs = chain.jobs_of_numbers('tick')
+    assert all(chain.jobs_of_numbers(name) == jobs for name in chain.ran)
+    assert {job.dag for job in jobs.values()} == {'chain'}
+    ran = sorted(job.job for job in jobs.values())
     count = len(ran)
-    assert chain.wrong == []
-    for jobs in chain.jobs.values():
-        assert sorted(j.job for j in jobs) == ran
-        assert {j.dag for j in jobs} == {'chain'}
-    releases = sorted((j.release_ns, j.job) for j in chain.jobs['last'])
+    releases = sorted((job.release_ns, job.job) for job in jobs.values())
     assert all(after - before == (job - job_before) * 20_000_000 for (before, job_before),
                (after, job) in zip(releases[1:], releases[2:]))  # the first was due earlier
     statistics = executor.statistics()
@@ -116,37 +72,33 @@ def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executo
 
 def test_jobs_that_overlap_and_overtake_are_told_apart(make_executor, make_node):
     """Odd jobs' relays take longer than a period, so messages on /b are out of order."""
-    def dawdle():
-        job = current_job()
-        assert job is not None
-        time.sleep(0.045 if job.job % 2 else 0.001)
-
-    chain = Chain(make_node, {'relay': dawdle})
+    chain = Declared(make_node, CHAIN, {
+        'relay': lambda: time.sleep(0.045 if current_job().job % 2 else 0.001)})
     executor = make_executor(loads(CHAIN))
     with Spinning(executor):
         chain.start(executor)
-        assert wait_for(lambda: len(chain.jobs['last']) >= 20)
-        chain.timer.cancel()
-        assert wait_for(lambda: len(chain.jobs['last']) == len(chain.jobs['tick']))
-    order = [j.job for j in chain.jobs['last']]
-    assert order != sorted(order) and sorted(order) == [j.job for j in chain.jobs['tick']]
-    assert chain.wrong == []
+        assert wait_for(lambda: len(chain.ran['last']) >= 20)
+        chain.cancel()
+        assert wait_for(lambda: len(chain.ran['last']) == len(chain.ran['tick']))
+    order = [each.number for each in chain.ran['last']]
+    assert order != sorted(order)
+    assert all(chain.jobs_of_numbers(name) == chain.jobs_of_numbers('tick') for name in chain.ran)
     assert sinks(executor)['/sink:last']['completed'] == len(order)
 
 
 def test_unequal_deadlines_are_judged_apart_and_misses_are_told(make_executor, make_node):
     misses: list[DeadlineMiss] = []
-    chain = Chain(make_node, {'early': lambda: time.sleep(0.015)})
+    chain = Declared(make_node, CHAIN, {'early': lambda: time.sleep(0.015)})
     graph = CHAIN.replace('50ms', '60s')
     executor = make_executor(loads(graph), on_deadline_miss=misses.append)
     with Spinning(executor):
         chain.start(executor)
         assert wait_for(lambda: len(misses) >= 5)
-        chain.timer.cancel()
-        assert wait_for(lambda: len(chain.jobs['last']) == len(chain.jobs['tick'])
+        chain.cancel()
+        assert wait_for(lambda: len(chain.ran['last']) == len(chain.ran['tick'])
                         and is_idle(executor))
     found = sinks(executor)
-    ran = {job.job for job in chain.jobs['early']}  # a busy machine skips periods, too
+    ran = {job.job for job in chain.jobs('early')}  # a busy machine skips periods, too
     assert found['/middle:early']['late'] == found['/middle:early']['completed'] == len(ran)
     assert found['/sink:last']['late'] == 0
     assert executor.statistics()['dags']['chain']['ends']['late'] == len(ran)
@@ -212,7 +164,7 @@ TWO_TO_ONE = """
 mddag: 1
 nodes:
   - node: /left
-    callbacks: [{name: tick, timer: 20ms, publishes: [/a, /left], dag: fork}]
+    callbacks: [{name: fork, timer: 20ms, publishes: [/a, /left], dag: fork}]
   - node: /worker
     callbacks:
       - {name: one, subscription: /left, publishes: [/x]}
@@ -222,61 +174,30 @@ nodes:
       - {name: both, sync: [/x, /y], deadline: 50ms}
       - {name: any, subscription: /a, deadline: 50ms}
   - node: /right
-    callbacks: [{name: tick, timer: 30ms, publishes: [/a], dag: other}]
+    callbacks: [{name: other, timer: 30ms, publishes: [/a], dag: other}]
 """
 
 
 def test_sync_completes_with_the_last_leg_and_or_tells_publishers_apart(make_executor, make_node):
-    group = ReentrantCallbackGroup()
-    left, worker, join, right = (make_node(n) for n in ('left', 'worker', 'join', 'right'))
-    legs: list[Any] = []
-    anys: list[Any] = []
-    a1, fork = (left.create_publisher(Header, t, 10) for t in ('/a', '/left'))
-    a2 = right.create_publisher(Header, '/a', 10)
-    x, y = (worker.create_publisher(Header, t, 10) for t in ('/x', '/y'))
-
-    def tick():
-        a1.publish(Header())
-        fork.publish(Header())
-
-    timers = [left.create_timer(0.02, tick, group, autostart=False),
-              right.create_timer(0.03, lambda: a2.publish(Header()), group, autostart=False)]
-    worker.create_subscription(
-        Header, '/left', lambda m: x.publish(Header()), 10, callback_group=group)
-    worker.create_subscription(
-        Header, '/left', lambda m: (time.sleep(0.005), y.publish(Header())), 10,
-        callback_group=group)
-    for topic in ('/x', '/y'):
-        join.create_subscription(
-            Header, topic, lambda m, t=topic: legs.append((current_job().job, t)), 10,
-            callback_group=group)
-    join.create_subscription(
-        Header, '/a', lambda m: anys.append((current_job().dag, current_job().job)), 10,
-        callback_group=group)
+    nodes = Declared(make_node, TWO_TO_ONE, {'two': lambda: time.sleep(0.005)})
     executor = make_executor(loads(TWO_TO_ONE))
+    legs, anys = nodes.ran['both'], nodes.ran['any']
     with Spinning(executor):
-        for node in (left, worker, join, right):
-            executor.add_node(node)
-        assert wait_for(lambda: a1.get_subscription_count() == a2.get_subscription_count() == 1
-                        and fork.get_subscription_count() == 2
-                        and x.get_subscription_count() == y.get_subscription_count() == 1)
-        for timer in timers:
-            timer.reset()
-        executor.wake()
+        nodes.start(executor)
         assert wait_for(lambda: len(legs) >= 20 and len(anys) >= 20)
-        for timer in timers:
-            timer.cancel()
-        assert wait_for(lambda: len(legs) == 2 * len({job for job, _ in legs})
-                        and is_idle(executor))
+        nodes.cancel()
+        assert wait_for(lambda: len(legs) == 2 * len(nodes.ran['fork']) and is_idle(executor))
     statistics = executor.statistics()
     # Where the machine is slow, periods are missed: those jobs expire, and nothing of them runs.
     forks, others = (statistics['dags'][n]['jobs'] - statistics['dags'][n]['ends']['expired']
                      for n in ('fork', 'other'))
-    ran = sorted({job for job, _ in legs})
+    ran = sorted(job.job for job in nodes.jobs('fork'))
     assert len(ran) == forks and forks >= 10
-    assert sorted(legs) == sorted((j, t) for j in ran for t in ('/x', '/y'))
-    assert sorted(job for dag, job in anys if dag == 'fork') == ran
-    assert len({job for dag, job in anys if dag == 'other'}) == others == len(anys) - forks
+    assert sorted((each.job.job, each.topic) for each in legs) == sorted(
+        (job, topic) for job in ran for topic in ('/x', '/y'))
+    assert sorted(job.job for job in nodes.jobs('any') if job.dag == 'fork') == ran
+    assert len({job.job for job in nodes.jobs('any') if job.dag == 'other'}) == others
+    assert others == len(anys) - forks
     found = sinks(executor)
     assert found['/join:both']['completed'] == forks
     assert found['/join:both']['response_ns']['min'] >= 5_000_000
@@ -333,14 +254,15 @@ def tick_as_timer(executor: Any, timer: Any, tick: Any) -> None:
 
 def test_a_lost_message_expires_its_job(make_executor, make_node):
     """Nobody runs the relay: its jobs cannot complete, expire, and free their places."""
-    chain = Chain(make_node)
+    chain = Declared(make_node, CHAIN)
     chain.nodes['middle'].destroy_subscription(next(iter(chain.nodes['middle'].subscriptions)))
     executor = make_executor(loads(CHAIN.replace('dag: chain', 'dag: chain, max_active_jobs: 3')))
     with Spinning(executor):
         for node in chain.nodes.values():
             executor.add_node(node)
-        chain.timer.reset()
-        assert wait_for(lambda: len(chain.jobs['tick']) >= 10)
+        for timer in chain.timers:
+            timer.reset()
+        assert wait_for(lambda: len(chain.ran['tick']) >= 10)
     found = sinks(executor)['/sink:last']
     dag = executor.statistics()['dags']['chain']
     assert found['completed'] == 0
@@ -357,7 +279,7 @@ def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, r
         judged.wait(60.0)
         ended.set()
 
-    chain = Chain(make_node, {'early': long})
+    chain = Declared(make_node, CHAIN, {'early': long})
     executor = make_executor(loads(CHAIN))
     with Spinning(executor) as spinning:
         chain.start(executor)

@@ -20,7 +20,8 @@ from msg_graph import loads
 import pytest
 
 from .conftest import Spinning, wait_for
-from .test_deadlines import CHAIN, Chain
+from .declared import Declared
+from .test_deadlines import CHAIN
 
 SECOND = 1_000_000_000
 
@@ -127,7 +128,7 @@ def values(status: Any) -> dict[str, str]:
 def test_statuses_are_published_from_ok_to_stale(make_executor, make_node):
     listener = Listener(make_node, make_executor)
     slow = [0.0]
-    chain = Chain(make_node, {'early': lambda: time.sleep(slow[0])})
+    chain = Declared(make_node, CHAIN, {'early': lambda: time.sleep(slow[0])})
     executor = make_executor(
         loads(CHAIN + ELSEWHERE), diagnostics_period='100ms',
         thresholds=Thresholds(window=2, name='robot'))
@@ -146,9 +147,9 @@ def test_statuses_are_published_from_ok_to_stale(make_executor, make_node):
         assert wait_for(lambda: listener.level('robot: chain') == DiagnosticStatus.ERROR)
         slow[0] = 0.0
         assert wait_for(lambda: listener.level('robot: chain') == DiagnosticStatus.OK)
-        chain.timer.cancel()
+        chain.cancel()
         assert wait_for(lambda: listener.level('robot: chain') == DiagnosticStatus.STALE)
-        chain.timer.reset()
+        chain.timers[0].reset()
         assert wait_for(lambda: listener.level('robot: chain') == DiagnosticStatus.OK)
         assert abs(listener.stamps[-1] - time.time()) < 5
         assert set(executor.get_nodes()) == set(chain.nodes.values())

@@ -14,7 +14,8 @@ from msg_graph import loads
 from std_msgs.msg import Header
 
 from .conftest import Spinning, wait_for
-from .test_deadlines import CHAIN, Chain, sinks
+from .declared import Declared
+from .test_deadlines import CHAIN, sinks
 
 
 class Wrong(Exception):
@@ -61,16 +62,16 @@ def agrees(trace: Path, statistics: dict[str, Any]) -> None:
 
 def test_the_job_of_a_callback_that_raises_has_failed(make_executor, make_node, tmp_path):
     misses: list[DeadlineMiss] = []
-    chain = Chain(make_node, {'relay': odd_jobs_raise})
+    chain = Declared(make_node, CHAIN, {'relay': odd_jobs_raise})
     trace = tmp_path / 'run.mcap'
     graph = CHAIN.replace('50ms', '5s').replace('10ms', '5s')
     executor = make_executor(loads(graph), trace=trace, on_deadline_miss=misses.append)
     chain.start(executor)
-    caught = spin_until(executor, lambda: sum(j.job % 2 for j in chain.jobs['relay']) >= 5)
-    chain.timer.cancel()
-    caught += spin_until(executor, lambda: len(chain.jobs['relay']) == len(chain.jobs['tick'])
-                         == len(chain.jobs['early']) and executor.statistics()['queue'] == 0)
-    ran = [job.job for job in chain.jobs['relay']]
+    caught = spin_until(executor, lambda: sum(j.job % 2 for j in chain.jobs('relay')) >= 5)
+    chain.cancel()
+    caught += spin_until(executor, lambda: len(chain.ran['relay']) == len(chain.ran['tick'])
+                         == len(chain.ran['early']) and executor.statistics()['queue'] == 0)
+    ran = [job.job for job in chain.jobs('relay')]
     odd = sorted(job for job in ran if job % 2)
     assert sorted(caught) == odd
     executor.shutdown(5.0)

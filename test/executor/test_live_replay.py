@@ -4,16 +4,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 import threading
 import time
 from typing import Any
 
 from benchmarks.known_causes import causes, record
+from mddag_executor import open_recording
+from mddag_executor.executor import current_job
 from mddag_executor.replay import replay, reschedule
 from msg_graph import loads
 import pytest
+from rclpy.task import Future
+from std_msgs.msg import Header
+from std_srvs.srv import Empty
+
+from .conftest import Spinning
+from .declared import Declared
 
 GRAPH = """\
 mddag: 1
@@ -42,99 +49,30 @@ nodes:
 """
 
 
-def build_nodes(context: Any) -> list[Any]:
-    """Make the declared nodes, and a timer that is not declared; some callbacks are slow."""
-    from rclpy.callback_groups import ReentrantCallbackGroup
-    from rclpy.node import Node
-    from rclpy.task import Future
-    from std_msgs.msg import Header
-    nodes: dict[str, Node] = {}
-
-    def node(name):
-        return nodes.setdefault(name, Node(
-            name, context=context, start_parameter_services=False, enable_rosout=False))
-
-    def publisher(name, topic):
-        return node(name).create_publisher(Header, topic, 10)
-
-    def subscribe(name, topic, callback):
-        node(name).create_subscription(
-            Header, topic, callback, 10, callback_group=ReentrantCallbackGroup())
-
-    count = 0
-    image, info = publisher('camera', '/image'), publisher('camera', '/info')
-    boxes, flat = publisher('left', '/boxes'), publisher('right', '/flat')
-    twist, odometry = publisher('imu', '/twist'), publisher('filter', '/odometry')
-
-    def grab():
-        nonlocal count
-        count += 1
-        message = Header(frame_id=str(count))
-        image.publish(message)
-        info.publish(message)
-
-    def detect(message):
-        time.sleep(0.002)
-        boxes.publish(message)
-
-    async def rectify(message):
-        """Wait for something once in a while, without a worker."""
-        if int(message.frame_id) % 5 == 0:
-            future: Any = Future()
-            threading.Timer(0.004, future.set_result, (None,)).start()
-            await future
-        flat.publish(message)
-
-    def join(message):
-        if int(message.frame_id) % 7 == 0:
-            time.sleep(0.015)
-
-    def use(message):
-        if int(message.frame_id) % 9 == 0:
-            time.sleep(0.007)
-        odometry.publish(message)
-
-    ticks = iter(range(10**9))
-    node('camera').create_timer(0.02, grab)
-    node('imu').create_timer(0.01, lambda: twist.publish(Header(frame_id=str(next(ticks)))))
-    subscribe('left', '/image', detect)
-    subscribe('right', '/info', rectify)
-    subscribe('right', '/info', lambda message: None)
-    subscribe('fuse', '/boxes', join)
-    subscribe('fuse', '/flat', join)
-    subscribe('filter', '/twist', use)
-    subscribe('filter', '/odometry', lambda message: None)
-    node('filter').create_timer(0.03, lambda: time.sleep(0.001))  # undeclared
-    return list(nodes.values())
+def every(jobs: int, seconds: float) -> Callable[[], None]:
+    """Return a body that sleeps in each so many-th job."""
+    return lambda: time.sleep(0.0 if current_job().job % jobs else seconds)
 
 
-@contextmanager
-def spinning(executor: Any) -> Iterator[None]:
-    """Spin in a thread, as programs do."""
-    thread = threading.Thread(target=executor.spin)
-    thread.start()
-    try:
-        yield
-    finally:
-        executor.shutdown(2.0)
-        thread.join(5.0)
-        assert not thread.is_alive()
+async def rectify() -> None:
+    """Wait for something once in a while, without a worker."""
+    if current_job().job % 5 == 0:
+        future: Any = Future()
+        threading.Timer(0.004, future.set_result, (None,)).start()
+        await future
 
 
-def test_replay_counts_what_the_executor_counted(ros_context, tmp_path):
-    from mddag_executor import MultiDeadlineExecutor
+def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_path):
     path = tmp_path / 'live.mcap'
-    executor = MultiDeadlineExecutor(
-        loads(GRAPH, 'live.yaml'), context=ros_context, trace=str(path))
-    nodes = build_nodes(ros_context)
-    for node in nodes:
-        executor.add_node(node)
-    with spinning(executor):
+    nodes = Declared(make_node, GRAPH, {
+        'detect': lambda: time.sleep(0.002), 'rectify': rectify, 'join': every(7, 0.015),
+        'use': every(9, 0.007)})
+    nodes.nodes['filter'].create_timer(0.03, lambda: time.sleep(0.001))  # undeclared
+    executor = make_executor(loads(GRAPH, 'live.yaml'), trace=str(path))
+    with Spinning(executor):
+        nodes.start(executor)
         time.sleep(2.5)
     live = executor.statistics()
-    for node in nodes:
-        node.destroy_node()
-
     outcome = replay(path)
     assert outcome.warnings == []
     result = outcome.result()
@@ -158,7 +96,8 @@ def test_replay_counts_what_the_executor_counted(ros_context, tmp_path):
     assert sinks['/right:watch']['completed'] > 20
     imu = live['dags']['/imu']
     assert sinks['/filter:show']['aborted'] == imu['ends']['aborted'] > 3
-    assert sum(imu['ends'].values()) == imu['jobs'] and sum(live['dropped'].values()) > 0
+    assert 0 <= imu['jobs'] - sum(imu['ends'].values()) <= 3  # the last ones may be open
+    assert sum(live['dropped'].values()) > 0
     for breakdown, response in breakdowns:
         worst = breakdown['worst']
         assert worst['completed_ns'] - worst['release_ns'] == response['max']
@@ -172,10 +111,8 @@ def test_replay_counts_what_the_executor_counted(ros_context, tmp_path):
         assert dag['jobs'] == live['dags'][name]['jobs']
 
 
-def test_what_is_late_when_it_arrives_is_aborted_after_its_release(ros_context, tmp_path):
-    from mddag_executor import MultiDeadlineExecutor
-    from rclpy.node import Node
-    from std_msgs.msg import Header
+def test_what_is_late_when_it_arrives_is_aborted_after_its_release(
+        make_executor, make_node, tmp_path):
     graph = """\
 mddag: 1
 workers: 1
@@ -186,20 +123,17 @@ nodes:
          deadline: 5ms}
 """
     path = tmp_path / 'late.mcap'
-    executor = MultiDeadlineExecutor(
-        loads(graph, 'g.yaml'), context=ros_context, trace=str(path))
-    node = Node('late', context=ros_context, start_parameter_services=False, enable_rosout=False)
+    node = make_node('late')
     publisher = node.create_publisher(Header, '/old', 10)
     node.create_subscription(Header, '/old', lambda message: None, 10)
-    executor.add_node(node)
-    with spinning(executor):
+    executor = make_executor(loads(graph, 'g.yaml'), trace=str(path), nodes=[node])
+    with Spinning(executor):
         for _ in range(20):
             second, rest = divmod(time.time_ns() - 1_000_000_000, 1_000_000_000)
             message = Header()
             message.stamp.sec, message.stamp.nanosec = second, rest
             publisher.publish(message)
             time.sleep(0.01)
-    node.destroy_node()
     outcome = replay(path)
     assert outcome.warnings == []
     sink = outcome.result()['dags']['/late']['sinks']['/late:cb']
@@ -207,15 +141,11 @@ nodes:
         '/late:cb']['aborted']
 
 
-def test_requests_that_arrive_together_are_recorded_one_by_one(ros_context, tmp_path):
-    from mddag_executor import MultiDeadlineExecutor, open_recording
-    from rclpy.node import Node
-    from rclpy.task import Future
-    from std_srvs.srv import Empty
+def test_requests_that_arrive_together_are_recorded_one_by_one(
+        make_executor, make_node, tmp_path):
     path = tmp_path / 'requests.mcap'
-    executor = MultiDeadlineExecutor(
-        loads(GRAPH, 'g.yaml'), num_workers=1, context=ros_context, trace=str(path))
-    node = Node('node', context=ros_context, start_parameter_services=False, enable_rosout=False)
+    executor = make_executor(loads(GRAPH, 'g.yaml'), num_workers=1, trace=str(path))
+    node = make_node()
     ran, done = [], Future()
 
     def serve(request, response):
@@ -238,7 +168,6 @@ def test_requests_that_arrive_together_are_recorded_one_by_one(ros_context, tmp_
     executor.add_node(node)
     executor.spin_until_future_complete(done, 10.0)
     executor.shutdown(5.0)
-    node.destroy_node()
     recording = open_recording(path)
     served = [row for row in recording.executions
               if '/serve' in recording.callback_name(int(row['callback']))]
