@@ -11,6 +11,7 @@ that it runs even if all workers wait for it.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 from mddag_executor.executor import compat
@@ -18,7 +19,7 @@ from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.loop import EventLoop, Events
 from mddag_executor.executor.sources import Source
-from mddag_executor.executor.timers import TimerQueue
+from mddag_executor.executor.timers import TimerQueue, TimerSource
 
 
 class AtOnce:
@@ -51,7 +52,8 @@ class AtOnce:
         self.has_run = False
         sources, _, expired = self.loop.sources(events)
         for source in sources:
-            source.collect()
+            with self._lock if isinstance(source, TimerSource) else nullcontext():
+                source.collect()
         if expired or self.timers.has_jumped:
             self.loop.timer.at = 0
             with self._lock:

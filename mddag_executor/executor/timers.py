@@ -85,7 +85,8 @@ class TimerSource(EntitySource):
 
     def collect(self) -> None:
         """Ask rcl when it is due, as it was reset."""
-        self._queue.look_at(self)
+        if self.fd >= 0:  # else it was removed after its arrival was found
+            self._queue.look_at(self)
 
     def next_due(self) -> int | None:
         """Return the time of its next call by rcl, monotonic ns; None while it is cancelled."""

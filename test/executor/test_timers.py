@@ -91,6 +91,26 @@ def test_a_timer_that_is_reset_before_it_is_due_never_runs_and_costs_no_memory(
     assert not barked
 
 
+@pytest.mark.parametrize('sleeps', [False, True], ids=['timer', 'rate'])
+def test_a_timer_that_left_while_its_arrival_was_handled_is_not_asked_again(
+    make_executor, make_node, sleeps,
+):
+    """Else two executors would advance it, and one of them would drop what is due."""
+    node = make_node()
+    kept = node.create_rate(1.0) if sleeps else node.create_timer(1.0, print)
+    executor, other = make_executor(nodes=[node]), make_executor()
+    executor._upkeep.refresh()
+    place = executor._at_once if sleeps else executor._pool
+    (source,) = place.timers._timers.values()
+    arrived = place.loop.sources(place.loop.wait(0))[0]
+    assert source in arrived and place.timers.next_due()
+    other.add_node(node)
+    for each in arrived:
+        each.collect()
+    assert not place.timers.next_due()
+    del kept
+
+
 @pytest.mark.parametrize(
     'kind', [ClockType.STEADY_TIME, ClockType.SYSTEM_TIME, ClockType.ROS_TIME])
 def test_timers_of_each_clock_run(make_executor, make_node, kind):
