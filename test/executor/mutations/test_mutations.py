@@ -22,9 +22,7 @@ import sys
 
 import pytest
 
-from .mddag_mutations import MEANING
-
-pytestmark = [pytest.mark.nightly, pytest.mark.timeout(500)]
+from .mddag_mutations import changed
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
@@ -45,92 +43,148 @@ class Case:
     """
     A mutation and tests of ``test/executor`` that must notice it.
 
+    :ivar changes: file in ``mddag_executor``, old and new text of each.
     :ivar every: each of them must notice it, else one of them.
     :ivar at_once: and by an assertion, before any time-out of the test's own.
     """
 
     mutation: str
+    changes: list[tuple[str, str, str]] = field(hash=False)
     tests: list[str] = field(hash=False)
     every: bool = False
     at_once: bool = False
 
 
-def of(file: str, *names: str) -> list[str]:
+def of(file, *names):
     """Return the ids of a file's tests."""
     return [f'{file}::{name}' for name in names]
 
 
+UNNOTICED = """\
+with self._pool.lock:
+                self._engine.ready(work, self._pool.tick())"""
+"""A task is ready, and no thread is woken."""
+
 CASES = [
     # those that take longest first
-    Case('every_twentieth_lost', of(
+    Case('every_twentieth_lost', [(
+        'executor/work.py', 'def step(self, must_check: bool = True) -> Any:', """\
+def step(self, must_check: bool = True) -> Any:
+        if self.coroutine is None and self.entity.ran % 20 == 19:
+            return None""")], of(
         'test_each_runs.py', 'test_each_time_that_a_timer_is_due_counts', *(
             f'test_each_of_many_runs_once[of_{kind}]' for kind in (
                 'tasks', 'subscriptions', 'services', 'guards', 'waitables'))), every=True),
-    Case('create_task_does_not_wake_spin_once', of(
+    Case('create_task_does_not_wake_spin_once', [
+        ('executor/executor.py', 'self._pool.report(self._engine.ready, work)', UNNOTICED),
+        ('executor/executor.py', """\
+may not check
+            self._at_once.ring()""", 'may not check\n            pass')], of(
         'test_spin.py', 'test_what_is_new_wakes_a_spin_once_that_waits[task]')),
-    Case('shutdown_leaves_wait_set', of(
+    Case('shutdown_leaves_wait_set', [(
+        'executor/waitables.py', '"""End the thread."""', 'return')], of(
         'test_spin.py', 'test_no_thread_goes_on_though_the_context_does[shutdown]')),
-    Case('shutdown_leaves_workers', of(
+    Case('shutdown_leaves_workers', [(
+        'executor/workers.py', 'self._closed = True', 'return True')], of(
         'test_spin.py', 'test_no_thread_goes_on_though_the_context_does[shutdown]')),
-    Case('unknown_waits_not_resumed', of(
+    Case('unknown_waits_not_resumed', [
+        ('executor/workers.py', 'self._of_next_step.append(work)', 'pass'),
+        ('executor/workers.py',
+         'self.call_at(monotonic_ns() + rest, partial(self.resume, work))', 'pass')], of(
         'test_spin.py',
         'test_a_coroutine_that_awaits_something_unknown_is_asked_again[False]',
         'test_a_coroutine_that_awaits_something_unknown_is_asked_again[True]'),
         every=True),
-    Case('groups_ignored', of('test_executor.py', 'test_mutually_exclusive_group_is_kept')),
-    Case('rad_is_fifo', of(
-        'test_deadlines.py',
-        'test_ready_callbacks_run_in_the_policys_order[rad-abc]')),
-    Case('depth_not_kept', of(
+    Case('groups_ignored', [(
+        'executor/entity.py', 'self.group = group', 'self.group = -1')], of(
+        'test_executor.py', 'test_mutually_exclusive_group_is_kept')),
+    Case('rad_is_fifo', [(
+        'core/policies.py', "Policy('rad', key_rad,", "Policy('rad', key_fifo,")], of(
+        'test_deadlines.py', 'test_ready_callbacks_run_in_the_policys_order[rad-abc]')),
+    Case('depth_not_kept', [(
+        'executor/entity.py', 'self.depth = depth', 'self.depth = 0')], of(
         'test_executor.py', 'test_queue_depth_is_kept_and_drops_are_counted')),
-    Case('every_twentieth_response_lost', of(
+    Case('every_twentieth_response_lost', [(
+        'executor/compat.py', 'future.set_result(response)', """\
+client.completed = getattr(client, 'completed', 0) + 1
+    if client.completed % 20:
+        future.set_result(response)""")], of(
         'test_each_runs.py', 'test_each_of_many_runs_once[of_services]')),
-    Case('coroutines_not_resumed', [
+    Case('coroutines_not_resumed', [(
+        'executor/engine.py', 'self.scheduler.resume(work.x)', 'pass')], [
         *of('test_each_runs.py', 'test_each_of_many_runs_once[of_coroutines]'),
         *of('test_like_rclpy.py',
             'test_a_coroutine_goes_on_in_the_step_after_its_future_is_done')], every=True),
-    Case('tasks_go_on_by_themselves', of(
-        'test_newer_rclpy.py',
-        'test_a_task_awaits_one_future_after_another[await-own]')),
-    Case('exceptions_swallowed', of(
+    Case('tasks_go_on_by_themselves_as_well', [(
+        'executor/compat.py', 'def _add_resume_callback(', 'def _not_called(')], of(
+        'test_newer_rclpy.py', 'test_a_task_awaits_one_future_after_another[await-own]')),
+    Case('exceptions_swallowed', [(
+        'executor/executor.py', 'self._errors.append(error)', 'pass')], of(
         'test_spin.py', *(
             f'test_an_exception_comes_out_of_spin[{kind}]' for kind in (
                 'timer', 'subscription', 'service', 'guard', 'waitable', 'task',
                 'coroutine'))), every=True, at_once=True),
-    Case('exceptions_of_takes_swallowed', of(
-        'test_spin.py', 'test_what_fails_when_it_is_taken_comes_out_of_spin'), at_once=True),
-    Case('create_task_does_not_wake_workers', of(
+    Case('exceptions_of_takes_swallowed', [
+        (f'executor/{file}.py', 'self._fail(error)', 'pass') for file in ('sources', 'waitables')],
+        of('test_spin.py', 'test_what_fails_when_it_is_taken_comes_out_of_spin'), at_once=True),
+    Case('create_task_does_not_wake_workers', [(
+        'executor/executor.py', 'self._pool.report(self._engine.ready, work)', UNNOTICED)], of(
         'test_executor.py', 'test_create_task_wakes_an_idle_executor')),
-    Case('rest_not_collected', of(
+    Case('rest_not_collected', [(
+        'executor/sources.py', 'entity.collect_more = partial(self.collect, MANY)', 'pass')], of(
         'test_bounds.py', 'test_few_requests_wait_in_python_and_none_is_lost')),
-    Case('held_subscriptions_not_released', of(
+    Case('subscriptions_that_publishing_threads_took_from_stay_silent', [
+        ('executor/loop.py', 'self._set_mask(sources, _EDGE)', 'pass'),
+        # which would register them again
+        ('executor/due.py', 'self._loop.move(source, urgency)', 'pass')], of(
         'test_delivery.py',
         'test_messages_of_this_process_and_of_another_one_come_all_and_in_order')),
-    Case('resets_of_timers_not_noticed', of(
+    Case('resets_of_timers_not_noticed', [(
+        'executor/timers.py', '"""Ask rcl when it is due, as it was reset."""', 'return')], of(
         'test_timers.py', 'test_a_timer_that_was_cancelled_runs_when_it_is_reset[spin]')),
-    Case('one_worker_at_a_time', of(
-        'test_executor.py', 'test_reentrant_group_fills_all_workers')),
-    Case('muted_for_ever', of(
-        'test_gil.py',
-        'test_what_cannot_start_is_left_in_the_middleware[elsewhere]')),
-    Case('nothing_muted', of(
+    Case('no_thread_waits_while_a_worker_runs', [(
+        'executor/workers.py', 'if self._parked and self.running and not self._is_stepping:',
+        'if len(self._parked) == len(self._threads) and self.running and not self._is_stepping:')],
+        of('test_executor.py', 'test_reentrant_group_fills_all_workers')),
+    Case('muted_for_ever', [(
+        'executor/loop.py', 'found: Events = []\n        for', 'return []\n        for')], of(
         'test_gil.py', 'test_what_cannot_start_is_left_in_the_middleware[elsewhere]')),
-    Case('urgent_ones_muted', of(
-        'test_gil.py',
-        'test_it_does_so_at_once[elsewhere]')),
-    Case('add_node_does_not_wake', of(
-        'test_executor.py', 'test_add_node_wakes_an_idle_executor')),
-    Case('release_is_when_noticed', of(
+    Case('nothing_muted', [(
+        'executor/loop.py', 'first = len(self._nested)\n        while', 'return\n        while')],
+        of('test_gil.py', 'test_what_cannot_start_is_left_in_the_middleware[elsewhere]')),
+    Case('urgent_ones_muted', [(
+        'executor/loop.py', 'first - 1] >= relative_deadline_ns', 'first - 1] >= 0')], of(
+        'test_gil.py', 'test_it_does_so_at_once[elsewhere]')),
+    Case('add_node_does_not_wake', [(
+        'executor/executor.py', 'if added:\n            self.wake()', 'if added:\n            pass'
+        )], of('test_executor.py', 'test_add_node_wakes_an_idle_executor')),
+    Case('release_is_when_noticed', [(
+        'executor/timers.py', 'yield fired', 'yield (fired[0], _now(), *fired[2:])')], of(
         'test_deadlines.py',
         'test_each_callback_runs_for_the_job_that_its_message_belongs_to')),
-    Case('messages_go_to_the_oldest_job', of(
+    Case('messages_go_to_the_oldest_open_job', [(
+        'executor/engine.py', 'slot, dag, job, _ = origin\n        vertex, leg = target', """\
+vertex, leg = target
+        dag = origin.dag
+        job, slot = min((
+            (state.job_index[i], i) for i, of in enumerate(state.job_dag)
+            if of == dag and state.job_state[i] == OPEN and state.x_state[
+                state.job_base[i] + self.tables.region_offset[vertex] + leg] == IDLE),
+            default=(origin.job, origin.slot))""")], of(
         'test_deadlines.py', 'test_jobs_that_overlap_and_overtake_are_told_apart')),
-    Case('messages_go_to_the_job_before', of(
+    Case('messages_go_to_the_job_before', [(
+        'executor/jobs.py', 'publication = Publication(time_ns(), ', """\
+before = globals().setdefault('BEFORE', {})
+        origin, before[state.topic] = before.get(state.topic, origin), origin
+        publication = Publication(time_ns(), """)], of(
         'test_deadlines.py',
         'test_each_callback_runs_for_the_job_that_its_message_belongs_to')),
-    Case('late_sinks_counted_in_time', of(
+    Case('late_sinks_counted_in_time', [(
+        'core/tally.py', 'self.late += late', 'pass')], of(
         'test_deadlines.py', 'test_unequal_deadlines_are_judged_apart_and_misses_are_told')),
-    Case('late_jobs_counted_in_time', of(
+    Case('late_jobs_counted_in_time', [(
+        'core/tally.py', 'self.ends[dag][deadline] += 1',
+        'self.ends[dag][COMPLETED if deadline == LATE else deadline] += 1')], of(
         'test_deadlines.py', 'test_unequal_deadlines_are_judged_apart_and_misses_are_told')),
 ]
 
@@ -142,18 +196,19 @@ class Result:
     tests: dict[str, tuple[str, float]]
     output: str
 
-    def of(self, *outcomes: str) -> set[str]:
+    def of(self, *outcomes):
         return {test for test, (outcome, _) in self.tests.items() if outcome in outcomes}
 
 
-def run(folder: Path, mutation: str, tests: list[str], *options: str) -> Result:
-    """Run tests with a broken executor ('': as it is), in a process of their own."""
-    report = folder / f'{mutation}.jsonl'
+def run(folder, name, changes, tests, *options):
+    """Run tests with a changed executor, in a process of their own."""
+    report = folder / f'{name}.jsonl'
     environment = {
         key: value for key, value in os.environ.items() if not key.startswith('PYTEST_')}
     environment.update(
         PYTEST_DISABLE_PLUGIN_AUTOLOAD='1', OPENBLAS_NUM_THREADS='1', TMPDIR=str(folder),
-        PYTHONPATH=str(HERE), MDDAG_MUTATION=mutation, MDDAG_MUTATION_REPORT=str(report))
+        PYTHONPATH=str(HERE), MDDAG_MUTATION=json.dumps(changes),
+        MDDAG_MUTATION_REPORT=str(report))
     child = subprocess.Popen(
         [sys.executable, '-m', 'pytest', '-q', '-p', 'pytest_timeout', '-p', 'mddag_mutations',
          '-p', 'no:cacheprovider', f'--timeout={HUNG_S}', *options,
@@ -171,8 +226,8 @@ def run(folder: Path, mutation: str, tests: list[str], *options: str) -> Result:
     return result(report, output)
 
 
-def result(report: Path, output: str) -> Result:
-    found: dict[str, tuple[str, float]] = {}
+def result(report, output):
+    found = {}
     for line in report.read_text().splitlines() if report.exists() else ():
         what = json.loads(line)
         test = Path(what['test']).relative_to(TESTS).as_posix()
@@ -191,22 +246,33 @@ def results(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp('mutations')
     with ThreadPoolExecutor(IN_PARALLEL) as pool:
         found = pool.map(lambda case: run(
-            folder, case.mutation, case.tests, *([] if case.every else ['-x'])), cases)
+            folder, case.mutation, case.changes, case.tests,
+            *([] if case.every else ['-x'])), cases)
         return dict(zip((case.mutation for case in cases), found))
 
 
+def test_each_mutation_changes_the_present_executor():
+    for case in CASES:
+        for file, old, new in case.changes:
+            compile(changed(ROOT / 'mddag_executor' / file, [(old, new)]), file, 'exec')
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(500)
 def test_all_of_them_pass_while_nothing_is_broken(tmp_path):
     tests = list(dict.fromkeys(test for case in CASES for test in case.tests))
-    result = run(tmp_path, '', tests)
+    result = run(tmp_path, 'unbroken', [], tests)
     assert result.of('passed') == set(result.tests) == set(tests), result.output
 
 
+@pytest.mark.nightly
+@pytest.mark.timeout(500)
 @pytest.mark.parametrize('case', CASES, ids=lambda case: case.mutation)
 def test_a_broken_executor_is_noticed(case, results):
     result = results[case.mutation]
     noticed = result.of('assertion') if case.at_once else result.of('assertion', 'error')
     hung = result.of('hung')
-    what = f'{MEANING[case.mutation]} This was noticed'
+    what = f'{case.mutation} was noticed'
     assert noticed or not hung, f'{what} by a time-out only: {hung}\n{result.output}'
     assert noticed, f'{what} by no test\n{result.output}'
     if case.every:
