@@ -89,13 +89,9 @@ class Predictor:
             processes=max(1, len(processes)))
         if self._compiled is None:
             self._compiled = prepare(tables, load, settings, MOST_TRIES)
-        decisions = Intakes(task_set, tables, costs).schedule(
-            load, settings, compiled=self._compiled).decisions
         tally = Tally(task_set, tables)
-        for time, dag in zip(load.times, load.dags):
-            if time < self._duration:
-                tally.released(dag)
-        tally.add(decisions)
+        Intakes(task_set, tables, costs).schedule(
+            load, settings, compiled=self._compiled).count_into(tally, load, settings)
         return tally
 
 

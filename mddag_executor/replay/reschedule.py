@@ -36,7 +36,6 @@ from mddag_executor.text import counted, listed
 from msg_graph import NO_GRAPH, Process, TaskSet
 from msg_graph.derive import no_garbage
 from msg_graph.model import MOST_WORKERS
-import numpy as np
 
 
 class Reschedule:
@@ -64,15 +63,11 @@ class Reschedule:
         self._skip, self._overheads, self._about = skip, overheads, recording_result(run)
         self._start = run.begin
         self.tally = MissTally(task_set, tables)
-        load, end = work.load, settings.duration_ns
         self._run = partial(schedule, tables) if work.intakes is None else Intakes(
             task_set, tables, work.intakes).schedule
-        _, _, self.decisions, self.busy = self._run(load, settings)
-        for time, dag, release in zip(*(
-                np.asarray(each).tolist() for each in (load.times, load.dags, load.releases))):
-            if time < end and release >= settings.judge_from:
-                self.tally.released(dag)
-        self.tally.add(self.decisions)
+        result = self._run(work.load, settings)
+        self.decisions, self.busy = result.decisions, result.busy
+        result.count_into(self.tally, work.load, settings)
 
     @cached_property
     def log(self) -> Sequence[LogEntry]:

@@ -89,7 +89,6 @@ class Machine(NamedTuple):
     lock_queue: list[list[int]]
     lock_had: list[int]
     switch_at: list[int]
-    # by worker: end of its last execution if it has not started another; or -NEVER
 
 
 def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = False) -> Machine:

@@ -69,13 +69,11 @@ def simulate(
     tables = Tables.build(
         task_set, on_late=settings.on_late,
         max_active_jobs=NEVER if max_active_jobs is None else max_active_jobs)
-    ended, entries, decisions, _ = schedule(tables, load, settings, log=log, progress=progress)
+    result = schedule(tables, load, settings, log=log, progress=progress)
     tally = Tally(task_set, tables)
-    for time, dag in zip(load.times, load.dags):
-        if time < settings.duration_ns and time <= ended:
-            tally.released(dag)
-    tally.add(decisions)
-    return SimulatedRun(settings, tally, ended, utilisation, entries, decisions)
+    result.count_into(tally, load, settings)
+    return SimulatedRun(
+        settings, tally, result.ended, utilisation, result.log, result.decisions)
 
 
 def check(settings: Settings) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from mddag_executor import defaults
-from mddag_executor.core import NEVER, Tables
+from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.state import as_object, Decision, empty, State
 from mddag_executor.simulate.deliveries import Deliveries
@@ -83,6 +83,15 @@ class Scheduled(NamedTuple):
     log: Sequence[LogEntry]
     decisions: Sequence[Decision]
     busy: list[int]
+
+    def count_into(self, tally: Tally, load: Load, settings: Settings) -> None:
+        """Count the judged jobs that were released, and the decisions."""
+        releases = load.releases if len(load.releases) else load.times
+        for time, dag, release in zip(load.times, load.dags, releases):
+            if (time <= self.ended and time < settings.duration_ns
+                    and release >= settings.judge_from):
+                tally.released(dag)
+        tally.add(self.decisions)
 
 
 def schedule(
