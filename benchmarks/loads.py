@@ -30,6 +30,7 @@ from benchmarks.executors import make_executor, noting, Start, within
 from benchmarks.publisher import PublisherProcess
 from mddag_executor.core.tally import quantiles_us
 from mddag_executor.executor import current_job
+from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.hosting.child import ChildError
 from mddag_executor.hosting.measure import (
     ExecutionPlan,
@@ -40,7 +41,7 @@ from mddag_executor.hosting.measure import (
     totals,
 )
 from mddag_executor.hosting.peers import run_nodes, UnfinishedSession
-from mddag_executor.hosting.synthetic import no_job, QOS, quiet_node, SyntheticWorkload
+from mddag_executor.hosting.synthetic import no_job, QOS, SyntheticWorkload
 from mddag_executor.resources import find
 from msg_graph import load, TaskSet
 import rclpy

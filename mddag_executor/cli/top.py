@@ -126,18 +126,15 @@ def _ticks(
 def _listening(board: Board) -> Iterator[Callable[[float], None]]:
     """Subscribe; give a function that collects what comes within a time."""
     from diagnostic_msgs.msg import DiagnosticArray
+    from mddag_executor.executor.quiet_nodes import quiet_node
     import rclpy
     from rclpy.context import Context
     from rclpy.executors import SingleThreadedExecutor
-    from rclpy.node import Node
-    from rclpy.parameter import Parameter
     from rclpy.signals import SignalHandlerOptions
     context = Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = Node(
-            'mddag_top', context=context, enable_rosout=False, start_parameter_services=False,
-            parameter_overrides=[Parameter('start_type_description_service', value=False)])
+        node = quiet_node('mddag_top', context)
         node.create_subscription(DiagnosticArray, TOPIC, board.take, 10)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)

@@ -38,6 +38,7 @@ import struct
 import time
 from typing import Any, TYPE_CHECKING
 
+from mddag_executor.executor.bounds import REMEMBERED
 from mddag_executor.executor.jobs import (
     Announced,
     NO_ORIGIN,
@@ -47,12 +48,11 @@ from mddag_executor.executor.jobs import (
     stamped_release,
 )
 from mddag_executor.executor.other_processes import contested
+from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.executor.work import Work
 from msg_graph import TaskSet
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import UInt8MultiArray
@@ -66,15 +66,6 @@ _QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1000)
 # sender, publisher, sequence, begin, end; home, number and release of the job; DAG, vertex, topic
 _ENTRY = struct.Struct('<QQQqqQQqiiI')
-
-
-def own_node(name: str, context: Context) -> Node:
-    """Make a hidden node of the executor itself, without the services and topics of others."""
-    # Its own arguments precede those of the process, which name the process' nodes.
-    return Node(
-        name, context=context, enable_rosout=False, start_parameter_services=False,
-        cli_args=['--ros-args', '-r', f'__node:={name}'],
-        parameter_overrides=[Parameter('start_type_description_service', value=False)])
 
 
 class Announcements:
@@ -103,7 +94,8 @@ class Announcements:
         digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
         names = [each.name for each in task_set.processes]
         own = names.index(process)
-        self.node = own_node(f'_mddag_jobs_{os.getpid()}_{own}', context)
+        self.node = quiet_node(
+            f'_mddag_jobs_{os.getpid()}_{own}', context, is_remapped=True)
         self._n_others = len(names) - 1
         self._publisher: Publisher | None = self.node.create_publisher(
             UInt8MultiArray, f'/mddag/jobs_{digest}/p{own}', _QOS)
@@ -191,7 +183,10 @@ class Announcements:
         release: int, dag: int, vertex: int, topic: int,
     ) -> None:
         if topic < len(self._topics) and dag < len(self._engine.dag_names):  # else unknown
-            publisher = self._publishers.setdefault((whose, of), PublisherNumbers())
+            publisher = self._publishers.pop((whose, of), None) or PublisherNumbers()
+            self._publishers[whose, of] = publisher  # the latest is last
+            if len(self._publishers) > REMEMBERED:
+                del self._publishers[next(iter(self._publishers))]
             self._jobs.take_in(self._topics[topic], Publication(
                 begin, publisher, Announced((home, number), dag, vertex, release), sequence, end))
 

@@ -32,8 +32,8 @@ from typing import NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import quantile
 from mddag_executor.core.tally import Counts, counts, Tally
-from mddag_executor.executor.announcements import own_node
 from mddag_executor.executor.bounds import END_S
+from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.executor.settings import Thresholds
 from mddag_executor.executor.shutdown import is_over, join, stop_at_exit
 from mddag_executor.text import counted
@@ -300,7 +300,8 @@ class Diagnostics:
         from diagnostic_msgs.msg import DiagnosticArray
 
         # no executor runs the node, since it has no callbacks
-        node = own_node(f'{NODE_NAME}_{os.getpid()}', self._context)
+        node = quiet_node(
+            f'{NODE_NAME}_{os.getpid()}', self._context, is_remapped=True)
         try:
             publisher = node.create_publisher(DiagnosticArray, TOPIC, 10)
             due = time.monotonic_ns() + self._period_ns

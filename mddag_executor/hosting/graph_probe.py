@@ -31,6 +31,7 @@ import time
 from typing import Any
 
 from mddag_executor.executor.compat import message_taker
+from mddag_executor.executor.quiet_nodes import quiet_node
 from msg_graph.binding import is_background
 from msg_graph.draft import Draft, DraftCallback, DraftNode
 from msg_graph.drift import Releases
@@ -116,9 +117,7 @@ def probe(seconds: float, tick: Callable[[float], None] | None = None) -> Probe:
     context = Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = Node(
-            '_mddag_graph_probe', context=context, use_global_arguments=False,
-            enable_rosout=False, start_parameter_services=False)
+        node = quiet_node('_mddag_graph_probe', context)
         try:
             return _look(node, context, seconds, tick or (lambda _: None))
         finally:

@@ -42,6 +42,7 @@ import time
 from typing import Any
 
 from mddag_executor.executor.jobs import header_stamp
+from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.hosting.bodies import (
     Emulate,
     native,
@@ -62,7 +63,6 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
@@ -82,17 +82,6 @@ _CLOCKS_NS = 1_000_000
 
 CurrentJob = Callable[[], Any]
 """Returns None, or an object with the ``release_ns`` of the job that the calling thread runs."""
-
-
-def quiet_node(full_name: str, context: Context | None = None, **parameters: bool) -> Node:
-    """Make a node without the services and topics that every node has."""
-    namespace, _, name = full_name.rpartition('/')
-    # Without the process' arguments: a remapped node would not be the declared one any more.
-    return Node(
-        name, namespace=namespace or '/', context=context, enable_rosout=False,
-        start_parameter_services=False, use_global_arguments=False,
-        parameter_overrides=[Parameter(key, value=value) for key, value in {
-            'start_type_description_service': False, **parameters}.items()])
 
 
 def no_job() -> None:

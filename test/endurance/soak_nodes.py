@@ -8,8 +8,9 @@ from collections.abc import Callable
 import threading
 
 from mddag_executor.executor import current_job
+from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.hosting.measure import ExecutionPlan
-from mddag_executor.hosting.synthetic import quiet_node, SyntheticWorkload
+from mddag_executor.hosting.synthetic import SyntheticWorkload
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
