@@ -34,6 +34,7 @@ FILES = {
     'docs/declare.md': {'common.yaml': COMMON},
     'docs/laboratory.md': {'graph.yaml': VISION},
     'docs/model.md': {'graph.yaml': VISION},
+    'docs/run.md': {'graph.yaml': VISION},
 }
 
 # What its commands need besides what every installation has.
