@@ -4,9 +4,9 @@
 Latest starts from measured execution times, for drivers that measure (rule 7).
 
 ``State.start_by`` and ``reach_by`` begin with the declared execution times.  When the measured
-mean of a vertex has changed by more than an eighth, those of its DAG are computed again.  So most
-executions cost one comparison.  The live executor measures CPU time: a callback that waits counts
-only for what it computes, since its wall time also has what it waited for others.
+time of a vertex has changed by more than an eighth, those of its DAG are computed again.  So most
+executions cost one comparison.  Measured is the time that the callback needs when nothing disturbs
+it: the mean CPU time, or the least recent duration if that is longer (``executor.gil``).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class MeanTimes:
         admit(t, s)
 
     def note(self, vertex: int, mean: int, holds: int) -> None:
-        """Note the recent mean execution time of a vertex, ns, and whether it holds the GIL."""
+        """Note the recent execution time of a vertex, ns, and whether it holds the GIL."""
         known = self._mean[vertex]
         change = mean - known
         if (change * CHANGE > known + LEAST_CHANGE_NS or -change * CHANGE > known + LEAST_CHANGE_NS

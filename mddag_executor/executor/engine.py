@@ -510,22 +510,20 @@ class Engine:
             self._complete(x, end)
             return
         entity.failed += failed
-        if origin is not None:
-            self.mean_times.note(origin.vertex, entity.habit.mean_ns, entity.habit.holds)
-        if self.verdicts.tally.overdue and work.origin is not None:
-            deadline = self.verdicts.tally.overdue.get((work.origin.vertex, work.origin.job), -1)
+        if self.verdicts.tally.overdue and origin is not None:
+            deadline = self.verdicts.tally.overdue.get((origin.vertex, origin.job), -1)
             if end <= deadline:  # it was reported overdue before this was known
                 entity.busy_ns += deadline + 1 - end
                 end = deadline + 1
         end_it = self.scheduler.fail if failed else self.scheduler.complete
         if self.record is None:
-            end_it(x, end)
-        elif work.origin is None:
+            whole = end_it(x, end)
+        elif origin is None:
             self._record_run(work, start, end, vtid, worker)
-            end_it(x, end)
+            whole = end_it(x, end)
         else:
             tables, state = self.tables, self._state
-            slot, dag, job, vertex = work.origin
+            slot, dag, job, vertex = origin
             deadline = state.job_release[slot] + tables.rad_offset[vertex]
             leg = x - state.job_base[slot] - tables.region_offset[vertex]
             held = state.x_holds[x]
@@ -535,6 +533,8 @@ class Engine:
             self.record(
                 EXECUTION, start, vtid, entity.address, dag, tables.index_in_dag[vertex],
                 job, worker, work.ready_ns, deadline, end, now, whole, leg, work.cpu_ns, held)
+        if origin is not None and whole:  # other messages of a sync take less
+            self.mean_times.note(origin.vertex, entity.habit.needs_ns, entity.habit.holds)
         if self._state.decisions:
             self._decided(now)
 

@@ -79,39 +79,53 @@ class GilHabit:
     :param declared: the declared value; None: it is measured.
     :ivar holds: 1 or 0, for its next execution; ``computes``: the same, also if it is short.
     :ivar mean_ns: recent average of its executions' CPU time.
+    :ivar needs_ns: how long it takes when nothing disturbs it: ``mean_ns``, or the least duration
+        of recent executions if that is longer.
     :ivar is_known: whether ``holds`` is declared, or has been measured.
     :ivar rests: how many of its next executions need not be measured, if it is positive.
     """
 
-    __slots__ = ('holds', 'computes', 'mean_ns', 'is_known', 'is_declared', 'rests', 'share',
-                 '_unclear', '_runs', '_is_trial')
+    __slots__ = ('holds', 'computes', 'mean_ns', 'needs_ns', 'is_known', 'is_declared', 'rests',
+                 'share', '_least', '_unclear', '_runs', '_is_trial')
 
     def __init__(self, declared: bool | None = None) -> None:
         self.is_declared = self.is_known = declared is not None
         self.holds = self.computes = int(declared or False)
-        self.mean_ns = 0
+        self.mean_ns = self.needs_ns = self._least = 0
         self.rests = 0
         self.share: float | None = None if declared is None else float(declared)
         self._unclear = 0
         self._runs = 0
         self._is_trial = False
 
-    def ran(self, wall: int, own: int, others: int, starved: bool = False) -> None:
+    def took(self, own: int, undisturbed: int) -> None:
         """
-        Update the habit from a measured execution.
+        Update the usual times.
+
+        :param own: CPU time of an execution, ns.
+        :param undisturbed: at most how long it would have taken if nothing had disturbed it, ns.
+        """
+        runs = self._runs = min(self._runs + 1, LATELY)
+        self.mean_ns += (own - self.mean_ns) // runs
+        # the least is forgotten slowly
+        self._least = undisturbed if runs == 1 else min(
+            undisturbed, self._least + self._least // SELDOM + 1)
+        self.needs_ns = max(self.mean_ns, self._least)
+
+    def learn(self, wall: int, own: int, others: int, starved: bool = False) -> None:
+        """
+        Update whether it holds the GIL from the execution that was last given to ``took``.
 
         :param wall: its duration, ns.
         :param own: CPU time of its thread, ns.
         :param others: CPU time of all other threads of the process meanwhile, ns.
         :param starved: whether another thread preempted it on its CPU meanwhile.
         """
-        runs = self._runs = min(self._runs + 1, LATELY)
-        self.mean_ns += (own - self.mean_ns) // runs
         if not self.is_declared:
-            self._learn(wall, own, others, starved, runs)
+            self._learn(wall, own, others, starved, self._runs)
         self.rests = 0
         if self.is_known and not self._is_trial:
-            self.rests = (SELDOM if runs == LATELY else LATELY) - 1
+            self.rests = (SELDOM if self._runs == LATELY else LATELY) - 1
 
     def _learn(self, wall: int, own: int, others: int, starved: bool, runs: int) -> None:
         usual = 0 if self._is_trial else self.holds
@@ -159,18 +173,20 @@ class Measurement:
             self._process, self._preempted = process_time_ns(), times_preempted()
         self._own = thread_time_ns()
 
-    def end(self, wall: int) -> int:
+    def end(self, wall: int, has_lent: bool) -> int:
         """
         Return the CPU time of the calling thread, ns.
 
         :param wall: the duration of the execution, ns.
+        :param has_lent: whether it waited without a worker: then only its CPU time counts.
         """
         own = thread_time_ns() - self._own
         if self._process is None:
             self._habit.rests -= 1
         else:
-            self._habit.ran(wall, own, process_time_ns() - self._process - own,
-                            times_preempted() > self._preempted)
+            self._habit.took(own, own if has_lent else wall)
+            self._habit.learn(wall, own, process_time_ns() - self._process - own,
+                              times_preempted() > self._preempted)
         return own
 
 

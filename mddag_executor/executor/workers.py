@@ -609,28 +609,29 @@ class WorkerPool:
         if measurement is None and not me.published and end - start <= SHORT_CALLBACK_NS:
             habit.rests -= 1
         else:
-            self._note_times(work, measurement, start, end, me.published)
+            self._note_times(me, work, measurement, end - start)
         if self.callback_ended is not None and me.outcome is None:
             self.callback_ended(entity.rclpy, None)
 
     def _note_times(
-        self, work: Work, measurement: Measurement | None, start: int, end: int, published: int
+        self, me: WorkerThread, work: Work, measurement: Measurement | None, wall: int
     ) -> None:
-        """Note how long an execution took, and when it published (monotonic ns; 0: it did not)."""
-        entity, wall = work.entity, end - start
+        """Note how long the thread's execution took, and when it published."""
+        entity = work.entity
         habit = entity.habit
         if measurement is None:
             habit.rests -= 1
         else:
-            work.cpu_ns += measurement.end(wall)
+            work.cpu_ns += measurement.end(wall, me.has_lent)
             if entity.is_nested != habit.computes and entity.classify is not None:
                 with self.lock:
                     entity.classify()
         if wall > SHORT_CALLBACK_NS:
             habit.rests = 0  # long callbacks are measured each time
         entity.wall_ns += (wall - entity.wall_ns) >> 3 if entity.ran else wall - entity.wall_ns
-        if published:
-            entity.tail_ns += (end - published - entity.tail_ns) >> 3
+        if me.published:
+            tail = me.end - self._offset - me.published
+            entity.tail_ns += (tail - entity.tail_ns) >> 3
 
     def _report_end(
         self, me: WorkerThread, work: Work, now: int, calls: list[Callable[[], None]]

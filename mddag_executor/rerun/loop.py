@@ -259,6 +259,7 @@ class Loop:
         self.callbacks += 1
         if origin is not None and takes:
             work.cpu_ns = max(0, self._times.computed(origin.dag, origin.vertex, release))
+            work.entity.habit.took(takes, takes)
         waited = self.now > execution.start
         if self.computing is not None and execution.worker >= 0 and not waited:
             self.computing.begin(execution, work, takes, [

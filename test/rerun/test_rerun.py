@@ -89,6 +89,14 @@ def test_the_same_again_and_with_other_workers(bag, graph):
     assert rerun(bag, graph, [Filter, Sink], workers=7).digest == first.digest
 
 
+def test_what_cannot_be_in_time_is_demoted(bag, graph):
+    graph.write_text(GRAPH.replace('deadline: 50ms', 'deadline: 14ms').replace(
+        'dag: main', 'dag: main, on_late: demote'))
+    result = rerun(bag, graph, [Filter, Sink]).result()
+    sink = result['dags']['main']['sinks']['/sink:take']
+    assert sink['demoted'] == sink['late'] == 20
+
+
 def test_outputs_are_a_bag_that_others_read(bag, graph, tmp_path):
     from rosbags.highlevel import AnyReader
     out = tmp_path / 'out.mcap'
