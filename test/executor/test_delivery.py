@@ -10,7 +10,6 @@ import threading
 import time
 from typing import Any
 
-from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor import compat
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -211,22 +210,13 @@ def test_work_does_not_wait_for_a_callback_that_goes_on_after_publishing(
     assert all(waited)
 
 
-def two_executors(
-    ros_context: Any, make_node: Any
-) -> tuple[list[MultiDeadlineExecutor], list[Any], list[list[str]]]:
-    """Return two executors, each with a node that subscribes to /a, and what these get."""
-    executors = [MultiDeadlineExecutor(context=ros_context) for _ in range(2)]
+def test_a_publishing_callback_wakes_the_workers_of_another_executor(make_executor, make_node):
+    """That it will end soon is no reason: it takes from its own executor only."""
     nodes, got = [make_node('first'), make_node('second')], [[], []]
-    for executor, node, heard in zip(executors, nodes, got):
+    for node, heard in zip(nodes, got):
         node.create_subscription(
             Header, '/a', lambda m, heard=heard: heard.append(m.frame_id), 100)
-        executor.add_node(node)
-    return executors, nodes, got
-
-
-def test_a_publishing_callback_wakes_the_workers_of_another_executor(ros_context, make_node):
-    """That it will end soon is no reason: it takes from its own executor only."""
-    (first, second), nodes, got = two_executors(ros_context, make_node)
+    first, second = (make_executor(nodes=[node]) for node in nodes)
     publisher = nodes[0].create_publisher(Header, '/a', 100)
     waited = []
 

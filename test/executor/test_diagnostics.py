@@ -103,8 +103,7 @@ class Listener:
         self.stamps: list[float] = []
         self.node = make_node('listener')
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_array, 10)
-        self.executor = make_executor()
-        self.executor.add_node(self.node)
+        self.executor = make_executor(nodes=[self.node])
 
     def _on_array(self, message: Any) -> None:
         self.stamps.append(message.header.stamp.sec + message.header.stamp.nanosec / 1e9)
@@ -156,8 +155,7 @@ def test_statuses_are_published_from_ok_to_stale(make_executor, make_node):
 
 
 def test_a_shutdown_of_the_context_ends_it_quietly(make_executor, make_node, ros_context, capfd):
-    executor = make_executor(diagnostics_period='20ms')
-    executor.add_node(make_node())
+    executor = make_executor(diagnostics_period='20ms', nodes=[make_node()])
     spinning = Spinning(executor)
     spinning._thread.start()
     assert wait_for(lambda: executor._diagnostics._thread is not None)

@@ -134,18 +134,12 @@ def test_tasks_functions_coroutines_and_futures_across_them(make_executor):
     assert waiting.result() == 'value!' and order == ['waits', 'has it']
 
 
-def test_create_task_wakes_an_idle_executor(make_executor):
-    executor = make_executor()
-    with Spinning(executor):
-        time.sleep(0.2)
-        task = executor.create_task(lambda: None)
-        assert wait_for(task.done)
-
-
-def test_add_node_wakes_an_idle_executor(make_executor, make_node):
+def test_tasks_and_nodes_wake_an_idle_executor(make_executor, make_node):
     executor = make_executor()
     calls: list[int] = []
     with Spinning(executor):
+        time.sleep(0.2)
+        assert wait_for(executor.create_task(lambda: None).done)
         time.sleep(0.2)
         node = make_node()
         node.create_timer(0.001, lambda: calls.append(1))
@@ -223,15 +217,6 @@ def test_mutually_exclusive_group_is_kept(make_executor, make_node):
             publisher.publish(Header())
         assert wait_for(lambda: len(ran) == 18)
     assert most[0] == 1
-
-
-def test_reentrant_group_fills_all_workers(make_executor):
-    executor = make_executor()
-    together = threading.Barrier(7)
-    tasks = [executor.create_task(together.wait, 5.0) for _ in range(7)]
-    with Spinning(executor):
-        assert wait_for(lambda: all(t.done() for t in tasks))
-    assert sorted(t.result() for t in tasks) == list(range(7))
 
 
 def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):

@@ -110,9 +110,7 @@ nodes:
     callbacks: [{name: tick, timer: 20ms, publishes: [/a], dag: chain}]
   - node: /sink
     callbacks: [{name: last, subscription: /a, deadline: 5s, execution_time: 1ms}]
-"""), num_workers=1, trace=trace)
-    executor.add_node(node)
-    executor.add_node(sink)
+"""), num_workers=1, trace=trace, nodes=[node, sink])
     assert wait_for(lambda: publisher.get_subscription_count() == 1)
     timer.reset()
     caught = spin_until(executor, lambda: len(came) >= 5)
@@ -142,9 +140,8 @@ def test_a_listener_may_handle_exceptions_of_callbacks(make_executor, make_node)
         return error is not None
 
     timers = [node.create_timer(0.01, tick), node.create_timer(0.01, coroutine)]
-    executor = make_executor()
+    executor = make_executor(nodes=[node])
     executor.on_callback_ended(note)
-    executor.add_node(node)
     with Spinning(executor) as spinning:
         assert wait_for(lambda: len(ended) > 10)
     assert spinning.error is None
@@ -169,8 +166,7 @@ mddag: 1
 nodes:
   - node: /source
     callbacks: [{name: tick, timer: 20ms, deadline: 5s, dag: chain}]
-"""))
-    executor.add_node(node)
+"""), nodes=[node])
     caught = spin_until(executor, lambda: len(ran) >= 3)
     executor.shutdown(5.0)
     ends = executor.statistics()['dags']['chain']['ends']

@@ -16,17 +16,9 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 
 from .conftest import Spinning, wait_for
+from .declared import Declared
 
-NAMES = ('a', 'b', 'c', 'd')
 MS = 1_000_000
-
-
-def graph(holds: str, deadlines: tuple[int, ...] = (50, 50, 50, 50)) -> msg_graph.TaskSet:
-    """Declare a subscription for each name; ``holds`` is what they say of the interpreter."""
-    return msg_graph.loads('mddag: 1\nnodes:\n  - node: /node\n    callbacks:\n' + ''.join(
-        f'      - {{name: {name}, subscription: /{name}, dag: {name}, period: 100ms, '
-        f'deadline: {deadline}ms, holds_interpreter: {holds}}}\n'
-        for name, deadline in zip(NAMES, deadlines)), 'g.yaml')
 
 
 def compute(ms: float) -> None:
@@ -36,74 +28,30 @@ def compute(ms: float) -> None:
         pass
 
 
-class Bodies:
-    """Callbacks that note when they run; one for each name."""
+@pytest.mark.parametrize('holds, most', [('true', 1), ('false', 4)])
+def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, holds, most):
+    node, gate = make_node('publishes'), threading.Barrier(most)
+    running, at_once = list[int](), list[int]()
 
-    def __init__(self, node: Any, body: Any) -> None:
-        self.ran: list[str] = []
-        self.at_once = 0
-        self._running = 0
-        self._lock = threading.Lock()
-        self._body = body
-        group = ReentrantCallbackGroup()
-        self.publishers = {name: node.create_publisher(Header, f'/{name}', 100) for name in NAMES}
-        for name in NAMES:
-            node.create_subscription(
-                Header, f'/{name}', lambda message, name=name: self._run(name), 100,
-                callback_group=group)
-
-    def _run(self, name: str) -> None:
-        with self._lock:
-            self._running += 1
-            self.at_once = max(self.at_once, self._running)
-            self.ran.append(name)
-        self._body(name)
-        with self._lock:
-            self._running -= 1
-
-    def publish(self, *names: str) -> None:
-        for name in names:
-            self.publishers[name].publish(Header())
-
-
-@pytest.mark.parametrize('holds, at_once', [('true', 1), ('false', 4)])
-def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, holds, at_once):
-    node = make_node()
-    gate = threading.Barrier(4) if at_once == 4 else None
-
-    def body(name):
-        if gate is not None:
-            gate.wait(20.0)  # passes only when all four are there
+    def body():
+        running.append(1)
+        at_once.append(len(running))
+        gate.wait(20.0)  # passes only when so many are there
         compute(5)
+        running.pop()
 
-    bodies = Bodies(node, body)
-    executor = make_executor(graph(holds), nodes=[node])
+    text = 'mddag: 1\nnodes:\n  - node: /node\n    callbacks:\n' + ''.join(
+        f'      - {{name: {name}, subscription: /{name}, dag: {name}, period: 100ms, '
+        f'deadline: 50ms, holds_interpreter: {holds}}}\n' for name in 'abcd')
+    nodes = Declared(make_node, text, dict.fromkeys('abcd', body))
+    publishers = [node.create_publisher(Header, f'/{name}', 10) for name in 'abcd']
+    executor = make_executor(msg_graph.loads(text), nodes=nodes.nodes.values())
     with Spinning(executor):
-        bodies.publish(*NAMES)
-        assert wait_for(lambda: len(bodies.ran) == 4, 20.0)
-    assert bodies.at_once == 1 if at_once == 1 else bodies.at_once >= at_once
-
-
-def test_what_is_held_back_runs_in_the_order_of_deadlines(make_executor, make_node):
-    node = make_node()
-    begun, go_on = threading.Event(), threading.Event()
-
-    def body(name):
-        if name == 'a' and not begun.is_set():
-            begun.set()
-            while not go_on.is_set():  # computes
-                pass
-
-    bodies = Bodies(node, body)
-    executor = make_executor(graph('true', (5_000, 60_000, 20_000, 40_000)), nodes=[node])
-    with Spinning(executor):
-        bodies.publish('a')
-        assert begun.wait(5.0)
-        bodies.publish('b', 'd', 'c')
-        assert wait_for(lambda: executor.statistics()['queue'] == 3)
-        go_on.set()
-        assert wait_for(lambda: len(bodies.ran) == 4)
-    assert bodies.ran == ['a', 'c', 'd', 'b']
+        assert wait_for(lambda: all(each.get_subscription_count() for each in publishers))
+        for publisher in publishers:
+            publisher.publish(Header())
+        assert wait_for(lambda: len(at_once) == 4 and not running, 20.0)
+    assert max(at_once) == most
 
 
 def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_node):
@@ -128,8 +76,7 @@ def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_
         '      - {name: step, timer: 1ms, dag: step, deadline: 1ms, holds_interpreter: true}\n'
         '      - {name: capture, timer: 100ms, dag: camera, deadline: 60s, '
         'holds_interpreter: true}\n',
-        'g.yaml'))
-    executor.add_node(node)
+        'g.yaml'), nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(seen) >= 3, 160.0)
     assert min(seen[:3]) >= 3
@@ -213,21 +160,18 @@ class Computing:
     :ivar meanwhile: called, while the long one computes, until it returns true.
     """
 
-    def __init__(self, executor: Any, node: Any) -> None:
+    def __init__(self, make_executor: Any, make_node: Any) -> None:
         self.ran: list[str] = []
         self.begun = threading.Event()
         self.meanwhile: Any = lambda: True
-        self.executor = executor
-        group = ReentrantCallbackGroup()
+        nodes = Declared(make_node, COMPUTING, {
+            'long': self._long, 'urgent': lambda: self.ran.append('urgent'),
+            'patient': lambda: self.ran.append('patient')})
+        self.executor = make_executor(
+            msg_graph.loads(COMPUTING, 'g.yaml'), nodes=nodes.nodes.values())
+        other = make_node('publishes')
         self.publishers = {
-            name: node.create_publisher(Header, f'/{name}', 10)
-            for name in ('long', 'urgent', 'patient')}
-        node.create_subscription(Header, '/long', self._long, 10, callback_group=group)
-        for name in ('urgent', 'patient'):
-            node.create_subscription(
-                Header, f'/{name}', lambda message, name=name: self.ran.append(name), 10,
-                callback_group=group)
-        executor.add_node(node)
+            name: other.create_publisher(Header, f'/{name}', 10) for name in nodes.ran}
         assert wait_for(lambda: all(
             p.get_subscription_count() == 1 for p in self.publishers.values()))
 
@@ -240,7 +184,7 @@ class Computing:
         return next(each.habit for each in self.executor._registry.by_id.values()
                     if each.callback is not None and each.callback.name == 'long')
 
-    def _long(self, message: Header) -> None:
+    def _long(self) -> None:
         self.ran.append('begins')
         self.begun.set()
         compute(60)
@@ -266,9 +210,8 @@ def computing(request, make_executor, make_node, monkeypatch):
     """Give these callbacks; messages come from threads of this process, or as from elsewhere."""
     if request.param == 'elsewhere':
         monkeypatch.setattr(publishing, 'replace_delivery', lambda *args: None)
-    executor = make_executor(msg_graph.loads(COMPUTING, 'g.yaml'))
-    found = Computing(executor, make_node())
-    with Spinning(executor):
+    found = Computing(make_executor, make_node)
+    with Spinning(found.executor):
         for name in found.publishers:  # so it is known how long each takes
             found.publish(name)
         assert wait_for(lambda: len(found.ran) == 4), found.ran

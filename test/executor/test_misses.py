@@ -17,7 +17,7 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from mddag_executor import DeadlineMiss, MultiDeadlineExecutor
+from mddag_executor import DeadlineMiss
 from mddag_executor.core.tally import total
 from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
@@ -28,6 +28,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
 from .conftest import run_program, Spinning, wait_for
+from .declared import Declared
 
 SECONDS = float(os.environ.get('MISS_STRESS_SECONDS', 0))
 PERIODS_MS = (3, 5, 7)
@@ -100,15 +101,14 @@ class SpinningOn(Spinning):
 @pytest.mark.parametrize(('does', 'workers'), [
     ('0', 7), ('1', 1), ('50', 2), ('raise', 1), ('exit', 7), ('log', 2), ('publish', 1),
     ('call', 1), ('call', 7)])
-def test_the_executor_runs_on_whatever_the_handler_does(ros_context, make_node, does, workers):
+def test_the_executor_runs_on_whatever_the_handler_does(make_executor, make_node, does, workers):
     node = make_node('late')
     handler = Handler(does, node)
     ran = Counter[int]()
     for i, period in enumerate(PERIODS_MS):
         node.create_timer(period / 1e3, lambda i=i: ran.update((i,)), handler.group)
-    executor = MultiDeadlineExecutor(
-        loads(LATE), num_workers=workers, on_deadline_miss=handler, context=ros_context)
-    executor.add_node(node)
+    executor = make_executor(
+        loads(LATE), num_workers=workers, on_deadline_miss=handler, nodes=[node])
     with SpinningOn(executor) as spinning:
         end = time.monotonic() + SECONDS
         assert wait_for(lambda: len(handler.misses) >= 5 and time.monotonic() >= end
@@ -128,7 +128,7 @@ def test_the_executor_runs_on_whatever_the_handler_does(ros_context, make_node, 
 
 
 def test_callbacks_run_while_the_handler_hangs_and_what_does_not_fit_is_counted(
-        ros_context, make_node, capfd):
+        make_executor, make_node, capfd):
     """The only worker is free for them, and memory is bounded."""
     go_on, misses = threading.Event(), []
 
@@ -139,9 +139,7 @@ def test_callbacks_run_while_the_handler_hangs_and_what_does_not_fit_is_counted(
     node = make_node('late')
     for period in PERIODS_MS:
         node.create_timer(period / 1e3, lambda: None)
-    executor = MultiDeadlineExecutor(
-        loads(LATE), num_workers=1, on_deadline_miss=hang, context=ros_context)
-    executor.add_node(node)
+    executor = make_executor(loads(LATE), num_workers=1, on_deadline_miss=hang, nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: executor.statistics()['unreported_misses'] >= 10)
         assert len(misses) == 1
@@ -195,13 +193,10 @@ def judged(dags: dict[str, Any]) -> dict[str, Any]:
         for sink, counts in dag['sinks'].items()}) for name, dag in dags.items()}
 
 
-def test_a_result_that_never_comes_is_a_miss_at_its_deadline(ros_context, make_node, capfd):
+def test_a_result_that_never_comes_is_a_miss_at_its_deadline(make_executor, make_node, capfd):
     misses: list[DeadlineMiss] = []
     once = Once(make_node, lambda: None, lambda: None)
-    executor = MultiDeadlineExecutor(
-        loads(ONCE), on_deadline_miss=misses.append, context=ros_context)
-    for node in once.nodes:
-        executor.add_node(node)
+    executor = make_executor(loads(ONCE), on_deadline_miss=misses.append, nodes=once.nodes)
     with Spinning(executor):
         once.go()
         assert wait_for(lambda: misses)
@@ -219,7 +214,7 @@ def test_a_result_that_never_comes_is_a_miss_at_its_deadline(ros_context, make_n
         'completed_ns': None}
 
 
-def test_a_callback_that_hangs_is_a_miss_once(ros_context, make_node, tmp_path):
+def test_a_callback_that_hangs_is_a_miss_once(make_executor, make_node, tmp_path):
     """Known while it hangs, to all who ask; what comes of it later is its verdict."""
     misses: list[DeadlineMiss] = []
     go_on = threading.Event()
@@ -234,11 +229,9 @@ def test_a_callback_that_hangs_is_a_miss_once(ros_context, make_node, tmp_path):
     once.nodes[0].create_subscription(
         DiagnosticArray, '/diagnostics', diagnosed, 10, callback_group=once.group)
     trace = str(tmp_path / 'run.mcap')
-    executor = MultiDeadlineExecutor(
-        loads(ONCE), on_deadline_miss=misses.append, context=ros_context, trace=trace,
-        diagnostics_period='50ms')
-    for node in once.nodes:
-        executor.add_node(node)
+    executor = make_executor(
+        loads(ONCE), on_deadline_miss=misses.append, trace=trace, diagnostics_period='50ms',
+        nodes=once.nodes)
     with Spinning(executor):
         once.go()
         assert wait_for(lambda: misses)
@@ -253,19 +246,7 @@ def test_a_callback_that_hangs_is_a_miss_once(ros_context, make_node, tmp_path):
     assert judged(replay(trace).result()['dags']) == judged(dags)
 
 
-def test_what_was_reported_is_what_a_replay_judges(ros_context, make_node, tmp_path):
-    """Callbacks end just before and after their deadlines."""
-    generator, group = random.Random(1), ReentrantCallbackGroup()
-    misses: list[DeadlineMiss] = []
-    node = make_node('many')
-    publisher = node.create_publisher(Header, '/many', 10)
-    node.create_timer(0.005, lambda: publisher.publish(Header()), group)
-    for _ in range(2):
-        node.create_subscription(
-            Header, '/many', lambda _: time.sleep(generator.uniform(0.0, 0.008)), 10,
-            callback_group=group)
-    trace = str(tmp_path / 'run.mcap')
-    executor = MultiDeadlineExecutor(loads("""
+MANY = """
 mddag: 1
 nodes:
   - node: /many
@@ -273,9 +254,19 @@ nodes:
       - {name: tick, timer: 5ms, publishes: [/many], dag: many}
       - {name: soon, subscription: /many, deadline: 4ms}
       - {name: later, subscription: /many, deadline: 6ms}
-"""), on_deadline_miss=misses.append, context=ros_context, trace=trace)
-    executor.add_node(node)
+"""
+
+
+def test_what_was_reported_is_what_a_replay_judges(make_executor, make_node, tmp_path):
+    """Callbacks end just before and after their deadlines."""
+    generator = random.Random(1)
+    misses: list[DeadlineMiss] = []
+    nodes = Declared(make_node, MANY, dict.fromkeys(
+        ('soon', 'later'), lambda: time.sleep(generator.uniform(0.0, 0.008))))
+    trace = str(tmp_path / 'run.mcap')
+    executor = make_executor(loads(MANY), on_deadline_miss=misses.append, trace=trace)
     with Spinning(executor):
+        nodes.start(executor)
         assert wait_for(lambda: executor.statistics()['dags']['many']['jobs'] >= 200)
     statistics = executor.statistics()
     reported = [(miss.vertex, miss.job) for miss in misses]

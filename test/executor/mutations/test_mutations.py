@@ -129,7 +129,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         of('test_spin.py', 'test_what_fails_when_it_is_taken_comes_out_of_spin'), at_once=True),
     Case('create_task_does_not_wake_workers', [(
         'executor/executor.py', 'self._pool.report(self._engine.ready, work)', UNNOTICED)], of(
-        'test_executor.py', 'test_create_task_wakes_an_idle_executor')),
+        'test_executor.py', 'test_tasks_and_nodes_wake_an_idle_executor')),
     Case('rest_not_collected', [(
         'executor/sources.py', 'entity.collect_more = partial(self.collect, MANY)', 'pass')], of(
         'test_bounds.py', 'test_few_requests_wait_in_python_and_none_is_lost')),
@@ -145,7 +145,7 @@ client.completed = getattr(client, 'completed', 0) + 1
     Case('no_thread_waits_while_a_worker_runs', [(
         'executor/workers.py', 'if self._parked and self.running and not self._is_stepping:',
         'if len(self._parked) == len(self._threads) and self.running and not self._is_stepping:')],
-        of('test_executor.py', 'test_reentrant_group_fills_all_workers')),
+        of('test_executor.py', 'test_synchronous_calls_from_all_workers_at_once')),
     Case('muted_for_ever', [(
         'executor/loop.py', 'found: Events = []\n        for', 'return []\n        for')], of(
         'test_gil.py', 'test_what_cannot_start_is_left_in_the_middleware[elsewhere]')),
@@ -157,7 +157,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         'test_gil.py', 'test_it_does_so_at_once[elsewhere]')),
     Case('add_node_does_not_wake', [(
         'executor/executor.py', 'if added:\n            self.wake()', 'if added:\n            pass'
-        )], of('test_executor.py', 'test_add_node_wakes_an_idle_executor')),
+        )], of('test_executor.py', 'test_tasks_and_nodes_wake_an_idle_executor')),
     Case('release_is_when_noticed', [(
         'executor/timers.py', 'yield fired', 'yield (fired[0], _now(), *fired[2:])')], of(
         'test_deadlines.py',
@@ -181,11 +181,11 @@ before = globals().setdefault('BEFORE', {})
         'test_each_callback_runs_for_the_job_that_its_message_belongs_to')),
     Case('late_sinks_counted_in_time', [(
         'core/tally.py', 'self.late += late', 'pass')], of(
-        'test_deadlines.py', 'test_unequal_deadlines_are_judged_apart_and_misses_are_told')),
+        'test_misses.py', 'test_what_was_reported_is_what_a_replay_judges')),
     Case('late_jobs_counted_in_time', [(
         'core/tally.py', 'self.ends[dag][deadline] += 1',
         'self.ends[dag][COMPLETED if deadline == LATE else deadline] += 1')], of(
-        'test_deadlines.py', 'test_unequal_deadlines_are_judged_apart_and_misses_are_told')),
+        'test_misses.py', 'test_what_was_reported_is_what_a_replay_judges')),
 ]
 
 
