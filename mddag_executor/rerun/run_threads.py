@@ -303,6 +303,7 @@ class _StallWatch:
         elif owner is not before:
             pass
         elif computes:
+            self._waited_s = 0.0  # a busy machine gives it little CPU time now and then
             self._computed_s += passed_s
             if self._computed_s > _COMPUTES * self._patience_s:
                 raise Stalled(owner, 'computing', _COMPUTES * self._patience_s)
