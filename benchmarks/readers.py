@@ -12,13 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 import math
-import multiprocessing
 import os
 import resource
+import sys
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
-from mddag_executor.errors import MddagError
+from mddag_executor.hosting.child import answer, run_child
 from mddag_executor.memory import peak_memory_mb
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import (
@@ -31,19 +31,7 @@ from mddag_executor.simulate import (
 from mddag_executor.trace import TraceReader
 from msg_graph import TaskSet
 
-
-class Speed(NamedTuple):
-    """The cost of reading: events in the file (as far as read), seconds, maximum memory."""
-
-    events: int
-    elapsed_s: float
-    cpu_s: float
-    peak_mb: float
-
-    @property
-    def per_s(self) -> float:
-        """Return events a second."""
-        return self.events / self.elapsed_s if self.elapsed_s else 0.0
+LIMIT_S = 3600.0
 
 
 def write_long_trace(path: str, task_set: TaskSet, events: int) -> None:
@@ -133,35 +121,28 @@ OTHERS = ('mcap, undecoded', 'rosbags, undecoded')
 """Readers that stop after a number of events: they are slow, and only their rate is reported."""
 
 
-def _in_child(name: str, path: str, limit: int, pipe: Any) -> None:
-    begin, cpu = time.monotonic(), time.process_time()
-    try:
-        count = READERS[name](path, limit)
-    except MddagError as error:
-        pipe.send(str(error))
-        return
-    took, cpu = time.monotonic() - begin, time.process_time() - cpu
-    children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    pipe.send(Speed(count, took, cpu + children.ru_utime + children.ru_stime,
-                    peak_memory_mb() + children.ru_maxrss / 1024))
-
-
-def measure(name: str, path: str, limit: int) -> Speed:
+def measure(name: str, path: str, limit: int) -> dict[str, Any]:
     """
     Run one of ``READERS`` over a file in a separate process.
 
     :param limit: number of events after which a reader of ``OTHERS`` stops.
+    :return: the cost of reading: events (as far as read), seconds, memory.
     """
-    context = multiprocessing.get_context('spawn')
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_in_child, args=(name, os.fspath(path), limit, theirs))
-    process.start()
-    theirs.close()
-    try:
-        found = ours.recv()
-    except EOFError:
-        found = f'{name}: the measurement ended early: see above'
-    process.join()
-    if isinstance(found, str):
-        raise MddagError(found)
-    return Speed(*found)
+    return run_child(
+        [sys.executable, '-m', 'benchmarks.readers', name, path, str(limit)], name, LIMIT_S)
+
+
+def _measure(name: str, path: str, limit: int) -> dict[str, Any]:
+    begin, cpu = time.monotonic(), time.process_time()
+    count = READERS[name](path, limit)
+    took, cpu = time.monotonic() - begin, time.process_time() - cpu
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return {
+        'events': count, 'elapsed_s': took,
+        'cpu_s': cpu + children.ru_utime + children.ru_stime, 'events_per_s': count / took,
+        'peak_mb': peak_memory_mb() + children.ru_maxrss / 1024,
+        'partial': name in OTHERS and count == limit}
+
+
+if __name__ == '__main__':
+    answer(lambda: _measure(sys.argv[1], sys.argv[2], int(sys.argv[3])))

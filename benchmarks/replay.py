@@ -118,7 +118,7 @@ def _slack(args: argparse.Namespace, folder: str) -> dict[str, Any]:
 # --- speed ---------------------------------------------------------------------------------------
 
 def _speed(args: argparse.Namespace, folder: str) -> dict[str, Any]:
-    from benchmarks.readers import measure, OTHERS, READERS, write_long_trace
+    from benchmarks.readers import measure, READERS, write_long_trace
     from mddag_executor.trace import TraceReader
     path = args.trace
     if path is None:
@@ -132,13 +132,8 @@ def _speed(args: argparse.Namespace, folder: str) -> dict[str, Any]:
             for place, name in enumerate(READERS):
                 line.update(turn * len(READERS) + place, name)
                 found = measure(name, path, args.others)
-                before = rows.get(name)
-                if before is None or found.elapsed_s < before['elapsed_s']:
-                    rows[name] = {
-                        'events': found.events, 'elapsed_s': found.elapsed_s,
-                        'cpu_s': found.cpu_s,
-                        'events_per_s': found.per_s, 'peak_mb': found.peak_mb,
-                        'partial': name in OTHERS and found.events == args.others}
+                rows[name] = min(
+                    found, rows.get(name, found), key=lambda row: float(row['elapsed_s']))
     return {'events': events, 'bytes': os.path.getsize(path), 'readers': rows}
 
 

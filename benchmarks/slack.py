@@ -29,6 +29,7 @@ from mddag_executor.defaults import processors
 from mddag_executor.errors import MddagError
 from mddag_executor.report.tables import short_names
 from msg_graph import TaskSet
+from msg_graph.edit import callbacks_of
 
 HOLDS, BREAKS = 0.9, 1.1
 LEAST, MOST = 1.2, 30.0
@@ -101,20 +102,13 @@ def with_times(task_set: TaskSet, times: dict[str, int]) -> str:
     text = 'tag:yaml.org,2002:str'
     # As nodes, not as values: a name such as on or 0x10 is not changed.
     declaration = yaml.compose(task_set.text, yaml.SafeLoader)
-    for node in _entries(declaration)['nodes'].value:
-        of_node = _entries(node)
-        for callback in of_node['callbacks'].value:
-            key = f'{of_node["node"].value}:{_entries(callback)["name"].value}'
-            if key in times:
-                callback.value = [each for each in callback.value
-                                  if each[0].value != 'execution_time']
-                callback.value.append((yaml.ScalarNode(text, 'execution_time'),
-                                       yaml.ScalarNode(text, f'{times[key]}ns')))
+    for key, callback, _ in callbacks_of(declaration):
+        if key in times:
+            callback.value = [each for each in callback.value
+                              if each[0].value != 'execution_time']
+            callback.value.append((yaml.ScalarNode(text, 'execution_time'),
+                                   yaml.ScalarNode(text, f'{times[key]}ns')))
     return str(yaml.serialize(declaration, Dumper=yaml.SafeDumper))
-
-
-def _entries(node: Any) -> dict[str, Any]:
-    return {key.value: value for key, value in node.value}
 
 
 def _misses(trace: str) -> tuple[int, int]:

@@ -79,9 +79,9 @@ def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Table[str, int]) 
     return checked(result, with_deadlines(task_set, deadlines))
 
 
-def _callbacks(text: str) -> Iterator[tuple[str, Any, dict[str, Any]]]:
+def callbacks_of(declaration: Any) -> Iterator[tuple[str, Any, dict[str, Any]]]:
     """Yield the key of each callback, its YAML node, and the nodes of its values."""
-    for node in _entries(yaml.compose(text, _LOADER))['nodes'].value:
+    for node in _entries(declaration)['nodes'].value:
         of_node = _entries(node)
         for callback in of_node['callbacks'].value:
             entries = _entries(callback)
@@ -96,7 +96,7 @@ def _with_deadlines(text: str, deadlines: Table[str, int]) -> str:
     """Return a text with other or additional deadlines."""
     lines = text.splitlines(keepends=True)
     edits: list[tuple[int, int, int, str]] = []  # line, from column, to column, new text
-    for key, callback, entries in _callbacks(text):
+    for key, callback, entries in callbacks_of(yaml.compose(text, _LOADER)):
         if key not in deadlines:
             continue
         value = exact_duration(deadlines[key])
