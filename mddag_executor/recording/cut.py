@@ -22,11 +22,9 @@ from dataclasses import replace
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.tables import (
     JobNumbers,
-    Mask,
     pick,
     Recording,
     RowNumbers,
-    WITHDRAWN,
 )
 import numpy as np
 
@@ -89,13 +87,4 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
         drops=pick(drops, (drops['time'] >= begin) & (drops['time'] < last)),
         demotions=pick(demotions, (demotions['time'] >= begin) & (demotions['time'] < last)),
         misses=pick(recording.misses, judged[jobs.of(recording.misses)]),
-        start=begin, end=until, judged_releases=(begin, end),
-        unjudged=None if recording.unjudged is None else _withdrawn(recording, jobs, judged))
-
-
-def _withdrawn(recording: Recording, jobs: JobNumbers, judged: Mask) -> dict[int, int]:
-    """Return by DAG the number of judged jobs that were withdrawn."""
-    ends = recording.job_ends
-    mine = ends[(ends['reason'] == WITHDRAWN) & judged[jobs.of(ends)]]
-    dags, counts = np.unique(mine['dag'], return_counts=True)
-    return dict(zip(dags.tolist(), counts.tolist()))
+        start=begin, end=until, judged_releases=(begin, end))

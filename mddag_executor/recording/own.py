@@ -686,9 +686,9 @@ def _pieces(table: Table, end_at: Ints) -> None:
         mine = np.flatnonzero(table['vertex'] >= 0)
         keys = _hashed(table['vertex'][mine], table['job'][mine], table['ready'][mine])
         some = np.unique(_hashed(*(table[name][suspended] for name in ('vertex', 'job', 'ready'))))
-        _number_pieces(table, mine[np.isin(keys, some)], 'job', end_at)
+        number_pieces(table, mine[np.isin(keys, some)], 'job', end_at)
     if undeclared.any():
-        _number_pieces(table, np.flatnonzero(undeclared), 'callback', end_at)
+        number_pieces(table, np.flatnonzero(undeclared), 'callback', end_at)
 
 
 def _hashed(vertex: Any, job: Any, ready: Any) -> Ints:
@@ -696,7 +696,7 @@ def _hashed(vertex: Any, job: Any, ready: Any) -> Ints:
     return found
 
 
-def _number_pieces(table: Table, mine: Ints, of: str, end_at: Ints) -> None:
+def number_pieces(table: Table, mine: Ints, of: str, end_at: Ints) -> None:
     """Count pieces among rows; pieces of an execution agree in vertex, ready time and a column."""
     columns = [table[name][mine] for name in (of, 'vertex', 'ready')]
     order = sort_by(*columns, end_at[mine])

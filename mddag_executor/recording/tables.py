@@ -29,6 +29,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TYPE_CHECKING
 
+from mddag_executor.core import NEVER
 import numpy as np
 import numpy.typing as npt
 
@@ -177,7 +178,6 @@ class Recording:
         job links them.
     :ivar callback_vertex: by callback a vertex of its declared callback, for executions without
         job.
-    :ivar unjudged: by DAG the number of withdrawn jobs; None: unknown.
     :ivar messages: number of messages of an ordinary bag; None: it is a trace.
     :ivar notes: assumptions, one line each; ``warnings``: missing or doubtful data.
     """
@@ -217,7 +217,6 @@ class Recording:
     worker_names: Sequence[str] = ()
     links: bool = False
     callback_vertex: dict[int, int] = field(default_factory=dict)
-    unjudged: dict[int, int] | None = None
     messages: int | None = None
     notes: Sequence[str] = ()
     warnings: list[str] = field(default_factory=list)
@@ -241,6 +240,19 @@ class Recording:
         counts = np.bincount(self.drops['reason'], minlength=len(self.drop_reasons))
         return Counter({
             name: n for name, n in zip(self.drop_reasons, counts.tolist()) if n})
+
+    @property
+    def unjudged(self) -> dict[int, int] | None:
+        """Return by DAG the number of withdrawn jobs; None: none can be."""
+        if not self.links:
+            return None
+        ends, released = self.job_ends, self.releases['release']
+        begin, end = self.judged_releases or (-NEVER, NEVER)
+        jobs = JobNumbers(self.releases)
+        judged = jobs.marked((released >= begin) & (released < end))[jobs.of(ends)]
+        dags, counts = np.unique(
+            ends['dag'][judged & (ends['reason'] == WITHDRAWN)], return_counts=True)
+        return dict(zip(dags.tolist(), counts.tolist()))
 
     def callbacks(self) -> tuple[Ints, Ints]:
         """Return the numbers of the callbacks that ran, and by execution the callback's index."""
@@ -367,6 +379,19 @@ def last_of(which: Mask, group: Any, before: bool = False) -> Ints:
         last = np.append(-1, last)[:len(which)]
     found: Ints = np.where((last >= 0) & (group[last] == group), last, -1)
     return found
+
+
+def find_pairs(known: tuple[Ints, Ints], wanted: tuple[Ints, Ints]) -> tuple[Ints, Ints]:
+    """Return by wanted pair the first known one, ``UNKNOWN`` without, and their number."""
+    values, second = np.unique(np.append(known[1], wanted[1]), return_inverse=True)
+    keys = np.append(known[0], wanted[0]) * len(values) + second
+    n = len(known[0])
+    keys, wanted_keys = keys[:n], keys[n:]
+    keys, first, count = np.unique(keys, return_index=True, return_counts=True)
+    at = np.searchsorted(keys, wanted_keys)
+    good = np.append(keys, UNKNOWN)[at] == wanted_keys
+    return (np.where(good, np.append(first, UNKNOWN)[at], UNKNOWN),
+            np.where(good, np.append(count, 0)[at], 0))
 
 
 def groups(values: Any) -> tuple[Ints, Ints]:

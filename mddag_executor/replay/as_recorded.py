@@ -92,7 +92,7 @@ class Replay:
             'duration_ns': duration,
             'utilisation': share(self.usage.busy, head.workers, duration),
             **self.tally.result()}
-        breakdown = self.chains.breakdown()
+        breakdown, unjudged = self.chains.breakdown(), recording.unjudged
         for dag in self.task_set.dags:
             sinks = result['dags'][dag.name]['sinks']
             first = self.judged.tables.first_vertex[dag.index]
@@ -100,8 +100,8 @@ class Replay:
                 sink = sinks[dag.vertices[local].name]
                 sink['breakdown'] = breakdown.get(first + local)
                 sink['slack_ns'] = slack(sink)
-            if recording.unjudged is not None:
-                result['dags'][dag.name]['unjudged'] = recording.unjudged.get(dag.index, 0)
+            if unjudged is not None:
+                result['dags'][dag.name]['unjudged'] = unjudged.get(dag.index, 0)
         return {
             **result, 'rescheduled': False, 'skip_ns': self.judged.skip,
             'callbacks': self.usage.callbacks(),

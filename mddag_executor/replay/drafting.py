@@ -31,10 +31,8 @@ from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
 from mddag_executor.recording.entities import Callback, KINDS
 from mddag_executor.recording.head import is_declared, named_errors, read_head
-from mddag_executor.recording.own import read_own
 from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by, VERTEX
-from mddag_executor.replay.imported_run import ImportedRun
-from mddag_executor.replay.undeclared_run import UndeclaredRun
+from mddag_executor.replay.run import open_recording
 from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
 from msg_graph import ExecutionTime, NO_GRAPH, TaskSet
@@ -83,7 +81,9 @@ class System:
         self.name = name or os.fspath(path)
         with named_errors(os.fspath(path), self.name):
             reader = TraceReader(path)
-            recording = _read(reader, self.name, progress)
+            head = read_head(reader)
+            graph = None if head is None or is_declared(head) else NO_GRAPH
+            recording = open_recording(reader, graph, self.name, progress)
         declared = recording.declared
         self.task_set: TaskSet | None = recording.task_set if declared else None
         self.workers: int | None = recording.head.workers if declared else None
@@ -231,17 +231,6 @@ class System:
             if fits:
                 count += self._measure(callback, fits.pop(0))
         return count
-
-
-def _read(
-    reader: TraceReader, name: str, progress: Callable[[int], None] | None
-) -> Recording:
-    head = read_head(reader)
-    if head is None:
-        return ImportedRun(reader, name, None, progress=progress).read()
-    if is_declared(head):
-        return read_own(reader, name, head, progress)
-    return UndeclaredRun(reader, name, head, NO_GRAPH, progress).read()
 
 
 def _runs_of(recording: Recording, which: Mask) -> Runs:

@@ -45,11 +45,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable as Function
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-from mddag_executor.recording.entities import Addresses, Callback, Entities
-from mddag_executor.recording.tables import Ints, last_of, Mask, sort_by, Table
+from mddag_executor.recording.entities import Addresses, Entities
+from mddag_executor.recording.tables import find_pairs, Ints, last_of, Mask, sort_by, Table
 from mddag_executor.replay.imported_events import (
     ADDRESSES,
     BECAME,
@@ -79,6 +79,7 @@ from mddag_executor.text import counted, listed
 import numpy as np
 
 _DEEPEST = 32
+_NONE, _SEVERAL = -1, -2      # instead of a publication
 _PUBLISHES = (INTRA, RCLCPP, RCL)
 _STAMPS = (DDS_WRITE, BIND, RMW_PUBLISH, WRITTEN)
 _ARRIVALS = (DISPATCH, DISPATCH_ERASED, TAKE, WITHIN, DEQUEUE, READY)
@@ -114,13 +115,15 @@ class Losses:
 
     def count(self, kind: str, affected: str, number: int = 1) -> None:
         """Count events of a kind."""
-        self._counts[kind][affected] += number
+        if number:
+            self._counts[kind][affected] += number
 
     def lines(self) -> list[str]:
         """Return the counts as text."""
         return [
             f'{counted(sum(counts.values()), noun)} {text}: '
-            + listed([f'{name} ({n})' for name, n in counts.most_common()], self._most)
+            + listed([f'{name} ({n})' for name, n in sorted(
+                counts.items(), key=lambda each: (-each[1], each[0]))], self._most)
             for counts, (noun, text) in zip(self._counts.values(), self._said.values()) if counts]
 
 
@@ -159,8 +162,9 @@ class Links:
         unknown), ``taken`` (when the message was taken; 0: unknown), ``message`` (-1: unknown).
     :ivar messages: publications: ``at`` (event), ``publisher`` (index of ``publishers``, -1:
         unknown), ``run`` (-1: none), ``time``, ``stamp``, ``within`` (only within the process).
+    :ivar topics: numbers of topics by name; ``topic_of``: by message the number of its topic.
     :ivar takes: executions with messages that they took themselves.
-    :ivar lost: signs of missing events, in the order of time.
+    :ivar lost: signs of missing events, in the order of time: the fields of ``Lost``.
     """
 
     def __init__(self, events: Events, who: Entities) -> None:
@@ -168,7 +172,7 @@ class Links:
         self._pid = np.array([pid for pid, _ in events.threads], dtype=np.int64)
         kind = self.events['kind']
         self.discarded = int(self.events['a'][kind == LOST].sum())
-        self.lost = [Lost(at, -1, -1, int(self.events['time'][at]))
+        self._lost = [Lost(at, -1, -1, int(self.events['time'][at]))
                      for at in np.flatnonzero(kind == LOST).tolist()]
         # by thread, then by time
         self._order = sort_by(self.events['thread'])
@@ -178,15 +182,22 @@ class Links:
         self.publishers, self._publisher = self._objects(
             np.isin(kind, _PUBLISHES) & (self.events['a'] != 0), who.publishers)
         self.taken, self._subscription = self._objects(kind == TAKE, who.taken)
+        names = ['', *(each.topic for each in self.publishers)]
+        self.topics = {name: number for number, name in enumerate(dict.fromkeys(names))}
         self.runs = self._runs()
         self.messages = self._publications()
-        self._stamp_messages()
-        arrived = self._arrivals()
-        self._by_stamp = self._messages_by_stamp()
-        self._started_by(arrived)
+        self.topic_of = self._numbers([*names[1:], ''])[self.messages['publisher']]
+        several = self._stamp_messages()
+        #: Topics and source timestamps of publications; several possible ones are there twice.
+        known = np.flatnonzero(self.messages['stamp'] != 0)
+        self._stamped = np.append(known, np.full(2 * len(several) + 1, _NONE))
+        topic, stamp = np.concatenate([
+            np.column_stack((self.topic_of, self.messages['stamp']))[known], several, several]).T
+        self._pairs = topic, stamp
+        self._started_by(self._arrivals())
         self._find_messages()
         self.takes = self._takes()
-        self.lost.sort(key=lambda each: each.at)
+        self.lost = np.array(sorted(self._lost), dtype=np.int64).reshape(-1, len(Lost._fields))
 
     def _objects(
         self, events: Mask, known: Addresses[Any],
@@ -256,8 +267,8 @@ class Links:
         number = np.empty(len(order), dtype=np.int64)
         number[order] = np.arange(len(order))
         self._top = np.where(self._top >= 0, number[self._top], -1) if len(order) else self._top
-        self.lost = [each._replace(run=int(number[each.run])) if each.run >= 0 else each
-                     for each in self.lost]
+        self._lost = [each._replace(run=int(number[each.run])) if each.run >= 0 else each
+                     for each in self._lost]
         begin, end_at = begin[order], end_at[order]
         runs = np.zeros(len(begin), _RUN)
         runs['callback'], runs['at'], runs['end_at'] = self._callback[begin], begin, end_at
@@ -322,7 +333,7 @@ class Links:
             elif not fresh or self.callbacks[number].made >= self.who.begin:
                 # otherwise it began before the recording
                 self.losses.count('starts', self.callbacks[number].label)
-                self.lost.append(Lost(here, number, -1, now))
+                self._lost.append(Lost(here, number, -1, now))
             if stack:
                 self._top[here] = stack[-1]
         for stack in stacks.values():
@@ -333,7 +344,7 @@ class Links:
 
     def _without_end(self, at: int, callback: int, run: int, now: int) -> None:
         self.losses.count('ends', self.callbacks[callback].label)
-        self.lost.append(Lost(at, callback, run, now))
+        self._lost.append(Lost(at, callback, run, now))
 
     def _running(self, events: Mask) -> Ints:
         """Return the executions that run at events, or -1."""
@@ -380,8 +391,17 @@ class Links:
             self.losses.count('partial', self.publishers[number].topic,
                               int((only_rcl == number).sum()))
 
-    def _stamp_messages(self) -> None:
-        """Find the source timestamps of publications."""
+    def _numbers(self, topics: Iterable[str]) -> Ints:
+        """Return the numbers of topics; ``len(self.topics)``: without publisher."""
+        return np.array([self.topics.get(topic, len(self.topics)) for topic in topics],
+                        dtype=np.int64)
+
+    def _stamp_messages(self) -> Ints:
+        """
+        Find the source timestamps of publications.
+
+        :return: pairs of topic and source timestamp of several possible publications; here none.
+        """
         table, found = self.events, self.messages
         kind, a = table['kind'], table['a']
         publishes = np.isin(kind, _PUBLISHES)
@@ -406,6 +426,7 @@ class Links:
             (of != RCL) | (a == 0) | (a == message) | (a == form))
         at = np.flatnonzero(good)[::-1]     # the first one is assigned last
         found['stamp'][self._row[last[at]]] = table['b'][at]
+        return np.empty((0, 2), dtype=np.int64)
 
     def topic(self, row: int) -> str:
         """Return the topic of a publication; empty if unknown."""
@@ -413,24 +434,12 @@ class Links:
         topic: str = self.publishers[publisher].topic if publisher >= 0 else ''
         return topic
 
-    def _messages_by_stamp(self) -> dict[tuple[str, int], int]:
-        """Return publications by topic and source timestamp; -1: ambiguous."""
-        topics = [each.topic for each in self.publishers] + ['']
-        found: dict[tuple[str, int], int] = {}
-        stamped = np.flatnonzero(self.messages['stamp'] != 0)
-        for row, publisher, stamp in zip(
-                stamped.tolist(), self.messages['publisher'][stamped].tolist(),
-                self.messages['stamp'][stamped].tolist()):
-            key = topics[publisher], stamp
-            found[key] = -1 if key in found else row
-        unstamped = self.messages[(self.messages['stamp'] == 0) & ~self.messages['within']]
-        self._unstamped = {topics[each] for each in np.unique(unstamped['publisher']).tolist()}
-        return found
-
-    def _find(self, topic: str, stamp: int) -> int:
-        """Return the publication of a source timestamp, or -1."""
-        found = self._by_stamp.get((topic, stamp), -1)
-        return found if found >= 0 else self._by_stamp.get(('', stamp), -1)
+    def _find(self, topic: Ints, stamp: Ints) -> Ints:
+        """Return the publications of source timestamps; ``_NONE`` or ``_SEVERAL`` without one."""
+        which, count = find_pairs(self._pairs, (topic, stamp))
+        unnamed, unnamed_count = find_pairs(self._pairs, (np.zeros_like(topic), stamp))
+        which = np.where((count != 1) & (unnamed_count == 1), unnamed, which)
+        return np.where((count > 1) & (unnamed_count != 1), _SEVERAL, self._stamped[which])
 
     # --- messages that arrive --------------------------------------------------------------------
 
@@ -453,16 +462,15 @@ class Links:
         found: Ints = np.where((last >= 0) & arrives[np.maximum(last, 0)], last, -1)
         return found
 
-    def _takes(self) -> list[tuple[int, int, int]]:
-        """Return executions, and what they took themselves (rule 5): event, execution, message."""
+    def _takes(self) -> tuple[Ints, Ints]:
+        """Return executions, and the messages that they took themselves (rule 5)."""
         table = self.events
         takes = (table['kind'] == TAKE) & (table['c'] != 0) & (self._subscription >= 0)
         runs = self._running(takes)
         at, runs = np.flatnonzero(takes)[runs >= 0], runs[runs >= 0]
-        topics = [each[0].start for each in self.taken]
-        found = [self._find(topics[number], stamp) for number, stamp in zip(
-            self._subscription[at].tolist(), table['b'][at].tolist())]
-        return [each for each in zip(at.tolist(), runs.tolist(), found) if each[2] >= 0]
+        topic = self._numbers(each[0].start for each in self.taken)[self._subscription[at]]
+        found = self._find(topic, table['b'][at])
+        return runs[found >= 0], found[found >= 0]
 
     def _started_by(self, arrived: Ints) -> None:
         """Find the message of each execution."""
@@ -496,33 +504,27 @@ class Links:
 
     def _find_messages(self) -> None:
         """Find messages by their source timestamps; count missing ones."""
-        runs = self.runs
-        rows = np.flatnonzero(runs['message'] < 0)
-        found = []
-        for number, stamp, taken, at, start in zip(*(runs[name][rows].tolist() for name in (
-                'callback', 'stamp', 'taken', 'at', 'start'))):
-            callback = self.callbacks[number]
-            message = -1
-            if stamp:
-                message = self._find(callback.start, stamp)
-                if message < 0:
-                    self._not_found(callback, number, stamp, at, start)
-            elif callback.kind == 'subscription' and not taken:
-                self.losses.count('without_message', callback.label)
-            found.append(message)
-        runs['message'][rows] = found
-
-    def _not_found(
-        self, callback: Callback, number: int, stamp: int, at: int, start: int
-    ) -> None:
-        topic = callback.start
-        if (topic, stamp) in self._by_stamp:
-            self.losses.count('ambiguous', callback.label)
-            self.lost.append(Lost(at, number, -1, start))
-        elif self._unstamped.isdisjoint((topic, '')):
-            self.losses.count('messages', callback.label)
-        else:
-            self.losses.count('unlinked', callback.label)
+        rows = np.flatnonzero(self.runs['message'] < 0)
+        runs = self.runs[rows]
+        number, stamped = runs['callback'], runs['stamp'] != 0
+        message = np.full(len(rows), _NONE)
+        topic = self._numbers(each.start for each in self.callbacks)[number[stamped]]
+        message[stamped] = self._find(topic, runs['stamp'][stamped])
+        self.runs['message'][rows] = np.maximum(message, -1)
+        unstamped = self.topic_of[(self.messages['stamp'] == 0) & ~self.messages['within']]
+        unstamped_topics = set(np.unique(unstamped).tolist())
+        several, missing = message == _SEVERAL, stamped & (message == _NONE)
+        for kind, which in (('ambiguous', several), ('messages', missing),
+                            ('without_message', ~stamped & (runs['taken'] == 0))):
+            for each, n in zip(*(c.tolist() for c in np.unique(
+                    number[which], return_counts=True))):
+                callback = self.callbacks[each]
+                if kind == 'messages' and unstamped_topics & {0, self.topics.get(callback.start)}:
+                    self.losses.count('unlinked', callback.label, n)
+                elif kind != 'without_message' or callback.kind == 'subscription':
+                    self.losses.count(kind, callback.label, n)
+        self._lost += [Lost(at, callback, -1, start) for at, callback, start in zip(*(
+            runs[name][several].tolist() for name in ('at', 'callback', 'start')))]
 
     def _within(self) -> dict[int, int]:
         """Return the message by event that dispatches or dequeues it in its process (rule 4)."""

@@ -69,10 +69,9 @@ def open_recording(
         head = read_head(reader)
         if head is not None and (task_set is None or is_declared(head)):
             return judged_by(read_own(reader, name or path, head, progress), task_set)
-        if head is not None and task_set is not None:
+        if head is not None:
             from mddag_executor.replay.undeclared_run import UndeclaredRun
-            return UndeclaredRun(
-                reader, name or path, head, task_set, progress).read()
+            return UndeclaredRun(reader, name or path, task_set, head, progress).read()
         from mddag_executor.replay.imported_run import ImportedRun
         return ImportedRun(reader, name or path, task_set, progress=progress).read()
 

@@ -27,12 +27,19 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable as Function
 
-from mddag_executor.recording.entities import Callback, INIT_EVENTS
-from mddag_executor.recording.head import Head, no_end
-from mddag_executor.recording.mapping import Target
-from mddag_executor.recording.tables import DROPS, Ints, Recording, rows, UNKNOWN
+from mddag_executor.recording.entities import INIT_EVENTS
+from mddag_executor.recording.head import no_end
+from mddag_executor.recording.own import number_pieces
+from mddag_executor.recording.tables import (
+    DROPS,
+    find_pairs,
+    Ints,
+    Mask,
+    Recording,
+    rows,
+    UNKNOWN,
+)
 from mddag_executor.replay.imported_events import (
     END,
     KINDS,
@@ -42,11 +49,10 @@ from mddag_executor.replay.imported_events import (
     START,
     TAKE,
 )
+from mddag_executor.replay.imported_jobs import ImportedJobs
 from mddag_executor.replay.imported_run import ImportedRun
 from mddag_executor.replay.links import Links
-from mddag_executor.trace import TraceReader
 from mddag_executor.trace.times import NEVER
-from msg_graph import Dag, TaskSet
 import numpy as np
 
 _DROP = 'mddag:drop'
@@ -59,10 +65,8 @@ _SOON_NS, _SOON_PART = 1_000_000, 10
 class _OwnLinks(Links):
     """The executions and messages of this executor (rules 1 and 2)."""
 
-    def _stamp_messages(self) -> None:
+    def _stamp_messages(self) -> Ints:
         """Find the source timestamps of publications (rule 2)."""
-        #: Topics and timestamps of several possible publications.
-        self._ambiguous: set[tuple[str, int]] = set()
         table, found = self.events, self.messages
         kind = table['kind']
         sent = np.zeros(len(table), dtype=np.bool_)
@@ -74,31 +78,30 @@ class _OwnLinks(Links):
         at = np.flatnonzero(stops)
         mine = (before >= 0) & sent[before]
         ends[self._row[before[mine]]] = table['time'][at[mine]]
-        topics: dict[str, list[int]] = {}
-        for row in range(len(found)):
-            topics.setdefault(self.topic(row), []).append(row)
-        times = {topic: found['time'][mine].tolist() for topic, mine in topics.items()}
+        rows_of = [np.flatnonzero(self.topic_of == topic) for topic in range(len(self.topics) + 1)]
+        published = [(mine.tolist(), found['time'][mine].tolist()) for mine in rows_of]
         takes = np.flatnonzero((kind == TAKE) & (self._subscription >= 0))
-        known: set[tuple[str, int]] = set()
-        for number, stamp in zip(self._subscription[takes].tolist(), table['b'][takes].tolist()):
-            topic = self.taken[number][0].start
-            if (topic, stamp) in known or topic not in topics:
+        topics = self._numbers(each[0].start for each in self.taken)[self._subscription[takes]]
+        known: set[tuple[int, int]] = set()
+        several: list[tuple[int, int]] = []
+        for topic, stamp in zip(topics.tolist(), table['b'][takes].tolist()):
+            if (topic, stamp) in known:
                 continue
-            last = bisect_right(times[topic], stamp + _ROUNDING_NS)
-            fits = [row for row in topics[topic][max(0, last - _UNSENT):last]
+            rows, times = published[topic]
+            last = bisect_right(times, stamp + _ROUNDING_NS)
+            fits = [row for row in rows[max(0, last - _UNSENT):last]
                     if not found['stamp'][row] and stamp <= ends[row] + _ROUNDING_NS]
             if fits:
                 known.add((topic, stamp))
             if len(fits) == 1:
                 found['stamp'][fits[0]] = stamp
             elif fits:
-                self._ambiguous.add((topic, stamp))
+                several.append((topic, stamp))
+        return np.array(several, dtype=np.int64).reshape(-1, 2)
 
-    def _messages_by_stamp(self) -> dict[tuple[str, int], int]:
-        return {**super()._messages_by_stamp(), **dict.fromkeys(self._ambiguous, -1)}
-
-    def _takes(self) -> list[tuple[int, int, int]]:
-        return []       # the executor takes messages in the threads of callbacks
+    def _takes(self) -> tuple[Ints, Ints]:
+        none = np.empty(0, dtype=np.int64)      # the executor takes messages in any thread
+        return none, none
 
     def _arrivals(self) -> Ints:
         """Find the taken message of each execution (rule 1)."""
@@ -118,45 +121,28 @@ class _OwnLinks(Links):
             same = table['b'][these] == table['b'][these[first[which]]]
             self._taken_at[these[same]] = mine[place[same]]
         starts = kind == START
-        last = self._last(ready, starts)
-        self.runs['ready'] = np.where(last >= 0, table['b'][last], self.runs['start'])
         last = self._last(ready | starts, starts)
-        found: Ints = np.where((last >= 0) & ready[last], self._taken_at[last], -1)
+        known = (last >= 0) & ready[last]
+        start = self.runs['start']
+        self.runs['ready'] = np.where(known, np.clip(table['b'][last], 0, start), start)
+        found: Ints = np.where(known, self._taken_at[last], -1)
         return found
 
 
 class UndeclaredRun(ImportedRun):
-    """
-    A run of this executor that was recorded without a declaration.
-
-    :param head: head of the trace.
-    :param task_set: the declaration to judge by.
-    """
+    """A run of this executor that was recorded without a declaration."""
 
     kinds = {**KINDS, **OWN_KINDS}
     others = (*INIT_EVENTS, _DROP)
     links_type = _OwnLinks
-
-    def __init__(
-        self, reader: TraceReader, name: str, head: Head, task_set: TaskSet,
-        progress: Function[[int], None] | None = None,
-    ) -> None:
-        super().__init__(reader, name, task_set, head, progress)
-        runs = self.links.runs
-        # by callback and ready time: number of remaining pieces; and their execution so far
-        self._to_come: dict[tuple[int, int], int] = {}
-        self._pieces: dict[tuple[int, int], _Pieces] = {}
-        for number, callback in enumerate(self.links.callbacks):
-            times = runs['ready'][runs['callback'] == number]
-            if callback.kind == 'timer' and len(times):
-                callback.grid = _grid(np.unique(times), callback.period)
-            different, counts = np.unique(times, return_counts=True)
-            for time, count in zip(different[counts > 1].tolist(), counts[counts > 1].tolist()):
-                self._to_come[number, time] = count
+    no_grid = 'off'
 
     def read(self) -> Recording:
         """Return the recording."""
         found = super().read()
+        ended = self.links.runs['end_at']
+        number_pieces(found.executions, np.arange(len(ended)), 'callback',
+                      np.where(ended < 0, NEVER, ended))
         found.shut_down = bool((self._events.table['kind'] == SHUTDOWN).any())
         if not found.shut_down:
             found.warnings.append(no_end(self.name))
@@ -174,57 +160,28 @@ class UndeclaredRun(ImportedRun):
         ends = table['a'][table['kind'] == SHUTDOWN]
         return int(ends[-1]) if len(ends) else self.end
 
-    def _ready(self, run: int, callback: Callback) -> int:
-        return self._ready_of[run]      # the executor records it
+    def _times(self, jobs: ImportedJobs) -> tuple[Ints, Ints]:
+        number, ready = self.links.runs['callback'], self.links.runs['ready'].copy()
+        for each, callback in enumerate(self.links.callbacks):
+            times = np.unique(ready[number == each])
+            if callback.kind == 'timer' and len(times):
+                callback.grid = _grid(times, callback.period)
+        # the time at which a request was taken is not recorded
+        release = self._releases(jobs, ready, 'timer', 'service')
+        timer = self._is_any('timer')[number[jobs.sources]]
+        mine = jobs.sources[timer]
+        release[timer] = self._due(mine, ready[mine])
+        return ready, release
 
-    def _release(self, run: int, callback: Callback, dag: Dag, target: Target) -> int:
-        ready = self._ready_of[run]
-        if callback.kind == 'service':
-            return ready        # the time at which a request was taken is not recorded
-        if callback.kind != 'timer':
-            return super()._release(run, callback, dag, target)
-        if callback.grid is None:
-            self._timers.odd.count('off', callback.label)
-            return ready
-        return self._timers.release(callback, ready)
-
-    def _assign(self, run: int, callback: Callback, target: Target) -> None:
-        key = self._runs[run][0], self._ready_of[run]
-        if key in self._pieces:
-            self._of[run], self._leg_of[run] = self._pieces[key].of, self._pieces[key].leg
-            return
-        super()._assign(run, callback, target)
-        if key in self._to_come:
-            self._pieces[key] = _Pieces(self._of[run], self._leg_of[run], self._runs[run][1])
-
-    def _ends_with(self, run: int) -> bool:
-        key = self._runs[run][0], self._ready_of[run]
-        pieces = self._pieces.get(key)
-        if pieces is None:
-            return True
-        self._to_come[key] -= 1
-        row = self._executions[run]
-        pieces.busy += int(row['busy'])
-        row['piece'], row['began'], row['busy'] = pieces.count, pieces.start, pieces.busy
-        pieces.count += 1
-        if self._to_come[key]:
-            return False
-        del self._to_come[key], self._pieces[key]
-        return True
-
-
-class _Pieces:
-    """
-    An execution of a coroutine with remaining pieces.
-
-    :ivar of: DAG, vertex and job; ``leg``: of a sync.
-    :ivar start: start of the first piece; ``count``: pieces so far; ``busy``: their total time.
-    """
-
-    __slots__ = ('of', 'leg', 'start', 'count', 'busy')
-
-    def __init__(self, of: tuple[int, int, int] | None, leg: int, start: int) -> None:
-        self.of, self.leg, self.start, self.count, self.busy = of, leg, start, 0, 0
+    def _pieces(self) -> tuple[Ints, Mask]:
+        """Return the first pieces of executions, and which end them (rule 4)."""
+        runs = self.links.runs
+        pairs = runs['callback'], runs['ready']
+        first, _ = find_pairs(pairs, pairs)
+        newest, lost = np.full(len(runs), UNKNOWN), np.zeros(len(runs), dtype=np.bool_)
+        np.maximum.at(newest, first, runs['end_at'])
+        lost[first[runs['end_at'] < 0]] = True
+        return first, (runs['end_at'] == newest[first]) & ~lost[first]
 
 
 def _grid(ready: Ints, period: int) -> int | None:
@@ -233,7 +190,7 @@ def _grid(ready: Ints, period: int) -> int | None:
 
     :param ready: when it was noticed.
     """
-    if period <= 0:
+    if not 0 < period < NEVER:
         return None
 
     def late(since: int) -> Ints:

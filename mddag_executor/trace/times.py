@@ -10,6 +10,7 @@ times are used as they are.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +19,9 @@ GAP_NS = 60 * 1_000_000_000
 FAR_NS = 366 * 24 * 3600 * 1_000_000_000
 
 
-def credible(stamp: int, arrival: int) -> bool:
-    """Return whether a stamp fits a time of arrival: not years before it."""
-    return 0 < stamp and arrival - stamp < FAR_NS
+def credible(stamp: Any, arrival: Any) -> Any:
+    """Return whether stamps fit times of arrival: not years before them."""
+    return (stamp > 0) & (arrival - stamp < FAR_NS)
 
 
 def joined(several: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:

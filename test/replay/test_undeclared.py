@@ -238,6 +238,17 @@ def test_timers_are_released_on_their_grid_if_they_keep_to_one(run):
     assert '6 executions of timers off the grid' in warning and '/radar timer' in warning
 
 
+@pytest.mark.parametrize('ready', [-2 ** 63, 2 ** 63 - 1])
+def test_a_damaged_ready_time_affects_its_execution_only(ready, run):
+    for start in range(0, 500 * MS, 100 * MS):
+        run.runs(GRAB, ready - START_TIME if start == 200 * MS else start, start,
+                 start + 2 * MS, start + MS)
+        run.detects(start + MS + 9 * US, start + MS + 99 * US)
+    sink = run.result(500 * MS)['dags']['/camera']['sinks']['/detect:run@/camera']
+    assert sink['completed'] == 5
+    assert sink['late'] == (ready < 0)
+
+
 def test_a_job_that_is_open_at_the_end_is_judged_by_that(run):
     run.runs(GRAB, 0, 0, 2 * MS, MS)
     run.add('drop', 3 * MS, 1, RUN, -1, -1, -1, 'qos_depth')
