@@ -28,7 +28,7 @@ from importlib.util import find_spec
 import os
 from pathlib import Path
 from types import FunctionType, ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 from mddag_executor import progress
 from mddag_executor.core import jobs, overload, policies, queues, rules, state, tables
@@ -150,27 +150,31 @@ def run_once(
 
     :return: the end, the log of every worker, the decisions, the busy time of each worker.
     """
-    lent = [LentTuple(tables, list(POLICIES).index(policy)), LentTuple(load), LentTuple(orders)]
+    lent = [Memory(*tables, list(POLICIES).index(policy)), Memory(*load), Memory(*orders)]
     core, _, _, busy, log = working = [
-        EmptyMemory(len(fields)) for fields in (
+        Memory(*[0] * len(fields)) for fields in (
             State._fields, Deliveries._fields, Machine._fields, ('busy',), ('log',))]
     addresses = [each.address for each in working]
     ended = entry_points()['run_once'](*(each.address for each in lent), *addresses)
     try:
         place = State._fields.index('decisions')
-        return (int(ended), log.rows(0, 6), core.rows(place, 6),  # type: ignore[return-value]
-                busy.words(0, 1)[:, 0].tolist())
+        return (int(ended), Rows(log.words(0, 6)),  # type: ignore[return-value]
+                Rows(core.words(place, 6)), busy.words(0, 1)[:, 0].tolist())
     finally:
         entry_points()['free_run'](*addresses)
 
 
-class LentTuple:
-    """A named tuple of integers and lists as a structure in numpy's memory."""
+class Memory:
+    """
+    A structure, or a vector, in numpy's memory.
 
-    def __init__(self, row: NamedTuple, *more: int) -> None:
+    :param fields: integers or columns; 0 is also an empty vector, to which compiled code appends.
+    """
+
+    def __init__(self, *fields: Any) -> None:
         self._columns: list[npt.NDArray[np.int64]] = []  # keeps the memory
         words = []
-        for value in (*row, *more):
+        for value in fields:
             if isinstance(value, int):
                 words += [value, 0, 0]
                 continue
@@ -178,18 +182,6 @@ class LentTuple:
             self._columns.append(column)
             words += [column.ctypes.data, len(column), len(column)]
         self._words = np.array(words, dtype=np.int64)
-
-    @property
-    def address(self) -> int:
-        """Return the address of the structure, valid as long as this object lives."""
-        return int(self._words.ctypes.data)
-
-
-class EmptyMemory:
-    """Memory for an empty structure or vector."""
-
-    def __init__(self, fields: int = 1) -> None:
-        self._words = np.zeros(3 * fields, dtype=np.int64)
 
     @property
     def address(self) -> int:
@@ -203,10 +195,6 @@ class EmptyMemory:
             return np.empty((0, width), dtype=np.int64)
         data = (ctypes.c_int64 * (length * width)).from_address(address)
         return np.ctypeslib.as_array(data).reshape(length, width).copy()
-
-    def rows(self, field: int, width: int) -> Rows:
-        """Return a field as tuples."""
-        return Rows(self.words(field, width))
 
 
 class Rows(Sequence[tuple[int, ...]]):

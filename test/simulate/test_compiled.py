@@ -206,7 +206,7 @@ def test_compiled_code_is_kept_until_a_source_changes(tmp_path):
         return python(
             'from mddag_executor.simulate import compiled', *change,
             'entry = compiled.entry_points()["free_run"]',
-            'memory = [compiled.EmptyMemory(99) for _ in range(5)]',
+            'memory = [compiled.Memory(*[0] * 99) for _ in range(5)]',
             'entry(*(each.address for each in memory))',
             'print(sum(entry.stats.cache_hits.values()), sum(entry.stats.cache_misses.values()))',
             NUMBA_CACHE_DIR=str(tmp_path))
