@@ -465,12 +465,6 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     return whole
 
 
-def record(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
-    """End an execution as it was recorded: without ready queue, group and workers."""
-    s.job_active[s.x_slot[x]] += 1
-    return complete(t, s, key, x, now)
-
-
 def fail(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     """End a running execution that failed, and with it its job (rule 8); see ``complete``."""
     slot = s.x_slot[x]

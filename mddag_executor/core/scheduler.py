@@ -15,7 +15,6 @@ from mddag_executor.core.state import (
     add_slot,
     as_object,
     Decision,
-    EXPIRED,
     N_IDLE,
     N_STALE,
     new_state,
@@ -118,10 +117,6 @@ class Scheduler:
         """End the job in a slot early unless it has ended already; see ``core.jobs.give_up``."""
         if self.state.job_state[slot] == OPEN:
             jobs.give_up(self.tables, self.state, slot, end, now)
-
-    def withdraw(self, slot: int) -> None:
-        """Close the open job in a slot without any decision: its end is not known."""
-        jobs.withdraw_job(self.state, slot, EXPIRED)
 
     def expire_idle(self, now: int) -> None:
         """Expire every job that can no longer complete."""

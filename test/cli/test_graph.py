@@ -167,27 +167,6 @@ def test_graphviz_that_fails(call, tmp_path, monkeypatch):
     assert not (tmp_path / 'o.svg').exists()
 
 
-TEXT = """\
-nodes:
-- node_name: /a
-  callbacks:
-  - {callback_name: /a/callback_0, callback_type: timer_callback, period_ns: 5000000}
-"""
-
-
-def test_from_caret(call, tmp_path):
-    (tmp_path / 'arch.yaml').write_text(TEXT)
-    done = call('graph', 'from-caret', 'arch.yaml', '-o', 'g.yaml', cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, '')
-    assert done.stdout == "1 blank to fill in, marked 'FILL IN'\n"
-    done = call('graph', 'check', 'g.yaml', cwd=tmp_path)
-    assert done.returncode == 2
-    assert 'deadline: is a blank to fill in (a sink' in done.stderr
-    text = (tmp_path / 'g.yaml').read_text()
-    done = call('graph', 'check', '-', stdin=text.replace('# deadline: 5ms', 'deadline: 5ms'))
-    assert (done.returncode, done.stderr) == (0, '')
-
-
 def test_schema(call, tmp_path):
     assert call('graph', 'schema').result == schema()
     done = call('graph', 'schema', '-o', 's.json', cwd=tmp_path)

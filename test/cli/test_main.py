@@ -50,12 +50,6 @@ def fail_with(error: BaseException) -> Callable[[argparse.Namespace], int]:
     return action
 
 
-@pytest.mark.parametrize('status', [0, 1])
-def test_the_status_is_that_of_the_verb(verb, status):
-    verb(lambda args: status)
-    assert program.main(['probe']) == status
-
-
 @pytest.mark.parametrize(('error', 'line'), [
     (InputError('a.yaml', 'no source', 'add a timer', line=3),
      'error: a.yaml:3: no source: add a timer'),

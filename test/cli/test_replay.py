@@ -10,9 +10,8 @@ from pathlib import Path
 from mddag_executor.trace import TraceFile
 import pytest
 
-from ..replay.recorded import four_jobs, MS
+from ..replay.recorded import MS
 from ..report.runs import by_hand, GRAPH, START
-from .test_golden import SEEN
 
 
 @pytest.fixture
@@ -142,13 +141,3 @@ nodes:
                        ('ona:t', "there is no sink 'ona:t': did you mean '/a/one:t'?")):
         done = call('explain', 'r.mcap', '--sink', name)
         assert (done.returncode, done.stderr) == (2, f'error: --sink: {says}\n')
-
-
-def test_an_imported_run_is_rescheduled_with_a_graph_only(tmp_path, call):
-    drive, graph = four_jobs(tmp_path / 'drive.mcap'), tmp_path / 'graph.yaml'
-    graph.write_text(SEEN)
-    done = call('replay', drive, graph, '--reschedule', '--policy', 'rad', '--workers', 1)
-    assert (done.returncode, done.stderr) == (0, '') and 'policy rad, 1 worker' in done.stdout
-    status, _, errors = call('replay', drive, '--reschedule')
-    assert (status, errors.count('\n')) == (2, 1)
-    assert errors.startswith(f'error: {drive}: it was imported') and 'GRAPH' in errors

@@ -4,42 +4,16 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import POLICIES, policy, rad_offsets, Tables
-from mddag_executor.core.state import (
-    ABORTED,
-    COMPLETED,
-    DROP,
-    empty,
-    EXPIRED,
-    JOB_END,
-    LATE,
-    ORDER,
-    RUNNING,
-    SINK_ABORTED,
-    SINK_COMPLETED,
-    SINK_EXPIRED,
-    SINK_LATE,
-    State,
-    WAITING,
-)
-from mddag_executor.simulate import END, LogEntry, PREEMPT, Settings
-from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import run
-from mddag_executor.simulate.machine import Machine
 from msg_graph import Dag, TaskSet
 import pytest
 
 from .brute_force import BruteForce
 from .task_sets import Case, cases, declaration, examples, task_sets, TICK
-
-Id = tuple[int, int, int]
-"""DAG, vertex in its DAG, job."""
 
 
 def paths_to_sinks(dag: Dag, index: int) -> Iterator[int]:
@@ -57,60 +31,6 @@ def rad_offset(dag: Dag, index: int) -> int:
     """Return RAD minus release as the paper defines it, ns."""
     deadlines = [dag.vertices[sink].deadline_ns for sink in paths_to_sinks(dag, index)]
     return min(deadline for deadline in deadlines if deadline is not None)
-
-
-@examples(100)
-@given(cases(), st.integers(5, 40))
-def test_every_job_ends_in_exactly_one_way(case, last_release):
-    horizon = last_release * (1 + sum(map(sum, case.ticks)))
-    run = case.run(horizon, last_release=last_release)
-    dags = case.task_set.dags
-    released = {(dag.index, job) for dag in dags
-                for job in range(-(-last_release * TICK // dag.period_ns))}
-    ends: dict[tuple[int, int], int] = {}
-    sinks: dict[Id, int] = {}
-    for kind, dag, vertex, job, deadline, time in run.decisions:
-        if kind == JOB_END:
-            assert (dag, job) not in ends
-            ends[dag, job] = deadline
-        elif kind in (*SINK_COMPLETED, SINK_ABORTED, SINK_EXPIRED):
-            assert (dag, vertex, job) not in sinks
-            assert (kind == SINK_LATE) == (kind in SINK_COMPLETED and time > deadline)
-            sinks[dag, vertex, job] = kind
-    assert set(ends) == released
-    assert len(sinks) == sum(len(dags[dag].sinks) for dag, _ in released)
-    for (dag, job), end in ends.items():
-        kinds = {kind for each, kind in sinks.items() if (each[0], each[2]) == (dag, job)}
-        if kinds.issubset(SINK_COMPLETED):
-            assert end == (LATE if SINK_LATE in kinds else COMPLETED)
-        else:
-            assert end == (ABORTED if SINK_ABORTED in kinds else EXPIRED)
-            assert not {SINK_ABORTED, SINK_EXPIRED} <= kinds
-    counted: Counter[str] = Counter()
-    for dag_result in run.result()['dags'].values():
-        counted.update(dag_result['ends'])
-    assert sum(counted.values()) == len(released)
-
-
-@examples(100)
-@given(cases(overheads=True), st.integers(5, 50))
-def test_whatever_gets_ready_ends_or_is_dropped_or_is_there(case, horizon):
-    """Also of jobs that are aborted or expire."""
-    tables = Tables.build(case.task_set)
-    settings = Settings(
-        case.policy, case.workers, horizon * TICK, case.preemptive,
-        dispatch_overhead_ns=case.dispatch_overhead * TICK,
-        switch_overhead_ns=case.switch_overhead * TICK)
-    state = empty(State)
-    log: list[LogEntry] = []
-    run(
-        tables, state, empty(Deliveries), empty(Machine), policy(case.policy).key,
-        case.load(horizon), replace(settings, judge='completions').orders, [], log, None)
-    kinds = Counter(kind for _, kind, *_ in log)
-    ready = state.scalars[ORDER] - kinds[PREEMPT]
-    dropped = sum(kind == DROP for kind, *_ in state.decisions)
-    there = Counter(state.x_state)
-    assert ready == kinds[END] + dropped + there[WAITING] + there[RUNNING]
 
 
 @examples(100)

@@ -82,22 +82,6 @@ def test_a_blocked_callback_does_not_abort_its_job():
     assert scheduler.decisions()[-1][0] == DROP
 
 
-def test_a_recorded_execution_goes_past_queue_workers_and_groups():
-    scheduler = live(workers=1)
-    group = scheduler.new_group()
-    busy = undeclared(scheduler, 0, group, 0)
-    assert scheduler.take(0, 0) == busy
-    slot = scheduler.release(0, 0, 0, 0)
-    source = scheduler.source(slot)
-    scheduler.state.x_group[source] = group
-    assert rules.record(
-        scheduler.tables, scheduler.state, scheduler.policy.key, source, 2)
-    assert scheduler.idle_workers == 0
-    assert scheduler.state.group_owner[group] == busy
-    assert scheduler.state.job_active[slot] == 0
-    assert scheduler.state.x_state[source] != WAITING
-
-
 def test_an_unknown_policy_is_refused_with_the_list():
     with pytest.raises(PolicyError, match=r"policy 'edf': .*: choose one of rad, rm, wc, fifo"):
         live(policy_name='edf')

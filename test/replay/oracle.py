@@ -6,8 +6,8 @@ from __future__ import annotations
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core import state as core
-from mddag_executor.core.jobs import is_judged, judge_from
-from mddag_executor.core.rules import record
+from mddag_executor.core.jobs import is_judged, judge_from, withdraw_job
+from mddag_executor.core.rules import complete
 from mddag_executor.core.state import Decision, IDLE, JOB_END, OPEN, SKIP
 from mddag_executor.core.tables import CONTINUE
 from mddag_executor.recording.tables import ABORTED, ALL_LEGS, EXPIRED, FAILED, Recording
@@ -66,7 +66,8 @@ class Oracle:
                 return
             x = self.scheduler.execution(slot, vertex, each)
             if state.x_state[x] == IDLE:
-                record(tables, state, self.scheduler.policy.key, x, end)
+                state.job_active[slot] += 1     # without ready queue, group and workers
+                complete(tables, state, self.scheduler.policy.key, x, end)
 
     def ended(self, dag: int, job: int, time: int, reason: int) -> None:
         slot = self.slots.get((dag, job))
@@ -75,7 +76,7 @@ class Oracle:
         if reason in ENDS:
             self.scheduler.give_up(slot, ENDS[reason], time)
         else:
-            self.scheduler.withdraw(slot)
+            withdraw_job(self.scheduler.state, slot, core.EXPIRED)     # without any decision
             del self.slots[dag, job]
 
     def judge_from(self, release: int) -> None:

@@ -23,7 +23,7 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tally import counts
 from mddag_executor.core.tolerances import not_tolerated
-from mddag_executor.replay.miss_tally import longest_run, MissTally
+from mddag_executor.replay.miss_tally import MissTally
 from mddag_executor.report.ci import annotation_lines, junit
 from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
@@ -66,12 +66,6 @@ def test_without_a_tolerance_each_miss_counts(missed):
     assert (counts(sink).due, counts(sink).missed) == (len(missed), sum(missed))
     found = not_tolerated({'/n': {'sinks': {'/n:a': sink}}})
     assert bool(found) == (any(missed) or not missed)
-
-
-@given(st.lists(st.integers(0, 30)))
-def test_the_longest_burst(numbers):
-    there = ''.join('x' if number in numbers else ' ' for number in range(31))
-    assert longest_run(numbers) == max(map(len, there.split()), default=0)
 
 
 HOSTILE = 'a"]]><&\'\x00\x1b[2J\n\ud800\uffff\u202e</testcase>'
