@@ -11,12 +11,14 @@ The rules are the same for live runs and recordings. Observations are counts by 
    do not count.
 2. *rate* of a source: the mean time between two releases differs from the declared period by more
    than ``TOLERANCE`` of it. At least ``LEAST`` releases are needed.
-3. *rate* of a subscription: it received messages more or less often than the jobs of its DAGs were
-   released, by more than ``TOLERANCE``. At least ``LEAST`` expected messages are needed. Dropped
-   messages count as received: their loss is no fault of the declaration. Syncs are not checked,
-   because a declaration does not say how messages are joined.
-4. *never ran*: a callback never ran, or a sync never got one of its topics, but should have run at
-   least twice. The report suggests an undeclared entity that may be meant (``binding.meant``).
+3. *rate* of a subscription: it received messages more or less often than the callbacks that
+   publish them ran, by more than ``TOLERANCE``; if these ran elsewhere, than the jobs of its DAGs
+   were released. At least ``LEAST`` expected messages are needed. Dropped messages count as
+   received: their loss is no fault of the declaration. Syncs are not checked, because a
+   declaration does not say how messages are joined.
+4. *never ran*: a callback never ran and got nothing, or a sync never got one of its topics, but
+   should have run at least twice. The report suggests an undeclared entity that may be meant
+   (``binding.meant``).
 5. A callback may run in another process if all its DAGs may span processes (``release_from:
    header_stamp``) or the declaration has ``processes:``, and its node was not seen here. Then it
    is not reported.
@@ -171,6 +173,9 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
                  default=0)
     if observed.duration_ns < 2 * slowest + latest:
         return None
+    due = _due_by_runs(callback, dags, observed)
+    if topic is None and (observed.got.get(callback.key, 0) or due is not None and due < 2):
+        return None     # the callbacks before it, or its own executions, were late or dropped
     text = (f'{callback.key} never {"ran" if topic is None else f"got a message of {topic}"} in '
             f'{observed.duration_ns / 1e9:.3f} s')
     question = meant(
@@ -192,11 +197,23 @@ def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift |
                            f'{format_duration(period)} is declared'))
 
 
+def _due_by_runs(callback: Callback, dags: list[Dag], observed: Observed) -> int | None:
+    """Return the number of runs of the callbacks that publish to this one; None: unknown."""
+    before = {dag.vertices[i].callback.key: dag.vertices[i].callback for dag in dags
+              for vertex in dag.vertices if vertex.callback.key == callback.key
+              for i in vertex.predecessors}
+    if not before or not before.keys() <= observed.ran.keys():
+        return None
+    # a sync runs once for each topic, and publishes once
+    return sum(observed.ran[key] // (len(each.topics) if each.kind == 'sync' else 1)
+               for key, each in before.items())
+
+
 def _message_rate(callback: Callback, dags: list[Dag], observed: Observed) -> Drift | None:
-    expected = 0
-    for dag in dags:
-        source = dag.vertices[dag.source].callback.key
-        expected += observed.releases.get(source, Releases()).count
+    expected = _due_by_runs(callback, dags, observed)
+    if expected is None:
+        expected = sum(observed.releases.get(
+            dag.vertices[dag.source].callback.key, Releases()).count for dag in dags)
     got = observed.got.get(callback.key, 0)
     # The last release may still be in progress.
     if expected < LEAST or expected * (1 - TOLERANCE) - len(dags) <= got <= expected * (

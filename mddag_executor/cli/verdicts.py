@@ -63,12 +63,14 @@ def unproven(place: str, what: str, remedy: str = _NEVER_DUE) -> int:
 
 
 def lines(result: dict[str, Any]) -> Iterator[str]:
-    """Yield which sinks are not within what their declarations tolerate, if any does."""
-    dags = result['dags']
-    if not any('tolerate' in sink for dag in dags.values() for sink in dag['sinks'].values()):
+    """Yield which sinks are not within what their declarations tolerate, if any tolerates some."""
+    sinks = {(name, sink): found for name, dag in result['dags'].items()
+             for sink, found in dag['sinks'].items()}
+    if not any('tolerate' in found for found in sinks.values()):
         return
-    broken = not_tolerated(dags)
-    for (_, sink), why in broken.items():
-        yield f'not tolerated: {printable(sink)}: {why}'
+    broken = not_tolerated(result['dags'])
+    for key, why in broken.items():
+        if 'tolerate' in sinks[key]:
+            yield f'not tolerated: {printable(key[1])}: {why}'
     if not broken:
         yield 'all misses, if any, are within what is tolerated'

@@ -587,18 +587,28 @@ class Engine:
 
     def _record_run(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Record the run of an undeclared callback, or of one that goes on later."""
-        record = self.record
-        assert record is not None
+        self._record_dispatch(work, start, vtid, worker)
+        assert self.record is not None
+        self.record('callback_start', start, vtid, work.entity.address, False)
+        self.record('callback_end', end, vtid, work.entity.address)
+
+    def _record_dispatch(self, work: Work, time: int, vtid: int, worker: int) -> None:
+        assert self.record is not None
         _, dag, job, vertex = work.origin or NO_ORIGIN
         index, deadline = -1, 0
         if dag >= 0:
             index = self.tables.index_in_dag[vertex]
             deadline = self.release_of(work) + self.tables.rad_offset[vertex]
-        address = work.entity.address
-        record(
-            'dispatch', start, vtid, address, dag, index, job, worker, work.ready_ns, deadline)
-        record('callback_start', start, vtid, address, False)
-        record('callback_end', end, vtid, address)
+        self.record(
+            'dispatch', time, vtid, work.entity.address, dag, index, job, worker, work.ready_ns,
+            deadline)
+
+    def _record_waiting(self, now: int) -> None:
+        """Record what waits at the end as dispatched then: a reader sees that it was not lost."""
+        for x, work in self._work.items():
+            if (self._state.x_state[x] == WAITING and self._state.x_started[x] < 0
+                    and work.origin is not None and self.open_release(work.origin) is not None):
+                self._record_dispatch(work, now, get_native_id(), -1)
 
     def release_of(self, work: Work) -> int:
         """Return the release of the job of a declared execution; the job must not have ended."""
@@ -693,6 +703,8 @@ class Engine:
             ended since, but later deadlines are not judged.
         """
         end = now if end is None else end
+        if self.record is not None:
+            self._record_waiting(now)
         self.scheduler.expire_idle(end)
         self._decided(now)
         self.scheduler.finish(end)

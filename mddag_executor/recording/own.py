@@ -14,7 +14,7 @@ Theory of operation
    order of the file.  An end belongs to the last dispatch; a ``complete`` belongs to the last
    ended execution of its thread, if DAG, vertex and job agree.
 4. A ``complete`` without execution is a row without start; a dispatch without end is a row without
-   end.
+   end: it ran at the end of the run, or waited (then its worker is -1, its start the run's end).
 5. Rows with the same vertex, job and ready time, up to the completing one, are pieces of one
    execution.
 6. A publication belongs to the execution that ran in its thread at that time.

@@ -122,10 +122,12 @@ class Never(NamedTuple):
 
     :ivar dropped: by vertex and job the reason why the execution was dropped.
     :ivar started: executions that were started: vertex, job, ready, start.
+    :ivar group: how long each of these waited for its callback group, ns.
     """
 
     dropped: dict[tuple[int, int], str]
     started: Table
+    group: Ints
 
     def waiting(self, vertices: Ints, times: Ints) -> Ints:
         """Return by vertex the job whose execution waited at the given time, or -1."""
@@ -297,20 +299,21 @@ def _pending(
     """
     pending = np.flatnonzero(spans['kind'] == _PENDING)
     started = never.started if len(pending) else never.started[:0]
-    waiting = {(vertex, job): (ready, start) for vertex, job, ready, start in zip(*(
-        started[name].tolist() for name in ('vertex', 'job', 'ready', 'start')))}
+    waiting = {(vertex, job): (ready, start, group) for vertex, job, ready, start, group in zip(
+        *(started[name].tolist() for name in ('vertex', 'job', 'ready', 'start')),
+        never.group.tolist())}
     before = never.waiting(spans['vertex'][pending], spans['end'][pending])
     for i, waiting_job in zip(pending.tolist(), before.tolist()):
         miss, vertex, _, begin, end, _ = spans[i].item()
         key = vertex, int(rows['job'][miss])
-        ready, start = waiting.get(key, (end, end))
+        ready, start, group = waiting.get(key, (end, end, 0))
         waits = never.dropped.get(key) == 'aborted' or ready < end <= start
         if not waits and key not in never.dropped and (
                 rows['kind'][miss] != SINK_EXPIRED or is_source[vertex]):
             full, = pool.full.within(*(np.array([each]) for each in (begin, end)))
             waits = pool.knows_workers and 2 * int(full) >= end - begin
         if waits:
-            spans['kind'][i] = _WAIT
+            spans['kind'][i], spans['more'][i] = _WAIT, min(group, end - begin)
         else:
             is_skipped = is_source[vertex] and key not in never.dropped and waiting_job >= 0
             times[i, SKIPPED if is_skipped else LOST] = left[i]

@@ -74,13 +74,13 @@ class Chains:
     """
     The chains of a judged recording.
 
-    :param waited: by execution how long its first piece waited for its callback group, ns.
+    :ivar waited: by execution how long its first piece waited for its callback group, ns.
     """
 
     def __init__(self, judged: Judged, executions: Table, waited: Ints) -> None:
         if not len(executions):     # row -1 must exist
             executions, waited = rows(EXECUTIONS, 1), np.zeros(1, dtype=np.int64)
-        self._judged, self._executions, self._waited = judged, executions, waited
+        self._judged, self._executions, self.waited = judged, executions, waited
         self._dags = [self._dag(dag, first) for dag, first in zip(
             judged.task_set.dags, judged.tables.first_vertex)]
         self._started: dict[int, tuple[Ints, Ints, Ints]] = {}
@@ -166,7 +166,7 @@ class Chains:
         for name in ('end', 'busy'):
             found[name] = np.where(running, NEVER, table[name])
         found['cpu'] = np.where(running, -1, table['cpu'])
-        found['group'] = np.where(running, 0, self._waited[link])
+        found['group'] = self.waited[link]
         return found
 
     def follow(

@@ -42,11 +42,13 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
     # declared callbacks that were started; other executions once each
     declared = (table['vertex'] >= 0) & (table['start'] >= 0)
     others = (table['vertex'] < 0) & (table['end'] >= 0) & (table['piece'] == 0)
-    numbers, callback_of = recording.callbacks()
+    every = declared | others
+    waits = (table['end'] < 0) & (table['start'] >= recording.end)
     late = (table['end'] >= since) | (table['end'] < 0)
-    counts, late_counts = (dict(zip(numbers.tolist(), np.bincount(
+    numbers, callback_of = recording.callbacks()
+    counts, late_counts, late_got = (dict(zip(numbers.tolist(), np.bincount(
         callback_of[which], minlength=len(numbers)).tolist()))
-        for which in (declared | others, (declared | others) & late))
+        for which in (every & ~waits, every & ~waits & late, every & late))
     keys = declared_keys(who, recording.recorded_set)
     for callback, vertex in zip(
             numbers.tolist(), recording.vertices_of_callbacks(declared).tolist()):
@@ -56,8 +58,9 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
     got = Counter(vertices[v].callback.key for v in recording.drops['vertex'][
         recording.drops['time'] >= since].tolist() if v >= 0)
     for callback, key in keys.items():
-        ran[key] += counts.get(callback, 0)
-        got[key] += late_counts.get(callback, 0)
+        # once, if only in the warm-up
+        ran[key] += late_counts.get(callback, 0) or min(1, counts.get(callback, 0))
+        got[key] += late_got.get(callback, 0)
     came: defaultdict[str, Set[str]] = defaultdict(set)
     for each in who.made:
         if counts.get(each.number) and each.number in keys:

@@ -64,7 +64,7 @@ class Explanation:
         self.stops = self._stops()
         missed, links = self._missed(judged, chains)
         pool = self._pool(missed)
-        self._never = Never(self._dropped(), self._started())
+        self._never = Never(self._dropped(), *self._started(chains.waited))
         self.found = find(
             missed, links, pool, self._usual(), self._never,
             np.array([*self._tables.dag_of, 0], dtype=np.int64),
@@ -147,9 +147,30 @@ class Explanation:
         return {(vertex, job): reasons[reason] for vertex, job, reason in zip(
             *(drops[name].tolist() for name in ('vertex', 'job', 'reason')))}
 
-    def _started(self) -> Table:
-        table = self._recording.executions
-        return pick(table, (table['vertex'] >= 0) & (table['start'] >= 0))
+    def _started(self, in_group: Ints) -> tuple[Table, Ints]:
+        """
+        Return the executions that were started, and sources that waited until an abort.
+
+        :return: with them, how long they waited for their callback groups.
+        """
+        recording, table = self._recording, self._recording.executions
+        which = (table['vertex'] >= 0) & (table['start'] >= 0)
+        started, in_group = pick(table, which), in_group[which]
+        aborted = {
+            (self._tables.dag_of[vertex], job): (vertex, time)
+            for _, vertex, job, time, reason in recording.drops.tolist()
+            if recording.drop_reasons[reason] == 'aborted'
+            and not self._task_set.vertices[vertex].predecessors}
+        if not aborted:
+            return started, in_group
+        # a release that was skipped at the time of the abort was skipped before it
+        waited = [(vertex, job, noticed, time + 1) for dag, job, noticed in zip(*(
+            recording.releases[name].tolist() for name in ('dag', 'job', 'noticed')))
+            if (dag, job) in aborted for vertex, time in [aborted[dag, job]]]
+        sources = np.zeros(len(waited), dtype=started.dtype)
+        for name, column in zip(('vertex', 'job', 'ready', 'start'), zip(*waited)):
+            sources[name] = column
+        return np.concatenate([started, sources]), np.r_[in_group, np.zeros(len(sources), int)]
 
     def _stops(self) -> list[tuple[int, int]]:
         """Return the stops of the machine, each from the last event before it."""

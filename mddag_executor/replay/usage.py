@@ -42,7 +42,7 @@ def group_waits(recording: Recording) -> Ints:
     number = {callback: group for callback, group in recording.who.groups.items() if group >= 0}
     if not number:
         return waited
-    rows = ran(recording)
+    rows = np.r_[ran(recording), np.flatnonzero((table['start'] >= 0) & (table['end'] < 0))]
     callbacks = np.array(sorted(number), dtype=np.int64)
     at = np.minimum(np.searchsorted(callbacks, table['callback'][rows]), len(callbacks) - 1)
     known = callbacks[at] == table['callback'][rows]
@@ -50,6 +50,7 @@ def group_waits(recording: Recording) -> Ints:
     order = np.argsort(group, kind='stable')
     rows, group = rows[order], group[order]
     ready, start, end = (table[name][rows] for name in ('ready', 'start', 'end'))
+    end = np.where(end < 0, recording.end, end)
     for begin, until in zip(*groups(group)):
         mine = slice(begin, until)
         # only if the previous one ended after this one was ready

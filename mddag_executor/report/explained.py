@@ -71,10 +71,19 @@ def job_lines(job: Mapping[str, Any]) -> Iterator[str]:
         each['callback'] for part in parts for each in part['behind']})
     yield (f'Job {job["job"]} of {printable(names[job["sink"]])}: {late} (deadline '
            f'{format_ns(allowed)} after its release): {job["cause"]}')
-    yield table(('callback', 'what', 'time', 'behind'), [
-        [names[part['vertex']], _what(part), format_ns(part['ns'], 3),
-         ', '.join(f'{names[each["callback"]]} {format_ns(each["ns"], 3)}'
-                   for each in part['behind']) or None] for part in parts])
+    rows: list[list[Cell]] = []
+    for part, before in zip(parts, [None, *parts]):
+        same = before is not None and before['vertex'] == part['vertex']
+        first: list[Cell] = [
+            '' if same else names[part['vertex']], _what(part), format_ns(part['ns'], 3)]
+        for each in part['behind'] or [None]:
+            rows.append([*first, *([None, None] if each is None else [
+                names[each['callback']], format_ns(each['ns'], 3)])])
+            first = ['', '', '']
+    if any(part['behind'] for part in parts):
+        yield table(('callback', 'what', 'time', 'behind', 'ran for'), rows)
+    else:
+        yield table(('callback', 'what', 'time'), [row[:3] for row in rows])
 
 
 def _what(part: Mapping[str, Any]) -> str:

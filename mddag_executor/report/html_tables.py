@@ -22,16 +22,11 @@ from mddag_executor.report.replays import (
 from mddag_executor.report.tables import (
     each_sink,
     missed_share,
-    percent,
-    rare_ends,
-    response_cells,
-    RESPONSES,
     short_names,
     Sink,
-    tolerate_cells,
-    tolerate_columns,
+    sink_columns,
 )
-from mddag_executor.report.text import Cell, format_ns, printable
+from mddag_executor.report.text import format_ns, printable
 from mddag_executor.text import counted
 
 _STYLE = Path(__file__).with_name('html.css')
@@ -130,12 +125,11 @@ def sinks_html(data: ReportData) -> str:
     demand.
     """
     dags = data.tally.result()['dags']
-    rare, tolerate = rare_ends(total(dags)), tolerate_columns(dags)
-    header = ['DAG', 'sink', 'due', 'in time', 'share', 'late', 'expired', *rare, *RESPONSES,
-              *tolerate]
+    columns, cells = sink_columns(dags)
+    header = ['DAG', 'sink', *columns]
     ranked = _ranked(data)
-    full = [(*_sink_cells(sink, rare), *(tolerate and tolerate_cells(sink.result)),
-             _reached_bar(_reached(sink))) for sink in ranked]
+    full = [(sink.dag, sink.shown_name, *cells(sink), _reached_bar(_reached(sink)))
+            for sink in ranked]
     bad = range(header.index('late'), header.index('median'))
     shown = html_table([*header, 'max of deadline'], full[:MOST_ROWS], 2, bad,
                        attributes=(f'data-reached="{_reached(sink):.4f}"' for sink in ranked))
@@ -148,15 +142,6 @@ def sinks_html(data: ReportData) -> str:
             f'<div class="wide" id="mddag-sinks">{shown}</div>\n'
             f'<script id="mddag-more-sinks" type="application/json">{json_for_html(rest)}'
             '</script>')
-
-
-def _sink_cells(sink: Sink, rare: Sequence[str]) -> list[Cell]:
-    verdicts = counts(sink.result)
-    return [
-        sink.dag, sink.shown_name, verdicts.due, verdicts.in_time,
-        percent(verdicts.in_time, verdicts.due), verdicts.late, verdicts.expired,
-        *(getattr(verdicts, name) for name in rare), *response_cells(sink.result['response_ns']),
-        format_ns(sink.result['relative_deadline_ns'])]
 
 
 def _reached_bar(share: float) -> Html:

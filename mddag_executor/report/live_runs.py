@@ -50,9 +50,7 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
         yield (f'{counted(len(deaf), "callback")} without messages, as a publisher has an '
                'incompatible QoS: '
                + listed([f'{name} ({policy})' for name, policy in deaf.items()]))
-    never = [*result['never_ran'], *(
-        name for name, each in result['callbacks'].items()
-        if each['declared'] and not each['ran'])]
+    never = result['never_ran']
     drift = result.get('drift', ())
     yield from drift_lines(drift)
     if never and not any(each['kind'] == 'never ran' for each in drift):

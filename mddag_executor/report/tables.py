@@ -11,7 +11,7 @@ the results that got a verdict, and *in time* those that completed by their dead
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from mddag_executor.core.tally import Counts, counts, is_kept, never_due, total
@@ -19,7 +19,6 @@ from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 
 MOST_LINES = 12     # of drift
-RESPONSES = ('median', 'p99', 'max', 'deadline')
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
@@ -70,38 +69,37 @@ def sink_table(dags: Mapping[str, Any]) -> str:
     sink, `tolerates` and `worst` say how many, and how many missed in the worst window. Rows with
     misses that are not tolerated are red on a terminal.
     """
-    every = total(dags)
-    weakly_hard = tolerate_columns(dags)
-    rare = ['expired'] * bool(every.expired) + rare_ends(every)
-    found = [(sink, counts(sink.result)) for sink in worst_first(dags)]
+    header, cells = sink_columns(dags)
+    found = worst_first(dags)
     rows: list[list[Cell]] = []
     above = None
-    for sink, verdicts in found:
-        rows.append([
-            '' if sink.dag == above else sink.dag, sink.shown_name, verdicts.due,
-            percent(verdicts.in_time, verdicts.due), verdicts.late,
-            *(getattr(verdicts, name) for name in rare),
-            *response_cells(sink.result['response_ns']),
-            format_ns(sink.result['relative_deadline_ns']),
-            *(weakly_hard and tolerate_cells(sink.result))])
+    for sink in found:
+        rows.append(['' if sink.dag == above else sink.dag, sink.shown_name, *cells(sink)])
         above = sink.dag
-    return table(
-        ('DAG', 'sink', 'due', 'in time', 'late', *rare, *RESPONSES, *weakly_hard), rows,
-        marked=[not is_kept(sink.result) for sink, _ in found])
+    return table(('DAG', 'sink', *header), rows,
+                 marked=[not is_kept(sink.result) for sink in found])
 
 
-def tolerate_columns(dags: Mapping[str, Any]) -> list[str]:
-    """Return the columns of tolerated misses, if any sink tolerates some."""
-    return ['tolerates', 'worst'] * any(
-        'tolerate' in sink for dag in dags.values() for sink in dag['sinks'].values())
+def sink_columns(dags: Mapping[str, Any]) -> tuple[list[str], Callable[[Sink], list[Cell]]]:
+    """Return the titles of a sink's columns after its name, and what gives its cells."""
+    tolerates = any('tolerate' in sink for dag in dags.values() for sink in dag['sinks'].values())
+    every = total(dags)
+    rare = ['expired'] * bool(every.expired) + rare_ends(every)
 
+    def cells(sink: Sink) -> list[Cell]:
+        verdicts, result = counts(sink.result), sink.result
+        row: list[Cell] = [
+            verdicts.due, percent(verdicts.in_time, verdicts.due), verdicts.late,
+            *(getattr(verdicts, name) for name in rare), *response_cells(result['response_ns']),
+            format_ns(result['relative_deadline_ns'])]
+        if tolerates:
+            limit = result.get('tolerate')
+            row += ['', ''] if limit is None else [
+                f'{limit["misses"]} of {limit["of"]}', limit['worst']]
+        return row
 
-def tolerate_cells(sink: Mapping[str, Any]) -> list[Cell]:
-    """Return what a sink tolerates, and its misses in the worst window."""
-    tolerate = sink.get('tolerate')
-    if tolerate is None:
-        return ['', '']
-    return [f'{tolerate["misses"]} of {tolerate["of"]}', tolerate['worst']]
+    return ['due', 'in time', 'late', *rare, 'median', 'p99', 'max', 'deadline',
+            *['tolerates', 'worst'] * tolerates], cells
 
 
 def worst_first(dags: Mapping[str, Any]) -> list[Sink]:

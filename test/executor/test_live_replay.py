@@ -141,6 +141,35 @@ nodes:
         '/late:cb']['aborted']
 
 
+def test_what_waits_at_the_end_was_not_lost(ros_context, tmp_path):
+    from mddag_executor import MultiDeadlineExecutor
+    from rclpy.node import Node
+    graph = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /a
+    callbacks:
+      - {name: hog, timer: 20ms, deadline: 10s, dag: hog}
+      - {name: starved, timer: 10ms, deadline: 10ms, dag: starved}
+"""
+    path = tmp_path / 'starved.mcap'
+    executor = MultiDeadlineExecutor(
+        loads(graph, 'g.yaml'), context=ros_context, trace=str(path))
+    node = Node('a', context=ros_context, start_parameter_services=False, enable_rosout=False)
+    node.create_timer(0.02, lambda: time.sleep(1.0))    # of the same group
+    node.create_timer(0.01, lambda: None)
+    executor.add_node(node)
+    with spinning(executor):
+        time.sleep(0.6)
+    node.destroy_node()
+    outcome = replay(path)
+    assert outcome.warnings == []
+    causes = outcome.explanation.summary()['sinks']['/a:starved']
+    assert causes['group'] > 10 and not causes['lost'] and not causes['released late']
+    assert [each.kind for each in outcome.drift()] == []
+
+
 def test_requests_that_arrive_together_are_recorded_one_by_one(
         make_executor, make_node, tmp_path):
     path = tmp_path / 'requests.mcap'

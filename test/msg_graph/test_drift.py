@@ -84,6 +84,18 @@ def test_the_rate_of_messages(got, said):
         assert found[0].text == f'/b:m got {got} messages, and by the declaration 50 were due'
 
 
+def test_what_an_overload_skips_and_drops_is_no_difference():
+    seen = observed()
+    seen.ran['/a:t'] = seen.got['/b:m'] = 20     # of 50 releases
+    seen.ran['/b:m'], seen.ran['/b:s'] = 1, 20
+    seen.got['/b:e'] = seen.ran['/b:e'] = 0
+    assert drift(TASKS, seen) == []
+    seen.ran['/b:m'] = 15
+    assert kinds(drift(TASKS, seen)) == [('never ran', '/b:e')]
+    seen.got['/b:e'] = 15       # all were dropped
+    assert drift(TASKS, seen) == []
+
+
 def test_a_callback_that_never_ran_is_the_reason_for_those_after_it():
     seen = observed()
     for key in ('/b:m', '/b:s', '/b:e'):

@@ -349,6 +349,29 @@ def test_an_undeclared_callback_may_hold_the_interpreter(tmp_path, call):
         'replay', path, '--reschedule').stdout
 
 
+def test_a_release_that_was_skipped_before_an_abort_has_the_cause_of_that(
+    tmp_path, call
+):
+    path = tmp_path / 'run.mcap'
+    with begin_trace(path, LENT.replace('50ms', '15ms'), workers=2) as file:
+        for job in range(5):
+            release = START_TIME + job * 1_000 * MS
+            ended = release + 25 * MS
+            file.add('dispatch', release, 1, 10, 5, -1, -1, -1, 0, release, 0)
+            file.add('callback_start', release, 1, 10, 5, False)
+            file.add('callback_end', ended, 1, 10, 5)
+            file.add('job_release', release, 1, 1, 1, 2 * job, release)
+            file.add('job_release', ended, 1, 1, 1, 2 * job + 1, release + 20 * MS)
+            file.add('expire', ended, 1, 1, 1, 2 * job + 1)
+            file.add('abort', ended, 1, 1, 1, 2 * job)
+            file.add('drop', ended, 1, 1, 8, 1, 0, 2 * job, 'aborted')
+        end_trace(file, START_TIME + 5_000 * MS)
+    result = call('explain', path, '--json', '-').result
+    assert result['causes']['interpreter'] == result['missed'] == 10
+    assert [each['parts'][0]['waiting_job'] for each in result['jobs'] if each['job'] % 2] == [
+        0, 2, 4, 6, 8]
+
+
 def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path, call):
     # /image has another name in the node
     path = tmp_path / 'run.mcap'
