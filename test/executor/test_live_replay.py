@@ -141,9 +141,7 @@ nodes:
         '/late:cb']['aborted']
 
 
-def test_what_waits_at_the_end_was_not_lost(ros_context, tmp_path):
-    from mddag_executor import MultiDeadlineExecutor
-    from rclpy.node import Node
+def test_what_waits_at_the_end_was_not_lost(make_executor, make_node, tmp_path):
     graph = """\
 mddag: 1
 workers: 2
@@ -154,15 +152,12 @@ nodes:
       - {name: starved, timer: 10ms, deadline: 10ms, dag: starved}
 """
     path = tmp_path / 'starved.mcap'
-    executor = MultiDeadlineExecutor(
-        loads(graph, 'g.yaml'), context=ros_context, trace=str(path))
-    node = Node('a', context=ros_context, start_parameter_services=False, enable_rosout=False)
+    node = make_node('a')
     node.create_timer(0.02, lambda: time.sleep(1.0))    # of the same group
     node.create_timer(0.01, lambda: None)
-    executor.add_node(node)
-    with spinning(executor):
+    executor = make_executor(loads(graph, 'g.yaml'), trace=str(path), nodes=[node])
+    with Spinning(executor):
         time.sleep(0.6)
-    node.destroy_node()
     outcome = replay(path)
     assert outcome.warnings == []
     causes = outcome.explanation.summary()['sinks']['/a:starved']
