@@ -134,9 +134,9 @@ class Judged:
 
     @property
     def missed(self) -> Table:
-        """Return the verdicts that are misses."""
+        """Return the verdicts that are misses, in the order of deadlines."""
         found: Table = self.verdicts[self.verdicts['kind'] != SINK_IN_TIME]
-        return found
+        return found[sort_by(found['deadline'])]
 
     # --- judging ---------------------------------------------------------------------------------
 
@@ -387,9 +387,7 @@ class Judged:
             if v in tally.windows:
                 for job in np.sort(missed['job']).tolist():
                     tally.windows[v].add(job)
-        missed = self.missed
-        if len(missed):
-            first = missed[missed['deadline'].argmin()]
+        for first in self.missed[:1]:
             tally.first_miss = {
                 'dag': self.task_set.dags[int(first['dag'])].name,
                 'vertex': tally.vertex_name(int(first['sink'])), 'job': int(first['job']),
