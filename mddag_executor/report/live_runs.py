@@ -29,21 +29,18 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
     measured = result['measured']
     if measured is not None:
         yield from measured_lines(measured)
-    dropped = result['dropped']
-    yield f'{sum(dropped.values())} dropped' + _details(dropped)
-    raised = {name: each['failed'] for name, each in result['callbacks'].items()
-              if each['failed']}
-    if raised:
-        yield f'{counted(sum(raised.values()), "run")} of callbacks that raised' + _details(raised)
-    skipped = {name: each['skipped'] for name, each in result['callbacks'].items()
-               if each['skipped']}
-    if skipped:
-        yield f'{counted(sum(skipped.values()), "timer release")} skipped' + _details(skipped)
-    undeclared = {
-        name: each['unattributed' if each['declared'] else 'ran']
-        for name, each in result['callbacks'].items()}
-    yield (f'{counted(sum(undeclared.values()), "run")} of undeclared callbacks'
-           + _details({name: count for name, count in undeclared.items() if count}))
+    callbacks = result['callbacks']
+    for one, many, numbers in (
+            ('dropped', 'dropped', result['dropped']),
+            ('run of callbacks that raised', 'runs of callbacks that raised',
+             _numbers(callbacks, 'failed')),
+            ('timer release skipped', 'timer releases skipped', _numbers(callbacks, 'skipped')),
+            ('run of undeclared callbacks', 'runs of undeclared callbacks', {
+                name: count for name, each in callbacks.items()
+                if (count := each['unattributed' if each['declared'] else 'ran'])})):
+        if numbers:
+            yield f'{counted(sum(numbers.values()), one, many)}: ' + listed(
+                [f'{name} {n}' for name, n in numbers.items()])
     deaf = {name: each['incompatible_qos'] for name, each in result['callbacks'].items()
             if each.get('incompatible_qos') and not each['ran']}
     if deaf:
@@ -101,5 +98,5 @@ def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
                f'{attribution["none"]} as part of no job')
 
 
-def _details(numbers: dict[str, int]) -> str:
-    return ': ' + listed([f'{name} {n}' for name, n in numbers.items()]) if numbers else ''
+def _numbers(callbacks: dict[str, Any], count: str) -> dict[str, int]:
+    return {name: each[count] for name, each in callbacks.items() if each[count]}

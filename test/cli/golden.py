@@ -35,8 +35,9 @@ def words(text: str) -> str:
     """Return the text of a live run without its numbers, and without what a busy machine adds."""
     text = re.sub(r'-?\d+(\.\d+)?( (ns|us|ms|s)\b)?', '#', re.sub(' +', ' ', text))
     text = re.sub('(, #)? (expired|demoted)', '', text)     # counts that are shown if not 0
-    return ''.join(f'{re.sub("# (#( %)? )*", "# ", line)}\n' for line in text.splitlines() if not
-                   re.search('due to # stops?|timer releases? skipped|differences? between', line))
+    return ''.join(f'{re.sub("# (#( %)? )*", "# ", line)}\n' for line in text.splitlines()
+                   if not re.search('due to # stops?|# dropped|timer releases? skipped|'
+                                    'differences? between', line))
 
 
 def shape(value: Any) -> Any:
