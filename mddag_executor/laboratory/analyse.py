@@ -17,7 +17,7 @@ as the live executor schedules.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -62,7 +62,11 @@ class Verdict:
     verdict: str
     figure: str
     reason: str
-    details: dict[str, Any] = field(default_factory=dict)
+    details: dict[str, Any]
+
+
+Outcome = tuple[str, str, str, dict[str, Any]]
+"""The last four fields of a verdict."""
 
 
 @dataclass(frozen=True)
@@ -94,13 +98,13 @@ def analyse(
     if workers < 1:
         raise UsageError(f'workers: {workers} is too few: give at least 1')
     tasks = tasks_of(task_set, budget)
-    found = [_longest_path(tasks), _utilisation(tasks, workers), _demand(tasks, workers)]
+    found = [Verdict(*about, *test(tasks, workers)) for about, test in _NECESSARY]
     impossible = any(verdict.verdict == FAILS for verdict in found)
     obstacle = 'a necessary test fails' if impossible else _obstacle(tasks)
-    for test in _SUFFICIENT:
+    for about, test_of in _SUFFICIENT:
         if progress is not None:
             progress(len(found))
-        found.append(test(tasks, workers, obstacle))
+        found.append(Verdict(*about, *test_of(tasks, workers, obstacle)))
     return Analysis(workers, budget, sum(task.utilisation for task in tasks), tuple(found))
 
 
@@ -108,7 +112,7 @@ def _sink(task: Task, sink: int) -> str:
     return f'{task.dag.name}: {task.dag.vertices[sink].name}'
 
 
-def _longest_path(tasks: Sequence[Task]) -> Verdict:
+def _longest_path(tasks: Sequence[Task], workers: int) -> Outcome:
     late = sum(length > deadline for task in tasks for _, deadline, length in task.sinks)
     task, sink, deadline, length = max(
         ((task, *sink) for task in tasks for sink in task.sinks),
@@ -119,25 +123,21 @@ def _longest_path(tasks: Sequence[Task]) -> Verdict:
     if late:
         sinks = sum(len(t.sinks) for t in tasks)
         reason = f'too long for {late} of {counted(sinks, "sink")}'
-    return Verdict(
-        'longest path', 'necessary', 'Graham 1969', 'any', 'executions take their budgets',
-        FAILS if late else HOLDS, figure, reason,
-        {_sink(task, sink): {'deadline_ns': deadline, 'longest_path_ns': length}
-         for task in tasks for sink, deadline, length in task.sinks})
+    return FAILS if late else HOLDS, figure, reason, {
+        _sink(task, sink): {'deadline_ns': deadline, 'longest_path_ns': length}
+        for task in tasks for sink, deadline, length in task.sinks}
 
 
-def _utilisation(tasks: Sequence[Task], workers: int) -> Verdict:
+def _utilisation(tasks: Sequence[Task], workers: int) -> Outcome:
     total = sum(task.utilisation for task in tasks)
     fits = total <= workers * (1 + 1e-12)
-    return Verdict(
-        'utilisation', 'necessary', 'Liu and Layland 1973', 'any',
-        'releases as often as declared, executions of their budgets', HOLDS if fits else FAILS,
-        f'{total / workers:.3f} of {counted(workers, "worker")}',
+    return (
+        HOLDS if fits else FAILS, f'{total / workers:.3f} of {counted(workers, "worker")}',
         'at most 1' if fits else 'above 1: the backlog grows without end',
         {task.dag.name: task.utilisation for task in tasks})
 
 
-def _demand(tasks: Sequence[Task], workers: int) -> Verdict:
+def _demand(tasks: Sequence[Task], workers: int) -> Outcome:
     demand = necessary.largest_demand(tasks, workers)
     fits = demand.work <= workers * demand.time
     reason = 'no interval asks for more work than there is time'
@@ -149,10 +149,8 @@ def _demand(tasks: Sequence[Task], workers: int) -> Verdict:
               f'of {format_duration(workers * demand.time)}')
     if demand.time == 1:
         figure = f'{format_duration(demand.work)} due before it can have been done'
-    return Verdict(
-        'demand bound', 'necessary', 'Baruah, Mok and Rosier 1990, refined for each sink', 'any',
-        'all DAGs may be released at one time, executions take their budgets',
-        HOLDS if fits else FAILS, figure, reason, {'time_ns': demand.time, 'work_ns': demand.work})
+    return HOLDS if fits else FAILS, figure, reason, {
+        'time_ns': demand.time, 'work_ns': demand.work}
 
 
 def _obstacle(tasks: Sequence[Task]) -> str | None:
@@ -173,7 +171,7 @@ def _obstacle(tasks: Sequence[Task]) -> str | None:
     return None
 
 
-def _graham(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdict:
+def _graham(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Outcome:
     bounds = [bound for task in tasks for bound in sufficient.graham(task, workers)]
     within = {task.dag.name: all(b.response is not None for b in bounds if b.task is task)
               for task in tasks}
@@ -185,48 +183,48 @@ def _graham(tasks: Sequence[Task], workers: int, obstacle: str | None) -> Verdic
         verdict, reason = HOLDS, 'the bound of each sink is within deadline and period'
     elif obstacle is None:
         reason = 'a bound is beyond the deadline or the period'
-    return Verdict(
-        "Graham's bound", 'sufficient', 'Graham 1969', WORK_CONSERVING,
-        'one DAG alone, done within its period', verdict,
-        f'{good} of {counted(len(tasks), "DAG")} in time, each alone', reason or '',
+    return (
+        verdict, f'{good} of {counted(len(tasks), "DAG")} in time, each alone', reason or '',
         {name: {'alone': HOLDS if ok else NOTHING} for name, ok in within.items()})
 
 
-_Bounds = Callable[[Sequence[Task], int], list[Bound]]
-
-
 def _response_times(
-    name: str, source: str, scheduler: str, bounds_of: _Bounds,
+    bounds_of: Callable[[Sequence[Task], int], list[Bound]],
     tasks: Sequence[Task], workers: int, obstacle: str | None,
-) -> Verdict:
-    """Return the verdict of a response-time test, whose bounds ``bounds_of`` returns."""
-    def verdict(verdict: str, figure: str, reason: str, details: dict[str, Any]) -> Verdict:
-        return Verdict(name, 'sufficient', source, scheduler, 'several and any deadlines', verdict,
-                       figure, reason, details)
-
+) -> Outcome:
+    """Return the outcome of a response-time test, whose bounds ``bounds_of`` returns."""
     if obstacle is not None:
-        return verdict(NOTHING, '-', obstacle, {})
+        return NOTHING, '-', obstacle, {}
     for task in tasks:
         if task.volume > workers * min(task.period, task.deadline):
-            reason = f'DAG {task.dag.name} alone is too much for the workers'
-            return verdict(NOTHING, '-', reason, {})
+            return NOTHING, '-', f'DAG {task.dag.name} alone is too much for the workers', {}
     bounds = bounds_of(tasks, workers)
     details = {_sink(b.task, b.sink): {'deadline_ns': b.deadline, 'response_bound_ns': b.response}
                for b in bounds}
     last = bounds[-1]
     if last.response is None:
-        return verdict(NOTHING, f'no bound for {_sink(last.task, last.sink)}',
-                       f'its bound is beyond its deadline of {format_duration(last.deadline)}',
-                       details)
+        return (
+            NOTHING, f'no bound for {_sink(last.task, last.sink)}',
+            f'its bound is beyond its deadline of {format_duration(last.deadline)}', details)
     tight = max(bounds, key=lambda b: (b.response or 0) / b.deadline)
-    return verdict(HOLDS, f'{format_duration(tight.response or 0)} of '
-                   f'{format_duration(tight.deadline)} at {_sink(tight.task, tight.sink)}',
-                   'each bound is within its deadline', details)
+    figure = (f'{format_duration(tight.response or 0)} of {format_duration(tight.deadline)} at '
+              f'{_sink(tight.task, tight.sink)}')
+    return HOLDS, figure, 'each bound is within its deadline', details
 
 
-_SUFFICIENT: tuple[Callable[[Sequence[Task], int, str | None], Verdict], ...] = (
-    _graham,
-    partial(_response_times, 'response time, any policy', 'after Melani et al. 2015',
-            WORK_CONSERVING, sufficient.work_conserving),
-    partial(_response_times, 'response time, RAD without preemption',
-            'after Melani et al. 2015, Serrano et al. 2016', RAD_LIVE, sufficient.rad))
+# The first fields of a verdict, and the test.
+_NECESSARY = (
+    (('longest path', 'necessary', 'Graham 1969', 'any', 'executions take their budgets'),
+     _longest_path),
+    (('utilisation', 'necessary', 'Liu and Layland 1973', 'any',
+      'releases as often as declared, executions of their budgets'), _utilisation),
+    (('demand bound', 'necessary', 'Baruah, Mok and Rosier 1990, refined for each sink', 'any',
+      'all DAGs may be released at one time, executions take their budgets'), _demand))
+_SUFFICIENT = (
+    (("Graham's bound", 'sufficient', 'Graham 1969', WORK_CONSERVING,
+      'one DAG alone, done within its period'), _graham),
+    (('response time, any policy', 'sufficient', 'after Melani et al. 2015', WORK_CONSERVING,
+      'several and any deadlines'), partial(_response_times, sufficient.work_conserving)),
+    (('response time, RAD without preemption', 'sufficient',
+      'after Melani et al. 2015, Serrano et al. 2016', RAD_LIVE, 'several and any deadlines'),
+     partial(_response_times, sufficient.rad)))
