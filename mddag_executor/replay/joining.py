@@ -403,6 +403,9 @@ class Joined:
             (part.recording.notices_stops for part in self._parts
              if part.recording.notices_stops is not None), default=None)
         table = found.executions
+        # a process may end before the others
+        waited = (table['end'] < 0) & (table['worker'] < 0)
+        table['start'][waited] = table['began'][waited] = found.end
         found.start = earliest(found.releases['release'], table['ready'][
             (table['end'] >= 0) & (table['start'] >= 0)])
 
