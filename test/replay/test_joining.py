@@ -197,6 +197,16 @@ def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(tmp_
     assert (verdicts.due, verdicts.in_time, verdicts.late) == (4, 1, 3)
 
 
+def test_what_waits_when_its_process_ends_waits_until_the_end_of_the_run(tmp_path):
+    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
+    up.runs(0, MS)
+    down.add('job_release', 3 * MS, 0, 0, BASE)
+    down.add('dispatch', 40 * MS, ADDRESS, 0, 1, 0, -1, BASE + 3 * MS, BASE + 8 * MS)
+    explanation = replay([up.end(100 * MS), down.end(40 * MS)]).explanation
+    assert explanation.summary()['causes']['waited'] == 1
+    assert explanation.worst()['parts'][-1]['ns'] == 97 * MS
+
+
 def test_who_is_started_again_or_never_judged_keeps_no_job_from_being_judged(tmp_path):
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
     again = Trace(tmp_path, 'down.2', 1, begin=30 * MS, judges_from=45 * MS)
