@@ -207,7 +207,6 @@ class Folder:
                 command, cwd=self.path, env=self._environment, text=True,
                 stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                 start_new_session=True) as process:
-            assert process.stdout is not None
             try:
                 if until is not None:
                     found = any(until in line for line in process.stdout)

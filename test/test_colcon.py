@@ -139,7 +139,6 @@ def test_a_signal_ends_ros2_launch_and_the_run(workspace, tmp_path, number, to_a
             ['bash', '-c', command], cwd=tmp_path, text=True, stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True,
             env={**os.environ, 'COLCON_TRACE': '', 'PYTHONUNBUFFERED': '1'}) as process:
-        assert process.stdout is not None
         pid = int(re.search(r'process started with pid \[(\d+)\]', next(
             line for line in process.stdout if 'process started' in line))[1])
         trace = tmp_path / 'out.mcap'

@@ -84,7 +84,6 @@ def imports(module: str, text: str, is_package: bool) -> Iterator[tuple[int, str
 def violations(module: str, text: str, is_package: bool = False) -> Iterator[str]:
     """Yield what a module imports and must not."""
     mine = part_of(module)
-    assert mine is not None
     for line, name in imports(module, text, is_package):
         theirs = part_of(name)
         foreign = name.split('.')[0]
@@ -127,7 +126,6 @@ BASES = frozenset(('BareExecutor', 'BareTask', 'Executor', 'Task', 'Future', 'Wa
 def rclpys_private_names() -> frozenset[str]:
     """Return the private names in rclpy, and those of its handles that no documented class has."""
     spec = find_spec('rclpy')
-    assert spec is not None and spec.origin is not None
     private, public = {'_rclpy'}, set()
     for path in Path(spec.origin).parent.rglob('*.py'):
         for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):

@@ -120,7 +120,6 @@ def test_messages_within_a_process_count(call, tmp_path):
     grab, detect = msg_graph.load(tmp_path / 'g.yaml').callbacks
     assert (grab.publishes, detect.topics, detect.deadline_ns) == (
         ('/image',), ('/image',), 100 * MS)
-    assert detect.execution_time is not None
     assert set(detect.execution_time.quantiles_ns) == {4 * MS}
     result = call('replay', 'c.mcap', 'g.yaml', '--json', '-', cwd=tmp_path).result
     sink, = result['dags']['/camera']['sinks'].values()

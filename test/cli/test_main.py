@@ -344,7 +344,7 @@ def ros2(monkeypatch):
     """Give what ros2cli does with a command line, in short: parse it, call the command's main."""
     if find_spec('ros2cli') is None:
         command_module = ModuleType('ros2cli.command')
-        command_module.CommandExtension = object    # type: ignore[attr-defined]
+        command_module.CommandExtension = object
         monkeypatch.setitem(sys.modules, 'ros2cli', ModuleType('ros2cli'))
         monkeypatch.setitem(sys.modules, 'ros2cli.command', command_module)
         monkeypatch.delitem(sys.modules, 'mddag_executor.cli.ros2', raising=False)

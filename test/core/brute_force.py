@@ -155,7 +155,6 @@ class BruteForce:
     def _deadline(self, job: Job, sink: int) -> int:
         """Return the absolute deadline of a sink."""
         relative = job.dag.vertices[sink].deadline_ns
-        assert relative is not None
         return job.release + relative // self.tick
 
     def priority(self, execution: Execution) -> int:
@@ -422,7 +421,6 @@ class BruteForce:
         if worst <= self.priority(best):
             return False
         victim = self.running[worker]
-        assert victim is not None
         self._note('preempt', worker, victim)
         self._start(best, worker)
         victim.left += self.switch_overhead

@@ -85,7 +85,6 @@ class StallWatch:
         self._thread.start()
 
     def _read(self) -> None:
-        assert self._process.stdout is not None
         for line in self._process.stdout:
             self.stalls.append(int(line))
 

@@ -74,7 +74,6 @@ def run_program(
         stderr=subprocess.PIPE, text=True)
     try:
         if send is not None:
-            assert process.stdout is not None
             assert process.stdout.readline() == 'ready\n', process.communicate()[1]
             time.sleep(after)
             process.send_signal(send)

@@ -14,7 +14,7 @@ class Pulse(Waitable):
     """A waitable that consists of a guard condition."""
 
     def __init__(self, node: Node, group: Any) -> None:
-        super().__init__(group)  # type: ignore[no-untyped-call]
+        super().__init__(group)
         self.guard = node.create_guard_condition(lambda: None)
         node._guards.remove(self.guard)
         self._index: int | None = None

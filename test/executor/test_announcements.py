@@ -244,7 +244,7 @@ def test_publications_that_overlap_are_announced_together_when_all_have_returned
     bench = Bench()
     announced_to: list[list[int]] = []
     bench.jobs.announce = lambda send, topic, several: announced_to.append(
-        [each.origin.job for each in several])  # type: ignore[union-attr]
+        [each.origin.job for each in several])
     bench.jobs.announce_on({TOPIC})
 
     def publish(job, publisher, send=lambda: None):

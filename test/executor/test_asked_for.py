@@ -34,7 +34,6 @@ nodes:
 
     def tick():
         job = current_job()
-        assert job is not None
         releases.append(job.release_ns)
         if len(releases) == 3:
             time.sleep(0.13)

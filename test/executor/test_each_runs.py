@@ -72,7 +72,7 @@ def of_waitables(executor: Any, node: Any, call: Callable[[int], None]) -> None:
         async def execute(data):
             ran()
         pulse = Pulse(node, node.default_callback_group)
-        pulse.execute = execute  # type: ignore[method-assign]
+        pulse.execute = execute
         node.add_waitable(pulse)
         return pulse.guard.trigger
     one_by_one(make, call)

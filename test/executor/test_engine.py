@@ -55,7 +55,6 @@ class Driver:
         self.log: list[Event] = []
 
     def note(self, now: int, kind: str, work: Work) -> None:
-        assert work.origin is not None
         _, dag, job, vertex = work.origin
         self.log.append(
             (now // TICK, kind, work.worker, dag, self.tables.index_in_dag[vertex], job))
@@ -73,7 +72,6 @@ class Driver:
                 self.engine.timer_due(Work(source, print), now, now)
             while (work := self.engine.dispatch(0, now)) is not None:
                 self.note(now, 'start', work)
-                assert work.origin is not None
                 _, dag, _, vertex = work.origin
                 ticks = self.case.ticks[dag][self.tables.index_in_dag[vertex]]
                 self.running[work.worker] = now + ticks * TICK, work
@@ -81,7 +79,6 @@ class Driver:
 
     def complete(self, work: Work, now: int) -> None:
         self.note(now, 'end', work)
-        assert work.origin is not None
         slot, dag, job, vertex = work.origin
         self.engine.finished(work, now, now, now, 0, work.worker)
         tables = self.tables

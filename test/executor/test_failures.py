@@ -24,7 +24,6 @@ class Wrong(Exception):
 
 def odd_jobs_raise() -> None:
     job = current_job()
-    assert job is not None
     if job.job % 2:
         raise Wrong(job.job)
 

@@ -48,7 +48,7 @@ def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
         node.create_guard_condition(fail).trigger()
     elif kind == 'waitable':
         pulse = Pulse(node, node.default_callback_group)
-        pulse.execute = fail_later  # type: ignore[method-assign]
+        pulse.execute = fail_later
         node.add_waitable(pulse)
         pulse.guard.trigger()
     else:

@@ -174,7 +174,7 @@ def test_a_signal_stops_a_session_wherever_it_interrupts_the_wait():
 
 
 def stop_at(steps: int) -> None:
-    session = Session(Idle())  # type: ignore[arg-type]
+    session = Session(Idle())
     answers = []
 
     def wait():

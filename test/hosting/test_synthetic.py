@@ -185,7 +185,6 @@ def test_every_release_reaches_every_sink(task_set, ros_context):
     # Each sink knows the release of its job exactly: the completions are on the nominal grid.
     for dag in task_set.dags:
         first = workload.ledger.first_release[dag.index]
-        assert first is not None
         ran = len(workload.ledger.durations[dag.index][dag.source])
         for index in dag.sinks:
             # A busy machine may skip releases and make jobs late, but what began is not lost;

@@ -65,7 +65,7 @@ def test_tables_are_drawn_as_one_by_one(values, percent, seed):
 
 def npz(**arrays: object) -> bytes:
     file = io.BytesIO()
-    np.savez(file, **arrays)  # type: ignore[arg-type]
+    np.savez(file, **arrays)
     return file.getvalue()
 
 

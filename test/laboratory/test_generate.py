@@ -116,7 +116,7 @@ def test_shapes(count, part, edges, ors, seed):
 ])
 def test_impossible(change, problem):
     with pytest.raises(UsageError) as caught:
-        generate(replace(Options(), **change))  # type: ignore[arg-type]
+        generate(replace(Options(), **change))
     assert str(caught.value).startswith(problem)
 
 

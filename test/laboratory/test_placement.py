@@ -35,7 +35,7 @@ def workload(*milliseconds: float, holds: str = '') -> TaskSet:
 
 def placed(task_set: TaskSet, n: int, *milliseconds: float, **rules: object) -> list[set[str]]:
     placing = Placing(task_set, n, [[round(ms * MS)] for ms in milliseconds],
-                      **rules)  # type: ignore[arg-type]
+                      **rules)
     return [set(process.nodes) for process in placing.processes(placing.place())]
 
 

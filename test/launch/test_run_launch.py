@@ -22,7 +22,6 @@ TOP = Path(__file__).resolve().parent.parent.parent
 def launch_file():
     spec = importlib.util.spec_from_file_location(
         'run_launch', TOP / 'launch' / 'run.launch.py')
-    assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -154,7 +154,7 @@ BOUND = graph("""
 
 
 def key(callback: object) -> str | None:
-    return None if callback is None else callback.key  # type: ignore[attr-defined, no-any-return]
+    return None if callback is None else callback.key
 
 
 def test_alike_ones_are_handed_out_in_order():

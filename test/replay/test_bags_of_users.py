@@ -84,7 +84,7 @@ def with_rosbags(
     storage: StoragePlugin, compression: CompressionMode = CompressionMode.NONE, version: int = 9
 ) -> Callable[[Path, Messages], None]:
     def write(path, given):
-        writer = Writer(path, version=version, storage_plugin=storage)     # type: ignore[arg-type]
+        writer = Writer(path, version=version, storage_plugin=storage)
         writer.set_compression(compression, CompressionFormat.ZSTD)
         with writer:
             connections = {name: writer.add_connection(name, kind, typestore=STORE)

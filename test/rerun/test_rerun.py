@@ -102,7 +102,7 @@ def test_outputs_are_a_bag_that_others_read(bag, graph, tmp_path):
     out = tmp_path / 'out.mcap'
     result = rerun(bag, graph, [Filter, Sink], output=out)
     with AnyReader([out]) as reader:
-        found = [(time, reader.deserialize(data, connection.msgtype).data)  # type: ignore
+        found = [(time, reader.deserialize(data, connection.msgtype).data)
                  for connection, time, data in reader.messages() if connection.topic == '/out']
     assert found == [(each.time, 2.0 * i) for i, each in enumerate(
         each for each in result.outputs if each.topic == '/out')]
@@ -143,7 +143,6 @@ class Early(Durations):
 @pytest.mark.parametrize('cpus', [None, 2])
 def test_what_was_published_early_leaves_early(bag, graph, cpus):
     recording = MessageBag(bag)
-    assert recording.start is not None and recording.end is not None
     source = RerunInput('bag', recording.start, recording.end, recording, Early(
         Tables.build(load(str(graph))), Load([], [], [], [], [0], [0]), recorded=True))
     result = Rerun(source, load(str(graph)), Settings(workers=2, cpus=cpus)).run(

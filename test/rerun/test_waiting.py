@@ -153,7 +153,7 @@ def test_rates_and_clocks_sleep_in_virtual_time(bag, graph):
 def test_threads_of_nodes_are_in_virtual_time_too(bag, graph):
     def fill(node):
         numbers = queue.Queue[int]()
-        node.numbers = numbers  # type: ignore[attr-defined]
+        node.numbers = numbers
         publisher = node.create_publisher(String, '/doubled', 10)
 
         def work():
@@ -170,7 +170,7 @@ def test_threads_of_nodes_are_in_virtual_time_too(bag, graph):
         threading.Thread(target=work, daemon=True).start()
 
     def take(node, number):
-        node.numbers.put(number)  # type: ignore[attr-defined]
+        node.numbers.put(number)
 
     seen, result = run_filter(bag, graph, take, fill=fill)
     assert seen == [(100.0 * i + 5, 2 * i) for i in range(5)] + [(405.0, 'pooled')]
@@ -205,8 +205,8 @@ def fibonacci() -> Node:
 def test_an_action(bag, graph):
     async def take(node, number):
         if number == 3:
-            assert node.client.wait_for_server(1.0)  # type: ignore[attr-defined]
-            goal = await node.client.send_goal_async(  # type: ignore[attr-defined]
+            assert node.client.wait_for_server(1.0)
+            goal = await node.client.send_goal_async(
                 Fibonacci.Goal(order=3),
                 lambda message: node.note(list(message.feedback.sequence)))
             node.note(goal.accepted)
@@ -214,7 +214,7 @@ def test_an_action(bag, graph):
             node.note((answer.status, list(answer.result.sequence)))
 
     def fill(node):
-        node.client = ActionClient(node, Fibonacci, 'fibonacci')  # type: ignore[attr-defined]
+        node.client = ActionClient(node, Fibonacci, 'fibonacci')
 
     for _ in range(2):
         seen, result = run_filter(bag, graph, take, fibonacci, fill=fill)
