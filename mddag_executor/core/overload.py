@@ -104,13 +104,13 @@ def _late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
     """
     slot = s.x_slot[x]
     vertex = s.x_vertex[x]
+    process = _process(t, s, vertex)
     begin = now
-    if first >= 0:
+    if first >= 0 and s.overloaded[process] != 0:
         begin += len(s.demoted[vertex]) * s.mean[vertex]
     elif s.x_started[x] >= 0:  # it was preempted
         begin -= s.x_cost[x] - s.x_left[x]
     refused = is_refused(t, s, vertex)
-    process = _process(t, s, vertex)
     if refused and now > s.refused_until[process] and s.refused_late[process] > 0:
         s.refused_late[process] = 0
         admit(t, s)
@@ -152,7 +152,7 @@ def set_start(t: Tables, s: State, vertex: int) -> None:
 
 def admit(t: Tables, s: State) -> None:
     """
-    Set which importance is refused in each process (rule 14), by the known execution times.
+    Set which importance is refused in each process (rule 14), and whether the rest is too much.
 
     A driver calls this at the begin and when the execution times have changed.
     """
@@ -164,11 +164,13 @@ def admit(t: Tables, s: State) -> None:
             for worker in range(len(s.pool)):
                 workers += int(s.pool[worker] == process)
         refused = s.refused_late[process]
+        s.overloaded[process] = 1
         for importance in range(IMPORTANT + 1):
             demand, held = _demand(t, s, process, importance)
             if demand > 0 and importance > refused:
                 refused = importance
             if demand <= workers * PPM and held <= PPM:
+                s.overloaded[process] = int(importance > refused)
                 break
         changed = changed or refused != s.refused_below[process]
         s.refused_below[process] = refused

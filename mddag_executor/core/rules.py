@@ -50,9 +50,10 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     has used up the misses that it tolerates).  So demoted jobs age, and each callback gets some
     time.  An execution with sinks of both kinds has as RAD the earliest deadline of those that can
     be in time.  Executions of one vertex keep their order: one that comes first while older ones
-    are demoted has to wait for these.  If it can be in time even so, the oldest inherits its
-    priority, so a backlog is worked off as soon as that helps; if not, it is demoted behind the
-    oldest.  Running executions keep their keys.  Only policies whose keys are times demote.
+    are demoted has to wait for these.  If it can be in time, the oldest inherits its priority, so
+    a backlog is worked off; if not, it is demoted behind the oldest.  In a lasting overload
+    (``State.overloaded``) the mean execution times of the older ones count, too.  Running
+    executions keep their keys.  Only policies whose keys are times demote.
 8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
     when an execution of it fails (its callback raises): each incomplete sink is missed.
     Executions that have not started are dropped after an abort.  After an expiry or a failure they

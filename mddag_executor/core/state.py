@@ -72,8 +72,9 @@ class State(NamedTuple):
     overtaking: list[int]
     # the executions of undeclared callbacks that may be used again
     undeclared: list[int]
-    # by process, from 1: the least importance that is not refused
+    # by process, from 1: the least importance that is not refused, and whether that needs too much
     refused_below: list[int]
+    overloaded: list[int]
     # the same because of late jobs, and until when
     refused_late: list[int]
     refused_until: list[int]
@@ -287,6 +288,7 @@ def add_process(s: State) -> None:
     """Add the columns of a process."""
     s.overtaking.append(1)
     s.refused_below.append(0)
+    s.overloaded.append(0)
     s.refused_late.append(0)
     s.refused_until.append(-NEVER)
 

@@ -21,9 +21,10 @@ Its reading of the documents:
   deadline that it leads to any more, if every vertex on the longest way takes its mean time, goes
   from then on as if its job were released ten relative deadlines later. As long as only some
   deadlines are out of reach, ``rad`` and ``llf`` go by those within reach. One that became ready
-  later at the same vertex does not go before it: it is late, too, if the mean time of each
-  execution that was demoted there leaves it no deadline within reach, and then goes directly
-  behind the oldest. If it is not late, the oldest goes as early as it.
+  later at the same vertex does not go before it: if it is late, too, it goes directly behind the
+  oldest; if not, the oldest goes as early as it. If the mean times of all vertices need more than
+  the workers, it is late if the mean time of each execution that was demoted there leaves it no
+  deadline within reach.
 * ``keep: newest`` at a source or sink: one of an earlier job that waits there and has never run
   vanishes when the next one is ready.
 * ``ros2`` goes by rounds. When a worker is free and the round has nothing left that it could take,
@@ -123,6 +124,9 @@ class BruteForce:
         self.laxity = {
             (dag.index, v): {sink: laxity(dag, v, sink) for sink in reachable_sinks(dag, v)}
             for dag in self.dags for v in range(len(dag.vertices))}
+        self.is_overloaded = sum(
+            self._mean(v) * 1_000_000 // dag.period_ns
+            for dag in self.dags for v in dag.vertices) > workers * 1_000_000
         self.sequence = 0
         self.now = 0
         self._simulate(horizon, stop_at_first_miss, last_release or horizon)
@@ -151,6 +155,10 @@ class BruteForce:
 
     def _period(self, dag: Dag) -> int:
         return dag.period_ns // self.tick
+
+    def _mean(self, vertex: Vertex) -> int:
+        declared = vertex.callback.execution_time
+        return 0 if declared is None else declared.mean_ns
 
     def _deadline(self, job: Job, sink: int) -> int:
         """Return the absolute deadline of a sink."""
@@ -204,9 +212,8 @@ class BruteForce:
         now = (self.now - job.release) * self.tick
         if execution.has_run:
             now -= done
-        if older is not None:
-            declared = vertex.callback.execution_time
-            now += ahead * (0 if declared is None else declared.mean_ns)
+        if older is not None and self.is_overloaded:
+            now += ahead * self._mean(vertex)
         within = {sink for sink, start in starts.items() if now <= start}
         lowest = self._priority(execution, within or {*starts})
         if not within and older is not None:
