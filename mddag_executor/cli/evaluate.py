@@ -161,7 +161,7 @@ def ratio_table(outcome: Evaluation) -> tuple[list[str], list[list[Cell]]]:
     """Return the table for people: acceptance ratio by bin of normalised utilisation."""
     acceptance = [*outcome.by_policy().values(), outcome.bound()]
     rows: list[list[Cell]] = []
-    for i, (centre, count) in enumerate(zip(outcome.bins, outcome.counts())):
+    for i, (centre, count) in enumerate(zip(outcome.bins, acceptance[-1].runs)):
         if count == 0 and len(outcome.experiments) > 1:
             continue  # most of so many bins may be
         rows.append([f'{centre:.2f}', count, *(_percent(each.ratio[i]) for each in acceptance)])

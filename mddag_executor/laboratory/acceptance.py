@@ -55,7 +55,7 @@ def wilson(accepted: int, runs: int) -> tuple[float, float]:
 
 class Acceptance:
     """
-    Acceptance of one set of runs: ratio and confidence interval of each bin and of all runs.
+    Acceptance of one set of runs: runs, ratio and confidence interval of each bin, total ratio.
 
     ``ratio`` and ``interval`` are None for an empty bin.
 
@@ -66,11 +66,11 @@ class Acceptance:
     def __init__(
         self, bins: npt.NDArray[np.int64], accepted: Bools, n_bins: int = len(BINS)
     ) -> None:
-        counts = np.bincount(bins, minlength=n_bins).tolist()
+        self.runs: list[int] = np.bincount(bins, minlength=n_bins).tolist()
         self.accepted: list[int] = np.bincount(bins[accepted], minlength=n_bins).tolist()
         self.ratio: list[float | None] = []
         self.interval: list[tuple[float, float] | None] = []
-        for good, runs in zip(self.accepted, counts):
+        for good, runs in zip(self.accepted, self.runs):
             self.ratio.append(good / runs if runs else None)
             self.interval.append(wilson(good, runs) if runs else None)
         self.total = float(np.mean(accepted)) if len(accepted) else None
@@ -156,12 +156,6 @@ class Evaluation:
         bins = bins_of(self.utilisation[self.done], self.bins)
         return Acceptance(bins, accepted[self.done], len(self.bins))
 
-    def counts(self) -> list[int]:
-        """Return how many runs each bin has."""
-        counts: list[int] = np.bincount(
-            bins_of(self.utilisation[self.done], self.bins), minlength=len(self.bins)).tolist()
-        return counts
-
     def result(self) -> dict[str, Any]:
         """Return the result format of ``evaluate --json``."""
         experiment = self.experiment
@@ -169,7 +163,7 @@ class Evaluation:
         return {
             'runs': self.runs, 'first_run': self.first_run,
             'elapsed_s': round(self.elapsed_s, 3), 'bins': list(self.bins),
-            'counts': self.counts(),
+            'counts': bound.runs,
             'acceptance': {name: each.ratio for name, each in acceptance.items()},
             'bound': bound.ratio,
             'policies': {

@@ -117,7 +117,7 @@ def _total(acceptance: Acceptance) -> str:
 
 
 def _counts(axes: Axes, evaluation: Evaluation) -> None:
-    counts, bins = evaluation.counts(), evaluation.bins
+    counts, bins = evaluation.bound().runs, evaluation.bins
     if len(evaluation.experiments) > 1:
         filled = [place for place, count in enumerate(counts) if count] or [0]
         chosen = slice(filled[0], filled[-1] + 1)

@@ -82,7 +82,7 @@ def test_the_paper_s_figure(autoware):
     these, it was within 1.8 (seeds 0 to 2).
     """
     outcome = evaluate(Experiment(autoware, ('rad', 'rm', 'wc')), 5000, jobs=2, compiled=True)
-    counts = outcome.counts()
+    counts = outcome.bound().runs
     for ours, theirs in zip(counts, REFERENCE_COUNTS):
         assert abs(ours - theirs) < 4 * math.sqrt(ours + theirs)
     for name, acceptance in outcome.by_policy().items():
@@ -178,7 +178,7 @@ def test_several_task_sets(small):
     assert (outcome.utilisation[20:40] * 2 != outcome.utilisation[:20]).any()
     again = evaluate(experiments, 30)  # more runs of each: the first ones stay
     assert (again.utilisation.reshape(3, 30)[:, :20] == outcome.utilisation.reshape(3, 20)).all()
-    assert outcome.bins == WIDE_BINS and sum(outcome.counts()) == 60
+    assert outcome.bins == WIDE_BINS and sum(outcome.bound().runs) == 60
     graphs = outcome.result()['graphs']
     assert [each['graph'] for each in graphs] == ['small.yaml', 'small.yaml', 'other.yaml']
     assert sum(each['accepted']['rad'] for each in graphs) == outcome.accepted[0].sum()
