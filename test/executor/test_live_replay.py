@@ -19,7 +19,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
-from .conftest import Spinning
+from .conftest import Spinning, wait_for
 from .declared import Declared
 
 GRAPH = """\
@@ -152,16 +152,21 @@ nodes:
       - {name: starved, timer: 10ms, deadline: 10ms, dag: starved}
 """
     path = tmp_path / 'starved.mcap'
-    node = make_node('a')
-    node.create_timer(0.02, lambda: time.sleep(1.0))    # of the same group
+    node, begun, go_on = make_node('a'), threading.Event(), threading.Event()
+    node.create_timer(0.02, lambda: (begun.set(), go_on.wait(30.0)))    # of the same group
     node.create_timer(0.01, lambda: None)
     executor = make_executor(loads(graph, 'g.yaml'), trace=str(path), nodes=[node])
     with Spinning(executor):
-        time.sleep(0.6)
+        assert begun.wait(15.0)
+        jobs = executor.statistics()['dags']['starved']['jobs']
+        assert wait_for(
+            lambda: executor.statistics()['dags']['starved']['jobs'] >= jobs + 30)
+        threading.Timer(0.5, go_on.set).start()     # the end waits for it
     outcome = replay(path)
     assert outcome.warnings == []
     causes = outcome.explanation.summary()['sinks']['/a:starved']
-    assert causes['group'] > 10 and not causes['lost'] and not causes['released late']
+    assert causes['group'] > 10 and not causes['lost']
+    assert causes['released late'] < 5  # on a busy machine
     assert [each.kind for each in outcome.drift()] == []
 
 
