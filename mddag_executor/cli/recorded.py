@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='run the nodes in N processes, packed by the recorded times, or in those of '
         'a YAML file with `processes:` (default: as recorded)')
     options.add(group, '--policy', otherwise='as recorded')
-    options.add(group, '--on-late', otherwise='continue')
+    options.add(group, '--on-late', otherwise='as recorded; of a bag: continue')
     options.add(group, '--preemptive', otherwise='as recorded, if the policy can')
     add('--overheads', type=_overheads, metavar='WHICH',
         help='the time that noticing, dispatch and transport take: recorded (default), '
@@ -156,7 +156,7 @@ def _rescheduled(
     with Progress('replaying') as line:
         return reschedule(
             path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
-            on_late=args.on_late or 'continue',
+            on_late=args.on_late,
             overheads=recorded, dispatch_overhead=0 if recorded else args.overheads, name=name,
             progress=line.events, skip=args.skip, cpus=args.cpus, processes=_processes(args))
 

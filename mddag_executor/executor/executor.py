@@ -166,7 +166,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._trace_clock = TraceClock()
         self._recorder = None if trace is None else Recorder(
             os.fspath(trace), task_set, policy, num_workers, deadline_ns, max_active_jobs,
-            self._trace_clock, overwrite=overwrite)
+            self._trace_clock, overwrite=overwrite, on_late=on_late)
         self._errors: deque[BaseException] = deque()
         self._process = process
         self._unclaimed = Unclaimed(self._fail, lambda: self._at_once.ring())

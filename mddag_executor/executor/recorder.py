@@ -12,6 +12,7 @@ import weakref
 
 from mddag_executor import defaults
 from mddag_executor.clocks import boot, TraceClock
+from mddag_executor.core.tables import ON_LATE
 from mddag_executor.executor.entity import Entity, SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.trace.errors import TraceError
 from msg_graph import TaskSet
@@ -36,7 +37,7 @@ class Recorder:
     def __init__(
         self, path: str, task_set: TaskSet | None, policy: str, workers: int,
         default_deadline: int, max_active_jobs: int, clock: TraceClock, writer: Any = None,
-        cpus: int | None = None, overwrite: bool = False,
+        cpus: int | None = None, overwrite: bool = False, on_late: str = 'continue',
     ) -> None:
         if writer is None:
             from mddag_executor.trace.writer import TraceWriter  # late: it loads the compression
@@ -50,7 +51,7 @@ class Recorder:
         self._say(
             'task_set', task_set.text if task_set else '', task_set.file if task_set else '',
             policy, workers, default_deadline, max_active_jobs, False,
-            defaults.processors() if cpus is None else cpus)
+            defaults.processors() if cpus is None else cpus, ON_LATE[on_late])
         self._say('caret_init', clock.offset_ns, 'jazzy')
         self._say('host', socket.gethostname(), boot())
         self._say('rmw_implementation', get_rmw_implementation_identifier())

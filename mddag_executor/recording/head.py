@@ -28,6 +28,7 @@ class Head(NamedTuple):
     The declaration and settings that the executor wrote at the beginning of the recording.
 
     :ivar cpus: number of CPUs that the process could use; 0: unknown.
+    :ivar on_late: treatment of late jobs, a value of ``core.tables.ON_LATE``.
     """
 
     time: int
@@ -39,6 +40,7 @@ class Head(NamedTuple):
     max_active_jobs: int
     preemptive: bool
     cpus: int = 0
+    on_late: int = 0
 
 
 def read_head(reader: TraceReader) -> Head | None:

@@ -17,7 +17,7 @@ from typing import Any
 
 from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, POLICIES, processes_of, Tables
 from mddag_executor.core import policy as find_policy
-from mddag_executor.core.tables import DEMOTE
+from mddag_executor.core.tables import DEMOTE, ON_LATE
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
 from mddag_executor.recording.head import Head, ReplayError
@@ -144,7 +144,7 @@ def reschedule(
     policy: str | None = None,
     workers: int | None = None,
     preemptive: bool | None = None,
-    on_late: str = 'continue',
+    on_late: str | None = None,
     overheads: bool = True,
     dispatch_overhead: int = 0,
     name: str | None = None,
@@ -163,7 +163,7 @@ def reschedule(
     :param workers: size of the pool of each process; None: as recorded.
     :param preemptive: whether a smaller key preempts a larger one; None: as recorded, if the
         policy supports it.
-    :param on_late: handling of late jobs of a DAG that does not declare it.
+    :param on_late: handling of late jobs of a DAG that does not declare it; None: as recorded.
     :param overheads: whether noticing, dispatch and transport take their recorded times, or none.
     :param dispatch_overhead: added to each execution, ns.
     :param name: the trace's name in messages, if not its path.
@@ -193,6 +193,8 @@ def reschedule(
     cpus = cpus or head.cpus or None
     if preemptive is None:
         preemptive = head.preemptive and not find_policy(policy).polling
+    if on_late is None:     # any other number is damage
+        on_late = next((name for name, n in ON_LATE.items() if n == head.on_late), 'continue')
     bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
     tables_of = partial(
         Tables.build, default_deadline=head.default_deadline, max_active_jobs=bound,

@@ -22,6 +22,7 @@ import os
 from typing import Any
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, rad_offsets, Tables
+from mddag_executor.core.tables import ON_LATE
 from mddag_executor.recording import tables
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.deadlines import Judged
@@ -51,7 +52,8 @@ def write_events(
     """Pass the events of such a trace to ``add``: name, time, thread, fields."""
     settings = run.settings
     add('task_set', 0, 0, task_set.text, task_set.file, settings.policy, settings.workers,
-        DEFAULT_DEADLINE_NS, _MOST, settings.preempts, settings.cpus or 0)
+        DEFAULT_DEADLINE_NS, _MOST, settings.preempts, settings.cpus or 0,
+        ON_LATE[settings.on_late])
     for place, callback in enumerate(task_set.callbacks, 1):
         add('rclcpp_callback_register', 0, 0, place, callback.key)
     computed = ComputedRun.of_run(task_set, load, run)

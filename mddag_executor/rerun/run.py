@@ -172,7 +172,8 @@ class Rerun:
             self._begin, self._over)
         self._recorder = None if writer is None else Recorder(
             writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE_NS,
-            MAX_ACTIVE_JOBS, _TraceTime(loop), writer, settings.cpus or 0)
+            MAX_ACTIVE_JOBS, _TraceTime(loop), writer, settings.cpus or 0,
+            on_late=self._engine.on_late)
         self._holder = NodeHolder(context, loop)
         self._holders = self._held()
         if settings.cpus is not None or self._holders:

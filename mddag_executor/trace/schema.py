@@ -128,9 +128,10 @@ _ALL = (
     _event('ros2_caret', 'dds_bind_addr_to_stamp', addr=_U64, source_stamp=_I64),
     _event('ros2_caret', 'sim_time', stamp=_I64),
     # this project
-    # the CPUs that the process could use, 0: unknown
-    _event('mddag', 'task_set', (0,), yaml=_STR, file=_STR, policy=_STR, workers=_I32,
-           default_deadline=_I64, max_active_jobs=_I32, preemptive=_BOOL, cpus=_I32),
+    # the CPUs that the process could use, 0: unknown; what is done with late jobs (`ON_LATE`)
+    _event('mddag', 'task_set', (0, 0), yaml=_STR, file=_STR, policy=_STR, workers=_I32,
+           default_deadline=_I64, max_active_jobs=_I32, preemptive=_BOOL, cpus=_I32,
+           on_late=_I32),
     # the boot of the machine that the steady clock counts from, '': unknown
     _event('mddag', 'host', name=_STR, boot=_STR),
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),

@@ -55,6 +55,19 @@ def test_execution_times_from_a_file(result_of, graph, times):
     assert result['dags']['lidar']['sinks']['/filter:far']['response_ns']['max'] == 2_001_000
 
 
+@pytest.mark.parametrize('on_late', ['continue', 'demote', 'abort'])
+def test_late_jobs_are_rescheduled_as_they_were_treated(call, result_of, graph, tmp_path, on_late):
+    trace = tmp_path / 'run.mcap'
+    simulated = result_of(graph, '--workers', 1, '--duration', '200ms', '--on-late', on_late,
+                          '--trace', trace)
+    again = call('replay', trace, '--reschedule', '--json', '-').result
+    assert again['on_late'] == on_late
+    for name in ('/filter:near', '/filter:far'):
+        sinks = [each['dags']['lidar']['sinks'][name] for each in (simulated, again)]
+        assert sinks[0]['late'] == sinks[1]['late'] and sinks[0]['completed'] == sinks[1][
+            'completed']
+
+
 def test_what_is_asked_for_is_done(result_of, graph):
     # One worker, 11 ms of work each 10 ms. Job k: tick from 11k, near done at 11k + 3, far at
     # 11k + 11. Late: near from job 3 on (36 ms), far from job 2 on (33 ms).
