@@ -10,7 +10,7 @@ due in contrast to the first run or, with a tolerance, if its p99 response time 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mddag_executor.core.tally import Counts, counts, total
@@ -21,9 +21,6 @@ from mddag_executor.text import counted
 _KEYS = ('min', 'median', 'p99', 'max')
 _HEADER = ('sink', 'due A', 'due B', 'in time A', 'in time B', 'median A', 'median B', 'p99 A',
            'p99 B', 'p99 B-A', '')
-
-_COUNTS: tuple[Callable[[Mapping[str, Any]], Cell], ...] = (
-    lambda side: side['due'], lambda side: percent(side['in_time'], side['due']))
 
 
 def compare(
@@ -116,16 +113,19 @@ def sinks_table(difference: Mapping[str, Any]) -> str:
     sinks.sort(key=lambda item: _order(item[1]))
     rows: list[list[Cell]] = []
     for name, sink in sinks:
-        sides = (sink['a'], sink['b'])
-        row: list[Cell] = [short[name]]
-        for cell in _COUNTS:
-            row.extend(None if side is None else cell(side) for side in sides)
-        for key in ('median', 'p99'):
-            row.extend(None if side is None or side['response_ns'] is None
-                       else format_ns(side['response_ns'][key], 3) for side in sides)
+        pairs = zip(_cells(sink['a']), _cells(sink['b']))
         share = None if sink['change'] is None else sink['change']['p99']
-        rows.append([*row, None if share is None else f'{100 * share:+.1f} %', _remark(sink)])
+        rows.append([short[name], *(cell for pair in pairs for cell in pair),
+                     None if share is None else f'{100 * share:+.1f} %', _remark(sink)])
     return table(_HEADER, rows, marked=[sink['worse'] for _, sink in sinks])
+
+
+def _cells(side: Mapping[str, Any] | None) -> list[Cell]:
+    if side is None:
+        return [None] * 4
+    response = side['response_ns']
+    return [side['due'], percent(side['in_time'], side['due']), *(
+        None if response is None else format_ns(response[key], 3) for key in ('median', 'p99'))]
 
 
 def _order(sink: Mapping[str, Any]) -> tuple[bool, float]:

@@ -87,11 +87,12 @@ def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
         f'{measured["warm_up_ns"] / 1e9:g} s: {measured["sink_jobs_due"]} due, '
         f'{measured["on_time"]} in time ({percent(measured["on_time"], measured["sink_jobs_due"])}'
         f'), {measured["late"]} late, {measured["missing"]} missing')
-    cpu = measured['cpu_us_per_callback']
+    cpu_us = measured['cpu_us_per_callback']
+    cpu = '-' if cpu_us is None else f'{cpu_us:.0f}'
     yield (
         f'utilisation {measured["utilisation"]:.3f} planned (seed {measured["seed"]}), '
-        f'{measured["utilisation_taken"]:.3f} taken; {measured["callbacks_per_s"]:.0f} callbacks '
-        f'a second, {"-" if cpu is None else f"{cpu:.0f}"} us of CPU each')
+        f'{measured["utilisation_taken"]:.3f} by measured times; '
+        f'{measured["callbacks_per_s"]:.0f} callbacks a second, {cpu} us of CPU each')
     attribution = measured['attribution']
     if attribution['wrong'] or attribution['none']:
         yield (f'{counted(attribution["wrong"], "callback")} ran as the wrong job, '
