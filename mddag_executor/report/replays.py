@@ -18,6 +18,7 @@ from mddag_executor.report.tables import (
 )
 from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
+from msg_graph.binding import is_background
 
 _PARTS = {
     'release lag': 'release_lag_ns', 'waiting': 'waiting_ns', 'for group': 'waiting_group_ns',
@@ -80,11 +81,11 @@ def recorded_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[C
 
 
 def communications_table(communications: Iterable[Mapping[str, Any]]) -> str:
-    """Return a table of messages: from publication to the start of the callback."""
+    """Return a table of messages, from publication to callback; those of ROS itself come last."""
     rows: list[list[Cell]] = [
         [each['topic'], each['publisher'], each['callback'], each['sent'], each['arrived'],
          *(_time(each['latency_ns'][key]) for key in ('min', 'median', 'p99', 'max'))]
-        for each in communications]
+        for each in sorted(communications, key=lambda each: is_background(each['topic'], ''))]
     return table(('topic', 'publisher', 'callback', 'sent', 'arrived', 'min', 'median', 'p99',
                   'max'), rows)
 
