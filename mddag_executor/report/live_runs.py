@@ -64,14 +64,14 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
 
 
 def _absent(dags: dict[str, Any]) -> Iterator[str]:
-    """Yield a line for each sink that more than one job of its process did not reach."""
-    for name, dag in dags.items():
-        for sink, verdicts in dag['sinks'].items():
-            absent = dag['jobs'] - counts(verdicts).due
-            if absent > 1:
-                yield printable(
-                    f'{absent} of {counted(dag["jobs"], "job")} of {name} did not come to {sink}, '
-                    'or its process died with the count: a replay of the traces shows why')
+    """Yield a line about the sinks that more than one job of their process did not reach."""
+    absent = [
+        f'{sink} {missing} of {dag["jobs"]}' for dag in dags.values()
+        for sink, verdicts in dag['sinks'].items()
+        if (missing := dag['jobs'] - counts(verdicts).due) > 1]
+    if absent:
+        yield ('jobs that did not come to their sinks, or whose process died with the count (a '
+               f'replay of the traces shows why): {listed(absent)}')
 
 
 def ended_line(process: dict[str, Any]) -> str:
