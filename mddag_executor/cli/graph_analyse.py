@@ -64,12 +64,12 @@ def _is_impossible(analysis: Analysis) -> bool:
 
 def _summary(analysis: Analysis) -> str:
     from mddag_executor.laboratory.analyse import HOLDS, SHARED
-    assumed = f'All sufficient tests assume: {SHARED}.\n'
-    begin = f'{assumed}{counted(analysis.workers, "worker")}, budget {analysis.budget}: '
+    begin = f'{counted(analysis.workers, "worker")}, budget {analysis.budget}: '
     if _is_impossible(analysis):
         return begin + 'no scheduler can keep these deadlines'
     proven = {each.scheduler: None for each in analysis.verdicts
               if each.kind == 'sufficient' and each.verdict == HOLDS}
     if proven:
-        return begin + 'the deadlines hold under ' + '; '.join(proven)
+        return (f'The tests that hold assume: {SHARED}.\n{begin}the deadlines hold under '
+                + '; '.join(proven))
     return begin + 'nothing is proven either way: simulate it'
