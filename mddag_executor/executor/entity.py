@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable as Callable_
+from collections.abc import Mapping
 import functools
 from typing import Any, TYPE_CHECKING
 
@@ -138,18 +139,27 @@ class Entity:
         """
         if self.callback is None and not self.ready + self.skipped + self.dropped:
             return
-        total = counts.setdefault(self.name, {
-            'kind': self.kind, 'declared': self.callback is not None, 'waiting': 0,
-            'holds_interpreter': False, 'interpreter_share': None, 'incompatible_qos': None,
-            **dict.fromkeys(COUNTS, 0)})
-        for key in COUNTS:
-            total[key] += getattr(self, key)
-        total['waiting'] += len(self.waiting)
-        total['holds_interpreter'] |= bool(self.habit.holds)
-        total['incompatible_qos'] = total['incompatible_qos'] or self.incompatible_qos
         share = self.habit.share
-        if share is not None:
-            total['interpreter_share'] = max(total['interpreter_share'] or 0.0, round(share, 3))
+        add_counts(counts, self.name, {
+            'kind': self.kind, 'declared': self.callback is not None,
+            'waiting': len(self.waiting), 'holds_interpreter': bool(self.habit.holds),
+            'interpreter_share': None if share is None else round(share, 3),
+            'incompatible_qos': self.incompatible_qos,
+            **{key: getattr(self, key) for key in COUNTS}})
+
+
+def add_counts(counts: dict[str, dict[str, Any]], name: str, more: Mapping[str, Any]) -> None:
+    """Add the counts of a callback to those of the same name."""
+    total = counts.get(name)
+    if total is None:
+        counts[name] = {**more}
+        return
+    for key in (*COUNTS, 'waiting'):
+        total[key] += more[key]
+    total['holds_interpreter'] |= more['holds_interpreter']
+    total['incompatible_qos'] = total['incompatible_qos'] or more['incompatible_qos']
+    total['interpreter_share'] = max(
+        total['interpreter_share'], more['interpreter_share'], key=lambda share: share or 0.0)
 
 
 def link(entity: Entity, task_set: TaskSet, tables: Tables, topic: str) -> None:

@@ -43,7 +43,7 @@ from typing import Any, BinaryIO, TextIO
 
 from mddag_executor.core.tally import of_processes
 from mddag_executor.errors import MddagError
-from mddag_executor.executor.entity import COUNTS
+from mddag_executor.executor.entity import add_counts
 from mddag_executor.hosting.child import signal_at_end_of
 from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure
 from mddag_executor.hosting.session import MATCH_TIMEOUT_S, Session
@@ -329,7 +329,10 @@ def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) ->
     :param plan: of the synthetic nodes, if the run has such.
     """
     parts = [result for _, result in results]
-    callbacks = _callbacks(parts)
+    callbacks: dict[str, dict[str, Any]] = {}
+    for part in parts:  # executors' internal callbacks may share a name
+        for name, counts in part['callbacks'].items():
+            add_counts(callbacks, name, counts)
     ledgers = [part['ledger'] for part in parts if part['ledger'] is not None]
     every = {process.name for process in task_set.processes}
     return {
@@ -349,23 +352,6 @@ def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) ->
             name for name, part in results if part['ledger'] is not None} != every else measure(
                 Ledger.of_processes(task_set, ledgers), plan),
         'drift': [each.result() for each in drift(task_set, _observed(task_set, results))]}
-
-
-def _callbacks(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the counts of all callbacks; executors' internal ones may share a name."""
-    callbacks: dict[str, Any] = {}
-    for part in parts:
-        for name, counts in part['callbacks'].items():
-            mine = callbacks.get(name)
-            if mine is None:
-                callbacks[name] = dict(counts)
-                continue
-            for key in (*COUNTS, 'waiting'):
-                mine[key] += counts[key]
-            mine['holds_interpreter'] |= counts['holds_interpreter']
-            mine['interpreter_share'] = max(
-                mine['interpreter_share'], counts['interpreter_share'], key=lambda s: s or 0.0)
-    return callbacks
 
 
 def _observed(task_set: TaskSet, results: Results) -> Observed:
