@@ -145,13 +145,8 @@ def judge(s: State, slot: int, kind: int, vertex: int, deadline: int, time: int)
 def close_job(s: State, slot: int, end: int, now: int) -> None:
     """End an open job (rule 8): remove it from the list; free its slot if nothing is active."""
     judged = -1 if is_judged(s, slot) else NOT_JUDGED
-    s.decisions.append((JOB_END, s.job_dag[slot], judged, s.job_index[slot], end, now))
-    withdraw_job(s, slot, end)
-
-
-def withdraw_job(s: State, slot: int, end: int) -> None:
-    """Close an open job as ``close_job``, without a decision: its end is not known."""
     dag = s.job_dag[slot]
+    s.decisions.append((JOB_END, dag, judged, s.job_index[slot], end, now))
     before, after = s.job_previous[slot], s.job_next[slot]
     if before < 0:
         s.oldest[dag] = after

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core import state as core
-from mddag_executor.core.jobs import is_judged, judge_from, withdraw_job
+from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.rules import complete
 from mddag_executor.core.state import Decision, IDLE, JOB_END, OPEN, SKIP
 from mddag_executor.core.tables import CONTINUE
@@ -76,7 +76,10 @@ class Oracle:
         if reason in ENDS:
             self.scheduler.give_up(slot, ENDS[reason], time)
         else:
-            withdraw_job(self.scheduler.state, slot, core.EXPIRED)     # without any decision
+            decisions = self.scheduler.state.decisions
+            before = len(decisions)
+            self.scheduler.give_up(slot, core.EXPIRED, time)
+            del decisions[before:]  # its end is not known
             del self.slots[dag, job]
 
     def judge_from(self, release: int) -> None:
