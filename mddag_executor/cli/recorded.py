@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
@@ -147,22 +147,25 @@ def _rescheduled(
     args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None
 ) -> Reschedule:
     """Run the scheduler over a recording of any kind."""
+    settings = {
+        'policy': args.policy, 'workers': args.workers, 'preemptive': args.preemptive,
+        'on_late': args.on_late, 'skip': args.skip, 'cpus': args.cpus, 'name': name}
     if is_bag(path):
-        return _rescheduled_bag(args, path, name, task_set)
+        return _rescheduled_bag(args, path, name, task_set, settings)
     options.refuse(args, ('execution_times', 'seed'),
                    'a trace has its own execution times: leave the option out')
     from mddag_executor.replay import reschedule
     recorded = args.overheads in (None, _RECORDED)
     with Progress('replaying') as line:
         return reschedule(
-            path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
-            on_late=args.on_late,
-            overheads=recorded, dispatch_overhead=0 if recorded else args.overheads, name=name,
-            progress=line.events, skip=args.skip, cpus=args.cpus, processes=_processes(args))
+            path, task_set, overheads=recorded,
+            dispatch_overhead=0 if recorded else args.overheads,
+            progress=line.events, processes=_processes(args), **settings)
 
 
 def _rescheduled_bag(
-    args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None
+    args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None,
+    settings: dict[str, Any],
 ) -> Reschedule:
     from mddag_executor.replay.bags_reschedule import reschedule_bag
     from mddag_executor.simulate import read_execution_times
@@ -180,10 +183,8 @@ def _rescheduled_bag(
         times = read_execution_times(task_set, text, times_name)
     with Progress('replaying'):
         return reschedule_bag(
-            path, task_set, policy=args.policy, workers=args.workers,
-            preemptive=args.preemptive, on_late=args.on_late or 'continue', times=times,
-            seed=args.seed or 0, dispatch_overhead=args.overheads or 0, name=name,
-            skip=args.skip, cpus=args.cpus)
+            path, task_set, times=times, seed=args.seed or 0,
+            dispatch_overhead=args.overheads or 0, **settings)
 
 
 def _processes(
