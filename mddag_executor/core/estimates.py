@@ -6,7 +6,7 @@ Latest starts from measured execution times, for drivers that measure (rule 7).
 ``State.start_by`` and ``reach_by`` begin with the declared execution times.  When the measured
 time of a vertex has changed by more than an eighth, those of its DAG are computed again.  So most
 executions cost one comparison.  Measured is the time that the callback needs when nothing disturbs
-it: the mean CPU time, or the least recent duration if that is longer (``executor.gil``).
+it: the mean CPU time or, if it waits, the least recent duration (``executor.gil``).
 """
 
 from __future__ import annotations

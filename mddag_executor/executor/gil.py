@@ -79,8 +79,8 @@ class GilHabit:
     :param declared: the declared value; None: it is measured.
     :ivar holds: 1 or 0, for its next execution; ``computes``: the same, also if it is short.
     :ivar mean_ns: recent average of its executions' CPU time.
-    :ivar needs_ns: how long it takes when nothing disturbs it: ``mean_ns``, or the least duration
-        of recent executions if that is longer.
+    :ivar needs_ns: how long it takes when nothing disturbs it: ``mean_ns`` or, unless it computes,
+        the least duration of recent executions if that is longer.
     :ivar is_known: whether ``holds`` is declared, or has been measured.
     :ivar rests: how many of its next executions need not be measured, if it is positive.
     """
@@ -110,7 +110,7 @@ class GilHabit:
         # the least is forgotten slowly
         self._least = undisturbed if runs == 1 else min(
             undisturbed, self._least + self._least // SELDOM + 1)
-        self.needs_ns = max(self.mean_ns, self._least)
+        self.needs_ns = self.mean_ns if self.computes else max(self.mean_ns, self._least)
 
     def learn(self, wall: int, own: int, others: int, starved: bool = False) -> None:
         """
