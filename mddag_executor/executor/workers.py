@@ -541,6 +541,7 @@ class WorkerPool:
         if holders:
             if holders[0].entity.habit.mean_ns >= TURN_NS or self.muting.until:
                 self.muting.update(now)
+                self.due.arm(now - self._offset)  # timers that are muted no more may be due sooner
             if engine.has_waiting:
                 self.due.check_holder(now - self._offset)
         entity = work.entity
