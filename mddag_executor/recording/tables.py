@@ -320,12 +320,8 @@ class JobNumbers:
 
     def of(self, table: Table) -> Ints:
         """Return the job numbers of rows."""
-        if not self.none:
-            return np.zeros(len(table), dtype=np.int64)
-        dag = table['dag'].astype(np.int64)
-        at = np.minimum(
-            np.searchsorted(self._numbers, table['job']), len(self._numbers) - 1)
-        known = (dag >= 0) & (dag < self._dags) & (self._numbers[at] == table['job'])
+        dag, at = table['dag'].astype(np.int64), look_up(self._numbers, table['job'])
+        known = (dag >= 0) & (dag < self._dags) & (at >= 0)
         return np.where(known, dag * len(self._numbers) + at, self.none)
 
     def marked(self, which: Mask) -> Mask:
@@ -381,6 +377,21 @@ def last_of(which: Mask, group: Any, before: bool = False) -> Ints:
     return found
 
 
+def rows_by(numbers: Any, n: int) -> list[Ints]:
+    """Return the rows of each number from 0 to n - 1."""
+    order = sort_by(numbers)
+    borders = np.searchsorted(numbers[order], np.arange(n + 1))
+    return np.split(order, borders)[1:-1]
+
+
+def look_up(numbers: Ints, wanted: Any) -> Ints:
+    """Return the first positions of wanted numbers; ``UNKNOWN`` for missing ones."""
+    order = np.append(sort_by(numbers), UNKNOWN)
+    at = order[np.searchsorted(numbers, wanted, sorter=order[:-1])]
+    found: Ints = np.where(np.append(numbers, 0)[at] == wanted, at, UNKNOWN)
+    return found
+
+
 def find_pairs(known: tuple[Ints, Ints], wanted: tuple[Ints, Ints]) -> tuple[Ints, Ints]:
     """Return by wanted pair the first known one, ``UNKNOWN`` without, and their number."""
     values, second = np.unique(np.append(known[1], wanted[1]), return_inverse=True)
@@ -388,10 +399,8 @@ def find_pairs(known: tuple[Ints, Ints], wanted: tuple[Ints, Ints]) -> tuple[Int
     n = len(known[0])
     keys, wanted_keys = keys[:n], keys[n:]
     keys, first, count = np.unique(keys, return_index=True, return_counts=True)
-    at = np.searchsorted(keys, wanted_keys)
-    good = np.append(keys, UNKNOWN)[at] == wanted_keys
-    return (np.where(good, np.append(first, UNKNOWN)[at], UNKNOWN),
-            np.where(good, np.append(count, 0)[at], 0))
+    at = look_up(keys, wanted_keys)
+    return np.append(first, UNKNOWN)[at], np.append(count, 0)[at]
 
 
 def groups(values: Any) -> tuple[Ints, Ints]:

@@ -50,7 +50,16 @@ from mddag_executor.core.state import (
     SINK_MISSED,
 )
 from mddag_executor.recording import tables as recorded
-from mddag_executor.recording.tables import Ints, JobNumbers, Mask, Recording, sort_by, Table
+from mddag_executor.recording.tables import (
+    Ints,
+    JobNumbers,
+    look_up,
+    Mask,
+    Recording,
+    rows_by,
+    sort_by,
+    Table,
+)
 from mddag_executor.replay.miss_tally import MissTally
 from mddag_executor.text import counted
 import numpy as np
@@ -107,16 +116,14 @@ class Judged:
         self.contradictions = 0
         self._outcomes: list[tuple[int, Ints, Ints, Mask]] = []
         self._judging = _Judging(recording, skip)
-        ends = _split(recording.job_ends, recording.job_ends['dag'], len(task_set.dags))
-        releases = _split(recording.releases, recording.releases['dag'], len(task_set.dags))
+        ends, releases = ([table[mine] for mine in rows_by(table['dag'], len(task_set.dags))]
+                          for table in (recording.job_ends, recording.releases))
         executions = recording.executions
         completing = np.flatnonzero(
             (executions['completes'] != recorded.NOTHING) & (executions['vertex'] >= 0))
         completing = completing[sort_by(executions['order'][completing])]
-        dag_of = executions['dag'][completing]
-        by_dag = np.split(
-            completing[np.argsort(dag_of.astype(np.int16), kind='stable')],
-            np.cumsum(np.bincount(dag_of, minlength=len(task_set.dags)))[:-1])
+        by_dag = [completing[mine] for mine in rows_by(
+            executions['dag'][completing].astype(np.int16), len(task_set.dags))]
         self.jobs: list[Jobs] = []
         found: list[Table] = []
         for dag in range(len(task_set.dags)):
@@ -455,30 +462,6 @@ class _Judging:
         at = np.searchsorted(self._orders, order, 'right') - 1
         judged = in_range & (release >= self._releases[at])
         return judged
-
-
-def _split(table: Table, dag: Any, n_dags: int) -> list[Table]:
-    order = np.argsort(dag, kind='stable')
-    borders = np.searchsorted(dag[order], np.arange(n_dags + 1))
-    return [table[order[begin:end]] for begin, end in zip(borders, borders[1:])]
-
-
-def look_up(numbers: Ints, wanted: Any) -> Ints:
-    """Return the positions of numbers; -1 for missing numbers."""
-    if not len(numbers):
-        return np.full(len(wanted), -1)
-    order = None
-    if (numbers[1:] < numbers[:-1]).any():
-        order = np.argsort(numbers, kind='stable')
-        numbers = numbers[order]
-    if numbers[-1] - numbers[0] == len(numbers) - 1:    # numbers without gaps
-        at = wanted - numbers[0]
-        there = (wanted >= numbers[0]) & (wanted <= numbers[-1])
-    else:
-        at = np.minimum(np.searchsorted(numbers, wanted), len(numbers) - 1)
-        there = numbers[at] == wanted
-    at = np.where(there, at, 0)
-    return np.where(there, at if order is None else order[at], -1)
 
 
 def judge(recording: Recording, skip: int = 0) -> Judged:

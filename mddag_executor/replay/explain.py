@@ -21,7 +21,7 @@ from mddag_executor.core import legs_of, POLICIES
 from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.recording.tables import Ints, pick, Recording, Table, VERTEX
+from mddag_executor.recording.tables import Ints, pick, Recording, rows_by, Table, VERTEX
 from mddag_executor.replay.causes import (
     behind,
     CAUSES,
@@ -205,11 +205,9 @@ class Explanation:
             return number.get(of_vertex.get(vertex, 0), -1) == number.get(callback, -2)
 
         callbacks, which = np.unique(table['callback'][rows], return_inverse=True)
-        order = np.argsort(which, kind='stable')
-        borders = np.searchsorted(which[order], np.arange(len(callbacks) + 1)).tolist()
         runs, on_workers = {}, {}
-        for callback, first, last in zip(callbacks.tolist(), borders, borders[1:]):
-            mine = rows[order[first:last]]
+        for callback, at in zip(callbacks.tolist(), rows_by(which, len(callbacks))):
+            mine = rows[at]
             runs[callback] = on_workers[callback] = Spans(
                 table['start'][mine], table['end'][mine])
             busy = mine[table['worker'][mine] >= 0]

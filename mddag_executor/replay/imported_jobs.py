@@ -38,6 +38,7 @@ from mddag_executor.recording.tables import (
     Mask,
     RELEASES,
     rows,
+    rows_by,
     sort_by,
     Table,
     UNKNOWN,
@@ -81,7 +82,7 @@ class ImportedJobs:
         dag = np.array(self._tables.dag_of)[source]
         self.releases = rows(RELEASES, len(dag), dag=dag, noticed=runs['start'][self.sources])
         #: By DAG the rows of its jobs.
-        self._jobs = [np.flatnonzero(dag == each.index) for each in self._dags]
+        self._jobs = rows_by(dag, len(self._dags))
         for mine in self._jobs:
             self.releases['job'][mine] = np.arange(len(mine))
         #: By run of a callback the row of its job, its vertex and leg.

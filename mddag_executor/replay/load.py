@@ -47,8 +47,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded_tables
-from mddag_executor.recording.tables import Ints, Recording, sort_by
-from mddag_executor.replay.deadlines import look_up
+from mddag_executor.recording.tables import Ints, look_up, Recording, sort_by
 from mddag_executor.replay.dispatches import dispatch_times
 from mddag_executor.replay.isolation import isolated_times, Recorded
 from mddag_executor.replay.noticed import Noticed

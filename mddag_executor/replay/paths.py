@@ -58,9 +58,11 @@ from mddag_executor.recording.tables import (
     EXECUTIONS,
     Ints,
     last_of,
+    look_up,
     Mask,
     Recording,
     rows,
+    rows_by,
     sort_by,
     Table,
 )
@@ -144,9 +146,7 @@ class Paths:
             self._add_vertices(recording.callback_vertex)
         # by the index of a callback the rows of its executions
         place = np.where(self._vertex >= 0, self._place[self._vertex], NONE).astype(np.int16)
-        order = np.argsort(place, kind='stable')
-        borders = np.searchsorted(place[order], np.arange(len(self._places) + 1))
-        self._of_place = np.split(order, borders)[1:-1]
+        self._of_place = rows_by(place, len(self._places))
         self._first = _first_pieces(table)
         self._start, self._end = table['start'].copy(), table['end'].copy()
         self._published()
@@ -158,8 +158,8 @@ class Paths:
         callbacks = np.array(sorted(of), dtype=np.int64)
         unknown = np.flatnonzero(self._vertex < 0)
         callback = self._recording.executions['callback'][unknown]
-        at = np.minimum(np.searchsorted(callbacks, callback), len(callbacks) - 1)
-        known = callbacks[at] == callback
+        at = look_up(callbacks, callback)
+        known = at >= 0
         self._vertex[unknown[known]] = np.array(
             [of[each] for each in callbacks.tolist()])[at[known]]
 
@@ -200,10 +200,8 @@ class Paths:
         run = np.where(by >= 0, self._first[by], NONE)
         # by topic its publications
         columns = np.stack([each[chosen] for each in (place, node, run, message, time)])
-        of_topic = topic[chosen].astype(np.int16)
-        order = np.argsort(of_topic, kind='stable')
-        borders = np.searchsorted(of_topic[order], np.arange(len(self._topics) + 1))
-        self._sent = [columns[:, mine] for mine in np.split(order, borders)[1:-1]]
+        self._sent = [columns[:, mine] for mine in rows_by(
+            topic[chosen].astype(np.int16), len(self._topics))]
 
     def _message(self, job: Any, vertex: Any, topic: Any) -> Ints:
         """Return the numbers of the messages that vertices publish in jobs."""
@@ -253,7 +251,7 @@ class Paths:
                     parent = timeline.as_of(ran.start)
             if hop is not None and hop.kind == 'topic':
                 taker, taken = self._took
-                at = _find(ran.runs, taker)
+                at = look_up(ran.runs, taker)
                 mine = at != NONE
                 parent[at[mine]] = _as_of_each(
                     messages, taken[mine], np.full(int(mine.sum()), _NEVER))
@@ -296,7 +294,7 @@ class Paths:
         ended = self._of_place[self._places[callback.key]]
         ended = ended[(self._start[ended] >= 0) & (self._end[ended] >= 0)]
         ended = ended[sort_by(self._end[ended])]
-        at = _find(ran.runs, self._first[ended])
+        at = look_up(ran.runs, self._first[ended])
         of = np.where(at != NONE, step[at], NONE) if len(step) else np.full(len(at), NONE)
         steps.end(of[of != NONE], self._end[ended][of != NONE])
         counts = (of != NONE) | (callback.kind != 'sync')
@@ -313,7 +311,7 @@ class Paths:
         mine = (sent[0] == self._places[callback.key]) | (
             (sent[0] == NONE) & (sent[1] == self._nodes[callback.node]))
         place, _, run, message, time = sent[:, mine]
-        at = _find(ran.runs, run)
+        at = look_up(ran.runs, run)
         parent = np.where((place != NONE) & (at != NONE), step[at], NONE) if len(step) \
             else np.full(len(at), NONE)
         latest = (parent == NONE) & ((callback.kind == 'sync') | (place == NONE))
@@ -482,15 +480,6 @@ def _first_pieces(table: Table) -> Ints:
         found[later] = [of.get(key, row) for key, row in zip(
             table[names][later].tolist(), later.tolist())]
     return found
-
-
-def _find(runs: Ints, wanted: Ints) -> Ints:
-    """Return the indices of runs; -1: missing."""
-    if not len(runs):
-        return np.full(len(wanted), NONE)
-    order = np.argsort(runs, kind='stable')
-    at = np.minimum(np.searchsorted(runs[order], wanted), len(runs) - 1)
-    return np.where(runs[order][at] == wanted, order[at], NONE)
 
 
 def _as_of_each(messages: Ints, wanted: Any, times: Ints) -> Ints:

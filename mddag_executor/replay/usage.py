@@ -10,7 +10,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from mddag_executor.recording.tables import groups, Ints, NOTHING, Recording, sort_by, Table
+from mddag_executor.recording.tables import (
+    groups,
+    Ints,
+    look_up,
+    NOTHING,
+    Recording,
+    sort_by,
+    Table,
+)
 from mddag_executor.replay.spans import Spans
 import numpy as np
 
@@ -44,8 +52,8 @@ def group_waits(recording: Recording) -> Ints:
         return waited
     rows = np.r_[ran(recording), np.flatnonzero((table['start'] >= 0) & (table['end'] < 0))]
     callbacks = np.array(sorted(number), dtype=np.int64)
-    at = np.minimum(np.searchsorted(callbacks, table['callback'][rows]), len(callbacks) - 1)
-    known = callbacks[at] == table['callback'][rows]
+    at = look_up(callbacks, table['callback'][rows])
+    known = at >= 0
     rows, group = rows[known], np.array([number[each] for each in callbacks.tolist()])[at[known]]
     order = np.argsort(group, kind='stable')
     rows, group = rows[order], group[order]
