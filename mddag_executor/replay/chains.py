@@ -160,8 +160,9 @@ class Chains:
         found = np.zeros(len(link), dtype=LINKS)
         found['vertex'], found['ready'] = table['vertex'], table['ready']
         n_legs = self._dags[dag].n_legs[found['vertex'] - self._dags[dag].first]
-        found['leg'] = np.where(running, -1, np.where(
-            table['leg'] < 0, np.maximum(n_legs, 1) - 1, table['leg']))
+        known = (table['leg'] >= 0) & (table['leg'] < n_legs)   # otherwise the last one
+        found['leg'] = np.where(
+            running, -1, np.where(known, table['leg'], np.maximum(n_legs, 1) - 1))
         found['start'] = np.where(running, table['start'], table['began'])
         for name in ('end', 'busy'):
             found[name] = np.where(running, NEVER, table[name])
