@@ -15,6 +15,7 @@ says something else: of those only the first three are asked.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import chain
 import os
 from pathlib import Path
 import random
@@ -235,7 +236,7 @@ def test_changes_under_a_right_crc(sound, tmp_path):
     """Such a file says what it says; it must not break anything."""
     data, _ = sound
     path = tmp_path / 'a.mcap'
-    for seed in rounds(1):
+    for seed in chain((8371,), rounds(1)):  # 8371: a leg that its callback does not have
         rng = random.Random(seed)
         changed = bytearray(data)
         inside(changed, rng)
