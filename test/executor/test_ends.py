@@ -95,6 +95,8 @@ def test_spin_returns_when_a_callback_shuts_down_as_rclpy_s_do(
     assert not ros_context.ok()
     executor.spin()     # and at once when it has ended before
     executor.shutdown()
+    if kind is MultiThreadedExecutor:  # rclpy's leaves its threads to the garbage collector
+        executor._executor.shutdown()
     assert 'Traceback' not in capfd.readouterr().err
 
 
