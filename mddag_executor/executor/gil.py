@@ -122,12 +122,12 @@ class GilHabit:
         :param starved: whether another thread preempted it on its CPU meanwhile.
         """
         if not self.is_declared:
-            self._learn(wall, own, others, starved, self._runs)
+            self._learn(wall, own, others, starved)
         self.rests = 0
         if self.is_known and not self._is_trial:
             self.rests = (SELDOM if self._runs == LATELY else LATELY) - 1
 
-    def _learn(self, wall: int, own: int, others: int, starved: bool, runs: int) -> None:
+    def _learn(self, wall: int, own: int, others: int, starved: bool) -> None:
         usual = 0 if self._is_trial else self.holds
         self._is_trial = False
         if own >= COMPUTES * wall:
@@ -148,7 +148,7 @@ class GilHabit:
             part = own / max(1, had)
         self._unclear = 0
         share = self.share
-        self.share = part if share is None else share + (part - share) / runs
+        self.share = part if share is None else share + (part - share) / self._runs
         self.is_known = True
         least, short = (WAITS, SHORT_NS // 2) if usual else (COMPUTES, 2 * SHORT_NS)
         self.computes = int(self.share >= least)

@@ -27,6 +27,7 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any, cast, NamedTuple
 
 from mddag_executor.core import NEVER, Scheduler, Tables
@@ -139,7 +140,7 @@ class Judged:
         """Return the first release that is judged."""
         return self._judging.last
 
-    @property
+    @cached_property
     def missed(self) -> Table:
         """Return the verdicts that are misses, in the order of deadlines."""
         found: Table = self.verdicts[self.verdicts['kind'] != SINK_IN_TIME]

@@ -230,10 +230,10 @@ class ImportedRun:
         release: Ints = np.where(other, ready[jobs.sources], stamp)
         ready[jobs.sources] = np.maximum(ready[jobs.sources], release)
         missing = np.flatnonzero(~other & np.where(by_header, ~stated, by_stamp & ~known))
-        for each, first in zip(*np.unique(number[missing], return_index=True)):
+        for each, first, n in zip(*np.unique(
+                number[missing], return_index=True, return_counts=True)):
             name = self._targets[self.links.callbacks[each].number].callback.key
-            self._fallbacks[f'{name} ({wanted[missing[first]]})'] += int(
-                (number[missing] == each).sum())
+            self._fallbacks[f'{name} ({wanted[missing[first]]})'] += int(n)
         return release
 
     def _due(self, which: Ints, time: Ints) -> Ints:
@@ -273,11 +273,12 @@ class ImportedRun:
                 f'{name}: the tracer discarded {counted(found.lost, "event")} or more: '
                 'executions and messages may be missing')
         lines += [f'{name}: {text}' for text in self.links.losses.lines()]
-        if found.unjudged:
-            dags = [f'{found.task_set.dags[dag].name} ({n})' for dag, n in found.unjudged.items()]
+        unjudged = found.unjudged
+        if unjudged:
+            dags = [f'{found.task_set.dags[dag].name} ({n})' for dag, n in unjudged.items()]
             lines.append(
                 f'{name}: not judged, because their events may be missing: '
-                f'{counted(sum(found.unjudged.values()), "job")}: {listed(dags)}')
+                f'{counted(sum(unjudged.values()), "job")}: {listed(dags)}')
         lines += [f'{name}: {text}' for text in self._odd.lines()]
         if self._fallbacks:
             lines.append(

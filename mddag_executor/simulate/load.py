@@ -55,7 +55,13 @@ Arrays = TypeVar('Arrays', Load, Tables)
 
 def as_lists(load: Load) -> Load:
     """Return a load whose columns are lists, not arrays."""
-    return Load(*(column if isinstance(column, list) else column.tolist() for column in load))
+    return Load(*map(as_list, load))
+
+
+def as_list(column: Any) -> list[int]:
+    """Return a column as a list of Python's integers."""
+    values: list[int] = column if isinstance(column, list) else column.tolist()
+    return values
 
 
 def as_arrays(columns: Arrays) -> Arrays:

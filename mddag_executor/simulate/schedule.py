@@ -14,7 +14,7 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core.state import as_object, Decision, empty, State
 from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import LogEntry, Orders, run
-from mddag_executor.simulate.load import as_lists, Load
+from mddag_executor.simulate.load import as_list, as_lists, Load
 from mddag_executor.simulate.machine import Machine
 
 # Approximate time of plain Python per execution, without and with a machine, to choose the faster.
@@ -87,7 +87,7 @@ class Scheduled(NamedTuple):
     def count_into(self, tally: Tally, load: Load, settings: Settings) -> None:
         """Count the judged jobs that were released, and the decisions."""
         releases = load.releases if len(load.releases) else load.times
-        for time, dag, release in zip(load.times, load.dags, releases):
+        for time, dag, release in zip(*map(as_list, (load.times, load.dags, releases))):
             if (time <= self.ended and time < settings.duration_ns
                     and release >= settings.judge_from):
                 tally.released(dag)

@@ -317,6 +317,16 @@ def test_a_callback_that_has_lent_its_worker_keeps_none_busy(worker, cause, tmp_
         assert job['parts'][0]['behind'] == behind
 
 
+def add_skipped_release(file, release, job, undeclared_end):
+    """Record an undeclared callback, a release beside it, and the next one, which is skipped."""
+    file.add('dispatch', release, 1, 10, 5, -1, -1, -1, 0, release, 0)
+    file.add('callback_start', release, 1, 10, 5, False)
+    file.add('callback_end', undeclared_end, 1, 10, 5)
+    file.add('job_release', release, 1, 1, 1, 2 * job, release)
+    file.add('job_release', release + 25 * MS, 1, 1, 1, 2 * job + 1, release + 20 * MS)
+    file.add('expire', release + 25 * MS, 1, 1, 1, 2 * job + 1)
+
+
 def test_an_undeclared_callback_may_hold_the_interpreter(tmp_path, call):
     # one of two workers runs it: the other worker's callback cannot begin before it ends; its next
     # release is skipped
@@ -325,12 +335,7 @@ def test_an_undeclared_callback_may_hold_the_interpreter(tmp_path, call):
         for job in range(5):
             release = START_TIME + job * 1_000 * MS
             start = release + 50 * MS
-            file.add('dispatch', release, 1, 10, 5, -1, -1, -1, 0, release, 0)
-            file.add('callback_start', release, 1, 10, 5, False)
-            file.add('callback_end', start, 1, 10, 5)
-            file.add('job_release', release, 1, 1, 1, 2 * job, release)
-            file.add('job_release', release + 25 * MS, 1, 1, 1, 2 * job + 1, release + 20 * MS)
-            file.add('expire', release + 25 * MS, 1, 1, 1, 2 * job + 1)
+            add_skipped_release(file, release, job, undeclared_end=start)
             add_execution(file, start, start + MS, 1, 0, 2 * job, 1, ready=release, thread=11,
                           address=8, computed=(MS, True))
         end_trace(file, START_TIME + 5_000 * MS)
@@ -357,12 +362,7 @@ def test_a_release_that_was_skipped_before_an_abort_has_the_cause_of_that(
         for job in range(5):
             release = START_TIME + job * 1_000 * MS
             ended = release + 25 * MS
-            file.add('dispatch', release, 1, 10, 5, -1, -1, -1, 0, release, 0)
-            file.add('callback_start', release, 1, 10, 5, False)
-            file.add('callback_end', ended, 1, 10, 5)
-            file.add('job_release', release, 1, 1, 1, 2 * job, release)
-            file.add('job_release', ended, 1, 1, 1, 2 * job + 1, release + 20 * MS)
-            file.add('expire', ended, 1, 1, 1, 2 * job + 1)
+            add_skipped_release(file, release, job, undeclared_end=ended)
             file.add('abort', ended, 1, 1, 1, 2 * job)
             file.add('drop', ended, 1, 1, 8, 1, 0, 2 * job, 'aborted')
         end_trace(file, START_TIME + 5_000 * MS)
