@@ -38,6 +38,7 @@ from mddag_executor.executor.registry import Registry, snapshot
 from mddag_executor.executor.sources import ServiceSource, Source, SubscriptionSource
 from mddag_executor.executor.timers import TimerSource
 from mddag_executor.executor.waitables import (
+    call_with_living,
     EventsSource,
     is_qos_event,
     WaitableSource,
@@ -257,30 +258,23 @@ class Upkeep:
     ) -> WaitableSource | None:
         """Return the source of waitables; None: there are no listeners for them."""
         pool = self._pool
-        alive = []
-        for entity in entities:
-            try:
-                with entity.rclpy:
-                    alive.append(entity)
-            except InvalidHandle:
-                pass  # destroyed meanwhile
-        try:
+
+        def listen(alive: list[Entity]) -> WaitableSource:
             source = make(
                 alive, self._context, self._executor, pool.post, pool.call_at, self._fail)
-        except InvalidHandle:
-            self.changed = True
-            return None
+            with pool.lock:
+                pool.loop.add(source)
+            try:
+                source.listen()
+            except (InvalidHandle, ListenerError):
+                self._drop(source)
+                raise
+            return source
+
+        try:
+            return call_with_living(entities, listen)
         except ListenerError:
             return None
-        with pool.lock:
-            pool.loop.add(source)
-        try:
-            source.listen()
-        except (InvalidHandle, ListenerError) as error:
-            self._drop(source)
-            self.changed |= isinstance(error, InvalidHandle)
-            return None
-        return source
 
     def _drop(self, source: WaitableSource) -> None:
         source.ignore()

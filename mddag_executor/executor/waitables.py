@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 import threading
 import time
-from typing import Any
+from typing import Any, TypeVar
 import weakref
 
 from mddag_executor.executor import compat
@@ -41,6 +41,8 @@ from rclpy.waitable import Waitable
 
 SENDER_CHECKS = 500
 """For how many ms to wait with a response until its request is noted (7.1.5)."""
+
+Result = TypeVar('Result')
 
 Post = Callable[[list[Work]], None]
 """Makes executions ready; must be called without the engine's lock."""
@@ -88,7 +90,7 @@ class WaitableSource(ChannelSource):
         self._set = FilledSet(context, [entity.rclpy for entity in entities])
         self._timers: list[NextCall] = []
         self._has_parts = False
-        self._set.parts(self._add_part)
+        self._set.parts(self._set.waitables, self._add_part)
         if not self._has_parts:
             raise ListenerError('nothing has no listener')  # it is ready when another one is
         self._lock = threading.Lock()
@@ -110,7 +112,8 @@ class WaitableSource(ChannelSource):
         :raises InvalidHandle: when one of them has been destroyed.
         """
         with self._lock:  # announcements meanwhile must not fill the wait set, too
-            self._set.parts(lambda kind, address: set_listener(kind, address, self.fd))
+            self._set.parts(self._set.waitables,
+                            lambda kind, address: set_listener(kind, address, self.fd))
         if self._has_more:
             self.collect()
 
@@ -118,10 +121,10 @@ class WaitableSource(ChannelSource):
         """End ``listen``, and wait until no thread collects from it."""
         self._ignored = True
         with self._lock:
-            try:
-                self._set.parts(clear_listener)
-            except InvalidHandle:
-                pass  # destroyed ones write no more
+            call_with_living(list(self._by_id.values()), self._clear)
+
+    def _clear(self, living: list[Entity]) -> None:
+        self._set.parts([each.rclpy for each in living], clear_listener)
 
     def collect(self) -> None:
         """Collect arrivals; must be called without the engine's lock."""
@@ -167,6 +170,32 @@ class WaitableSource(ChannelSource):
         if early:
             self._at(time.monotonic_ns() + 1_000_000,
                      partial(self._post_noted, early, checks + 1))
+
+
+def call_with_living(
+    entities: list[Entity], call: Callable[[list[Entity]], Result],
+) -> Result | None:
+    """
+    Call with those waitables that are not destroyed; again without those destroyed meanwhile.
+
+    :return: the result; None when none is left.
+    """
+    before = len(entities) + 1
+    while 0 < len(living := [each for each in entities if _is_alive(each)]) < before:
+        before = len(living)
+        try:
+            return call(living)
+        except InvalidHandle:
+            pass
+    return None
+
+
+def _is_alive(entity: Entity) -> bool:
+    try:
+        with entity.rclpy:
+            return True
+    except InvalidHandle:
+        return False
 
 
 def is_qos_event(waitable: Waitable) -> bool:

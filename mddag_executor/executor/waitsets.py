@@ -46,7 +46,8 @@ class FilledSet:
     ) -> None:
         self.waitables = list(waitables)
         self._guards = {}
-        self._held = [context.handle, *self.waitables]
+        self._context: Any = context.handle
+        self._held = [self._context, *self.waitables]
         counts = NumberOfEntities()
         for guard in guards:
             handle: Any = guard.handle
@@ -69,17 +70,17 @@ class FilledSet:
         """
         return _held(self._held)
 
-    def parts(self, call: Callable[[str, int], None]) -> None:
+    def parts(self, waitables: Iterable[Waitable], call: Callable[[str, int], None]) -> None:
         """
-        Call a function with kind and address of each rcl entity in the waitables.
+        Call a function with kind and address of each rcl entity in some of the waitables.
 
         Kinds are ``subscription``, ``guard_condition``, ``timer``, ``client``, ``service``,
         ``event``.
 
         :raises InvalidHandle: when one of them has been destroyed.
         """
-        with _held(self._held):
-            self._fill()
+        with _held([self._context, *waitables]):
+            self._fill(waitables)
             filled = _RclWaitSet.from_address(self._set.pointer)
             for kind in _KINDS:
                 for index in range(getattr(filled, f'n_{kind}')):
@@ -87,11 +88,11 @@ class FilledSet:
                     if address is not None and address not in self._guards:
                         call(kind, address)
 
-    def _fill(self) -> None:
+    def _fill(self, waitables: Iterable[Waitable]) -> None:
         self._set.clear_entities()
         for guard in self._guards.values():
             self._set.add_guard_condition(guard.handle)
-        for waitable in self.waitables:
+        for waitable in waitables:
             waitable.add_to_wait_set(self._set)
 
     def wait(
@@ -110,7 +111,7 @@ class FilledSet:
         :raises InvalidHandle: when one of them has been destroyed.
         """
         with _held(self._held):
-            self._fill()
+            self._fill(self.waitables)
             if timeout_ns is not None:
                 self._set.wait(timeout_ns)
             for waitable in self.waitables:

@@ -4,16 +4,20 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from typing import Any
 
 from mddag_executor.executor import compat
+from mddag_executor.executor.waitables import EventsSource
 import pytest
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import EventHandler, PublisherEventCallbacks
 from rclpy.guard_condition import GuardCondition
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Header
 from test_msgs.action import Fibonacci
 
 from .conftest import is_idle, Spinning, wait_for
@@ -134,6 +138,61 @@ class spun:
         self._future.set_result(None)
         self._thread.join(30.0)
         assert not self._thread.is_alive()
+
+
+# --- QoS events ----------------------------------------------------------------------------------
+
+
+def test_events_keep_their_listener_when_another_one_is_destroyed_meanwhile(
+        make_executor, make_node, monkeypatch):
+    """No thread waits for them in a wait set, which would disturb the next listener."""
+    node, victims, waiting = make_node(), [], set()
+    subscriptions = [node.create_subscription(Header, f'/t{i}', print, 10) for i in range(20)]
+    executor = make_executor(nodes=[node])
+    listen, add = EventsSource.listen, EventHandler.add_to_wait_set
+
+    def destroy_before(self):
+        while victims:
+            node.destroy_subscription(victims.pop())
+        listen(self)
+
+    def note(self, wait_set):
+        waiting.add(threading.current_thread().name)
+        add(self, wait_set)
+
+    monkeypatch.setattr(EventsSource, 'listen', destroy_before)
+    monkeypatch.setattr(EventHandler, 'add_to_wait_set', note)
+    with Spinning(executor) as spinning:
+        for number in range(10):
+            assert wait_for(lambda: is_idle(executor))
+            victims.append(subscriptions.pop())
+            subscriptions.insert(0, node.create_subscription(Header, f'/n{number}', print, 10))
+            assert wait_for(lambda: not victims)
+    assert spinning.error is None
+    assert waiting and 'mddag-wait-set' not in waiting
+
+
+def test_the_middleware_writes_to_no_file_after_the_executor_has_ended(
+        make_executor, make_node, tmp_path):
+    """Not even if the event of another subscription has just been destroyed."""
+    node, source, noticed = make_node(), make_node('source'), []
+    subscriptions = [node.create_subscription(Header, f'/t{i}', print, 10) for i in range(20)]
+    executor = make_executor(nodes=[node])
+    executor.spin_once(0.0)
+    subscriptions[0].event_handlers[0].destroy()
+    executor.shutdown()
+    files = [(tmp_path / f'{number}').open('w+b', buffering=0) for number in range(200)]
+    sensor = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    for number in range(1, 20):
+        source.create_publisher(Header, f'/t{number}', sensor, event_callbacks=(
+            PublisherEventCallbacks(incompatible_qos=noticed.append)))
+    with Spinning(make_executor(nodes=[source])):
+        assert wait_for(lambda: len(noticed) == 19)
+    sizes = []
+    for file in files:
+        with file:
+            sizes.append(os.fstat(file.fileno()).st_size)
+    assert sizes == [0] * 200
 
 
 # --- guard conditions, and waitables of a user's own ---------------------------------------------
