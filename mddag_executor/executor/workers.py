@@ -626,7 +626,8 @@ class WorkerPool:
             work.cpu_ns += measurement.end(wall, me.has_lent)
             if entity.is_nested != habit.computes and entity.classify is not None:
                 with self.lock:
-                    entity.classify()
+                    if entity.classify is not None:  # it may have been removed meanwhile
+                        entity.classify()
         if wall > SHORT_CALLBACK_NS:
             habit.rests = 0  # long callbacks are measured each time
         entity.wall_ns += (wall - entity.wall_ns) >> 3 if entity.ran else wall - entity.wall_ns
