@@ -58,11 +58,15 @@ def columns_of(replay: Replay, rows: str) -> list[Column]:
     return executions(replay)[0] if rows == 'executions' else jobs(replay)
 
 
-def executions(replay: Replay) -> tuple[list[Column], Ints]:
-    """Return the columns of executions, and their rows of the table."""
+def executions(replay: Replay, rows: Ints | None = None) -> tuple[list[Column], Ints]:
+    """
+    Return the columns of executions, and their rows of the table.
+
+    :param rows: only these rows.
+    """
     recording, judged = replay.recording, replay.judged
-    rows = ran(recording)
-    row, release, known = _releases(replay, rows)
+    rows = ran(recording) if rows is None else rows
+    release, known = _releases(replay, rows)
     ready = recording.executions['ready'][rows]
     order = sort_by(np.where(known, release, ready))
     rows, release, known = rows[order], release[order], known[order]
@@ -87,17 +91,17 @@ def executions(replay: Replay) -> tuple[list[Column], Ints]:
         Column('slack_ns', reference - end, known)], rows
 
 
-def _releases(replay: Replay, rows: Ints) -> tuple[Ints, Ints, Mask]:
-    """Return the jobs of executions (rows), their releases, and which have one."""
-    table = replay.recording.executions
-    row, release = np.full(len(rows), -1), np.zeros(len(rows), dtype=np.int64)
-    dags = table['dag'][rows]
+def _releases(replay: Replay, rows: Ints) -> tuple[Ints, Mask]:
+    """Return the releases of the jobs of executions (rows), and which are known."""
+    dags, vertex, job = (
+        replay.recording.executions[name][rows] for name in ('dag', 'vertex', 'job'))
+    release, known = np.zeros(len(rows), dtype=np.int64), np.zeros(len(rows), dtype=np.bool_)
     for dag, jobs_of in enumerate(replay.judged.jobs):
-        mine = np.flatnonzero((dags == dag) & (table['vertex'][rows] >= 0))
-        row[mine] = jobs_of.rows_of(table['job'][rows[mine]])
-        some = mine[row[mine] >= 0]
-        release[some] = jobs_of.release[row[some]]
-    return row, release, row >= 0
+        mine = np.flatnonzero((dags == dag) & (vertex >= 0))
+        row = jobs_of.rows_of(job[mine])
+        mine, row = mine[row >= 0], row[row >= 0]
+        release[mine], known[mine] = jobs_of.release[row], True
+    return release, known
 
 
 def jobs(replay: Replay) -> list[Column]:

@@ -3,7 +3,6 @@
 (() => {
   const NARROW = 700;                   // pixels, as in html.css
   const DARK = window.matchMedia('(prefers-color-scheme: dark)').matches;
-  const MISSES = new Set(['late', 'expired', 'failed', 'aborted']);
   const element = (id) => document.getElementById(id);
   const meta = JSON.parse(element('mddag-meta').textContent);
 
@@ -18,15 +17,13 @@
     return found;
   }
 
-  function jobText(place) {
-    if (place < 0) return 'declared by no DAG';
-    const [dag, job, release] = meta.jobs[place];
+  function jobText(dag, job, release) {
+    if (dag < 0) return 'declared by no DAG';
     const text = `job ${job} of ${meta.dags[dag]}`;
-    return release === null ? text : `${text}, released at ${release.toFixed(6)} s`;
+    return isNaN(release) ? text : `${text}, released at ${release.toFixed(6)} s`;
   }
 
-  function verdictText(place) {
-    const [sink, , deadline, response, verdict] = meta.verdicts[place];
+  function verdictText([sink, , , , deadline, response, verdict]) {
     const name = meta.short[sink], due = `(deadline ${time(deadline)})`;
     if (response === null) return `MISSED at ${name}: ${verdict} ${due}`;
     const slack = deadline - response;
@@ -37,52 +34,36 @@
   function fillTexts(bars, marks) {     // a to d: the lines of a tool tip
     const d = bars.data, all = (column, text) => Array.from(column, text);
     d.a = all(d.name, (name) => meta.names[name]);
-    d.b = all(d.job, jobText);
+    d.b = all(d.job, (job, i) => jobText(d.dag[i], job, d.release[i]));
     d.c = all(d.worker, (worker, i) => {
       const where = worker < 0 ? 'a spare thread' : meta.workers[worker] || `worker ${worker}`;
       return `started ${d.left[i].toFixed(6)} s on ${where}, waited ` +
         `${time(Math.round(d.waited[i] * 1e9))}, ran ${time(Math.round((d.right[i] - d.left[i]) * 1e9))}`;
     });
-    d.d = all(d.verdict, (verdict, i) => verdict >= 0 ? verdictText(verdict)
+    d.d = all(d.verdict, (verdict, i) => verdict >= 0 ? verdictText(meta.verdicts[verdict])
       : d.name[i] < meta.declared ? 'no verdict known' : '');
-    const m = marks.data;
-    m.a = all(m.verdict, (verdict) => meta.names[meta.verdicts[verdict][0]]);
-    m.b = all(m.verdict, (verdict) => jobText(meta.verdicts[verdict][1]));
-    m.c = all(m.verdict, verdictText);
-    m.d = all(m.verdict, () => '');
+    const m = marks.data, of = all(m.verdict, (verdict) => meta.verdicts[verdict]);
+    m.a = of.map(([sink]) => meta.names[sink]);
+    m.b = of.map(([, ...job]) => jobText(...job));
+    m.c = of.map(verdictText);
+    m.d = of.map(() => '');
   }
 
-  const missed = meta.missed.map(([verdict, release, deadline, shown]) => ({
-    release, deadline, shown, text: `${jobText(meta.verdicts[verdict][1])}: ${verdictText(verdict)}`}));
+  const missed = meta.missed.map((place) => {
+    const verdict = meta.verdicts[place], [, dag, job, release, deadline, response] = verdict;
+    return {release, deadline: release + deadline / 1e9, shown: release + (response ?? deadline) / 1e9,
+            text: `${jobText(dag, job, release)}: ${verdictText(verdict)}`};
+  });
 
   // The table of sinks: search, sort, and the rows that are not in the page at first.
   function sinks() {
     const table = document.querySelector('#mddag-sinks table');
     if (!table) return;
     const body = table.tBodies[0], search = element('mddag-search');
-    const titles = [...table.tHead.rows[0].cells].map((cell) => cell.textContent);
-    const button = element('mddag-all-sinks');
-    let more = JSON.parse(element('mddag-more-sinks').textContent);
+    const titles = [...table.tHead.rows[0].cells], button = element('mddag-all-sinks');
 
     function all() {
-      const [first] = body.rows;
-      for (const cells of more) {
-        const row = first.cloneNode(true), reached = cells[cells.length - 1];
-        row.dataset.reached = reached;
-        [...row.cells].forEach((cell, i) => {
-          if (i < cells.length - 1) {
-            cell.textContent = cells[i];
-            if (MISSES.has(titles[i])) cell.className = cells[i] === '0' ? '' : 'bad';
-            return;
-          }
-          const bar = cell.querySelector('i');
-          bar.style.width = `${100 * Math.min(1, reached)}%`;
-          bar.style.background = reached > 1 ? '#d7191c' : reached > 0.9 ? '#fd8d3c' : '#3182bd';
-          cell.querySelector('b').textContent = `${Math.round(100 * reached)} %`;
-        });
-        body.append(row);
-      }
-      more = [];
+      for (const row of body.rows) row.hidden = false;
       if (button) button.remove();
     }
 
@@ -104,7 +85,7 @@
       }
     });
     let last = null;
-    [...table.tHead.rows[0].cells].forEach((title, column) =>
+    titles.forEach((title, column) =>
       title.addEventListener('click', () => {
         all();
         const turn = last === column ? -1 : 1;

@@ -8,7 +8,7 @@ The HTML report of a run: one file with tables and pictures that needs no networ
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from html import escape
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO
@@ -28,14 +28,15 @@ from mddag_executor.report.html_data import (
 )
 from mddag_executor.report.html_tables import (
     callbacks_html,
+    html_table,
     misses_html,
     page_head,
-    paths_html,
     sinks_html,
     worst_html,
     worst_line,
 )
-from mddag_executor.report.tables import never_due_lines, verdicts_line
+from mddag_executor.report.replays import PATHS_HEADER, paths_rows
+from mddag_executor.report.tables import never_due_lines, ratio, verdicts_line
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import Timeline
 from mddag_executor.simulate import Load, SimulatedRun
@@ -61,53 +62,38 @@ def check_available() -> None:
 def of_outcome(outcome: Replay | Reschedule) -> ReportData:
     """Return the data of a report about a recorded run."""
     result = outcome.result()
-    what, title = 'recording', 'Replay as recorded'
-    notes: Sequence[str] = ()
-    worker_names: Sequence[str]
-    if isinstance(outcome, Reschedule):
-        replay = Replay(outcome.computed().recording(result['workers']))
-        what, title = ('bag', 'Bag') if outcome.recorded is None else (what, 'Replay')
-        title, notes = f'{title}, rescheduled', outcome.notes
-        worker_names = outcome.worker_names
-    else:
-        replay, worker_names = outcome, outcome.recording.worker_names
-    facts = [(what, result['recording']['trace']), *_facts(result),
-             *(('assumed', note) for note in notes)]
-    return _data(
-        replay, title, facts, result['workers'], outcome.duration_ns, outcome.warnings,
-    )._replace(paths=result.get('paths', {}), recorded=result.get('recorded_callbacks', {}),
-               misses=result.get('misses'), worker_names=worker_names,
-               causes=replay.explanation.causes() if isinstance(outcome, Replay) else {})
+    trace = result['recording']['trace']
+    if isinstance(outcome, Replay):
+        return _data(
+            'Replay as recorded', [('recording', trace)], result, outcome, outcome.duration_ns,
+        )._replace(causes=outcome.explanation.causes(),
+                   worker_names=outcome.recording.worker_names)
+    what, title = ('bag', 'Bag') if outcome.recorded is None else ('recording', 'Replay')
+    data = _data(f'{title}, rescheduled', [(what, trace)], result,
+                 Replay(outcome.computed().recording(result['workers'])), outcome.duration_ns)
+    return data._replace(facts=[*data.facts, *(('assumed', note) for note in outcome.notes)],
+                         worker_names=outcome.worker_names)
 
 
 def of_run(task_set: TaskSet, load: Load, run: SimulatedRun) -> ReportData:
     """Return the data of a report about a run that was simulated with its log."""
-    workers = run.settings.workers
-    replay = Replay(ComputedRun.of_run(task_set, load, run).recording(workers))
-    facts = [('declaration', task_set.file), *_facts(run.result())]
-    return _data(replay, 'Simulation', facts, workers, run.ended_ns, [])._replace(
-        tally=run.tally)
+    replay = Replay(ComputedRun.of_run(task_set, load, run).recording(run.settings.workers))
+    return _data('Simulation', [('declaration', task_set.file)], run.result(), replay,
+                 run.ended_ns)
 
 
 def _data(
-    replay: Replay, title: str, facts: list[tuple[str, str]], workers: int, duration_ns: int,
-    warnings: list[str],
+    title: str, facts: list[tuple[str, str]], result: Mapping[str, Any], replay: Replay,
+    duration_ns: int,
 ) -> ReportData:
-    judged = replay.judged
-    return ReportData(
-        title, facts, replay.task_set, judged.tables, replay.tally, replay.chains.breakdown(),
-        replay.usage, Timeline(replay.recording, judged), workers, duration_ns, warnings)
-
-
-def _facts(result: dict[str, Any]) -> list[tuple[str, str]]:
-    utilisation = result['utilisation']
     pool = [('policy', str(result['policy']) + (', preemptive' if result['preemptive'] else '')),
             ('workers', str(result['workers']))]
     if 'recorded_callbacks' in result:      # recorded by another executor
         pool = [('imported', f'{result["workers"]} threads ran callbacks')]
-    return [
-        *pool, ('duration', format_ns(result['duration_ns'])),
-        ('utilisation', '-' if utilisation is None else f'{utilisation:.3f}')]
+    facts = [*facts, *pool, ('duration', format_ns(result['duration_ns'])),
+             ('utilisation', ratio(result['utilisation']))]
+    return ReportData(title, facts, result, replay, Timeline(replay.recording, replay.judged),
+                      duration_ns)
 
 
 def write(file: BinaryIO, data: ReportData) -> None:
@@ -127,42 +113,46 @@ def write(file: BinaryIO, data: ReportData) -> None:
 def _page(
     data: ReportData, prepared: Prepared, library: str, script: str, divisions: list[str]
 ) -> Iterator[str]:
-    plots = [f'<div class="mddag-plot">{division}</div>' for division in divisions]
+    overview, workers, callbacks, *histograms = (
+        f'<div class="mddag-plot">{division}</div>' for division in divisions)
+    task_set = data.replay.task_set
     title = escape(printable(
-        f'{data.title}: {PurePath(data.task_set.file or data.facts[0][1]).name}'))
+        f'{data.title}: {PurePath(task_set.file or data.facts[0][1]).name}'))
     yield page_head(title)
     yield library
     yield f'</head><body>\n<h1>{title}</h1>\n'
     yield from _head(data)
-    if data.task_set.dags:
+    if task_set.dags:
         yield misses_html(data, prepared)
         yield f'<h2>Sinks</h2>\n{sinks_html(data)}\n'
     else:
-        yield '<p class="note">No DAG is declared: give a GRAPH to judge deadlines.</p>\n'
+        yield _note('No DAG is declared: give a GRAPH to judge deadlines.')
     legend = ''.join(f'<span><i style="background:{colour}"></i>{text}</span>'
                      for colour, text in zip(COLOURS, _LEGEND))
     yield (f'<h2 id="mddag-timeline">Timeline</h2>\n<p class="legend">{legend}'
            '<span><b class="miss">&#9660;</b>where a deadline was missed</span></p>\n')
-    yield ('<p class="note">Times count from the beginning of the run. Drag the window of the '
-           'first picture, or its edges. In the others drag to move, zoom with Ctrl and the wheel '
-           '(or the tools above a picture), and point at a bar for its facts.</p>\n')
+    yield _note('Times count from the beginning of the run. Drag the window of the first picture, '
+                'or its edges. In the others drag to move, zoom with Ctrl and the wheel (or the '
+                'tools above a picture), and point at a bar for its facts.')
     yield ('<p class="buttons"><button id="mddag-previous">&#9664; previous miss</button> '
            '<button id="mddag-next">next miss &#9654;</button> '
            '<button id="mddag-whole">whole run</button> <span id="mddag-status"></span></p>\n')
-    yield f'{plots[0]}\n<p class="note">{_BARS}</p>\n'
-    yield f'<h3>By worker</h3>\n{plots[1]}\n<h3>By callback</h3>\n'
+    yield f'{overview}\n{_note(_BARS)}'
+    yield f'<h3>By worker</h3>\n{workers}\n<h3>By callback</h3>\n'
     if prepared.n_hidden:
-        yield ('<p class="note">Only the DAGs that missed the largest share of their deadlines; '
-               f'{prepared.n_hidden} of {len(data.task_set.dags)} are left out.</p>\n')
-    yield f'{plots[2]}\n'
-    if data.paths:
-        yield ('<h2>End to end</h2>\n<p class="note">From the first publication to the start of '
-               f'the last callback.</p>\n{paths_html(data)}\n')
-    if plots[3:]:
-        yield '<h2>Response times against deadlines</h2>\n'
-        yield ('<p class="note">Nearest to its deadline, or furthest past it, first. What never '
-               'completed is in the table of sinks only.</p>\n')
-        yield '<div class="grid">' + ''.join(plots[3:]) + '</div>\n'
+        yield _note('Only the DAGs that missed the largest share of their deadlines; '
+                    f'{prepared.n_hidden} of {len(task_set.dags)} are left out.')
+    yield f'{callbacks}\n'
+    if data.result.get('paths'):
+        yield '<h2>End to end</h2>\n' + _note(
+            'From the first publication to the start of the last callback.')
+        paths = html_table(PATHS_HEADER, paths_rows(data.result['paths']), 3)
+        yield f'<div class="wide">{paths}</div>\n'
+    if histograms:
+        yield '<h2>Response times against deadlines</h2>\n' + _note(
+            'Nearest to its deadline, or furthest past it, first. What never completed is in the '
+            'table of sinks only.')
+        yield f'<div class="grid">{"".join(histograms)}</div>\n'
         yield f'<h2>Where the time of the worst jobs went</h2>\n{worst_html(data)}\n'
     yield f'<h2>Callbacks</h2>\n{callbacks_html(data)}\n'
     yield f'<footer>mddag_executor {escape(__version__)}</footer>\n'
@@ -172,23 +162,27 @@ def _page(
     yield '</body></html>\n'
 
 
+def _note(text: str, kind: str = 'note') -> str:
+    return f'<p class="{kind}">{escape(printable(text))}</p>\n'
+
+
 def _head(data: ReportData) -> Iterator[str]:
-    dags = data.tally.result()['dags']
+    dags = data.result['dags']
     every = total(dags)
     yield '<p class="facts">' + ' '.join(
         f'<span><b>{escape(printable(word))}</b> {escape(printable(text))}</span>'
         for word, text in data.facts) + '</p>\n'
-    if data.task_set.dags:
+    if dags:
         good = every.due and not every.missed
-        lines = [line for line in (worst_line(data), *(
-            () if data.misses is None else causes_line(data.misses))) if line is not None]
+        lines = [*worst_line(data)]
+        if data.result.get('misses') is not None:
+            lines += causes_line(data.result['misses'])
         yield (f'<div class="verdict {"good" if good else "bad"}"><b>{verdicts_line(dags)}</b>'
                + ''.join(f'<p>{escape(printable(line))}</p>' for line in lines) + '</div>\n')
-    for warning in [*never_due_lines(dags), *data.warnings]:
-        yield f'<p class="warning">{escape(printable(warning))}</p>\n'
-    timeline = data.timeline
-    if timeline.kept < timeline.n_executions:
-        yield (f'<p class="warning">The timelines show {timeline.kept} of '
-               f'{counted(timeline.n_executions, "execution")}: around missed deadlines, '
-               'and evenly spread over the run elsewhere. Tables and histograms are of all; '
-               'mddag export -o RUN.pftrace shows all in Perfetto.</p>\n')
+    for warning in [*never_due_lines(dags), *data.result.get('warnings', ())]:
+        yield _note(warning, 'warning')
+    shown, n = len(data.timeline.rows), data.timeline.n_executions
+    if shown < n:
+        yield _note(f'The timelines show {shown} of {counted(n, "execution")}: around missed '
+                    'deadlines, and evenly spread over the run elsewhere. Tables and histograms '
+                    'are of all; mddag export -o RUN.pftrace shows all in Perfetto.', 'warning')

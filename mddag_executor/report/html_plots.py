@@ -26,9 +26,9 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 from mddag_executor.replay.usage import PoolUse
-from mddag_executor.report.html_data import COLOURS, label, Line, Prepared, ReportData
+from mddag_executor.report.html_data import COLOURS, label, Line, Prepared, ReportData, seconds
 from mddag_executor.report.tables import short_names
-from mddag_executor.report.text import format_ns, printable
+from mddag_executor.report.text import format_ns
 import numpy as np
 
 MOST_HISTOGRAMS = 30
@@ -56,17 +56,13 @@ def figures(data: ReportData, prepared: Prepared) -> Figures:
     duration = max(1, data.duration_ns) / 1e9
     time = Range1d(
         start=0, end=duration, bounds=(-0.2 * duration, 1.2 * duration), name='timeline_range')
-    names = [printable(name) for name in data.worker_names] or [
-        f'worker {w}' for w in range(data.workers)]
-    workers = [Line('spare threads' if w == data.workers else names[w], y, False)
-               for w, y in enumerate(prepared.worker_lines) if y]
-    workers.append(Line('missed deadlines', 0, False))
+    gaps = [(seconds(data, left), seconds(data, right)) for left, right in data.timeline.gaps]
     executions = ColumnDataSource(prepared.executions, name='executions')
     marks = ColumnDataSource(prepared.marks, name='marks')
     return Figures(
-        _overview(data, prepared, time),
-        _timeline('workers', workers, time, prepared.gaps, executions, marks),
-        _timeline('callbacks', prepared.lines, time, prepared.gaps, executions, marks),
+        _overview(data, time),
+        _timeline('workers', prepared.worker_lines, time, gaps, executions, marks),
+        _timeline('callbacks', prepared.lines, time, gaps, executions, marks),
         _histograms(data))
 
 
@@ -97,20 +93,20 @@ def _seconds(plot: Any, what: str) -> None:
     plot.xaxis.formatter = BasicTickFormatter(use_scientific=False)
 
 
-def _overview(data: ReportData, prepared: Prepared, time: Range1d) -> Any:
+def _overview(data: ReportData, time: Range1d) -> Any:
     """Return the use of the pool over the whole run, with a movable window."""
-    duration = max(1, data.duration_ns) / 1e9
+    duration, workers = max(1, data.duration_ns) / 1e9, data.result['workers']
     plot: Any = figure(
         height=150, sizing_mode='stretch_width', tools='', toolbar_location=None,
-        x_range=Range1d(start=0, end=duration), y_range=Range1d(start=0, end=data.workers * 1.08),
+        x_range=Range1d(start=0, end=duration), y_range=Range1d(start=0, end=workers * 1.08),
         min_border_left=_LEFT, name='overview')
-    edges, busy = _over_time(data.timeline.busy_over_time, prepared.origin)
+    edges, busy = _over_time(data, data.timeline.busy_over_time)
     plot.quad(left=edges[:-1], right=edges[1:], bottom=0, top=busy,
               fill_color=_BLUE, line_color=None)
-    edges, missed = _over_time(data.timeline.missed_over_time, prepared.origin)
+    edges, missed = _over_time(data, data.timeline.missed_over_time)
     late = missed > 0
-    plot.quad(left=edges[:-1][late], right=edges[1:][late], bottom=data.workers * 1.02,
-              top=data.workers * 1.08, fill_color=_RED, line_color=_RED, line_width=3)
+    plot.quad(left=edges[:-1][late], right=edges[1:][late], bottom=workers * 1.02,
+              top=workers * 1.08, fill_color=_RED, line_color=_RED, line_width=3)
     plot.yaxis.axis_label = 'busy workers'
     _seconds(plot, 'time (s)')
     tool = RangeTool(x_range=time)
@@ -121,12 +117,10 @@ def _overview(data: ReportData, prepared: Prepared, time: Range1d) -> Any:
     return plot
 
 
-def _over_time(use: PoolUse, origin: int) -> tuple[Any, Any]:
+def _over_time(data: ReportData, use: PoolUse) -> tuple[Any, Any]:
     """Return the edges of steps (s), and the mean number of busy workers in each."""
-    found = use.result()
-    steps = found['step_ns'] * np.arange(len(found['busy_ns']) + 1)
-    return (((found['start_ns'] or 0) - origin + steps) / 1e9,
-            np.array(found['busy_ns']) / found['step_ns'])
+    edges = (use.start or 0) + use.step * np.arange(len(use.busy) + 1)
+    return seconds(data, edges), np.array(use.busy) / use.step
 
 
 def _timeline(
@@ -187,17 +181,12 @@ def _lines(plot: Any, lines: list[Line]) -> None:
 
 def _histograms(data: ReportData) -> list[Any]:
     """Return response-time histograms, sinks with the least slack first."""
-    names = {vertex: data.tally.vertex_name(vertex) for vertex in data.tables.sinks}
-    short = short_names(names.values())
-    sinks = [vertex for vertex in data.tables.sinks if data.tally.sinks[vertex].responses]
-
-    def near(vertex: int) -> float:
-        tally = data.tally.sinks[vertex]
-        return -(tally.longest or 0) / max(1, tally.relative_deadline_ns)
-
-    sinks.sort(key=near)
-    return [_histogram(label(short[names[vertex]], 46), data.tally.sinks[vertex])
-            for vertex in sinks[:MOST_HISTOGRAMS]]
+    tally = data.replay.tally
+    short = short_names(tally.vertex_name(vertex) for vertex in tally.sinks)
+    sinks = [(short[tally.vertex_name(vertex)], sink)
+             for vertex, sink in tally.sinks.items() if sink.responses]
+    sinks.sort(key=lambda item: -(item[1].longest or 0) / max(1, item[1].relative_deadline_ns))
+    return [_histogram(label(name, 46), sink) for name, sink in sinks[:MOST_HISTOGRAMS]]
 
 
 def _histogram(title: str, tally: Any) -> Any:

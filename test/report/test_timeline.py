@@ -52,18 +52,20 @@ def test_a_schedule_is_told_as_its_trace_says(settings, utilisation, tmp_path):
         task_set, load, run.log, run.decisions, 300 * runs.MS, run.ended_ns).recording(),
         open_recording(tmp_path / 'run.mcap'))
     seen, read = html.of_run(task_set, load, run), html.of_outcome(replay(tmp_path / 'run.mcap'))
-    assert seen.tally.result() == read.tally.result() == run.tally.result()
-    ours, theirs = seen.timeline.shown(), read.timeline.shown()
-    assert seen.timeline.n_executions == len(ours.executions) > 50
-    for one, other, columns in (
-            (ours.executions, theirs.executions,
-             ['vertex', 'job', 'worker', 'ready', 'start', 'end']),
-            (ours.releases, theirs.releases, ['dag', 'job', 'release']),
-            (ours.verdicts, theirs.verdicts, ['sink', 'job', 'deadline', 'completed', 'kind'])):
-        assert sorted(one[columns].tolist()) == sorted(other[columns].tolist())
+    assert seen.replay.tally.result() == read.replay.tally.result() == run.tally.result()
+    assert seen.timeline.n_executions == len(seen.timeline.rows) > 50
+    for name, columns in (('executions', ['vertex', 'job', 'worker', 'ready', 'start', 'end']),
+                          ('releases', ['dag', 'job', 'release'])):
+        ours, theirs = (getattr(each.replay.recording, name)[columns] for each in (seen, read))
+        if name == 'executions':
+            ours, theirs = ours[seen.timeline.rows], theirs[read.timeline.rows]
+        assert sorted(ours.tolist()) == sorted(theirs.tolist())
+    columns = ['sink', 'job', 'deadline', 'completed', 'kind']
+    assert sorted(seen.timeline.verdicts[columns].tolist()) == sorted(
+        read.timeline.verdicts[columns].tolist())
     assert seen.timeline.busy_over_time.result() == read.timeline.busy_over_time.result()
-    assert seen.usage.callbacks() == read.usage.callbacks()
-    assert seen.breakdown == read.breakdown
+    assert seen.replay.usage.callbacks() == read.replay.usage.callbacks()
+    assert seen.replay.chains.breakdown() == read.replay.chains.breakdown()
 
 
 def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path):
@@ -84,8 +86,8 @@ def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path):
 def test_a_rescheduled_run_has_the_verdicts_of_its_report(workers):
     outcome = reschedule(runs.CONFIG.parent / 'bags' / 'demo_short.mcap', workers=workers)
     data = html.of_outcome(outcome)
-    assert data.tally.result()['dags'] == outcome.tally.result()['dags']
-    executions = data.timeline.shown().executions
+    assert data.replay.tally.result()['dags'] == outcome.tally.result()['dags']
+    executions = data.replay.recording.executions[data.timeline.rows]
     busy = [int((executions['end'] - executions['start'])[executions['worker'] == w].sum())
             for w in range(workers)]
     for ours, theirs in zip(busy, outcome.busy):
@@ -96,11 +98,11 @@ def test_a_bag_has_the_verdicts_of_its_report(tmp_path):
     task_set = msg_graph.loads(BY_HEADER.replace('20ms', '13ms'), 'g.yaml')
     outcome = reschedule_bag(write_bag(tmp_path / 'bag'), task_set)
     data = html.of_outcome(outcome)
-    assert data.tally.result()['dags'] == outcome.tally.result()['dags']
+    assert data.replay.tally.result()['dags'] == outcome.tally.result()['dags']
     assert data.timeline.n_missed == 9 and ('assumed', outcome.notes[0]) in data.facts
     # (the tenth has no verdict: the bag ends with its release)
     # a release lies before the message that brings it
-    assert data.breakdown[1]['worst']['release_lag_ns'] == 5 * runs.MS
+    assert data.replay.chains.breakdown()[1]['worst']['release_lag_ns'] == 5 * runs.MS
 
 
 ONE = """\
@@ -109,8 +111,14 @@ nodes: [{node: /n, callbacks: [{name: a, timer: 100us, deadline: 60us}]}]
 """
 
 
-def ran(*executions: tuple[int, int, int, int, int], end: int = 10 ** 6) -> Timeline:
-    """Return the timeline of executions: callback, vertex, job (released at its start), …."""
+def ran(
+    *executions: tuple[int, int, int, int, int], end: int = 10 ** 6
+) -> tuple[Timeline, tables.Table]:
+    """
+    Return the timeline of executions, and their table.
+
+    An execution is: callback, vertex, job (released at its start), ….
+    """
     task_set = msg_graph.loads(ONE, 'g.yaml')
     rows = Rows(tables.EXECUTIONS, 'callback', 'vertex', 'dag', 'job', 'ready', 'began', 'start',
                 'end', 'completes', 'order')
@@ -126,25 +134,25 @@ def ran(*executions: tuple[int, int, int, int, int], end: int = 10 ** 6) -> Time
     recording = Recording(
         'by hand', Head(0, '', '', 'rad', 1, 0, 0, False), task_set, task_set, who,
         releases=releases.table(), executions=rows.table(), end=end, judged_until=end)
-    return Timeline(recording, Judged(recording), most=100, block=10)
+    timeline = Timeline(recording, Judged(recording), most=100, block=10)
+    return timeline, recording.executions[timeline.rows]
 
 
 def test_detail_is_bounded_and_keeps_the_misses():
     us = 1000
-    timeline = ran(*((1, 0, i, 100 * us * i, 100 * us * i + (70 if i in (333, 777) else 50) * us)
-                     for i in range(1000)))
-    shown = timeline.shown()
-    executions = shown.executions
+    timeline, executions = ran(*(
+        (1, 0, i, 100 * us * i, 100 * us * i + (70 if i in (333, 777) else 50) * us)
+        for i in range(1000)))
     assert timeline.n_executions == 1000 and timeline.n_missed == 2
-    assert timeline.kept == len(executions) <= 100
+    assert len(executions) <= 100
     assert {333, 777} <= set(executions['job'].tolist())
-    assert {333, 777} <= set(shown.verdicts['job'].tolist())
+    assert {333, 777} <= set(timeline.verdicts['job'].tolist())
     jobs = executions['job']
     assert jobs[0] == 0 and jobs[-1] >= 960
     assert int(np.diff(jobs).max()) <= 330      # what is shown is spread over the run
-    for left, right in timeline.gaps():
+    for left, right in timeline.gaps:
         inside = (executions['start'] > left) & (executions['end'] < right)
         assert not inside.any() and left < right
-    assert len(timeline.gaps()) >= 3
+    assert len(timeline.gaps) >= 3
     assert sum(timeline.busy_over_time.result()['busy_ns']) == (998 * 50 + 2 * 70) * us
     assert sum(timeline.missed_over_time.result()['busy_ns']) == 2
