@@ -11,6 +11,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import legs_of, Tables
 from mddag_executor.executor.gil import GilHabit
+from mddag_executor.executor.jobs import new_address
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import entity_name
 
@@ -104,7 +105,7 @@ class Entity:
         self.is_nested = 0
         # its callback group, if that must be asked whether it may run
         self.gate: Gate | None = None
-        self.address = id(self)
+        self.address = new_address()
         # entered before a callback runs: it raises once the entity is destroyed
         self.handle = rclpy.handle if kind in _HAVE_HANDLES else None
 

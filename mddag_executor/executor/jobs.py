@@ -25,6 +25,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from itertools import count
+import secrets
 import threading
 from time import time_ns
 from typing import Any, NamedTuple
@@ -135,10 +137,19 @@ class PublisherNumbers:
         self._unlike = (0, NO_NUMBER, 0)
 
 
+new_address: Callable[[], int] = count(secrets.randbits(46) << 16).__next__
+"""
+Returns a number that stands for an address in a trace.
+
+Unlike an address, it is never used again, nor by another process.
+"""
+
+
 class PublisherState:
     """
     The state of a publisher: its topic, and how many messages it has published.
 
+    :ivar address: the publisher's address in a trace.
     :ivar is_tracked: whether a declared callback has published a trigger topic with it, which
         starts the counting of its publications.
     :ivar sending: the publication that is being sent.
@@ -146,11 +157,12 @@ class PublisherState:
         publish in the thread that owns it.
     """
 
-    __slots__ = ('lock', 'topic', 'count', 'numbers', 'is_tracked', 'sending')
+    __slots__ = ('lock', 'topic', 'count', 'numbers', 'is_tracked', 'sending', 'address')
 
     def __init__(self, topic: str) -> None:
         self.lock = threading.RLock()
         self.topic = topic
+        self.address = new_address()
         self.count = 0
         self.numbers = PublisherNumbers()
         self.is_tracked = False

@@ -101,12 +101,19 @@ def replace_delivery(topic: str, old: LocalDelivery | None, new: LocalDelivery |
             _deliveries.pop(topic, None)
 
 
+def state_of(publisher: Any) -> PublisherState:
+    """Return the state of a publisher, which begins with the first use."""
+    state: PublisherState = publisher.__dict__.setdefault(
+        _STATE, PublisherState(publisher.topic_name))
+    return state
+
+
 def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Publication | None:
     """Publish; return the publication if a callback published on a trigger topic."""
     running = current.running
     topic = None
     if running is not None:
-        running.publishes(publisher, msg, state.topic)
+        running.publishes(state, msg)
         topic = running.engine.jobs.topics.get(state.topic)
     if topic is None and not state.is_tracked:
         original(publisher, msg)
@@ -140,9 +147,7 @@ def install() -> None:
     set_filter = getattr(Subscription, 'set_content_filter', None)
 
     def publish(self: Any, msg: Any) -> None:
-        state = self.__dict__.get(_STATE)
-        if state is None:
-            state = self.__dict__.setdefault(_STATE, PublisherState(self.topic_name))
+        state = self.__dict__.get(_STATE) or state_of(self)
         deliveries = _deliveries.get(state.topic)
         if deliveries is None:
             if current.running is None and not state.is_tracked:

@@ -14,6 +14,7 @@ from mddag_executor import defaults
 from mddag_executor.clocks import boot, TraceClock
 from mddag_executor.core.tables import ON_LATE
 from mddag_executor.executor.entity import Entity, SERVICE, SUBSCRIPTION, TIMER
+from mddag_executor.executor.publishing import state_of
 from mddag_executor.trace.errors import TraceError
 from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
@@ -85,8 +86,9 @@ class Recorder:
         for publisher in list(node.publishers):
             if publisher not in self._known:
                 self._known.add(publisher)
+                handle = state_of(publisher).address
                 self._say(
-                    'rcl_publisher_init', id(publisher), address, id(publisher),
+                    'rcl_publisher_init', handle, address, handle,
                     publisher.topic_name, publisher.qos_profile.depth)
 
     def _entity(self, entity: Entity, node: int) -> None:

@@ -39,7 +39,7 @@ class RunningThread(Protocol):
     pool: Any
     published: int
 
-    def publishes(self, publisher: Any, msg: Any, topic: str) -> None:
+    def publishes(self, state: Any, msg: Any) -> None:
         """Note that the callback publishes."""
 
     def is_short(self) -> bool:

@@ -55,6 +55,7 @@ from mddag_executor.executor.debugging import engine_lock
 from mddag_executor.executor.due import DueTimes, Guard, Muting
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.gil import Measurement
+from mddag_executor.executor.jobs import PublisherState
 from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
 from mddag_executor.executor.misses import MissLog
 from mddag_executor.executor.shutdown import is_over
@@ -114,11 +115,12 @@ class WorkerThread:
             work.entity.wall_ns <= SHORT_CALLBACK_NS
             or self.published > 0 and work.entity.tail_ns <= SHORT_CALLBACK_NS)
 
-    def publishes(self, publisher: Any, msg: Any, topic: str) -> None:
+    def publishes(self, state: PublisherState, msg: Any) -> None:
         """Note that the running callback publishes."""
+        topic = state.topic
         record, work = self.engine.record, self.work
         if record is not None:
-            record(PUBLICATION, self.pool.clock.now(), self.vtid, id(publisher), id(msg))
+            record(PUBLICATION, self.pool.clock.now(), self.vtid, state.address, id(msg))
         if work is not None and topic not in work.entity.publishes:
             work.entity.publishes.add(topic)
         if not self.published:

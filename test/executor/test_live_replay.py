@@ -19,7 +19,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
-from .conftest import Spinning, wait_for
+from .conftest import is_idle, Spinning, wait_for
 from .declared import Declared
 
 GRAPH = """\
@@ -60,6 +60,43 @@ async def rectify() -> None:
         future: Any = Future()
         threading.Timer(0.004, future.set_result, (None,)).start()
         await future
+
+
+def test_entities_may_come_and_go_while_recorded(make_executor, make_node, tmp_path):
+    """A new one often gets the address of an earlier one: it is not taken for that."""
+    graph = """
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: step, timer: 10ms, publishes: [/left]}
+      - {name: tick, timer: 20ms, publishes: [/right]}
+  - node: /b
+    callbacks:
+      - {name: use, subscription: /left, deadline: 1s}
+      - {name: show, subscription: /right, deadline: 1s}
+"""
+    path, node, other, heard = tmp_path / 'live.mcap', make_node('a'), make_node('b'), []
+    executor = make_executor(loads(graph, 'live.yaml'), nodes=[node, other], trace=str(path))
+    with Spinning(executor):
+        for _ in range(6):
+            for period, topic in ((0.01, '/left'), (0.02, '/right')):
+                heard.clear()
+                publisher = node.create_publisher(Header, topic, 10)
+                made = [
+                    other.create_subscription(Header, topic, heard.append, 10),
+                    node.create_timer(period, lambda p=publisher: p.publish(Header())), publisher]
+                assert wait_for(lambda: heard)
+                other.destroy_subscription(made[0])
+                node.destroy_timer(made[1])
+                assert wait_for(lambda: is_idle(executor))
+                node.destroy_publisher(publisher)
+                del made, publisher
+    run = open_recording(path)
+    executions, sent = run.to_pandas('executions'), run.to_pandas('publications')
+    assert (executions['callback'] == executions['vertex']).all()
+    assert set(zip(sent['vertex'], sent['publisher'])) == {
+        ('/a:step', '/left'), ('/a:tick', '/right')}
 
 
 def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_path):
