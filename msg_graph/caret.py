@@ -99,7 +99,7 @@ class _Reader:
         text = self.text(tree, key) if text is None else text
         wrong = what.check(text)
         if wrong is not None:
-            raise GraphError(self._file, tree.line, f"'{key}': {wrong[0]}", wrong[1])
+            raise GraphError(self._file, tree.line, f"'{key}': {wrong.problem}", wrong.remedy)
         return text
 
     def node(self, tree: Mapping) -> DraftNode:

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 
 from msg_graph.duration import format_duration
-from msg_graph.errors import Collector, did_you_mean, GraphError, shown
+from msg_graph.errors import Collector, did_you_mean, for_each, listed, shown
 from msg_graph.include import as_text, read, resolve
 from msg_graph.language import CALLBACK_KEYS, Entry, FILE, NODE_KEYS, PATH_KEYS, TRIGGERS
 from msg_graph.model import Callback, Path, Process
@@ -54,59 +55,51 @@ def parse_declaration(text: str, file: str, path: str | None = None) -> Declarat
     if resolved is not tree:
         text = as_text(resolved)
     top = Entry(resolved, 'the declaration', FILE)
-    found = Collector()
-    workers: int | None = None
-    callbacks: list[Callback] = []
-    paths: list[Path] = []
     entries: dict[str, Entry] = {}
-    processes: tuple[Process, ...] = ()
-    with found:
-        workers = top.get('workers')
-    with found:
-        callbacks = _callbacks(top.get('nodes'), file, entries)
-    with found:
-        paths = _paths(top.get('paths') or [], entries)
+    found = Collector()
+    workers = found(top.get, 'workers')
+    callbacks = found(_callbacks, top, file, entries)
+    paths = found(_paths, top, entries)
     found.check()
-    with found:
-        processes = read_processes(top, (callback.node for callback in callbacks))
-    found.check()
+    processes = read_processes(top, (callback.node for callback in callbacks))
     return Declaration(file, text, workers, callbacks, paths, processes, entries)
 
 
-def read_processes(entry: Entry, nodes: Iterable[str]) -> tuple[Process, ...]:
+def read_processes(top: Entry, nodes: Iterable[str]) -> tuple[Process, ...]:
     """
-    Return the processes that an entry declares.
+    Return the processes that the entry of a file declares.
 
     :param nodes: the declared ones, in file order.
     """
-    said: dict[str, dict[str, int]] = entry.get('processes')
+    declared: Entry = top.get('processes')
     nodes = list(dict.fromkeys(nodes))
-    place: dict[str, str] = {}
+    process_of: dict[str, str] = {}
+
+    def place(process: str, node: str) -> None:
+        other = process_of.setdefault(node, process)
+        if node not in nodes:
+            raise declared.error(
+                process, f'there is no node {shown(node)}',
+                did_you_mean(node, nodes, 'name a node of the declaration'), item=node)
+        if other != process:
+            raise declared.error(
+                process, f'node {shown(node)} is in process {shown(other)}, too',
+                'remove one of them: a node runs in one process', item=node)
+
     found = Collector()
-    for process, lines in said.items():
-        for node, line in lines.items():
-            with found:
-                other = place.setdefault(node, process)
-                if node not in nodes:
-                    raise _error(entry, line, f'there is no node {shown(node)}',
-                                 did_you_mean(node, nodes, 'name a node of the declaration'))
-                if other != process:
-                    raise _error(
-                        entry, line, f'node {shown(node)} is in process {shown(other)}, too',
-                        'remove one of them: a node runs in one process')
+    for process in declared:
+        for node in found(declared.get, process) or ():
+            found(place, process, node)
     found.check()
-    processes = []
-    for i, process in enumerate(said):
-        here = tuple(n for n in nodes if place.get(n, process if i == 0 else None) == process)
+    processes: list[Process] = []
+    for process in declared:
+        rest = process if not processes else None
+        here = tuple(node for node in nodes if process_of.get(node, rest) == process)
         if not here:
-            raise entry.error('processes', f'no node runs in process {shown(process)}',
-                              'name one, or remove the process')
+            raise top.error('processes', f'no node runs in process {shown(process)}',
+                            'name one, or remove the process')
         processes.append(Process(process, here))
     return tuple(processes)
-
-
-def _error(entry: Entry, line: int, problem: str, remedy: str) -> GraphError:
-    return GraphError(entry.file, line, f"{entry.name}: 'processes': {problem}", remedy)
 
 
 def processes_text(processes: Iterable[Process]) -> str:
@@ -117,37 +110,32 @@ def processes_text(processes: Iterable[Process]) -> str:
     return text
 
 
-def _callbacks(nodes: list[Tree], file: str, entries: dict[str, Entry]) -> list[Callback]:
-    callbacks: list[Callback] = []
-    found = Collector()
-    for place, tree in enumerate(nodes, 1):
-        with found:
-            entry = Entry(tree, f'node {place}', NODE_KEYS)
-            node = entry.get('node')
-            entry.name = f'node {shown(node)}'
-            for number, callback_tree in enumerate(entry.get('callbacks'), 1):
-                name = f'callback {number} of node {shown(node)}'
-                with found:
-                    each = Entry(callback_tree, name, CALLBACK_KEYS)
-                    callback = _callback(each, node, file)
-                    other = entries.setdefault(callback.key, each)
-                    if other is not each:
-                        where = 'line ' if other.file == each.file else f'{other.file}:'
-                        raise each.error(
-                            'name', f'this name is taken in {where}{other.line}',
-                            'give each callback of a node a name of its own')
-                    callbacks.append(callback)
-    found.check()
-    return callbacks
+def _callbacks(top: Entry, file: str, entries: dict[str, Entry]) -> list[Callback]:
+    def of_node(numbered: tuple[int, Tree]) -> list[Callback]:
+        entry = Entry(numbered[1], f'node {numbered[0]}', NODE_KEYS)
+        node = entry.get('node')
+        entry.name = f'node {shown(node)}'
+        return for_each(enumerate(entry.get('callbacks'), 1), lambda each: _callback(
+            Entry(each[1], f'callback {each[0]} of {entry.name}', CALLBACK_KEYS), node, file,
+            entries))
+
+    return list(chain.from_iterable(for_each(enumerate(top.get('nodes'), 1), of_node)))
 
 
-def _callback(entry: Entry, node: str, top: str) -> Callback:
+def _callback(entry: Entry, node: str, top: str, entries: dict[str, Entry]) -> Callback:
     name = entry.get('name')
     key = f'{node}:{name}'
     entry.name = f'callback {shown(key)}'
-    kind = entry.one_of(TRIGGERS, 'what starts the callback')
+    kinds = [kind for kind in TRIGGERS if kind in entry]
+    if not kinds:
+        raise entry.error(
+            None, 'nothing says what starts the callback', f'add one of {", ".join(TRIGGERS)}')
+    if len(kinds) > 1:
+        raise entry.error(
+            kinds[1], f'{listed(kinds)} exclude each other', 'keep one, or make two callbacks')
+    kind = kinds[0]
     timer_period = entry.get('timer')
-    return Callback(
+    callback = Callback(
         node=node, name=name, key=key,
         kind=kind,  # type: ignore[arg-type]
         timer_period_ns=timer_period,
@@ -160,6 +148,12 @@ def _callback(entry: Entry, node: str, top: str) -> Callback:
             'max_active_jobs', 'holds_interpreter', 'keep', 'importance', 'tolerate')},
         line=entry.line,
         file=None if entry.file == top else entry.file)
+    other = entries.setdefault(key, entry)
+    if other is not entry:
+        where = 'line ' if other.file == entry.file else f'{other.file}:'
+        raise entry.error('name', f'this name is taken in {where}{other.line}',
+                          'give each callback of a node a name of its own')
+    return callback
 
 
 def _period(entry: Entry, timer_period: int | None) -> int | None:
@@ -176,17 +170,14 @@ def _period(entry: Entry, timer_period: int | None) -> int | None:
     return period
 
 
-def _paths(trees: list[Tree], entries: dict[str, Entry]) -> list[Path]:
-    paths: list[Path] = []
-    found = Collector()
-    for place, tree in enumerate(trees, 1):
-        with found:
-            entry = Entry(tree, f'path {place}', PATH_KEYS)
-            name = entry.get('name')
-            entry.name = f'path {shown(name)}'
-            path = Path(name, entry.get('callbacks'))
-            if entries.setdefault(name, entry) is not entry:
-                raise entry.error('name', 'this name is taken', 'give each path a name of its own')
-            paths.append(path)
-    found.check()
-    return paths
+def _paths(top: Entry, entries: dict[str, Entry]) -> list[Path]:
+    def read_path(numbered: tuple[int, Tree]) -> Path:
+        entry = Entry(numbered[1], f'path {numbered[0]}', PATH_KEYS)
+        name = entry.get('name')
+        entry.name = f'path {shown(name)}'
+        path = Path(name, entry.get('callbacks'))
+        if entries.setdefault(name, entry) is not entry:
+            raise entry.error('name', 'this name is taken', 'give each path a name of its own')
+        return path
+
+    return for_each(enumerate(top.get('paths'), 1), read_path)

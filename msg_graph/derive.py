@@ -8,7 +8,7 @@ Theory of operation
 Source: Yano and Azumi, "Multi-Deadline DAG Scheduling Model for Autonomous Driving Systems" (RTSS
 2024 work in progress), and the callback semantics of ROS 2.
 
-Rules 1, 2, 3 and 6 concern callbacks (``Links``), the others make vertices.
+Rules 1, 2, 3 and 6 concern callbacks (``_Links``), the others make vertices.
 
 1. *Trigger edges* come from topics: from each callback that publishes a topic to each subscription
    or sync callback that the topic starts. *Queue edges* (``reads``) start no callback; they only
@@ -46,12 +46,14 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 import gc
 from graphlib import CycleError, TopologicalSorter
+from itertools import pairwise
 from os import fspath, PathLike
 from typing import Any
 
 from msg_graph.declaration import Declaration, parse_declaration
 from msg_graph.draft import with_blanks
 from msg_graph.errors import Collector, did_you_mean, for_each, GraphError, listed, shown
+from msg_graph.language import CALLBACK_KEYS
 from msg_graph.model import Callback, Dag, Path, QueueEdge, TaskSet, Vertex
 from msg_graph.yamltext import decode, MAX_BYTES
 
@@ -130,114 +132,137 @@ def derive_task_set(
     :param without_deadline: receives the keys of the sinks without a deadline; None: they are
         errors.
     """
-    links = Links(declaration)
+    links = _Links(declaration)
+    callbacks = declaration.callbacks
     found = Collector()
-    order: list[int] = []
-    queue_edges: tuple[QueueEdge, ...] = ()
-    paths: tuple[Path, ...] = ()
-    with found:
-        links.check_triggers()
-    with found:
-        queue_edges = links.queue_edges()
+    found(for_each, callbacks, links.check_start)
+    queue_edges = found(for_each, [(each, read) for each in callbacks for read in each.reads],
+                        links.queue_edge)
     found.check()
-    with found:
-        order = links.order()
-    with found:
-        links.check_deadlines(without_deadline)
-    with found:
-        paths = links.paths(declaration)
+    order = found(links.order)
+    found(for_each, callbacks, lambda each: links.check_end(each, without_deadline))
+    found(for_each, declaration.paths, links.check_path)
     found.check()
-    expansion = _Expansion(links)
-    for callback in order:
-        expansion.expand(callback)
     return TaskSet(
-        dags=_dags(links, expansion),
-        callbacks=tuple(declaration.callbacks),
-        queue_edges=queue_edges,
-        paths=paths,
-        workers=declaration.workers,
-        file=declaration.file,
-        text=declaration.text,
-        processes=declaration.processes,
-    )
+        dags=_dags(links, _vertices(links, order)), callbacks=tuple(callbacks),
+        queue_edges=tuple(queue_edges), paths=tuple(declaration.paths),
+        workers=declaration.workers, file=declaration.file, text=declaration.text,
+        processes=declaration.processes)
 
 
-class Links:
+class _Links:
     """Publishers and subscribers by topic; callbacks are places in the file."""
 
     def __init__(self, declaration: Declaration) -> None:
         self.entries = declaration.entries
         self.callbacks = declaration.callbacks
-        self.by_key = {callback.key: callback for callback in self.callbacks}
+        self._by_key = {callback.key: callback for callback in self.callbacks}
         self.publishers: dict[str, list[int]] = {}
-        self.started: dict[str, list[int]] = {}
+        self._started: dict[str, list[int]] = {}
         for place, callback in enumerate(self.callbacks):
             for topic in callback.publishes:
                 self.publishers.setdefault(topic, []).append(place)
             for topic in callback.topics:
-                self.started.setdefault(topic, []).append(place)
+                self._started.setdefault(topic, []).append(place)
 
-    @staticmethod
-    def is_source(callback: Callback) -> bool:
-        """Return whether a job starts with this callback (rule 2), after ``check_triggers``."""
-        return callback.period_ns is not None
-
-    def check_triggers(self) -> None:
+    def check_start(self, callback: Callback) -> None:
         """Check sources, and that the topics of all other callbacks are published (rule 2)."""
-        for_each(self.callbacks, self._check_trigger)
-
-    def _check_trigger(self, callback: Callback) -> None:
-        if callback.kind == 'service' and callback.period_ns is None:
-            raise self.entries[callback.key].error(
-                'service', 'a service is a source, and it has no period',
-                "add 'period:' with the time between two requests")
+        error = self.entries[callback.key].error
+        is_source = _is_source(callback)
+        if callback.kind == 'service' and not is_source:
+            raise error('service', 'a service is a source, and it has no period',
+                        "add 'period:' with the time between two requests")
         # for a timer, header_stamp describes the messages it sends to other processes
         if callback.kind == 'timer' and callback.release_from == 'source_timestamp':
-            raise self.entries[callback.key].error(
-                'release_from', 'a timer is released when it is due',
-                "remove 'release_from:', or start the callback by a subscription")
-        if self.is_source(callback):
-            self._check_source(callback)
-        else:
-            self._check_started(callback)
-
-    def _check_source(self, callback: Callback) -> None:
-        if callback.kind == 'sync':
-            raise self.entries[callback.key].error(
-                'period', 'a sync callback joins topics, so it cannot be a source',
-                "remove 'period:' and declare the publishers of its topics")
+            raise error('release_from', 'a timer is released when it is due',
+                        "remove 'release_from:', or start the callback by a subscription")
+        if callback.kind == 'sync' and is_source:
+            raise error('period', 'a sync callback joins topics, so it cannot be a source',
+                        "remove 'period:' and declare the publishers of its topics")
+        if not is_source:
+            self._check_keys(callback, ('sink',), 'a topic of this graph starts this one',
+                             'move it to the source callback')
         for topic in callback.topics:
-            if topic in self.publishers:
-                publisher = self.callbacks[self.publishers[topic][0]].key
-                raise self.entries[callback.key].error(
-                    'period', f'only a source has a period, but {shown(publisher)} publishes '
-                    f'{shown(topic)}',
-                    "remove 'period:', or take the topic out of that callback's 'publishes:'")
-
-    def _check_started(self, callback: Callback) -> None:
-        for key in ('dag', 'max_active_jobs', 'on_late'):
-            if self.entries[callback.key].has(key):
-                raise self._only_source(callback, key)
-        if callback.release_from != 'arrival':
-            raise self._only_source(callback, 'release_from')
-        for topic in callback.topics:
-            if topic not in self.publishers:
+            publishers = self.publishers.get(topic)
+            if is_source and publishers:
+                raise error('period', 'only a source has a period, but '
+                            f'{shown(self.callbacks[publishers[0]].key)} publishes {shown(topic)}',
+                            "remove 'period:', or take the topic out of that callback's "
+                            "'publishes:'")
+            if not is_source and not publishers:
                 remedy = "add it to a 'publishes:'"
                 if callback.kind == 'subscription':
                     remedy += ", or add 'period:' if it comes from outside of the graph"
-                raise self.entries[callback.key].error(
-                    callback.kind, f'no callback publishes {shown(topic)}',
-                    did_you_mean(topic, self.publishers, remedy), item=topic)
+                raise error(callback.kind, f'no callback publishes {shown(topic)}',
+                            did_you_mean(topic, self.publishers, remedy), item=topic)
 
-    def _only_source(self, callback: Callback, key: str) -> GraphError:
-        return self.entries[callback.key].error(
-            key, f"'{key}:' is for the source of a DAG, and a topic of this graph starts this one",
-            'move it to the source callback')
+    def check_end(self, callback: Callback, without: list[str] | None) -> None:
+        """Check that exactly the sinks have deadlines (rule 6); or collect those without."""
+        topic = next((t for t in callback.publishes if t in self._started), None)
+        if topic is not None:
+            after = self.callbacks[self._started[topic][0]].key
+            self._check_keys(callback, ('source',) if _is_source(callback) else (),
+                             f'this callback starts {shown(after)} by {shown(topic)}',
+                             "move it to the sinks after it, or read that topic by a queue edge "
+                             "('reads:')")
+        elif callback.deadline_ns is None and without is not None:
+            without.append(callback.key)
+        elif callback.deadline_ns is None:
+            raise self.entries[callback.key].error(
+                None, 'it is a sink (it starts no other callback) and has no deadline',
+                "add 'deadline:'")
+
+    def _check_keys(
+        self, callback: Callback, may_be: tuple[str, ...], why: str, remedy: str
+    ) -> None:
+        """Refuse keys for sources and sinks on other callbacks, unless they say the default."""
+        entry = self.entries[callback.key]
+        for key in entry:
+            kind, of = CALLBACK_KEYS[key].kind, CALLBACK_KEYS[key].of
+            if of and not set(of).intersection(may_be) and entry.get(key) != kind.missing:
+                raise entry.error(key, f"'{key}:' is for a {' or a '.join(of)}, and {why}", remedy)
+
+    def queue_edge(self, reading: tuple[Callback, str]) -> QueueEdge:
+        """Return the queue edge of a callback that reads a topic or variable (rule 1)."""
+        callback, read = reading
+        error = self.entries[callback.key].error
+        if read.startswith('/'):
+            writers = tuple(self.callbacks[place].key for place in self.publishers.get(read, ()))
+            if not writers:
+                raise error('reads', f'it reads {shown(read)}, which no callback publishes',
+                            did_you_mean(read, self.publishers, "add it to a 'publishes:'"),
+                            item=read)
+            return QueueEdge(callback.key, read, writers)
+        writer = f'{callback.node}:{read}'
+        if writer not in self._by_key:
+            siblings = [each.name for each in self.callbacks if each.node == callback.node]
+            raise error(
+                'reads', f'it reads the unknown callback {shown(read)}',
+                did_you_mean(read, siblings, f'name a callback of its node: {listed(siblings)}'),
+                item=read)
+        return QueueEdge(callback.key, None, (writer,))
+
+    def check_path(self, path: Path) -> None:
+        """Check that each step of a path is a trigger or queue edge (rule 1)."""
+        error = self.entries[path.name].error
+        for key in path.callbacks:
+            if key not in self._by_key:
+                raise error('callbacks', f'unknown callback {shown(key)}',
+                            did_you_mean(key, self._by_key, 'name a declared callback'), item=key)
+        for before, after in pairwise(map(self._by_key.__getitem__, path.callbacks)):
+            reads_variable = before.node == after.node and before.name in after.reads
+            if not reads_variable and set(before.publishes).isdisjoint(
+                    after.topics + after.reads):
+                raise error(
+                    'callbacks', 'no trigger or queue edge leads from '
+                    f'{shown(before.key)} to {shown(after.key)}',
+                    "name the callbacks between them, or add what is missing to 'reads:'",
+                    item=after.key)
 
     def order(self) -> list[int]:
         """Return the callbacks in a topological order; a cycle is an error (rule 3)."""
         before: dict[Any, Iterable[Any]] = dict(self.publishers)
-        before.update((place, () if self.is_source(callback) else callback.topics)
+        before.update((place, () if _is_source(callback) else callback.topics)
                       for place, callback in enumerate(self.callbacks))
         sorter = TopologicalSorter(before)
         with suppress(CycleError):  # callbacks outside of a cycle are sorted nevertheless
@@ -289,168 +314,79 @@ class Links:
                 places = list(walk)
                 yield places[places.index(place):][::-1]
 
-    def check_deadlines(self, without: list[str] | None) -> None:
-        """Check that exactly the sinks have deadlines (rule 6); or collect those without."""
-        for_each(self.callbacks, lambda each: self._check_deadline(each, without))
 
-    def _check_deadline(self, callback: Callback, without: list[str] | None) -> None:
-        topic = next((t for t in callback.publishes if t in self.started), None)
-        if topic is None:
-            if callback.deadline_ns is None and without is not None:
-                without.append(callback.key)
-            elif callback.deadline_ns is None:
-                raise self.entries[callback.key].error(
-                    None, 'it is a sink (it starts no other callback) and has no deadline',
-                    "add 'deadline:'")
-        elif callback.deadline_ns is not None:
-            after = self.callbacks[self.started[topic][0]].key
-            raise self.entries[callback.key].error(
-                'deadline', f'it has a deadline but is no sink: it starts {shown(after)} by '
-                f'{shown(topic)}',
-                'move the deadline to the sinks after it, or read that topic by a queue edge '
-                "('reads:')")
-        if topic is not None:
-            self._check_no_sink(callback)
-
-    def _check_no_sink(self, callback: Callback) -> None:
-        entry = self.entries[callback.key]
-        for key in ('importance', 'tolerate'):
-            if entry.has(key):
-                raise entry.error(
-                    key, f"'{key}:' is for a sink, and this callback starts another one",
-                    'move it to the sinks after it')
-        if entry.has('keep') and not self.is_source(callback):
-            raise entry.error(
-                'keep', "'keep:' is for a source or a sink, and this callback is neither",
-                "move it, or give the topic's QoS a depth of 1")
-
-    def queue_edges(self) -> tuple[QueueEdge, ...]:
-        """Return the queue edges, each with its writers (rule 1)."""
-        return tuple(for_each(
-            [(each, read) for each in self.callbacks for read in each.reads],
-            self._queue_edge))
-
-    def _queue_edge(self, reading: tuple[Callback, str]) -> QueueEdge:
-        callback, read = reading
-        if read.startswith('/'):
-            writers = tuple(self.callbacks[p].key for p in self.publishers.get(read, ()))
-            if not writers:
-                raise self.entries[callback.key].error(
-                    'reads', f'it reads {shown(read)}, which no callback publishes',
-                    did_you_mean(read, self.publishers, "add it to a 'publishes:'"), item=read)
-            return QueueEdge(callback.key, read, writers)
-        writer = f'{callback.node}:{read}'
-        if writer not in self.by_key:
-            siblings = [c.name for c in self.callbacks if c.node == callback.node]
-            raise self.entries[callback.key].error(
-                'reads', f'it reads the unknown callback {shown(read)}',
-                did_you_mean(read, siblings, f'name a callback of its node: {listed(siblings)}'),
-                item=read)
-        return QueueEdge(callback.key, None, (writer,))
-
-    def paths(self, declaration: Declaration) -> tuple[Path, ...]:
-        """Return the declared paths; each step must be a trigger or queue edge (rule 1)."""
-        return tuple(for_each(declaration.paths, self._path))
-
-    def _path(self, path: Path) -> Path:
-        entry, keys = self.entries[path.name], path.callbacks
-        for key in keys:
-            if key not in self.by_key:
-                raise entry.error(
-                    'callbacks', f'unknown callback {shown(key)}',
-                    did_you_mean(key, self.by_key, 'name a declared callback'), item=key)
-        for before, after in zip(keys, keys[1:]):
-            if not self._linked(self.by_key[before], self.by_key[after]):
-                raise entry.error(
-                    'callbacks', 'no trigger or queue edge leads from '
-                    f'{shown(before)} to {shown(after)}',
-                    "name the callbacks between them, or add what is missing to 'reads:'",
-                    item=after)
-        return path
-
-    def _linked(self, before: Callback, after: Callback) -> bool:
-        if before.node == after.node and before.name in after.reads:
-            return True
-        return not set(before.publishes).isdisjoint(after.topics + after.reads)
+def _is_source(callback: Callback) -> bool:
+    return callback.period_ns is not None
 
 
-@dataclass
-class _Expansion:
-    """Vertices of all DAGs as columns, made callback by callback in topological order (rule 4)."""
+@dataclass(eq=False, slots=True)
+class _Vertex:
+    """A vertex in the making; callbacks are places in the file, ``index`` is that in its DAG."""
 
-    links: Links
-    callback: list[int] = field(default_factory=list)
-    predecessors: list[list[int]] = field(default_factory=list)
-    source: list[int] = field(default_factory=list)
-    of_callback: dict[int, list[int]] = field(default_factory=dict)
-    edges: int = 0
+    callback: int
+    source: int
+    before: list[_Vertex]
+    after: list[_Vertex] = field(default_factory=list)
+    index: int = -1
 
-    def expand(self, place: int) -> None:
-        """Make the vertices of one callback, after those of its publishers."""
-        callback = self.links.callbacks[place]
-        if self.links.is_source(callback):
-            self._bound(place, 1, 0)
-            self.of_callback[place] = [self._add(place, [], place)]
-            return
-        publishers = self.links.publishers
-        before = sorted({p for topic in callback.topics for p in publishers[topic]})
-        count = sum(len(self.of_callback[publisher]) for publisher in before)
-        self._bound(place, 1 if callback.kind == 'sync' else count, count)
-        vertices = [v for publisher in before for v in self.of_callback[publisher]]
-        if callback.kind == 'sync':
-            self._check_one_source(place, vertices)
-            self.of_callback[place] = [self._add(place, vertices, self.source[vertices[0]])]
-        else:
-            self.of_callback[place] = [self._add(place, [v], self.source[v]) for v in vertices]
 
-    def _add(self, place: int, predecessors: list[int], source: int) -> int:
-        self.callback.append(place)
-        self.predecessors.append(predecessors)
-        self.source.append(source)
-        return len(self.callback) - 1
-
-    def _bound(self, place: int, vertices: int, edges: int) -> None:
-        self.edges += edges
-        for what, count, most in (
-            ('vertices', len(self.callback) + vertices, MAX_VERTICES),
-            ('edges', self.edges, MAX_EDGES),
-        ):
-            if count > most:
-                raise self.links.entries[self.links.callbacks[place].key].error(
-                    None, f'with it the DAGs have {count} {what}, more than {most}',
+def _vertices(links: _Links, order: list[int]) -> list[list[_Vertex]]:
+    """Make the vertices of each callback, after those of its publishers (rules 4 and 5)."""
+    vertices: list[list[_Vertex]] = [[] for _ in links.callbacks]
+    total = {'vertices': 0, 'edges': 0}
+    for place in order:
+        callback = links.callbacks[place]
+        publishers = set() if _is_source(callback) else {
+            publisher for topic in callback.topics for publisher in links.publishers[topic]}
+        count = sum(len(vertices[publisher]) for publisher in publishers)
+        total['vertices'] += count if callback.kind == 'subscription' and publishers else 1
+        total['edges'] += count
+        for what, most in (('vertices', MAX_VERTICES), ('edges', MAX_EDGES)):
+            if total[what] > most:
+                raise links.entries[callback.key].error(
+                    None, f'with it the DAGs have {total[what]} {what}, more than {most}',
                     'a callback runs once for each publisher before it: use fewer publishers for '
                     "one topic, or read some by a queue edge ('reads:')")
-
-    def _check_one_source(self, place: int, vertices: list[int]) -> None:
-        first = self.source[vertices[0]]
-        other = next((v for v in vertices if self.source[v] != first), None)
-        if other is None:
-            return
-        callback = self.links.callbacks[place]
-        published = self.links.callbacks[self.callback[other]].publishes
-        topic = next(topic for topic in callback.topics if topic in published)
-        keys = [self.links.callbacks[source].key for source in (first, self.source[other])]
-        raise self.links.entries[callback.key].error(
-            'sync',
-            f'it joins two sources, {shown(keys[0])} and {shown(keys[1])}, but a DAG has one',
-            f"read {shown(topic)} by a queue edge: take it out of 'sync:' and list it under "
-            "'reads:'", item=topic)
+        before = [vertex for publisher in sorted(publishers) for vertex in vertices[publisher]]
+        if not before:
+            vertices[place] = [_Vertex(place, place, [])]
+        elif callback.kind == 'sync':
+            _check_one_source(links, callback, before)
+            vertices[place] = [_Vertex(place, before[0].source, before)]
+        else:
+            vertices[place] = [_Vertex(place, each.source, [each]) for each in before]
+    return vertices
 
 
-def _dags(links: Links, expansion: _Expansion) -> tuple[Dag, ...]:
+def _check_one_source(links: _Links, callback: Callback, before: list[_Vertex]) -> None:
+    other = next((v for v in before if v.source != before[0].source), None)
+    if other is None:
+        return
+    published = links.callbacks[other.callback].publishes
+    topic = next(topic for topic in callback.topics if topic in published)
+    first, second = (shown(links.callbacks[v.source].key) for v in (before[0], other))
+    raise links.entries[callback.key].error(
+        'sync', f'it joins two sources, {first} and {second}, but a DAG has one',
+        f"read {shown(topic)} by a queue edge: take it out of 'sync:' and list it under "
+        "'reads:'", item=topic)
+
+
+def _dags(links: _Links, vertices: list[list[_Vertex]]) -> tuple[Dag, ...]:
     """Sort the vertices into DAGs and number both (rules 5 and 7)."""
-    members: dict[int, list[int]] = {
-        place: [] for place, callback in enumerate(links.callbacks) if links.is_source(callback)}
-    for place in range(len(links.callbacks)):
-        for vertex in expansion.of_callback[place]:
-            members[expansion.source[vertex]].append(vertex)
+    members: dict[int, list[_Vertex]] = {
+        place: [] for place, callback in enumerate(links.callbacks) if _is_source(callback)}
+    for of_callback in vertices:
+        for vertex in of_callback:
+            vertex.index = len(members[vertex.source])
+            members[vertex.source].append(vertex)
     names = _dag_names(links, list(members))
+    is_single = [len(of_callback) == 1 for of_callback in vertices]
     return tuple(
-        _dag(links, expansion, source, names[source], index, vertices)
-        for index, (source, vertices) in enumerate(members.items()))
+        _dag(links.callbacks, place, names[place], index, of_dag, is_single)
+        for index, (place, of_dag) in enumerate(members.items()))
 
 
-def _dag_names(links: Links, sources: list[int]) -> dict[int, str]:
+def _dag_names(links: _Links, sources: list[int]) -> dict[int, str]:
     """Return the name of each source's DAG (rule 7)."""
     names: dict[int, str] = {}
     taken: dict[str, int] = {}
@@ -473,45 +409,35 @@ def _dag_names(links: Links, sources: list[int]) -> dict[int, str]:
 
 
 def _dag(
-    links: Links, expansion: _Expansion, source: int, name: str, index: int, members: list[int]
+    callbacks: list[Callback], source: int, name: str, index: int, members: list[_Vertex],
+    is_single: list[bool],
 ) -> Dag:
-    local = {vertex: i for i, vertex in enumerate(members)}
-    predecessors = [sorted(local[p] for p in expansion.predecessors[v]) for v in members]
-    successors: list[list[int]] = [[] for _ in members]
-    for after, befores in enumerate(predecessors):
-        for before in befores:
-            successors[before].append(after)
-    callbacks = [links.callbacks[expansion.callback[vertex]] for vertex in members]
-    for callback, after_it in zip(callbacks, successors):
-        topics = {topic: n for n, topic in enumerate(callback.publishes)}
-        after_it.sort(key=lambda v: min(topics[t] for t in callbacks[v].topics if t in topics))
-    times_here = Counter(expansion.callback[vertex] for vertex in members)
+    """Return a DAG; ``is_single`` says by callback whether it is only one vertex of all DAGs."""
+    for vertex in members:
+        for before in vertex.before:
+            before.after.append(vertex)
+    number_here = Counter(vertex.callback for vertex in members)
     seen: Counter[int] = Counter()
     vertices = []
-    for i, member in enumerate(members):
-        place = expansion.callback[member]
-        callback = callbacks[i]
-        seen[place] += 1
-        vertex_name = callback.key
-        if len(expansion.of_callback[place]) > 1:
-            vertex_name += f'@{name}'
-        if times_here[place] > 1:
-            vertex_name += f'#{seen[place]}'
+    for vertex in members:
+        callback = callbacks[vertex.callback]
+        vertex_name = callback.key if is_single[vertex.callback] else f'{callback.key}@{name}'
+        if number_here[vertex.callback] > 1:
+            seen[vertex.callback] += 1
+            vertex_name += f'#{seen[vertex.callback]}'
+        topics = {topic: place for place, topic in enumerate(callback.publishes)}
+        after = sorted(vertex.after, key=lambda v: min(
+            topics[topic] for topic in callbacks[v.callback].topics if topic in topics))
         vertices.append(Vertex(
-            name=vertex_name, callback=callback, dag=index, index=i,
-            predecessors=tuple(predecessors[i]), successors=tuple(successors[i]),
-            deadline_ns=callback.deadline_ns))
-    first = links.callbacks[source]
+            name=vertex_name, callback=callback, dag=index, index=vertex.index,
+            predecessors=tuple(sorted(v.index for v in vertex.before)),
+            successors=tuple(v.index for v in after), deadline_ns=callback.deadline_ns))
+    first = callbacks[source]
     assert first.period_ns is not None
     return Dag(
-        name=name,
-        index=index,
-        period_ns=first.period_ns,
-        vertices=tuple(vertices),
-        source=local[expansion.of_callback[source][0]],
+        name=name, index=index, period_ns=first.period_ns, vertices=tuple(vertices),
+        source=next(v.index for v in members if v.callback == source),
         sinks=tuple(v.index for v in vertices if not v.successors),
-        edges=tuple((i, after) for i, each in enumerate(successors) for after in sorted(each)),
-        release_from=first.release_from,
-        on_late=first.on_late,
-        max_active_jobs=first.max_active_jobs,
-    )
+        edges=tuple((v.index, after) for v in vertices for after in sorted(v.successors)),
+        release_from=first.release_from, on_late=first.on_late,
+        max_active_jobs=first.max_active_jobs)

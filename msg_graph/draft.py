@@ -34,7 +34,7 @@ from dataclasses import dataclass, field
 import re
 
 from msg_graph.duration import DAY, exact_duration, format_duration, MICROSECOND
-from msg_graph.errors import GraphError, GraphErrors, printable
+from msg_graph.errors import GraphError, printable, together
 from msg_graph.language import PATH
 from msg_graph.model import ExecutionTime, ReleaseFrom
 from msg_graph.yamltext import plain_scalar
@@ -210,8 +210,7 @@ def with_blanks(error: GraphError, text: str, file: str) -> GraphError:
     unfinished = {bisect_right(starts, blank.line or 0) for blank in blanks}
     others = [each for each in error.errors if each.file != file or each.line is None
               or bisect_right(starts, each.line) not in unfinished]
-    found = (*blanks, *others)
-    return found[0] if len(found) == 1 else GraphErrors(found)
+    return together([*blanks, *others])
 
 
 class _Writer:

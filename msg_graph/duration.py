@@ -7,7 +7,7 @@ from __future__ import annotations
 from decimal import Decimal, ROUND_HALF_EVEN
 import re
 
-from msg_graph.errors import shown
+from msg_graph.errors import shown, ValueProblem
 
 MICROSECOND = 1_000
 MILLISECOND = 1_000_000
@@ -27,22 +27,8 @@ _NUMBER = r'(?P<sign>[+-]?)(?P<number>[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18
 _DURATION = re.compile(_NUMBER + r'[ \t]*(?P<unit>[^\W\d_]*)')
 
 
-class DurationError(ValueError):
-    """
-    A text that is not a valid time.
-
-    :ivar problem: what is wrong with it.
-    :ivar remedy: what to write instead.
-    """
-
-    def __init__(self, problem: str, remedy: str) -> None:
-        super().__init__(problem, remedy)
-        self.problem = problem
-        self.remedy = remedy
-
-    def __str__(self) -> str:
-        """Return the error as one line."""
-        return f'{self.problem}: {self.remedy}'
+class DurationError(ValueProblem):
+    """A text that is not a valid time."""
 
 
 def parse_duration(

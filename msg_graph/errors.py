@@ -4,10 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 import difflib
-from types import TracebackType
-from typing import TypeVar
+from typing import Any, cast, TypeVar
 
 T = TypeVar('T')
 R = TypeVar('R')
@@ -72,47 +71,60 @@ class GraphErrors(GraphError):
         return f'{self.errors[0]} (and {len(self.errors) - 1} more)'
 
 
+class ValueProblem(ValueError):
+    """
+    A text that is no valid value; ``str()`` is one line.
+
+    :ivar problem: what is wrong with it.
+    :ivar remedy: what to write instead.
+    """
+
+    def __init__(self, problem: str, remedy: str) -> None:
+        super().__init__(problem, remedy)
+        self.problem = problem
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        return f'{self.problem}: {self.remedy}'
+
+
+def together(errors: Sequence[GraphError]) -> GraphError:
+    """Return several errors, at least one, as one."""
+    return errors[0] if len(errors) == 1 else GraphErrors(tuple(errors))
+
+
 class Collector:
     """
     Collects errors that do not depend on each other.
 
-    It is a context manager that collects an error each time it is entered; ``check`` raises the
-    collected ones. At ``MOST_ERRORS`` it raises at once: more are not read, and the search for
-    similar words takes time.
+    ``check`` raises the collected ones. At ``MOST_ERRORS`` they are raised at once: more are not
+    read, and the search for similar words takes time.
     """
 
     def __init__(self) -> None:
-        self.errors: list[GraphError] = []
-        self._full: GraphErrors | None = None
+        self._errors: list[GraphError] = []
 
-    def __enter__(self) -> Collector:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> bool:
-        if not isinstance(error, GraphError) or error is self._full:
-            return False
-        self.errors.extend(error.errors)
-        if len(self.errors) >= MOST_ERRORS:
-            self._full = GraphErrors(tuple(self.errors[:MOST_ERRORS]))
-            raise self._full from None
-        return True
+    def __call__(self, work: Callable[..., R], *arguments: Any) -> R:
+        """Return what a function returns; if it raises an error, ``check`` raises it."""
+        result: Any = None  # if it fails; not used then, since ``check`` raises
+        try:
+            result = work(*arguments)
+        except GraphError as error:
+            self._errors.extend(error.errors)
+        if len(self._errors) >= MOST_ERRORS:
+            self.check()
+        return cast(R, result)
 
     def check(self) -> None:
         """End a stage: the next one would only find consequences of these errors."""
-        if len(self.errors) == 1:
-            raise self.errors[0]
-        if self.errors:
-            raise GraphErrors(tuple(self.errors))
+        if self._errors:
+            raise together(self._errors[:MOST_ERRORS])
 
 
 def for_each(items: Iterable[T], work: Callable[[T], R]) -> list[R]:
     """Apply a function to each item; return the results."""
     found = Collector()
-    results: list[R] = []
-    for item in items:
-        with found:
-            results.append(work(item))
+    results = [found(work, item) for item in items]
     found.check()
     return results
 

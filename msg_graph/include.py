@@ -95,7 +95,7 @@ def _yaml_node(tree: Tree) -> yaml.Node:
             'tag:yaml.org,2002:seq', [_yaml_node(item) for item in tree.items],
             flow_style=all(isinstance(item, Scalar) for item in tree.items))
     return yaml.MappingNode('tag:yaml.org,2002:map', [
-        (_yaml_node(Scalar('', 0, key, True)), _yaml_node(value))
+        (_yaml_node(Scalar('', 0, key)), _yaml_node(value))
         for key, value in tree.entries.items()], flow_style=False)
 
 
@@ -118,12 +118,12 @@ class _Resolver:
                 None, f'with all includes there are more than {MAX_SIZE} entries',
                 'include less, or split it into several graphs')
         parts: dict[str, list[Tree]] = {'nodes': [], 'paths': []}
-        for place, each in enumerate(top.get('include') or (), 1):
+        for place, each in enumerate(top.get('include'), 1):
             inner = self._included(each, place, chain)
             for key, items in parts.items():
-                items += Entry(inner, '', FILE).get(key) or () if key in inner.entries else ()
+                items += _items(inner, key)
         for key, items in parts.items():
-            items += top.get(key) if top.has(key) else ()
+            items += top.get(key) if key in top else ()
         resolved.entries = {
             key: value for key, value in resolved.entries.items()
             if key not in ('include', 'arguments')} | {
@@ -137,7 +137,8 @@ class _Resolver:
             tree.entries['file'], tree.key_lines['file'] = short, short.line
         entry = Entry(tree, f'include {place}', INCLUDE)
         path, name = self._locate(entry, chain)
-        values = {key: text for key, text, _ in entry.get('set')}
+        given: Entry = entry.get('set')
+        values = {key: given.get(key) for key in given}
         return _renamed(
             entry, self.file(self._read(entry, path, name), values, [*chain, (path, name)]))
 
@@ -245,7 +246,8 @@ def _renamed(entry: Entry, inner: Mapping) -> Mapping:
     :param entry: of ``include:``.
     """
     space: str = entry.get('namespace') or ''
-    remap: dict[str, str] = {old: new for old, new, _ in entry.get('remap')}
+    remapped: Entry = entry.get('remap')
+    remap: dict[str, str] = {old: remapped.get(old) for old in remapped}
     seen: set[str] = set()
 
     def name(text: str) -> str:
@@ -273,11 +275,10 @@ def _renamed(entry: Entry, inner: Mapping) -> Mapping:
     for each in _items(inner, 'paths'):
         _rename(each, ('callbacks',), key)
         _rename(each, ('name',), path)
-    for old, _, line in entry.get('remap'):
+    for old in remap:
         if old not in seen:
-            raise GraphError(
-                entry.file, line, f'{entry.name}: it remaps {shown(old)}, which the included '
-                'file does not name', did_you_mean(old, seen, "remove it from 'remap:'"))
+            raise remapped.error(old, f'the included file does not name {shown(old)}',
+                                 did_you_mean(old, seen, "remove it from 'remap:'"))
     return inner
 
 

@@ -6,11 +6,12 @@ The language of declarations: every key with the kind of its value, for parser a
 Theory of operation
 -------------------
 An *entry* is a mapping of the declaration. A table lists its keys, each with the *kind* of its
-value. A kind reads a value, with errors that name file, line and entry, and has its part of the
-JSON Schema. So the tables below are the only description of a file: the parser uses them, and the
-JSON Schema is made from them.
+value. A kind reads a value, and has its part of the JSON Schema. So the tables below are the only
+description of a file: the parser uses them, and the JSON Schema is made from them.
 
-A *name* of a node, topic, callback, … is a text that is valid as such.
+There are three kinds: a single value (``scalar``), a list (``many``) and a mapping with keys of
+the user (``table``). A single value is text; a function turns it into a time, a name, … or says
+what is wrong with it. Errors name the entry and the key (*where*), file and line.
 
 The schema is of draft 7, the one best supported by language servers for YAML. It describes single
 entries; only ``load`` checks the rules about several (publishers, cycles, sinks).
@@ -18,7 +19,7 @@ entries; only ``load`` checks the rules about several (publishers, cycles, sinks
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
 import math
@@ -26,8 +27,8 @@ import os
 import re
 from typing import Any
 
-from msg_graph.duration import DAY, DurationError, MICROSECOND, parse_duration, UNITS
-from msg_graph.errors import did_you_mean, GraphError, listed, shown
+from msg_graph.duration import DAY, MICROSECOND, parse_duration, UNITS
+from msg_graph.errors import did_you_mean, GraphError, shown, ValueProblem
 from msg_graph.model import ExecutionTime, MOST_WORKERS, WeaklyHard
 from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
@@ -44,8 +45,8 @@ _USE: Schema = {'type': 'string', 'pattern': ARGUMENT_USE}
 _ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
 _WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
 
-Check = Callable[[str], 'tuple[str, str] | None']
-"""Checks a text; returns the problem and its remedy, or None."""
+Check = Callable[[str], ValueProblem | None]
+"""Checks a text; returns what is wrong with it, or None."""
 
 
 @dataclass(frozen=True)
@@ -65,22 +66,30 @@ class Name:
         """Return whether it is a full name of the ROS graph, as of a node or topic."""
         return self.pattern is _ROS_NAME
 
-    def check(self, text: str) -> tuple[str, str] | None:
-        """Return the problem of a name and its remedy, or None."""
-        what = f'{self.what} name'
+    def check(self, text: str) -> ValueProblem | None:
+        """Return what is wrong with a name, or None."""
         if self.is_global and not text.startswith('/'):
-            return (f'{shown(text)} is not an absolute {what}',
-                    f'write it in full, as {shown("/" + text.lstrip("~/"))}')
+            return ValueProblem(f'{shown(text)} is not an absolute {self.what} name',
+                                f'write it in full, as {shown("/" + text.lstrip("~/"))}')
         if not self.pattern.fullmatch(text):
             if self.is_global:
-                return (f'{shown(text)} is not a valid {what}',
-                        "use '/' and words of letters, digits and '_' that start with no digit")
-            return (f'{shown(text)} is no name for a {self.what}',
-                    "use letters, digits, '_', '-' and '.'")
+                return ValueProblem(
+                    f'{shown(text)} is not a valid {self.what} name',
+                    "use '/' and words of letters, digits and '_' that start with no digit")
+            return ValueProblem(f'{shown(text)} is no name for a {self.what}',
+                                "use letters, digits, '_', '-' and '.'")
         if len(text) > self.longest:
-            return (f'the {what if self.is_global else "name"} {shown(text)} is too long',
-                    f'use at most {self.longest} characters')
+            return ValueProblem(f'the {self.what} name {shown(text)} is too long',
+                                f'use at most {self.longest} characters')
         return None
+
+    @property
+    def schema(self) -> Schema:
+        """Return the JSON Schema."""
+        return {
+            # YAML reads some short names as numbers, and this program does not.
+            'type': 'string' if self.is_global else ['string', 'integer'],
+            'pattern': f'^(?:{self.pattern.pattern})$|{ARGUMENT_USE}', 'maxLength': self.longest}
 
 
 NODE = Name('node', _ROS_NAME)  # after rmw_validate_node_name and its namespaces
@@ -93,21 +102,16 @@ PATH = Name('path')
 PROCESS = Name('process')
 
 
-def check_read(text: str) -> tuple[str, str] | None:
-    """Check an entry of ``reads``: a topic, or the name of a callback of the same node."""
-    if ':' in text:
-        return (
-            f'{shown(text)} names a callback with its node',
-            'name the topic that is taken, or just the name of a callback of the same node')
-    return (TOPIC if text.startswith('/') else CALLBACK).check(text)
+def kind_of(tree: Tree) -> str:
+    """Return a description of a tree."""
+    if isinstance(tree, Scalar):
+        return 'an empty value' if tree.is_null else f'the text {shown(tree.text)}'
+    return 'a list' if isinstance(tree, Sequence) else 'a mapping'
 
 
-def check_key(text: str) -> tuple[str, str] | None:
-    """Check the key of a callback, ``/node:callback``."""
-    node, colon, name = text.rpartition(':')
-    if not colon:
-        return (f'{shown(text)} names no callback', "write '/node:callback'")
-    return NODE.check(node) or CALLBACK.check(name)
+def error_at(value: Tree, where: str, problem: str, remedy: str) -> GraphError:
+    """Return the error about a value."""
+    return GraphError(value.file, value.line, f'{where}: {problem}', remedy)
 
 
 @dataclass(frozen=True)
@@ -115,23 +119,29 @@ class Kind:
     """
     The kind of a value.
 
-    :ivar read: returns the value at a key of an entry, or raises a ``GraphError``.
+    :ivar read: returns a value, named *where* in errors, or raises a ``GraphError``.
     :ivar schema: its JSON Schema.
     :ivar missing: its value if the key is missing.
     """
 
-    read: Callable[[Entry, str, Tree], Any]
+    read: Callable[[Tree, str], Any]
     schema: Schema
     missing: Any = None
 
 
 @dataclass(frozen=True)
 class Key:
-    """A key that an entry may have: the kind of its value, and its description in editors."""
+    """
+    A key that an entry may have.
+
+    :ivar about: its description in editors.
+    :ivar of: the callbacks that may have it, if only these: sources, sinks or both.
+    """
 
     kind: Kind
     about: str
     needed: bool = False
+    of: tuple[str, ...] = ()
 
 
 RENAMED = {'on_miss': 'on_late'}
@@ -148,30 +158,25 @@ class Entry:
 
     def __init__(self, tree: Tree, name: str, keys: Table[str, Key]) -> None:
         self.file = tree.file
+        self.line = tree.line
         self.name = name
         self._keys = keys
         if not isinstance(tree, Mapping):
-            raise GraphError(
-                tree.file, tree.line, f'{name} is {kind_of(tree)}',
-                f'write a mapping with the keys {", ".join(keys)}')
+            raise error_at(tree, name, f'{kind_of(tree)} is no mapping',
+                           f'write one with the keys {", ".join(keys)}')
         self._tree = tree
         for key in tree.entries:
             if key not in keys:
-                if RENAMED.get(key) in keys:
-                    raise self.error(
-                        key, f'unknown key {shown(key)}', f"write '{RENAMED[key]}:' instead")
+                new = RENAMED.get(key)
                 raise self.error(
-                    key, f'unknown key {shown(key)}',
-                    did_you_mean(key, keys, f'use {", ".join(keys)}'))
+                    key, f'unknown key {shown(key)}', f"write '{new}:' instead" if new in keys
+                    else did_you_mean(key, keys, f'use {", ".join(keys)}'))
 
-    @property
-    def line(self) -> int:
-        """Return the line that the mapping starts in."""
-        return self._tree.line
-
-    def has(self, key: str) -> bool:
-        """Return whether the mapping has the key."""
+    def __contains__(self, key: str) -> bool:
         return key in self._tree.entries
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tree.entries)
 
     def get(self, key: str) -> Any:
         """Return the value of a key, or the kind's value for a missing key."""
@@ -183,17 +188,7 @@ class Entry:
             return described.kind.missing
         if isinstance(value, Scalar) and value.is_null:
             raise self.error(key, f'{shown(key)} has no value', 'give it one or remove the key')
-        return described.kind.read(self, key, value)
-
-    def one_of(self, keys: Table[str, Any], what: str) -> str:
-        """Return the key that the mapping has, of several alternatives."""
-        found = [key for key in keys if self.has(key)]
-        if not found:
-            raise self.error(None, f'nothing says {what}', f'add one of {", ".join(keys)}')
-        if len(found) > 1:
-            raise self.error(
-                found[1], f'{listed(found)} exclude each other', 'keep one, or make two callbacks')
-        return found[0]
+        return described.kind.read(value, f'{self.name}: {shown(key)}')
 
     def line_of(self, key: str, item: str | None = None) -> int:
         """Return the line of a key, or of an item of the list there; else the mapping's line."""
@@ -211,253 +206,215 @@ class Entry:
         line = self.line if key is None else self.line_of(key, item)
         return GraphError(self.file, line, f'{self.name}: {problem}', remedy)
 
-    def value_error(self, key: str, value: Tree, problem: str, remedy: str) -> GraphError:
-        """Return the error about a value at a key."""
-        return GraphError(
-            self.file, value.line, f'{self.name}: {shown(key)}: {problem}', remedy)
 
+# --- the three kinds -----------------------------------------------------------------------------
 
-def text(check: Check, form: Schema, missing: str | None = None) -> Kind:
-    """Return the kind of a text that passes a check."""
-    def read(entry: Entry, key: str, value: Tree) -> str:
-        if not isinstance(value, Scalar):
-            raise entry.value_error(key, value, f'is {kind_of(value)}', 'write a text')
-        if value.is_null:
-            raise entry.value_error(key, value, 'has an empty entry', 'write a text')
-        wrong = check(value.text)
-        if wrong is not None:
-            raise entry.value_error(key, value, *wrong)
-        return value.text
+def scalar(
+    parse: Callable[[str], Any], form: Schema, missing: Any = None, plain: bool = False
+) -> Kind:
+    """
+    Return the kind of a single value.
+
+    :param parse: turns its text into the value, or raises a ``ValueProblem``.
+    :param plain: it must not be in quotes.
+    """
+    def read(value: Tree, where: str) -> Any:
+        if not isinstance(value, Scalar) or value.is_null:
+            raise error_at(value, where, f'{kind_of(value)} is no single value', 'write one')
+        if plain and not value.plain:
+            raise error_at(value, where, f'{shown(value.text)} is in quotes', 'remove them')
+        try:
+            return parse(value.text)
+        except ValueProblem as error:
+            raise error_at(value, where, error.problem, error.remedy) from None
 
     return Kind(read, form, missing)
 
 
+def many(item: Kind, least: int = 1, different: bool = False, too_few: str = '') -> Kind:
+    """
+    Return the kind of a list, read as a tuple.
+
+    :param different: no two items may be equal.
+    :param too_few: what to do about too few items.
+    """
+    def read(value: Tree, where: str) -> tuple[Any, ...]:
+        if not isinstance(value, Sequence):
+            raise error_at(value, where, f'{kind_of(value)} is no list',
+                           'write a list, as [a, b] or as - a')
+        if len(value.items) < least:
+            raise error_at(value, where, f'the list is {"too short" if value.items else "empty"}',
+                           too_few if value.items else 'add an entry')
+        found = [item.read(each, where) for each in value.items]
+        if different and len(set(found)) < len(found):
+            place = next(i for i, each in enumerate(found) if each in found[:i])
+            raise error_at(value.items[place], where,
+                           f'{shown(found[place])} is listed twice', 'remove one of them')
+        return tuple(found)
+
+    form = {'type': 'array', 'items': item.schema, 'minItems': least}
+    return Kind(read, {**form, 'uniqueItems': True} if different else form, ())
+
+
+def table(values: Kind, names: Name | None = None) -> Kind:
+    """Return the kind of a mapping with keys of the user, read as an ``Entry``."""
+    key = Key(values, '')
+
+    def read(value: Tree, where: str) -> Entry:
+        given = value.entries if isinstance(value, Mapping) else ('NAME',)
+        entry = Entry(value, where, dict.fromkeys(given, key))
+        for each in given:
+            if names is not None and (wrong := names.check(each)) is not None:
+                raise entry.error(each, wrong.problem, wrong.remedy)
+        return entry
+
+    form = {'type': 'object', 'additionalProperties': values.schema}
+    if names is not None:
+        form['propertyNames'] = {'pattern': f'^(?:{names.pattern.pattern})$'}
+    return Kind(read, form, Entry(Mapping('', 0), '', {}))
+
+
+# --- single values -------------------------------------------------------------------------------
+
+def text(check: Check, form: Schema, missing: str | None = None) -> Kind:
+    """Return the kind of a text that passes a check."""
+    def parse(text: str) -> str:
+        wrong = check(text)
+        if wrong is not None:
+            raise wrong
+        return text
+
+    return scalar(parse, form, missing)
+
+
 def name(what: Name) -> Kind:
     """Return the kind of a name."""
-    return text(what.check, {
-        # YAML reads some short names as numbers, and this program does not.
-        'type': 'string' if what.is_global else ['string', 'integer'],
-        'pattern': f'^(?:{what.pattern.pattern})$|{ARGUMENT_USE}', 'maxLength': what.longest})
+    return text(what.check, what.schema)
 
 
-def choice(*words: str, missing: str | None = '') -> Kind:
-    """Return the kind of a choice of words; a missing key gives the first, or ``missing``."""
-    def check(word: str) -> tuple[str, str] | None:
-        if word in words:
-            return None
-        return (f'{shown(word)} is not known',
-                did_you_mean(word, words, f'use {", ".join(words)}'))
+def choice(*words: str, missing: str | None = None) -> Kind:
+    """Return the kind of a choice of words."""
+    def check(word: str) -> ValueProblem | None:
+        return None if word in words else ValueProblem(
+            f'{shown(word)} is not known', did_you_mean(word, words, f'use {", ".join(words)}'))
 
-    return text(
-        check, {'anyOf': [{'enum': list(words)}, _USE]}, words[0] if missing == '' else missing)
-
-
-def items(form: Schema) -> Kind:
-    """Return the kind of a non-empty list whose items are read later."""
-    def read(entry: Entry, key: str, value: Tree) -> list[Tree]:
-        if not isinstance(value, Sequence):
-            raise entry.error(
-                key, f'{shown(key)} is {kind_of(value)}', 'write a list, as [a, b] or as - a')
-        if not value.items:
-            raise entry.error(key, f'{shown(key)} is empty', 'add an entry')
-        return value.items
-
-    return Kind(read, {'type': 'array', 'items': form, 'minItems': 1})
-
-
-def texts(item: Kind, least: int = 0, *too_few: str) -> Kind:
-    """
-    Return the kind of a list of different texts.
-
-    :param least: the minimum number of texts.
-    :param too_few: the problem of fewer texts, and its remedy.
-    """
-    def read(entry: Entry, key: str, value: Tree) -> tuple[str, ...]:
-        if not isinstance(value, Sequence):
-            raise entry.error(
-                key, f'{shown(key)} is {kind_of(value)}', f'write a list, as {key}: [a, b]')
-        result: dict[str, None] = {}
-        for each in value.items:
-            found = item.read(entry, key, each)
-            if found in result:
-                raise entry.value_error(
-                    key, each, f'{shown(found)} is listed twice', 'remove one of them')
-            result[found] = None
-        if least and not result:
-            raise entry.error(key, f'{shown(key)} is empty', 'add an entry')
-        if len(result) < least:
-            raise entry.error(key, too_few[0].format(len(result)), too_few[1])
-        return tuple(result)
-
-    return Kind(read, {'type': 'array', 'items': item.schema, 'minItems': least,
-                       'uniqueItems': True}, ())
-
-
-def numbers(**bounds: int) -> Kind:
-    """Return the kind of a non-empty list of finite numbers."""
-    trees = items({'anyOf': [{'type': 'number', **bounds}, _USE]})
-
-    def read(entry: Entry, key: str, value: Tree) -> list[float]:
-        found = []
-        for each in trees.read(entry, key, value):
-            is_number = isinstance(each, Scalar) and each.plain and _NUMBER.fullmatch(each.text)
-            number = float(each.text) if is_number else math.nan
-            if not math.isfinite(number):
-                raise entry.value_error(
-                    key, each, f'{_described(each)} is not a number', 'write a finite number')
-            found.append(number)
-        return found
-
-    return Kind(read, trees.schema)
+    return text(check, {'anyOf': [{'enum': list(words)}, _USE]}, missing)
 
 
 def time(least_ns: int = MICROSECOND) -> Kind:
     """Return the kind of a time of at most a day, ns."""
-    def read(entry: Entry, key: str, value: Tree) -> int:
-        if not isinstance(value, Scalar):
-            raise entry.error(
-                key, f'{shown(key)} is {kind_of(value)}', "write a time, as '100ms'")
-        try:
-            return parse_duration(value.text, minimum_ns=least_ns, maximum_ns=DAY)
-        except DurationError as error:
-            raise entry.value_error(key, value, error.problem, error.remedy) from None
-
-    return Kind(read, {'allOf': [{'$ref': '#/definitions/time'}]})
+    return scalar(lambda text: parse_duration(text, minimum_ns=least_ns),
+                  {'allOf': [{'$ref': '#/definitions/time'}]})
 
 
 def whole(least: int, most: int) -> Kind:
     """Return the kind of an integer within bounds."""
-    def read(entry: Entry, key: str, value: Tree) -> int:
-        if not (isinstance(value, Scalar) and value.plain and _INTEGER.fullmatch(value.text)):
-            raise entry.error(key, f'{shown(key)} is {_described(value)}', 'write an integer')
-        if not least <= int(value.text) <= most:
-            raise entry.error(key, f'{shown(key)} is {value.text}',
-                              f'write a number from {least} to {most}')
-        return int(value.text)
+    def parse(text: str) -> int:
+        if not (_INTEGER.fullmatch(text) and least <= int(text) <= most):
+            raise ValueProblem(f'{shown(text)} is no integer from {least} to {most}', 'write one')
+        return int(text)
 
-    return Kind(read, {'anyOf': [
-        {'type': 'integer', 'minimum': least, 'maximum': most}, _USE]})
+    return scalar(parse, {'anyOf': [
+        {'type': 'integer', 'minimum': least, 'maximum': most}, _USE]}, plain=True)
 
 
-def truth() -> Kind:
-    """Return the kind of a boolean."""
-    def read(entry: Entry, key: str, value: Tree) -> bool:
-        if not (isinstance(value, Scalar) and value.plain and value.text in ('true', 'false')):
-            raise entry.error(key, f'{shown(key)} is {_described(value)}', 'write true or false')
-        return value.text == 'true'
+def number(**bounds: int) -> Kind:
+    """Return the kind of a finite number; only the JSON Schema has the bounds."""
+    def parse(text: str) -> float:
+        found = float(text) if _NUMBER.fullmatch(text) else math.nan
+        if not math.isfinite(found):
+            raise ValueProblem(f'{shown(text)} is not a number', 'write a finite number')
+        return found
 
-    return Kind(read, {'anyOf': [{'type': 'boolean'}, _USE]})
-
-
-def pairs(value_kind: Kind) -> Kind:
-    """Return the kind of a mapping of texts: key, text and line of each."""
-    def read(entry: Entry, key: str, value: Tree) -> list[tuple[str, str, int]]:
-        if not isinstance(value, Mapping):
-            raise entry.error(key, f"'{key}' is no mapping", f'write {key}: {{name: value}}')
-        keys = dict.fromkeys(value.entries, Key(value_kind, ''))
-        inner = Entry(value, f"{entry.name}: '{key}'", keys)
-        return [(each, inner.get(each), inner.line_of(each)) for each in keys]
-
-    return Kind(read, {'type': 'object', 'additionalProperties': value_kind.schema}, [])
+    return scalar(parse, {'anyOf': [{'type': 'number', **bounds}, _USE]}, plain=True)
 
 
-def kind_of(tree: Tree) -> str:
-    """Return a description of a tree."""
-    if isinstance(tree, Scalar):
-        return 'empty' if tree.is_null else f'the text {shown(tree.text)}'
-    return 'a list' if isinstance(tree, Sequence) else 'a mapping'
+def _truth(text: str) -> bool:
+    if text not in ('true', 'false'):
+        raise ValueProblem(f'{shown(text)} is no truth value', 'write true or false')
+    return text == 'true'
 
 
-def _described(tree: Tree) -> str:
-    return shown(tree.text) if isinstance(tree, Scalar) else kind_of(tree)
+def _weakly_hard(text: str) -> WeaklyHard:
+    found = _OF.fullmatch(text)
+    if found is None:
+        raise ValueProblem(
+            f'{shown(text)} is no tolerance', "write how many of how many, as '1 of 100'")
+    misses, of = int(found[1]), int(found[2])
+    if not 0 < misses < of:
+        raise ValueProblem(
+            f'{shown(text)} makes no sense', 'tolerate at least 1 miss, and fewer than all')
+    return WeaklyHard(misses, of)
 
 
 FORMAT = '1'
 
 
-def _check_format(given: str) -> tuple[str, str] | None:
-    if given == FORMAT:
-        return None
-    return f'{shown(given)} is no known version of the format', f"write 'mddag: {FORMAT}'"
+def _check_format(given: str) -> ValueProblem | None:
+    return None if given == FORMAT else ValueProblem(
+        f'{shown(given)} is no known version of the format', f"write 'mddag: {FORMAT}'")
 
 
-def _check_file(path: str) -> tuple[str, str] | None:
+def _check_file(path: str) -> ValueProblem | None:
     if os.path.isabs(path) or path.startswith('~') or '\0' in path or not path:
-        return (f'{shown(path)} is no relative path',
-                'write it as seen from the file that includes it')
+        return ValueProblem(f'{shown(path)} is no relative path',
+                            'write it as seen from the file that includes it')
     return None
 
 
-def weakly_hard() -> Kind:
-    """Return the kind of 'N of M': at most N misses in any M results in a row."""
-    def read(entry: Entry, key: str, value: Tree) -> WeaklyHard:
-        found = _OF.fullmatch(value.text) if isinstance(value, Scalar) else None
-        if found is None:
-            raise entry.value_error(
-                key, value, f'is {_described(value)}', "write how many of how many, as '1 of 100'")
-        misses, of = int(found[1]), int(found[2])
-        if not 0 < misses < of:
-            raise entry.value_error(
-                key, value, f'{misses} of {of} makes no sense',
-                'tolerate at least 1 miss, and fewer than all')
-        return WeaklyHard(misses, of)
-
-    return Kind(read, {'type': 'string', 'pattern': f'^(?:{_OF.pattern})$|{ARGUMENT_USE}',
-                       'examples': ['1 of 100']})
+def _check_read(text: str) -> ValueProblem | None:
+    """Check an entry of ``reads``: a topic, or the name of a callback of the same node."""
+    if ':' in text:
+        return ValueProblem(
+            f'{shown(text)} names a callback with its node',
+            'name the topic that is taken, or just the name of a callback of the same node')
+    return (TOPIC if text.startswith('/') else CALLBACK).check(text)
 
 
-def _read_execution_time(entry: Entry, key: str, value: Tree) -> ExecutionTime:
+def _check_key(text: str) -> ValueProblem | None:
+    """Check the key of a callback, ``/node:callback``."""
+    node, colon, name = text.rpartition(':')
+    if not colon:
+        return ValueProblem(f'{shown(text)} names no callback', "write '/node:callback'")
+    return NODE.check(node) or CALLBACK.check(name)
+
+
+# --- execution times -----------------------------------------------------------------------------
+
+def _read_execution_time(value: Tree, where: str) -> ExecutionTime:
     if isinstance(value, Scalar):
-        return ExecutionTime((time(least_ns=1).read(entry, key, value),), (50.0,))
-    inner = Entry(value, f'execution time of {entry.name}', QUANTILES)
-    quantiles_us = inner.get('quantiles_us')
-    if quantiles_us[0] < 0:
-        raise inner.error('quantiles_us', f'the quantile {quantiles_us[0]} is negative',
-                          'write times in us')
-    for before, after in zip(quantiles_us, quantiles_us[1:]):
-        if after < before:
-            raise inner.error('quantiles_us', f'the quantile {after} comes after {before}',
-                              'write them in rising order')
-    if not 1 <= quantiles_us[-1] * 1000 <= DAY:
-        raise inner.error(
-            'quantiles_us', f'the largest quantile, {quantiles_us[-1]} us, makes no sense',
-            'write times from 0.001 us to a day, in us')
-    return ExecutionTime(tuple(round(us * 1000) for us in quantiles_us),
-                         _percent(inner, len(quantiles_us)))
+        return ExecutionTime((time(least_ns=1).read(value, where),), (50.0,))
+    entry = Entry(value, where, QUANTILES)
+    quantiles_us, percent = entry.get('quantiles_us'), entry.get('percent')
+    count = len(quantiles_us)
+    if not percent:     # evenly spaced
+        percent = tuple(100.0 * i / (count - 1) for i in range(count)) if count > 1 else (50.0,)
+    for key, wrong, problem, remedy in (
+        ('quantiles_us', quantiles_us[0] < 0,
+         f'the quantile {quantiles_us[0]} is negative', 'write times in us'),
+        ('quantiles_us', list(quantiles_us) != sorted(quantiles_us),
+         'the quantiles do not rise', 'write them in rising order'),
+        ('quantiles_us', not 1 <= quantiles_us[-1] * 1000 <= DAY,
+         f'the largest quantile, {quantiles_us[-1]} us, makes no sense',
+         'write times from 0.001 us to a day, in us'),
+        ('percent', len(percent) != count,
+         f'the number of shares is {len(percent)}, that of quantiles {count}',
+         'give one for each'),
+        ('percent', percent[0] < 0 or percent[-1] > 100,
+         'a share is not within 0 and 100', 'write percentages'),
+        ('percent', list(percent) != sorted(set(percent)),
+         'the shares do not rise', 'write them in rising order'),
+    ):
+        if wrong:
+            raise entry.error(key, problem, remedy)
+    return ExecutionTime(tuple(round(us * 1000) for us in quantiles_us), percent)
 
 
-def _read_processes(entry: Entry, key: str, value: Tree) -> dict[str, dict[str, int]]:
-    """Return the nodes of each process, with their lines."""
-    found: dict[str, dict[str, int]] = {}
-    for process, _, line in _NODES_BY_PROCESS.read(entry, key, value):
-        wrong = PROCESS.check(process)
-        if wrong is not None:
-            problem, remedy = wrong
-            raise GraphError(entry.file, line, f'{entry.name}: {shown(key)}: {problem}', remedy)
-        nodes = value.entries[process] if isinstance(value, Mapping) else None
-        assert isinstance(nodes, Sequence)
-        found[process] = {each.text: each.line for each in nodes.items if isinstance(each, Scalar)}
-    return found
-
-
-def _percent(entry: Entry, count: int) -> tuple[float, ...]:
-    """Return the percentages of the quantiles: declared, or evenly spaced."""
-    percent = entry.get('percent')
-    if percent is None:
-        return tuple(100.0 * i / (count - 1) for i in range(count)) if count > 1 else (50.0,)
-    if len(percent) != count:
-        raise entry.error(
-            'percent', f'the number of shares is {len(percent)}, that of quantiles {count}',
-            'give one for each')
-    if percent[0] < 0 or percent[-1] > 100:
-        raise entry.error('percent', 'a share is not within 0 and 100', 'write percentages')
-    if any(after <= before for before, after in zip(percent, percent[1:])):
-        raise entry.error('percent', 'the shares do not rise', 'write them in rising order')
-    return tuple(percent)
-
+# --- the keys ------------------------------------------------------------------------------------
 
 def _entries(what: str) -> Kind:
-    return items({'$ref': f'#/definitions/{what}'})
+    """Return the kind of a list whose items are read as entries later."""
+    return many(Kind(lambda value, where: value, {'$ref': f'#/definitions/{what}'}))
 
 
 def _mapping(keys: dict[str, Key]) -> Schema:
@@ -467,15 +424,16 @@ def _mapping(keys: dict[str, Key]) -> Schema:
                            for word, key in keys.items()}}
 
 
-_NODES_BY_PROCESS = pairs(texts(name(NODE)))
-_PROCESSES = Kind(_read_processes, {
-    **_NODES_BY_PROCESS.schema, 'propertyNames': {'pattern': f'^(?:{PROCESS.pattern.pattern})$'}},
-    {})
-_VALUES = pairs(text(lambda _: None, {'type': ['string', 'number', 'boolean', 'null']}))
+_TRUTH = scalar(_truth, {'anyOf': [{'type': 'boolean'}, _USE]}, plain=True)
+_WEAKLY_HARD = scalar(_weakly_hard, {
+    'type': 'string', 'pattern': f'^(?:{_OF.pattern})$|{ARGUMENT_USE}', 'examples': ['1 of 100']})
+_VALUES = table(text(lambda _: None, {'type': ['string', 'number', 'boolean', 'null']}))
+_TOPICS = many(name(TOPIC), 0, different=True)
 
 QUANTILES = {
-    'quantiles_us': Key(numbers(minimum=0), 'Quantiles in us, rising.', needed=True),
-    'percent': Key(numbers(minimum=0, maximum=100), 'The shares that they belong to, rising.'),
+    'quantiles_us': Key(many(number(minimum=0)), 'Quantiles in us, rising.', needed=True),
+    'percent': Key(many(number(minimum=0, maximum=100)),
+                   'The shares that they belong to, rising.'),
 }
 _EXECUTION_TIME = Kind(_read_execution_time, {'oneOf': [time().schema, _mapping(QUANTILES)]})
 
@@ -490,7 +448,8 @@ FILE = {
     'nodes': Key(_entries('node'),
                  'The nodes; a node may have several entries, and their order counts for ties.',
                  needed=True),
-    'processes': Key(_PROCESSES, 'The processes that the nodes run in, each with its nodes; those '
+    'processes': Key(table(many(name(NODE), 0, different=True), PROCESS),
+                     'The processes that the nodes run in, each with its nodes; those '
                      'that are not named run in the first.'),
     'paths': Key(_entries('path'), 'End-to-end paths over trigger and queue edges.'),
 }
@@ -498,7 +457,7 @@ INCLUDE = {
     'file': Key(text(_check_file, {'type': 'string'}), 'The file, as seen from this one.',
                 needed=True),
     'namespace': Key(name(NODE), 'Put before all names of the included file.'),
-    'remap': Key(pairs(name(TOPIC)), 'Names of the included file and what they become.'),
+    'remap': Key(table(name(TOPIC)), 'Names of the included file and what they become.'),
     'set': Key(_VALUES, 'Values of the arguments of the included file.'),
 }
 NODE_KEYS = {
@@ -508,8 +467,8 @@ NODE_KEYS = {
 TRIGGERS = {
     'timer': Key(time(), 'A timer of this period starts it.'),
     'subscription': Key(name(TOPIC), 'A message on this topic starts it.'),
-    'sync': Key(texts(name(TOPIC), 2, 'a sync callback joins topics, and here is {}',
-                      "give at least 2, or write 'subscription:' for one topic"),
+    'sync': Key(many(name(TOPIC), 2, different=True,
+                     too_few="give at least 2, or write 'subscription:' for one topic"),
                 'Messages on all of these topics together start it.'),
     'service': Key(name(SERVICE), 'A request of this service starts it.'),
 }
@@ -517,33 +476,39 @@ CALLBACK_KEYS = {
     'name': Key(name(CALLBACK), 'Name of the callback, unique in its node.', needed=True),
     **TRIGGERS,
     'period': Key(time(), 'Time between two releases of a source that is no timer.'),
-    'publishes': Key(texts(name(TOPIC)), 'The topics that it publishes.'),
-    'reads': Key(texts(text(check_read, {'anyOf': [name(TOPIC).schema, name(CALLBACK).schema]})),
+    'publishes': Key(_TOPICS, 'The topics that it publishes.'),
+    'reads': Key(many(text(_check_read, {'anyOf': [TOPIC.schema, CALLBACK.schema]}), 0,
+                      different=True),
                  'Queue edges: topics that it takes messages from, and callbacks of its node '
                  'whose variables it reads. They never start it.'),
-    'deadline': Key(time(), 'Relative deadline of a sink, counted from the release of its DAG.'),
-    'release_from': Key(choice('arrival', 'source_timestamp', 'header_stamp'),
-                        'Where the release time of a source comes from.'),
+    'deadline': Key(time(), 'Relative deadline of a sink, counted from the release of its DAG.',
+                    of=('sink',)),
+    'release_from': Key(choice('arrival', 'source_timestamp', 'header_stamp', missing='arrival'),
+                        'Where the release time of a source comes from.', of=('source',)),
     'execution_time': Key(_EXECUTION_TIME, 'Its execution time: constant, or quantiles.'),
-    'holds_interpreter': Key(truth(), 'Whether it computes in Python (true), or waits, or '
+    'holds_interpreter': Key(_TRUTH, 'Whether it computes in Python (true), or waits, or '
                              'computes with the lock of the interpreter released (false).'),
     'group': Key(name(GROUP), 'Its mutually exclusive callback group in the node.'),
-    'dag': Key(name(DAG), 'Name of the DAG that it is the source of.'),
-    'on_late': Key(choice('continue', 'demote', 'abort', missing=None),
-                   'What is done with a late job of its DAG, if it is a source.'),
-    'keep': Key(choice('all', 'newest'),
-                'Of a source or sink: newest drops what has not started when the next is ready.'),
+    'dag': Key(name(DAG), 'Name of the DAG that it is the source of.', of=('source',)),
+    'on_late': Key(choice('continue', 'demote', 'abort'),
+                   'What is done with a late job of its DAG, if it is a source.', of=('source',)),
+    'keep': Key(choice('all', 'newest', missing='all'),
+                'Of a source or sink: newest drops what has not started when the next is ready.',
+                of=('source', 'sink')),
     'importance': Key(choice('high', 'normal', 'low', missing='normal'),
-                      'Of a sink: in an overload the least important is late first.'),
-    'tolerate': Key(weakly_hard(), "Of a sink: how many misses are tolerated, as '1 of 100'."),
+                      'Of a sink: in an overload the least important is late first.',
+                      of=('sink',)),
+    'tolerate': Key(_WEAKLY_HARD, "Of a sink: how many misses are tolerated, as '1 of 100'.",
+                    of=('sink',)),
     'max_active_jobs': Key(whole(1, 1_000_000),
-                           'Bound on the open jobs of its DAG, if it is a source.'),
+                           'Bound on the open jobs of its DAG, if it is a source.',
+                           of=('source',)),
 }
 PATH_KEYS = {
     'name': Key(name(PATH), 'Name of the path.', needed=True),
-    'callbacks': Key(texts(text(check_key, {'type': 'string', 'pattern': (
+    'callbacks': Key(many(text(_check_key, {'type': 'string', 'pattern': (
         f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$|{ARGUMENT_USE}')}),
-        2, 'a path of one callback', 'give at least 2'),
+        2, different=True, too_few='give at least 2'),
         "The callbacks along it, each as '/node:callback'.", needed=True),
 }
 

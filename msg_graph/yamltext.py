@@ -18,8 +18,9 @@ The tree is built from the parser's events, not by PyYAML's composer or construc
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 import re
-from typing import Any
+from typing import Any, ClassVar
 
 from msg_graph.errors import GraphError, shown
 import yaml
@@ -36,17 +37,15 @@ _PLAIN = re.compile(r'[/A-Za-z_][/A-Za-z0-9_.-]*')
 _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
 
 
+@dataclass(eq=False, slots=True)
 class Scalar:
     """A text; ``plain`` if it is written without quotes."""
 
-    __slots__ = ('file', 'line', 'text', 'plain')
-    size = 1
-
-    def __init__(self, file: str, line: int, text: str, plain: bool) -> None:
-        self.file = file
-        self.line = line
-        self.text = text
-        self.plain = plain
+    file: str
+    line: int
+    text: str
+    plain: bool = True
+    size: ClassVar[int] = 1
 
     @property
     def is_null(self) -> bool:
@@ -54,29 +53,25 @@ class Scalar:
         return self.plain and self.text in ('', '~', 'null')
 
 
+@dataclass(eq=False, slots=True)
 class Sequence:
     """A list of trees."""
 
-    __slots__ = ('file', 'line', 'items', 'size')
-
-    def __init__(self, file: str, line: int, items: list[Tree] | None = None) -> None:
-        self.file = file
-        self.line = line
-        self.items = [] if items is None else items
-        self.size = 1
+    file: str
+    line: int
+    items: list[Tree] = field(default_factory=list)
+    size: int = 1
 
 
+@dataclass(eq=False, slots=True)
 class Mapping:
     """Trees by key, in file order, and the line of each key."""
 
-    __slots__ = ('file', 'line', 'entries', 'key_lines', 'size')
-
-    def __init__(self, file: str, line: int) -> None:
-        self.file = file
-        self.line = line
-        self.entries: dict[str, Tree] = {}
-        self.key_lines: dict[str, int] = {}
-        self.size = 1
+    file: str
+    line: int
+    entries: dict[str, Tree] = field(default_factory=dict)
+    key_lines: dict[str, int] = field(default_factory=dict)
+    size: int = 1
 
 
 Tree = Scalar | Sequence | Mapping

@@ -69,7 +69,7 @@ def violations(specs: list[Spec]) -> set[str]:
         if is_sink and not spec.deadline:
             found.add('has no deadline')
         if spec.deadline and not is_sink:
-            found.add('is no sink')
+            found.add('is for a sink')
     for via in range(len(specs)):
         starts |= {(a, b) for a, b in product(range(len(specs)), repeat=2)
                    if (a, via) in starts and (via, b) in starts}

@@ -150,7 +150,7 @@ def test_a_file_of_its_own():
             Process('x', ('/a', '/b', '/c')),)
     for text, says in (('', "there is no 'processes:'"), ('mddag: 1', "there is no 'processes:'"),
                        ('processes: {x: [/d]}', "p.yaml:1: the file: 'processes': there is no"),
-                       ('[1]', 'p.yaml:1: the file is a list')):
+                       ('[1]', 'p.yaml:1: the file: a list is no mapping')):
         with pytest.raises(GraphError) as caught:
             load_processes(text, 'p.yaml', tasks)
         assert says in str(caught.value)

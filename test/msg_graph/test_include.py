@@ -150,7 +150,7 @@ def test_includes_within_includes(tmp_path):
     ('set: {late: 80ms}', 'set: {lat: 80ms, late: 1s}', 'parts/sensor.yaml:3',
      "sets 'lat', which is no argument of this file: did you mean 'late'?"),
     ('/shared: /twist}\n    set: {late: 80', '/share: /twist}\n    set: {late: 80', 'top.yaml:6',
-     "remaps '/share', which the included file does not name: did you mean '/shared'?"),
+     "'remap': the included file does not name '/share': did you mean '/shared'?"),
     ('remap: {/cropped: /left,', 'remap: {/cropped: left,', 'top.yaml:6', 'not an absolute topic'),
     ('namespace: /rear', 'namespace: rear', 'top.yaml:9', 'is not an absolute node name'),
     ('namespace: /rear', 'name: /rear', 'top.yaml:9', "unknown key 'name'"),
@@ -167,7 +167,7 @@ def test_includes_within_includes(tmp_path):
     ('  period: 100ms', '  1period: 100ms', 'parts/sensor.yaml:4', 'is no name for an argument'),
     ('  period: 100ms', '  period: [1]', 'parts/sensor.yaml:4', 'is no text'),
     ('    remap: {/cropped: /behind, /shared: /twist}', '    remap: [1]', 'top.yaml:10',
-     "'remap' is no mapping"),
+     "'remap': a list is no mapping: write one with"),
 ])
 def test_errors_name_their_file(tmp_path, wrong, right, place, problem):
     assert wrong in TOP + SENSOR

@@ -34,7 +34,7 @@ T = '{name: t, timer: 10ms, publishes: [/a]}'
      "name a callback of its node: 'callback_1'"),
     # what only a source may have
     *(([T, 'name: s', '  subscription: /a', f'  {key} {MARK}', '  deadline: 10ms'],
-       f"callback '/n:s': '{key.split()[0]}' is for the source of a DAG")
+       f"callback '/n:s': '{key.split()[0]}' is for a source")
       for key in ('dag: d', 'on_late: continue', 'max_active_jobs: 3',
                   'release_from: header_stamp')),
     ([T, 'name: s', '  subscription: /a', f'  period: 10ms {MARK}', '  deadline: 10ms'],
@@ -43,7 +43,7 @@ T = '{name: t, timer: 10ms, publishes: [/a]}'
       '{name: s, subscription: /b, deadline: 10ms}'], "'keep:' is for a source or a sink"),
     *(([f'{{name: t, timer: 10ms, publishes: [/a], {key}}} {MARK}',
         '{name: s, subscription: /a, deadline: 10ms}'],
-       f"'{key.split()[0]}' is for a sink, and this callback starts another one: move it")
+       f"'{key.split()[0]}' is for a sink, and this callback starts '/n:s' by '/a': move it")
       for key in ('importance: high', 'tolerate: 1 of 10')),
     (['name: s', '  sync: [/a, /b]', f'  period: 10ms {MARK}', '  deadline: 10ms'],
      'a sync callback joins topics, so it cannot be a source'),
@@ -73,7 +73,7 @@ T = '{name: t, timer: 10ms, publishes: [/a]}'
      "callback '/n:s': it is a sink (it starts no other callback) and has no deadline: add"),
     ([f'{{name: t, timer: 10ms, publishes: [/a], deadline: 10ms}} {MARK}',
       '{name: s, subscription: /a, deadline: 10ms}'],
-     "callback '/n:t': it has a deadline but is no sink: it starts '/n:s' by '/a': move"),
+     "callback '/n:t': 'deadline:' is for a sink, and this callback starts '/n:s' by '/a': move"),
     (['{name: t, timer: 10ms, deadline: 1ms, dag: /n/u}',
       '{name: v, timer: 10ms, deadline: 1ms}',
       f'{{name: u, timer: 10ms, deadline: 1ms}} {MARK}'],
@@ -192,13 +192,13 @@ def found(text: str) -> GraphErrors:
 
 
 @pytest.mark.parametrize(('text', 'expected'), [
-    (ENTRIES, [(2, "'workers' is 'none'"), (6, "'10' has no unit"), (7, "unknown key 'deadine'"),
+    (ENTRIES, [(2, "'none' is no integer"), (6, "'10' has no unit"), (7, "unknown key 'deadine'"),
                (9, 'taken in line 8'), (10, 'not an absolute node name'),
-               (13, 'a path of one callback'), (14, "'y' names no callback")]),
+               (13, 'the list is too short'), (14, "'y' names no callback")]),
     (LINKS, [(6, "no callback publishes '/c'"), (7, "no callback publishes '/d'"),
-             (9, "'dag:' is for the source"), (8, "unknown callback 'w'"),
+             (9, "'dag:' is for a source"), (8, "unknown callback 'w'"),
              (8, "it reads '/e', which no callback")]),
-    (GRAPH, [(7, 'in a cycle'), (5, 'deadline but is no sink'), (6, 'has no deadline'),
+    (GRAPH, [(7, 'in a cycle'), (5, "'deadline:' is for a sink"), (6, 'has no deadline'),
              (9, 'has no deadline'), (11, 'no trigger or queue edge leads')]),
 ])
 def test_every_error_of_a_stage(text, expected):
