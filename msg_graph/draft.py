@@ -29,7 +29,7 @@ A named path becomes an entry if each of its nodes has exactly one matching call
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, field
 import re
 
@@ -219,22 +219,19 @@ class _Writer:
         self._draft = draft
         self._accepted = accepted
         self._callbacks = list(draft.callbacks())
-        self._publishers: dict[str, list[DraftCallback]] = {}
+        self._published = {topic for each in self._callbacks for topic in each.publishes}
+        self._perhaps_published = self._published.union(
+            topic for each in self._callbacks for topic in each.maybe)
         self._started: dict[str, list[DraftCallback]] = {}
         for callback in self._callbacks:
-            for topic in callback.publishes:
-                self._publishers.setdefault(topic, []).append(callback)
-            if callback.kind in ('subscription', 'sync'):
-                for topic in callback.starts:
-                    self._started.setdefault(topic, []).append(callback)
-        self._published = {*self._publishers, *(
-            topic for callback in self._callbacks for topic in callback.maybe)}
-        self._period = self._shortest_periods()
+            for topic in callback.starts if callback.kind in ('subscription', 'sync') else ():
+                self._started.setdefault(topic, []).append(callback)
+        self._fastest = self._fastest_sources()
 
     def _is_source(self, callback: DraftCallback) -> bool:
-        return _is_source(callback, self._published)
+        return _is_source(callback, self._perhaps_published)
 
-    def _shortest_periods(self) -> dict[str, DraftCallback]:
+    def _fastest_sources(self) -> dict[str, DraftCallback]:
         """Return by callback the source with the shortest period that may lead to it."""
         found: dict[str, DraftCallback] = {}
         sources = [c for c in self._callbacks if self._is_source(c) and c.source_period_ns]
@@ -265,108 +262,87 @@ class _Writer:
             yield '    callbacks:'
             yield from self._possible_syncs(node)
             for callback in node.callbacks.values():
-                yield from self._callback(callback)
+                yield f'      - name: {plain_scalar(callback.name)}'
+                yield from (f'        {line}' for line in self._entries(callback))
         yield from self._paths()
 
     def _possible_syncs(self, node: DraftNode) -> Iterator[str]:
         """Yield a comment on the subscriptions of a node that one source leads to."""
         topics: dict[str, list[str]] = {}
         for callback in node.callbacks.values():
-            if callback.kind == 'subscription' and not self._is_source(callback) and (
-                    source := self._period.get(callback.key)):
+            source = self._fastest.get(callback.key)
+            if callback.kind == 'subscription' and source and not self._is_source(callback):
                 topics.setdefault(source.key, []).append(plain_scalar(callback.starts[0]))
         for each in topics.values():
             if len({*each}) > 1:
                 yield ('      # If these are one sync, declare one callback: '
                        f'sync: [{", ".join(each)}]')
 
-    def _callback(self, callback: DraftCallback) -> Iterator[str]:
-        yield f'      - name: {plain_scalar(callback.name)}'
-        yield self._trigger(callback)
-        yield from self._source(callback)
+    def _entries(self, callback: DraftCallback) -> Iterator[str]:
+        """Yield the entries of a callback after its name, without indentation."""
+        if callback.kind == 'timer':
+            yield _timer(callback)
+        elif callback.kind == 'sync':
+            yield f'sync: {_listed(callback.starts)}'
+        else:
+            yield f'{callback.kind}: {callback.starts[0]}'
+        if callback.dag and self._is_source(callback):
+            yield f'dag: {plain_scalar(callback.dag)}'
+        if callback.kind in ('subscription', 'service'):
+            yield from self._period(callback)
         if callback.group is not None:
-            yield f'        group: {plain_scalar(callback.group)}'
-        yield from self._publishes(callback)
+            yield f'group: {plain_scalar(callback.group)}'
+        if callback.maybe:
+            yield _blank(f'publishes: {_listed(callback.publishes + callback.maybe)}',
+                         f'which callback publishes {", ".join(callback.maybe)}?')
+            if callback.publishes:
+                yield '# (instead of the next line)'
+        if callback.publishes:
+            yield f'publishes: {_listed(callback.publishes)}'
         if callback.reads:
-            yield f'        reads: [{", ".join(map(plain_scalar, callback.reads))}]'
-        if not any(topic in self._started for topic in callback.publishes):
+            yield f'reads: {_listed(map(plain_scalar, callback.reads))}'
+        if self._started.keys().isdisjoint(callback.publishes):
             yield self._deadline(callback)
-        yield from (f'        {key}: {value}' for key, value in callback.also.items())
+        yield from (f'{key}: {value}' for key, value in callback.also.items())
         if callback.times is not None:
             yield from _execution_time(*callback.times)
 
-    def _trigger(self, callback: DraftCallback) -> str:
-        if callback.kind == 'timer':
-            if callback.guessed and not (callback.publishes or callback.maybe):
-                return (f'        # timer: 100ms  # {MARK}: what starts it? Nothing is seen of '
-                        'the node but its name; remove it if it has no callbacks')
-            if callback.guessed and callback.interval_ns is None:
-                return (f'        # timer: 100ms  # {MARK}: what starts it? No message came while '
-                        'the system was probed')
-            if callback.guessed:
-                return (f'        timer: {_rounded(callback.interval_ns or 0)}  # {MARK}: is this '
-                        f'a timer? Proposed: the measured {_measured(callback)}')
-            period_ns = callback.period_ns or 0
-            if not _is_timer_period(period_ns):
-                return (f'        # timer: 100ms  # {MARK}: its period is said to be '
-                        f'{exact_duration(period_ns)}')
-            return f'        timer: {_whole(period_ns)}'
-        if callback.kind == 'sync':
-            return f'        sync: [{", ".join(callback.starts)}]'
-        return f'        {callback.kind}: {callback.starts[0]}'
-
-    def _source(self, callback: DraftCallback) -> Iterator[str]:
-        """Yield the entries of a source: the name of its DAG, and its period if it is no timer."""
-        source = self._is_source(callback)
-        if source and callback.dag:
-            yield f'        dag: {plain_scalar(callback.dag)}'
-        if callback.kind in ('timer', 'sync'):
-            return
-        if source and callback.period_ns is not None:
-            yield f'        period: {exact_duration(callback.period_ns)}'
+    def _period(self, callback: DraftCallback) -> Iterator[str]:
+        """Yield the period of a subscription or service that is a source."""
+        is_service = callback.kind == 'service'
+        what = ('the time between two requests' if is_service else
+                'no callback here publishes the topic; the time between two messages')
+        if not self._is_source(callback):
+            if callback.starts[0] not in self._published:
+                yield f'# {callback.starts[0]} has no known publisher yet: see its blanks'
+        elif callback.period_ns is not None:
+            yield f'period: {exact_duration(callback.period_ns)}'
             if callback.release_from != 'arrival':
-                yield f'        release_from: {callback.release_from}'
-        elif source:
-            yield self._period_line(callback)
-        elif callback.starts[0] not in self._publishers:
-            yield f'        # {callback.starts[0]} has no known publisher yet: see its blanks'
+                yield f'release_from: {callback.release_from}'
+        elif callback.interval_ns is not None:
+            yield self._proposal(
+                f'period: {_rounded(callback.interval_ns)}', what, _measured(callback))
+        else:
+            yield _blank(f'period: {"1s" if is_service else "100ms"}', what)
 
     def _proposal(self, entry: str, what: str, why: str) -> str:
         """Return the line of a proposed entry: a blank, or the entry if proposals are accepted."""
         if self._accepted:
-            return f'        {entry}  # proposed: {why}'
-        return f'        # {entry}  # {MARK}: {what}; proposed: {why}'
-
-    def _period_line(self, callback: DraftCallback) -> str:
-        what = ('the time between two requests' if callback.kind == 'service' else
-                'no callback here publishes the topic; the time between two messages')
-        if callback.interval_ns is not None:
-            return self._proposal(f'period: {_rounded(callback.interval_ns)}', what,
-                                  f'the measured {_measured(callback)}')
-        default = '1s' if callback.kind == 'service' else '100ms'
-        return f'        # period: {default}  # {MARK}: {what}'
-
-    def _publishes(self, callback: DraftCallback) -> Iterator[str]:
-        every = ', '.join(callback.publishes + callback.maybe)
-        if callback.maybe:
-            names = ', '.join(callback.maybe)
-            yield f'        # publishes: [{every}]  # {MARK}: which callback publishes {names}?'
-            if callback.publishes:
-                yield '        # (instead of the next line)'
-        if callback.publishes:
-            yield f'        publishes: [{", ".join(callback.publishes)}]'
+            return f'{entry}  # proposed: {why}'
+        return _blank(entry, f'{what}; proposed: {why}')
 
     def _deadline(self, callback: DraftCallback) -> str:
         if callback.deadline_ns is not None and not callback.maybe:
-            return f'        deadline: {exact_duration(callback.deadline_ns)}'
+            return f'deadline: {exact_duration(callback.deadline_ns)}'
         what = 'if it is a sink' if callback.maybe else 'a sink'
-        if callback.key not in self._period:
-            return (f'        # deadline: 100ms  # {MARK}: {what}; no source with a known period '
-                    'leads here')
-        source = self._period[callback.key]
-        leads = 'timer' if source.kind == 'timer' else 'source'
-        return self._proposal(f'deadline: {_period(source)}', what,
-                              f'the period of the {leads} that leads here')
+        source = self._fastest.get(callback.key)
+        if source is None:
+            return _blank('deadline: 100ms', f'{what}; no source with a known period leads here')
+        period = (_rounded(source.interval_ns or 0) if source.period_ns is None
+                  else _whole(source.period_ns))
+        kind = 'timer' if source.kind == 'timer' else 'source'
+        return self._proposal(
+            f'deadline: {period}', what, f'the period of the {kind} that leads here')
 
     def _paths(self) -> Iterator[str]:
         found = [(path, self._path_keys(path)) for path in self._draft.paths]
@@ -382,24 +358,40 @@ class _Writer:
                 yield printable(f'# {MARK}: path {path.name}: which callbacks? {chain}')
 
     def _path_keys(self, path: DraftPath) -> list[str]:
-        keys = [callback.key for key in path.keys for callback in self._callbacks
-                if callback.key == key]
-        if len(keys) < len(path.keys):
+        """Return the callbacks of a path if each of its steps has exactly one, else none."""
+        choices = [[c for c in self._callbacks if c.key == key][:1] for key in path.keys]
+        choices += [[c for c in self._callbacks if c.node == node
+                     and (taken == UNDEFINED or taken in c.starts or taken in c.reads)
+                     and (published == UNDEFINED or published in c.publishes)]
+                    for node, taken, published in path.steps]
+        if (len(choices) < 2 or any(len(fits) != 1 for fits in choices)
+                or PATH.check(path.name) is not None):
             return []
-        for node, taken, published in path.steps:
-            fits = [c for c in self._callbacks if c.node == node
-                    and (taken == UNDEFINED or taken in c.starts or taken in c.reads)
-                    and (published == UNDEFINED or published in c.publishes)]
-            if len(fits) != 1:
-                return []
-            keys.append(fits[0].key)
-        return keys if len(keys) > 1 and PATH.check(path.name) is None else []
+        return [fits[0].key for fits in choices]
 
 
-def _period(source: DraftCallback) -> str:
-    if source.period_ns is not None:
-        return _whole(source.period_ns)
-    return _rounded(source.interval_ns or 0)
+def _blank(entry: str, what: str) -> str:
+    return f'# {entry}  # {MARK}: {what}'
+
+
+def _listed(texts: Iterable[str]) -> str:
+    return f'[{", ".join(texts)}]'
+
+
+def _timer(callback: DraftCallback) -> str:
+    period_ns = callback.period_ns or 0
+    if not callback.guessed and _is_timer_period(period_ns):
+        return f'timer: {_whole(period_ns)}'
+    if not callback.guessed:
+        return _blank('timer: 100ms', f'its period is said to be {exact_duration(period_ns)}')
+    if not (callback.publishes or callback.maybe):
+        return _blank('timer: 100ms', 'what starts it? Nothing is seen of the node but its name; '
+                      'remove it if it has no callbacks')
+    if callback.interval_ns is None:
+        return _blank('timer: 100ms',
+                      'what starts it? No message came while the system was probed')
+    return (f'timer: {_rounded(callback.interval_ns)}  # {MARK}: is this a timer? '
+            f'Proposed: {_measured(callback)}')
 
 
 def _whole(period_ns: int) -> str:
@@ -416,11 +408,12 @@ def _rounded(nanoseconds: int) -> str:
 
 
 def _measured(callback: DraftCallback) -> str:
-    return f'time between two of its executions, {format_duration(callback.interval_ns or 0)}'
+    return ('the measured time between two of its executions, '
+            f'{format_duration(callback.interval_ns or 0)}')
 
 
 def _execution_time(time: ExecutionTime, count: int) -> Iterator[str]:
-    quantiles = ', '.join(f'{ns / 1000:.3f}'.rstrip('0').rstrip('.') for ns in time.quantiles_ns)
-    percent = ', '.join(repr(share).removesuffix('.0') for share in time.percent)
-    yield f'        # measured in {count} execution{"s" * (count != 1)}'
-    yield f'        execution_time: {{quantiles_us: [{quantiles}], percent: [{percent}]}}'
+    quantiles = [f'{ns / 1000:.3f}'.rstrip('0').rstrip('.') for ns in time.quantiles_ns]
+    percent = [repr(share).removesuffix('.0') for share in time.percent]
+    yield f'# measured in {count} execution{"s" * (count != 1)}'
+    yield f'execution_time: {{quantiles_us: {_listed(quantiles)}, percent: {_listed(percent)}}}'
