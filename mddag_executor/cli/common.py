@@ -48,6 +48,7 @@ _MCAP = b'\x89MCAP'
 MOST_BYTES = 64 << 20
 """The largest declaration, architecture file or table of execution times."""
 _read_already: object = None  # the stream that was standard input when it was read
+_copy: Any = None  # of it
 
 
 def read_text(path: str) -> tuple[str, str]:
@@ -79,18 +80,19 @@ def load_graph(path: str) -> TaskSet:
     return msg_graph.loads(text, name=name)
 
 
-@contextmanager
-def input_file(path: str) -> Iterator[Path]:
-    """Give a seekable file for a path; what comes from standard input (`-`) is kept in a copy."""
-    if path != '-':
-        yield Path(path)
-        return
-    source = _claim_stdin()
-    with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
-        copy = Path(folder, STDIN)
-        with copy.open('wb') as target:
-            shutil.copyfileobj(source, target, 1 << 20)
-        yield copy
+def input_path(given: R) -> tuple[R | str, str]:
+    """
+    Return the path of a file or recording, and its name for messages.
+
+    Standard input (`-`) is copied to a file, which is removed when the program ends.
+    """
+    global _copy
+    if given != '-':
+        return given, str(given)  # as the user wrote it: pathlib would change ./a
+    source, _copy = _claim_stdin(), tempfile.NamedTemporaryFile(prefix='mddag-')
+    shutil.copyfileobj(source, _copy, 1 << 20)
+    _copy.flush()
+    return _copy.name, STDIN
 
 
 def recording_and_graph(args: argparse.Namespace) -> None:
@@ -146,16 +148,6 @@ def _is_trace(path: str) -> bool:
             return file.read(len(_MCAP)) == _MCAP
     except OSError:
         return False
-
-
-@contextmanager
-def input_recording(given: R) -> Iterator[tuple[R | str, str]]:
-    """Give the path of a recording (of a copy, for `-`) or its traces, and what to call it."""
-    if given != '-':
-        yield given, str(given)  # as the user wrote it: pathlib would change ./a
-        return
-    with input_file(given) as path:
-        yield str(path), STDIN
 
 
 def _claim_stdin() -> BinaryIO:

@@ -15,17 +15,14 @@ its p99 response time grew by more than that, or if no sink was due in both; 2 o
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded, verdicts
+from mddag_executor.cli.recorded import Source
 from mddag_executor.cli.text import warn
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.run import Given
     from msg_graph import TaskSet
-
-    Trace = tuple[Given, str]     # its path, and what messages call it
 
 EXAMPLE = """\
 mddag diff before.mcap after.mcap
@@ -60,49 +57,48 @@ def main(args: argparse.Namespace) -> int:
     """Compare two runs."""
     from mddag_executor.report import diff
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    runs = [common.one_run([path], ()) for path in (args.first, args.second)]
-    with ExitStack() as files:
-        first, second = (files.enter_context(common.input_recording(run)) for run in runs)
-        before, after = _results(args, first, second, task_set)
+    first, second = (
+        Source(*common.input_path(common.one_run([path], ())), task_set)
+        for path in (args.first, args.second))
+    before, after = _results(args, first, second)
     difference = diff.compare(before, after, args.tolerance)
     common.show(args, difference, diff.lines(difference, args.callbacks))
     if not args.fail_on_worse:
         return 0
     if not difference['worse'] and not difference['compared']:
         return verdicts.unproven(
-            f'{first[1]} and {second[1]}', 'no sink was due in both, so nothing was compared')
+            f'{first.name} and {second.name}',
+            'no sink was due in both, so nothing was compared')
     return int(difference['worse'])
 
 
 def _results(
-    args: argparse.Namespace, first: Trace, second: Trace, task_set: TaskSet | None
+    args: argparse.Namespace, first: Source, second: Source
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the results of both runs, in their order."""
-    if task_set is None and not _has_declaration(first):
-        # without one of its own it is judged by the other's, and that must have one
+    if _has_declaration(first):
+        before, declared = _result(first, args.skip)
         if not _has_declaration(second):
-            recorded.check_deadlines(*first)
-            recorded.check_deadlines(*second)
-        after, declared = _result(second, task_set, args.skip)
-        return _result(first, declared, args.skip)[0], after
-    before, declared = _result(first, task_set, args.skip)
-    if task_set is None and not _has_declaration(second):
-        task_set = declared
-    return before, _result(second, task_set, args.skip)[0]
+            second = second._replace(task_set=declared)
+        return before, _result(second, args.skip)[0]
+    # without one of its own it is judged by the other's, and that must have one
+    if not _has_declaration(second):
+        first.check_deadlines()
+        second.check_deadlines()
+    after, declared = _result(second, args.skip)
+    return _result(first._replace(task_set=declared), args.skip)[0], after
 
 
-def _has_declaration(trace: Trace) -> bool:
+def _has_declaration(source: Source) -> bool:
     from mddag_executor.replay.run import has_declaration
-    path, name = trace      # several traces can be joined only if each has a declaration
-    return not isinstance(path, str) or (not recorded.is_bag(path) and has_declaration(path, name))
+    # several traces can be joined only if each has a declaration
+    return source.task_set is not None or not isinstance(source.path, str) or (
+        not source.is_bag and has_declaration(source.path, source.name))
 
 
-def _result(
-    trace: Trace, task_set: TaskSet | None, skip: int
-) -> tuple[dict[str, Any], TaskSet]:
+def _result(source: Source, skip: int) -> tuple[dict[str, Any], TaskSet]:
     """Return the result of a run, and the declaration that judged it."""
-    path, name = trace
-    outcome = recorded.as_recorded(path, name, task_set, f'replaying {name}', skip)
+    outcome = recorded.as_recorded(source, f'replaying {source.name}', skip)
     warn(*outcome.warnings)
     return outcome.result(), outcome.task_set
 

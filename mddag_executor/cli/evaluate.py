@@ -135,9 +135,8 @@ def _samples(path: str | None, task_sets: Sequence[TaskSet]) -> list[Samples | N
     if path is None:
         return [None] * len(task_sets)
     from mddag_executor.laboratory.draws import read_samples
-    with common.input_file(path) as file:
-        name = common.STDIN if path == '-' else path
-        return [read_samples(task_set, file, name) for task_set in task_sets]
+    file, name = common.input_path(path)
+    return [read_samples(task_set, Path(file), name) for task_set in task_sets]
 
 
 def _write(args: argparse.Namespace, outcome: Evaluation) -> None:

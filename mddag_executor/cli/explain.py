@@ -43,12 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Explain the misses of a trace."""
     common.recording_and_graph(args)
-    span = recorded.span_of(args.begin, args.end, args.skip)
-    with recorded.opened(args) as (path, name, task_set):
-        if task_set is None or recorded.is_bag(path):
-            recorded.check_deadlines(path, name)
-        outcome = recorded.as_recorded(
-            path, name, task_set, doing='explaining', skip=args.skip, span=span)
+    source = recorded.source_of(args)
+    if source.task_set is None:
+        source.check_deadlines()
+    outcome = recorded.as_recorded(source, 'explaining', args.skip, args.begin, args.end)
     sink = None if args.sink is None else _sink(args.sink, outcome.task_set)
     warn(*outcome.warnings)
     result = outcome.explanation.result(sink, args.job)

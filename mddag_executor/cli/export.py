@@ -50,21 +50,20 @@ def main(args: argparse.Namespace) -> int:
     common.recording_and_graph(args)
     form = _form(args)
     check_available(form)
-    span = recorded.span_of(args.begin, args.end)
     if form == _TABLES:
         common.check_folder(args.output, FILES)
     else:
         common.check_output(args.output)
-    with recorded.opened(args) as (path, name, task_set):
-        if args.rows == 'jobs' and task_set is None:
-            recorded.check_deadlines(path, name)
-        replay = recorded.as_recorded(path, name, task_set, 'exporting', span=span)
-        if form == _TABLES:
-            with common.output_folder(args.output, FILES) as folder:
-                write_tables(replay.recording, folder)
-        else:
-            with common.output_file(args.output) as file:
-                write(form, file, replay, args.rows or 'executions')
+    source = recorded.source_of(args)
+    if args.rows == 'jobs' and source.task_set is None:
+        source.check_deadlines()
+    replay = recorded.as_recorded(source, 'exporting', begin=args.begin, end=args.end)
+    if form == _TABLES:
+        with common.output_folder(args.output, FILES) as folder:
+            write_tables(replay.recording, folder)
+    else:
+        with common.output_file(args.output) as file:
+            write(form, file, replay, args.rows or 'executions')
     warn(*replay.warnings)
     if args.output != '-':
         say(f'exported: {printable(args.output)}')

@@ -93,7 +93,8 @@ def _recorded(traces: list[str], task_set: TaskSet) -> tuple[list[list[int]], Ta
     """Return mean CPU times as recorded, of callbacks that wait what they took."""
     from mddag_executor.cli import recorded
     path = traces[0] if len(traces) == 1 else traces
-    used = recorded.as_recorded(path, ', '.join(traces), task_set).usage.callbacks()
+    source = recorded.Source(path, ', '.join(traces), task_set)
+    used = recorded.as_recorded(source).usage.callbacks()
     times = {}
     holds = {}
     for callback in task_set.callbacks:

@@ -11,9 +11,8 @@ it can only be rescheduled: its messages are the releases.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any, TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
@@ -79,46 +78,59 @@ def check(args: argparse.Namespace) -> None:
                    'a run is replayed as it was recorded: add --reschedule')
 
 
-@contextmanager
-def opened(args: argparse.Namespace) -> Iterator[tuple[Given, str, TaskSet | None]]:
-    """Give the recording that TRACE… names, what messages call it, and GRAPH's task set."""
+class Source(NamedTuple):
+    """
+    A recording of any kind.
+
+    :ivar name: its name for messages.
+    :ivar task_set: of GRAPH, if it is given.
+    """
+
+    path: Given
+    name: str
+    task_set: TaskSet | None = None
+
+    @property
+    def is_bag(self) -> bool:
+        """Return whether it is an ordinary bag, which can only be rescheduled."""
+        from mddag_executor.replay.bags import is_ordinary
+        return isinstance(self.path, str) and is_ordinary(self.path)
+
+    def check_deadlines(self) -> None:
+        """Check that the recording itself has deadlines."""
+        if self.is_bag:
+            raise self.no_graph()
+        from mddag_executor.replay.run import check_declared
+        check_declared(self.path, self.name)
+
+    def no_graph(self) -> UsageError:
+        """Return the error about a bag that is not rescheduled, or has no graph."""
+        return UsageError(
+            f'{self.name}: no run of this executor is recorded in it, so there are no jobs: to '
+            'take its messages as releases give a GRAPH and --reschedule')
+
+
+def source_of(args: argparse.Namespace) -> Source:
+    """Return the recording that TRACE… names, with GRAPH's task set."""
     from mddag_executor.replay.bags import opened_trace
     task_set = None if args.graph is None else common.load_graph(args.graph)
-    with common.input_recording(args.trace) as (path, name):
-        trace = opened_trace(path) if isinstance(path, str) else None
-        yield trace or path, name, task_set
-
-
-def is_bag(path: Given) -> bool:
-    """Return whether a recording is an ordinary bag, which can only be rescheduled."""
-    from mddag_executor.replay.bags import is_ordinary
-    return isinstance(path, str) and is_ordinary(path)
-
-
-def check_deadlines(path: Given, name: str) -> None:
-    """Check that a recording has deadlines, if no graph is given."""
-    if is_bag(path):
-        raise _no_graph(name)
-    from mddag_executor.replay.run import check_declared
-    check_declared(path, name)
-
-
-def _no_graph(name: str) -> UsageError:
-    return UsageError(
-        f'{name}: no run of this executor is recorded in it, so there are no jobs: to take its '
-        'messages as releases give a GRAPH and --reschedule')
+    path, name = common.input_path(args.trace)
+    trace = opened_trace(path) if isinstance(path, str) else None
+    return Source(trace or path, name, task_set)
 
 
 def as_recorded(
-    path: Given, name: str, task_set: TaskSet | None, doing: str = 'replaying', skip: int = 0,
-    span: tuple[int, int] | None = None,
+    source: Source, doing: str = 'replaying', skip: int = 0, begin: int | None = None,
+    end: int | None = None,
 ) -> Replay:
-    """Replay a recorded run."""
+    """Replay a recorded run, or the part of it from ``begin`` to ``end``."""
     from mddag_executor.replay import replay
-    if is_bag(path):
-        raise _no_graph(name)
+    span = span_of(begin, end, skip)
+    if source.is_bag:
+        raise source.no_graph()
     with Progress(doing) as line:
-        return replay(path, task_set, name=name, progress=line.events, skip=skip, span=span)
+        return replay(source.path, source.task_set, name=source.name, progress=line.events,
+                      skip=skip, span=span)
 
 
 def span_of(begin: int | None, end: int | None, skip: int = 0) -> tuple[int, int] | None:
@@ -133,48 +145,38 @@ def span_of(begin: int | None, end: int | None, skip: int = 0) -> tuple[int, int
     return span
 
 
-def outcome_of(
-    args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None
-) -> Replay | Reschedule:
+def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
     """Reschedule a recording if that is wanted or it is a bag; else replay it as recorded."""
-    if args.reschedule or is_bag(path):
-        return _rescheduled(args, path, name, task_set)
-    return as_recorded(
-        path, name, task_set, skip=args.skip, span=span_of(args.begin, args.end))
-
-
-def _rescheduled(
-    args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None
-) -> Reschedule:
-    """Run the scheduler over a recording of any kind."""
+    if not args.reschedule and not source.is_bag:
+        return as_recorded(source, skip=args.skip, begin=args.begin, end=args.end)
     settings = {
         'policy': args.policy, 'workers': args.workers, 'preemptive': args.preemptive,
-        'on_late': args.on_late, 'skip': args.skip, 'cpus': args.cpus, 'name': name}
-    if is_bag(path):
-        return _rescheduled_bag(args, path, name, task_set, settings)
+        'on_late': args.on_late, 'skip': args.skip, 'cpus': args.cpus, 'name': source.name}
+    if source.is_bag:
+        return _rescheduled_bag(args, source, settings)
     options.refuse(args, ('execution_times', 'seed'),
                    'a trace has its own execution times: leave the option out')
     from mddag_executor.replay import reschedule
     recorded = args.overheads in (None, _RECORDED)
     with Progress('replaying') as line:
         return reschedule(
-            path, task_set, overheads=recorded,
+            source.path, source.task_set, overheads=recorded,
             dispatch_overhead=0 if recorded else args.overheads,
             progress=line.events, processes=_processes(args), **settings)
 
 
 def _rescheduled_bag(
-    args: argparse.Namespace, path: Given, name: str, task_set: TaskSet | None,
-    settings: dict[str, Any],
+    args: argparse.Namespace, source: Source, settings: dict[str, Any]
 ) -> Reschedule:
     from mddag_executor.replay.bags_reschedule import reschedule_bag
     from mddag_executor.simulate import read_execution_times
+    path, task_set = source.path, source.task_set
     assert isinstance(path, str)
     if args.processes is not None:
         raise UsageError('--processes: an ordinary bag does not say what computes: leave the '
                          'option out')
     if task_set is None or not args.reschedule:
-        raise _no_graph(name)
+        raise source.no_graph()
     if args.overheads == _RECORDED:
         raise UsageError('--overheads: a bag has none: give a time for each dispatch')
     times = None

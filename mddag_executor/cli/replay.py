@@ -49,9 +49,8 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.replay import Replay
     common.recording_and_graph(args)
     recorded.check(args)
-    with recorded.opened(args) as (path, name, task_set):
-        outcome = recorded.outcome_of(args, path, name, task_set)
-        drift = outcome.drift() if isinstance(outcome, Replay) else []
+    outcome = recorded.outcome_of(args, recorded.source_of(args))
+    drift = outcome.drift() if isinstance(outcome, Replay) else []
     warn(*outcome.warnings)
     result = outcome.result()
     if not args.reschedule:

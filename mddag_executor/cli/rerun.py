@@ -116,8 +116,8 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
     settings = Settings(
         defaults.workers(args.workers, task_set), args.cpus, args.policy, args.seed,
         args.all_clocks, ros_args=tuple(args.ros_args))
+    path, name = common.input_path(args.recording)
     with ExitStack() as files:
-        path, name = files.enter_context(common.input_recording(args.recording))
         source = open_input(path, task_set, args.times, args.seed, name)
         output: BinaryIO | None = None
         if args.output is not None:

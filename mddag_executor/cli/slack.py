@@ -84,14 +84,15 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
     from mddag_executor.replay import reschedule
     from mddag_executor.replay.slack import Problem
     options.refuse(args, _ONLY_GRAPH, 'a recording has its own: leave the option out')
-    with recorded.opened(args) as (path, name, task_set), Progress('replaying') as line:
-        if recorded.is_bag(path):
-            raise UsageError(
-                f'{name}: it has no execution times: give the declaration instead of an ordinary '
-                'bag')
+    source = recorded.source_of(args)
+    if source.is_bag:
+        raise UsageError(f'{source.name}: it has no execution times: give the declaration instead '
+                         'of an ordinary bag')
+    with Progress('replaying') as line:
         outcome = reschedule(
-            path, task_set, policy=args.policy, workers=args.workers, preemptive=args.preemptive,
-            name=name, progress=line.events, skip=args.skip, cpus=args.cpus)
+            source.path, source.task_set, policy=args.policy, workers=args.workers,
+            preemptive=args.preemptive, name=source.name, progress=line.events, skip=args.skip,
+            cpus=args.cpus)
     warn(*outcome.warnings)
     problem = Problem(outcome.work, outcome.settings, outcome.tables,
                       outcome.task_set.places_of_vertices())

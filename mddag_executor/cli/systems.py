@@ -36,9 +36,7 @@ def recorded_system(given: str) -> System:
                 system = System(trace, given, line.events)
             system.warnings = [*warnings, *system.warnings]
         else:
-            name = common.STDIN if given == '-' else given
-            with common.input_file(given) as path:
-                system = System(path if given == '-' else given, name, line.events)
+            system = System(*common.input_path(given), line.events)
     warn(*system.warnings)
     return system
 
