@@ -84,15 +84,15 @@ def input_path(given: R) -> tuple[R | str, str]:
     """
     Return the path of a file or recording, and its name for messages.
 
-    Standard input (`-`) is copied to a file, which is removed when the program ends.
+    Standard input (`-`) is copied to a file without a name, which can be read more than once.
     """
     global _copy
     if given != '-':
         return given, str(given)  # as the user wrote it: pathlib would change ./a
-    source, _copy = _claim_stdin(), tempfile.NamedTemporaryFile(prefix='mddag-')
+    source, _copy = _claim_stdin(), tempfile.TemporaryFile()
     shutil.copyfileobj(source, _copy, 1 << 20)
     _copy.flush()
-    return _copy.name, STDIN
+    return f'/proc/self/fd/{_copy.fileno()}', STDIN
 
 
 def recording_and_graph(args: argparse.Namespace) -> None:

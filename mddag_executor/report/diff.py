@@ -14,7 +14,13 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mddag_executor.core.tally import Counts, counts, total
-from mddag_executor.report.tables import percent, short_names, verdicts_text
+from mddag_executor.report.tables import (
+    percent,
+    short_names,
+    times,
+    verdicts_text,
+    with_means,
+)
 from mddag_executor.report.text import Cell, format_ns, printable, table
 from mddag_executor.text import counted
 
@@ -99,10 +105,8 @@ def _sink(
 def _callback(use: Mapping[str, int] | None) -> dict[str, Any] | None:
     if use is None:
         return None
-    n = use['executions']
-    return {
-        'executions': n, 'mean_ns': use['busy_ns'] // n if n else None,
-        'longest_ns': use['longest_ns'], 'mean_wait_ns': use['waiting_ns'] // n if n else None}
+    found = with_means(use)
+    return {key: found[key] for key in ('executions', 'mean_ns', 'longest_ns', 'mean_wait_ns')}
 
 
 def sinks_table(difference: Mapping[str, Any]) -> str:
@@ -123,9 +127,8 @@ def sinks_table(difference: Mapping[str, Any]) -> str:
 def _cells(side: Mapping[str, Any] | None) -> list[Cell]:
     if side is None:
         return [None] * 4
-    response = side['response_ns']
-    return [side['due'], percent(side['in_time'], side['due']), *(
-        None if response is None else format_ns(response[key], 3) for key in ('median', 'p99'))]
+    return [side['due'], percent(side['in_time'], side['due']),
+            *times(side['response_ns'], 'median', 'p99')]
 
 
 def _order(sink: Mapping[str, Any]) -> tuple[bool, float]:
@@ -158,13 +161,11 @@ def callbacks_table(difference: Mapping[str, Any]) -> str:
     """Return a table of the callbacks' executions and times in both runs."""
     rows: list[list[Cell]] = []
     short = short_names(difference['callbacks'])
-    for key, sides in difference['callbacks'].items():
-        row: list[Cell] = [short[key]]
-        for what in ('executions', 'mean_ns', 'longest_ns', 'mean_wait_ns'):
-            for side in (sides['a'], sides['b']):
-                value = None if side is None else side[what]
-                row.append(value if value is None or what == 'executions' else format_ns(value, 3))
-        rows.append(row)
+    for key, both in difference['callbacks'].items():
+        sides = [both[side] for side in 'ab']
+        rows.append([short[key], *(side and side['executions'] for side in sides), *(
+            cell for what in ('mean_ns', 'longest_ns', 'mean_wait_ns')
+            for side in sides for cell in times(side, what))])
     return table(('callback', 'ran A', 'ran B', 'mean A', 'mean B', 'longest A', 'longest B',
                   'wait A', 'wait B'), rows)
 

@@ -14,6 +14,8 @@ from mddag_executor.report.tables import (
     ratio,
     run_lines,
     short_names,
+    times,
+    with_means,
     worst_first,
 )
 from mddag_executor.report.text import Cell, format_ns, printable, table
@@ -34,40 +36,30 @@ _COMPARISON_HEADER = (
 
 def times_tables(dags: Mapping[str, Any]) -> Iterator[str]:
     """Yield tables of the parts of response times: mean, and of the worst job."""
-    for title, which in (('Where the response times went, on average:', 'mean'),
-                         ('The same of the worst job of each sink:', 'worst')):
-        found = [(sink.shown_name, None if sink.result['breakdown'] is None
-                  else sink.result['breakdown'][which]) for sink in worst_first(dags)]
+    for title, which, job in (
+            ('Where the response times went, on average:', 'mean', []),
+            ('The same of the worst job of each sink:', 'worst', ['job'])):
+        found = [(sink.shown_name, (sink.result['breakdown'] or {which: None})[which])
+                 for sink in worst_first(dags)]
         # most programs have neither groups that wait nor coroutines
-        parts = [name for name, key in _PARTS.items() if name not in ('for group', 'suspended')
-                 or any(of is not None and of[key] for _, of in found)]
+        parts = {name: key for name, key in _PARTS.items() if name not in (
+            'for group', 'suspended') or any(of and of[key] for _, of in found)}
         yield title
-        yield table(('sink', *(['job'] if which == 'worst' else []), *parts), [
-            [name, *([None] if which == 'worst' else []), *[None] * len(parts)] if of is None else
-            [name, *([of['job']] if which == 'worst' else []),
-             *(_time(of[_PARTS[part]]) for part in parts)]
+        yield table(('sink', *job, *parts), [
+            [name, *((of or {}).get(each) for each in job), *times(of, *parts.values())]
             for name, of in found])
-
-
-def _time(nanoseconds: int) -> str:
-    return format_ns(nanoseconds, 3)
 
 
 def callbacks_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[Cell]]:
     """Yield the rows of the table of callbacks."""
     short = short_names(callbacks)
     for key, use in callbacks.items():
-        n = use['executions']
+        n, busy = use.get('measured', 0), use.get('measured_busy_ns', 0)
         yield [
-            short[key], n, _time(use['busy_ns']), _time(use['busy_ns'] // n) if n else None,
-            _time(use['longest_ns']), _time(use['waiting_ns'] // n) if n else None,
-            _time(use['longest_wait_ns']), *_computed(use)]
-
-
-def _computed(use: Mapping[str, int]) -> list[Cell]:
-    """Return the share of CPU time in a callback's time, and how often it held the GIL."""
-    n, busy = use.get('measured', 0), use.get('measured_busy_ns', 0)
-    return [f'{use["cpu_ns"] / busy:.0%}' if n and busy else None,
+            short[key], use['executions'],
+            *times(with_means(use), 'busy_ns', 'mean_ns', 'longest_ns', 'mean_wait_ns',
+                   'longest_wait_ns'),
+            f'{use["cpu_ns"] / busy:.0%}' if n and busy else None,
             f'{use["held_interpreter"] / n:.0%}' if n else None]
 
 
@@ -75,16 +67,16 @@ def recorded_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[C
     """Yield the rows of the table of an imported recording's callbacks."""
     for label, use in callbacks.items():
         n = use['executions']
-        yield [
-            label, n, _time(use['busy_ns']), _time(use['shortest_ns']) if n else None,
-            _time(use['busy_ns'] // n) if n else None, _time(use['longest_ns']) if n else None]
+        mean = {**use, 'mean_ns': use['busy_ns'] // max(1, n)}
+        yield [label, n, *times(use, 'busy_ns'),
+               *times(mean if n else None, 'shortest_ns', 'mean_ns', 'longest_ns')]
 
 
 def communications_table(communications: Iterable[Mapping[str, Any]]) -> str:
     """Return a table of messages, from publication to callback; those of ROS itself come last."""
     rows: list[list[Cell]] = [
         [each['topic'], each['publisher'], each['callback'], each['sent'], each['arrived'],
-         *(_time(each['latency_ns'][key]) for key in ('min', 'median', 'p99', 'max'))]
+         *times(each['latency_ns'], 'min', 'median', 'p99', 'max')]
         for each in sorted(communications, key=lambda each: is_background(each['topic'], ''))]
     return table(('topic', 'publisher', 'callback', 'sent', 'arrived', 'min', 'median', 'p99',
                   'max'), rows)
@@ -119,11 +111,9 @@ def paths_rows(paths: Mapping[str, Any]) -> Iterator[list[Cell]]:
         arrived: Cell = f'{path["arrived"]} of {path["flows"]}'
         every = {case.replace('_', '-'): path['response_time'][case] for case in _CASES}
         every['data age'] = path['data_age']
-        for case, times in every.items():
-            figures: list[Cell] = [None] * 5 if times is None else [
-                times['count'],
-                *(_time(times[key]) for key in ('min', 'median', 'p99', 'max'))]
-            yield [shown, arrived, case, *figures]
+        for case, of in every.items():
+            yield [shown, arrived, case, None if of is None else of['count'],
+                   *times(of, 'min', 'median', 'p99', 'max')]
             shown = arrived = ''
 
 
@@ -137,9 +127,7 @@ def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> st
             counts(sides[0]).due]
         row += [percent(counts(side).in_time, counts(side).due) for side in sides]
         for key in ('p99', 'max'):
-            for side in sides:
-                response = side['response_ns']
-                row.append(None if response is None else _time(response[key]))
+            row += [cell for side in sides for cell in times(side['response_ns'], key)]
         rows.append(row)
     return table(_COMPARISON_HEADER, rows)
 
@@ -164,7 +152,7 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     undeclared = result['undeclared']
     if undeclared['executions']:
         yield (f'{counted(undeclared["executions"], "run")} of undeclared callbacks, '
-               f'{_time(undeclared["busy_ns"])} altogether')
+               f'{format_ns(undeclared["busy_ns"], 3)} altogether')
     dropped = result['dropped']
     if dropped:
         yield f'{sum(dropped.values())} dropped: ' + ', '.join(

@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 from mddag_executor.report.html_tables import Html, html_table, page_head
-from mddag_executor.report.tables import percent, short_names
+from mddag_executor.report.tables import percent, short_names, times
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 
@@ -44,11 +44,8 @@ def _is_judged(result: Mapping[str, Any]) -> bool:
 
 def _margins(sink: Mapping[str, Any]) -> list[Cell]:
     margin, deadline = sink['margin_ns'], sink['relative_deadline_ns']
-    if margin is None:
-        return [format_ns(deadline), None, None, None, None]
-    of_it = percent(margin['min'], deadline) if margin['min'] >= 0 else None
-    return [format_ns(deadline), format_ns(margin['min'], 3), of_it,
-            format_ns(margin['p1'], 3), format_ns(margin['median'], 3)]
+    of_it = None if margin is None or margin['min'] < 0 else percent(margin['min'], deadline)
+    return [format_ns(deadline), *times(margin, 'min'), of_it, *times(margin, 'p1', 'median')]
 
 
 def _missed_lines(result: Mapping[str, Any]) -> Iterator[str]:

@@ -90,7 +90,8 @@ def sink_columns(dags: Mapping[str, Any]) -> tuple[list[str], Callable[[Sink], l
         verdicts, result = counts(sink.result), sink.result
         row: list[Cell] = [
             verdicts.due, percent(verdicts.in_time, verdicts.due), verdicts.late,
-            *(getattr(verdicts, name) for name in rare), *response_cells(result['response_ns']),
+            *(getattr(verdicts, name) for name in rare),
+            *times(result['response_ns'], 'median', 'p99', 'max'),
             format_ns(result['relative_deadline_ns'])]
         if tolerates:
             limit = result.get('tolerate')
@@ -117,11 +118,17 @@ def rare_ends(every: Counts) -> list[str]:
     return [name for name in ('failed', 'aborted', 'dropped', 'demoted') if getattr(every, name)]
 
 
-def response_cells(response: Mapping[str, int] | None) -> list[Cell]:
-    """Return the cells for median, p99 and max of response times."""
-    if response is None:
-        return [None, None, None]
-    return [format_ns(response[key], 3) for key in ('median', 'p99', 'max')]
+def times(values: Mapping[str, Any] | None, *keys: str) -> list[Cell]:
+    """Return cells with some of the values, times in ns; empty ones for unknown values."""
+    return [None if values is None or values[key] is None else format_ns(values[key], 3)
+            for key in keys]
+
+
+def with_means(use: Mapping[str, int]) -> dict[str, int | None]:
+    """Return the usage of a callback, with ``mean_ns`` and ``mean_wait_ns`` of its executions."""
+    n = use['executions']
+    return {**use, 'mean_ns': use['busy_ns'] // n if n else None,
+            'mean_wait_ns': use['waiting_ns'] // n if n else None}
 
 
 def percent(part: int, whole: int) -> str:
