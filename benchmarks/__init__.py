@@ -10,9 +10,8 @@ The benchmarks behind the figures of the docs; run from a checkout, not installe
 
 Theory of operation
 -------------------
-One measurement is a ``Spec``.  ``campaign`` runs each in a separate process (``python -m
-benchmarks.child``), one after the other, so no measurement shares threads, caches or nodes with
-another.
+One measurement is a ``Spec``.  ``campaign`` runs each in a separate process, one after
+the other, so no measurement shares threads, caches or nodes with another.
 
 There are two families of loads.  *Declared* loads (``autoware``, ``reference-system``) are the
 synthetic nodes of a declaration, with the same draw of execution times for every executor; they

@@ -14,10 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
-import json
+from dataclasses import dataclass, replace
 import statistics
-import sys
 from typing import Any
 
 from mddag_executor.core import policy as find_policy
@@ -91,16 +89,6 @@ class Spec:
         """Return the executor's name, with the policy unless that is rad."""
         return self.executor if self.policy == 'rad' else f'{self.executor}:{self.policy}'
 
-    def to_json(self) -> str:
-        """Return the measurement as text."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> Spec:
-        """Return the measurement that ``to_json`` wrote."""
-        fields: dict[str, Any] = json.loads(text)
-        return cls(**fields)
-
 
 def parse_executors(text: str, policies: str | None = None) -> list[tuple[str, str]]:
     """
@@ -153,9 +141,10 @@ def measure(
                 replace(spec, process=name), tick if name == names[0] else None, patience_s),
                 names)
             return of_processes(spec, list(parts))
-    return run_child(
-        [sys.executable, '-m', 'benchmarks.child', spec.to_json()], spec.name,
+    figures: dict[str, Any] = run_child(
+        'benchmarks.loads:run', (spec,), spec.name,
         spec.seconds + spec.warm_up_s + patience_s + spec.idle * 0.05, tick)
+    return figures
 
 
 def _processes(spec: Spec) -> list[str]:

@@ -14,11 +14,10 @@ from functools import partial
 import math
 import os
 import resource
-import sys
 import time
 from typing import Any
 
-from mddag_executor.hosting.child import answer, run_child
+from mddag_executor.hosting.child import run_child
 from mddag_executor.memory import peak_memory_mb
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import (
@@ -128,8 +127,8 @@ def measure(name: str, path: str, limit: int) -> dict[str, Any]:
     :param limit: number of events after which a reader of ``OTHERS`` stops.
     :return: the cost of reading: events (as far as read), seconds, memory.
     """
-    return run_child(
-        [sys.executable, '-m', 'benchmarks.readers', name, path, str(limit)], name, LIMIT_S)
+    cost: dict[str, Any] = run_child(f'{__name__}:_measure', (name, path, limit), name, LIMIT_S)
+    return cost
 
 
 def _measure(name: str, path: str, limit: int) -> dict[str, Any]:
@@ -142,7 +141,3 @@ def _measure(name: str, path: str, limit: int) -> dict[str, Any]:
         'cpu_s': cpu + children.ru_utime + children.ru_stime, 'events_per_s': count / took,
         'peak_mb': peak_memory_mb() + children.ru_maxrss / 1024,
         'partial': name in OTHERS and count == limit}
-
-
-if __name__ == '__main__':
-    answer(lambda: _measure(sys.argv[1], sys.argv[2], int(sys.argv[3])))

@@ -13,12 +13,10 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 import gc
-import json
-import sys
 import time
 from typing import Any
 
-from mddag_executor.hosting.child import answer, ChildError, run_child, Tick
+from mddag_executor.hosting.child import ChildError, run_child, Tick
 from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Mode
 from mddag_executor.hosting.session import Session
 from mddag_executor.hosting.synthetic import no_job, SyntheticWorkload
@@ -104,33 +102,26 @@ def measure_peer(
     :param executor: ``single``, ``multi`` or ``events``.
     :param seconds: duration of the measurement, after ``WARM_UP_S``.
     :raises ChildError: when the run cannot be made.
+    :raises mddag_executor.hosting.measure.PlanError: when no execution time is declared.
     """
     task_set = load(graph)
+    plan = ExecutionPlan(task_set, seed, utilisation, workers, mode)
     names: Iterable[str | None] = [p.name for p in task_set.processes] or [None]
-    plan = seed, utilisation, workers, mode
 
     def part(name: str | None) -> dict[str, Any]:
-        request = {'executor': executor, 'graph': graph, 'seconds': seconds, 'process': name,
-                   'plan': plan}
-        return run_child(
-            [sys.executable, '-m', 'mddag_executor.hosting.peers', json.dumps(request)], executor,
+        ledger: dict[str, Any] = run_child(
+            f'{__name__}:run', (executor, plan, seconds, name), executor,
             seconds + WARM_UP_S + PATIENCE_S, tick if len(task_set.processes) < 2 else None)
+        return ledger
 
     with ThreadPoolExecutor(max(1, len(task_set.processes))) as threads:
         ledgers = list(threads.map(part, names))
-    return measure(Ledger.of_processes(task_set, ledgers), ExecutionPlan(task_set, *plan))
+    return measure(Ledger.of_processes(task_set, ledgers), plan)
 
 
-def run(request: dict[str, Any]) -> dict[str, Any]:
-    """Run nodes in this process; return their ledger."""
+def run(executor: str, plan: ExecutionPlan, seconds: float, process: str | None) -> dict[str, Any]:
+    """Run the nodes of a plan, or of one of its processes, here; return their ledger."""
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    task_set = load(request['graph'])
-    plan = ExecutionPlan(task_set, *request['plan'])
-    workload = SyntheticWorkload(
-        task_set, plan, current_job=no_job, process=request['process'])
-    run_nodes(make_peer(request['executor'], plan.workers), workload, request['seconds'])
+    workload = SyntheticWorkload(plan.task_set, plan, current_job=no_job, process=process)
+    run_nodes(make_peer(executor, plan.workers), workload, seconds)
     return vars(workload.ledger)
-
-
-if __name__ == '__main__':
-    answer(lambda: run(json.loads(sys.argv[1])))

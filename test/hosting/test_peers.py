@@ -9,6 +9,7 @@ import subprocess
 import sys
 
 from mddag_executor.hosting.child import ChildError, CrashError, run_child
+from mddag_executor.hosting.measure import PlanError
 from mddag_executor.hosting.peers import measure_peer
 from msg_graph import GraphError
 import pytest
@@ -21,23 +22,6 @@ nodes:
   - {node: /a, callbacks: [{name: t, timer: 20ms, publishes: [/x], execution_time: 1ms}]}
   - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 500ms, execution_time: 1ms}]}
 """
-
-CHILD = """
-from mddag_executor.hosting.child import answer
-import os, threading
-from pathlib import Path
-
-
-def run():
-    %s
-
-answer(run)
-"""
-
-
-def child(body: str) -> list[str]:
-    return [sys.executable, '-c', CHILD % body]
-
 
 def test_nodes_are_measured_as_one_run(tmp_path):
     graph = tmp_path / 'graph.yaml'
@@ -56,31 +40,41 @@ def test_what_is_wrong_is_one_line(tmp_path):
         measure_peer('multi', str(tmp_path / 'bad.yaml'), 2, seconds=1.0, seed=0, utilisation=0.1,
                      mode='sleep')
     (tmp_path / 'untimed.yaml').write_text(GRAPH.replace(', execution_time: 1ms', ''))
-    with pytest.raises(ChildError, match='untimed.yaml: no callback has an execution time'):
+    with pytest.raises(PlanError, match='untimed.yaml: no callback has an execution time'):
         measure_peer('multi', str(tmp_path / 'untimed.yaml'), 2, seconds=1.0, seed=0,
                      utilisation=0.1, mode='sleep')
 
 
-@pytest.mark.parametrize(('body', 'says'), [
-    ('raise ValueError("boom")', '^it: ValueError: boom$'),
-    ('os.kill(os.getpid(), 11)', '^it: it crashed with signal 11$'),
-    ('os._exit(3)', '^it: it ended with status 3$'),
-    ('os._exit(0)', "^it: it ended well but gave no result: b''$")])
-def test_a_crash_says_how(body, says):
-    with pytest.raises(CrashError, match=says):
-        run_child(child(body), 'it', 60.0)
+@pytest.mark.parametrize(('function', 'arguments', 'says'), [
+    ('builtins:int', ('boom',), "ValueError: invalid literal for int.. with base 10: 'boom'$"),
+    ('signal:raise_signal', (11,), 'it crashed with signal 11 and gave no result$'),
+    ('os:_exit', (3,), 'it ended with status 3 and gave no result$'),
+    ('nowhere:run', (), "ModuleNotFoundError: No module named 'nowhere'$"),
+    ('time:sleep', (60,), 'it did not end within 1 s and was killed$')])
+def test_a_crash_says_how(function, arguments, says):
+    with pytest.raises(CrashError, match=f'^it: {says}'):
+        run_child(function, arguments, 'it', 1.0 if function == 'time:sleep' else 60.0)
+
+
+def test_what_the_child_refuses_is_its_message_and_its_output_is_not_shown(capfd):
+    with pytest.raises(ChildError, match="^policy 'x': ") as raised:
+        run_child('mddag_executor.core:policy', ('x',), 'it', 60.0)
+    assert not isinstance(raised.value, CrashError)
+    expression = '(__import__("os").write(1, b"said"), {2: None})'
+    assert run_child('builtins:eval', (expression,), 'it', 60.0) == (4, {2: None})
+    assert capfd.readouterr() == ('', '')
 
 
 @pytest.mark.parametrize('hangs', [
-    'threading.Event().wait()',
-    'import ctypes; ctypes.PyDLL(None).pause()'])  # with the interpreter: none of it runs any more
+    'time.sleep(60)',
+    'ctypes.PyDLL(None).pause()'])  # with the interpreter: none of it runs any more
 def test_a_child_does_not_outlive_who_wants_its_result(tmp_path, hangs):
     mark = tmp_path / 'pid'
-    body = (f'Path({str(mark)!r} + "x").write_text(str(os.getpid())); '
+    body = (f'import ctypes, os, time; open({str(mark)!r} + "x", "w").write(str(os.getpid())); '
             f'os.rename({str(mark)!r} + "x", {str(mark)!r}); {hangs}')
     parent = subprocess.Popen([sys.executable, '-c', (
         'from mddag_executor.hosting.child import run_child; '
-        f'run_child({child(body)!r}, "it", 60.0)')])
+        f'run_child("builtins:exec", ({body!r},), "it", 60.0)')])
     try:
         assert wait_for(mark.exists, 60.0)
         parent.send_signal(signal.SIGKILL)
