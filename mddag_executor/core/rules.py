@@ -104,7 +104,7 @@ from mddag_executor.core.jobs import (
     outdate_sink,
 )
 from mddag_executor.core.overload import demote, note_miss
-from mddag_executor.core.policies import Key, KeyFunction
+from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import (
     add_stale,
     idle_worker,
@@ -151,7 +151,9 @@ def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     s.job_active[slot] += 1
     s.x_left[x] = s.x_cost[x]
     order = s.scalars[ORDER] = s.scalars[ORDER] + 1
-    _enqueue(t, s, x, key(t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], order))
+    s.x_key[x] = key(
+        t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], order) + (x,)
+    _enqueue(t, s, x)
     if t.keep_newest[s.x_vertex[x]] != 0:
         _keep_newest(t, s, x, now)
 
@@ -193,20 +195,19 @@ def ready_undeclared(
     s.x_group[x] = group
     s.x_holds[x] = holds
     order = s.scalars[ORDER] = s.scalars[ORDER] + 1
-    _enqueue(t, s, x, key(t, t.n_vertices, now, job, order))
+    s.x_key[x] = key(t, t.n_vertices, now, job, order) + (x,)
+    _enqueue(t, s, x)
     return x
 
 
-def _enqueue(t: Tables, s: State, x: int, k: Key) -> None:
+def _enqueue(t: Tables, s: State, x: int) -> None:
     """Let a fresh execution wait with its key."""
-    entry = (k[0], k[1], k[2], k[3], x)
-    s.x_key[x] = entry
     s.x_started[x] = -1
     s.x_state[x] = WAITING
     if s.scalars[POLLING] == 0:
-        heappush(s.ready, entry)
+        heappush(s.ready, s.x_key[x])
     else:
-        wait_for_poll(t, s, entry)
+        wait_for_poll(t, s, s.x_key[x])
 
 
 def edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int) -> None:
@@ -259,7 +260,7 @@ def peek(t: Tables, s: State, now: int) -> int:
             entry = queue[0]
             x = entry[4]
             group = s.x_group[x]
-            slot = s.x_slot[x]
+            vertex = s.x_vertex[x]
             if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
                 heappop(queue)
                 if s.scalars[POLLING] == 0:
@@ -268,7 +269,7 @@ def peek(t: Tables, s: State, now: int) -> int:
                     wait_for_poll(t, s, entry)
                 queue = next_queue(t, s, False)
                 continue
-            if (now > s.job_hope[slot] + s.start_by[s.x_vertex[x]]
+            if (vertex < t.n_vertices and now > s.job_hope[s.x_slot[x]] + s.start_by[vertex]
                     and demote(t, s, x, now)):
                 if group >= 0 and s.group_owner[group] == -1:
                     _release_group(s, group)  # others of the group may go first
@@ -282,8 +283,9 @@ def peek(t: Tables, s: State, now: int) -> int:
                     _release_group(s, group)  # others of the group may go first
                 queue = next_queue(t, s, False)
                 continue
-            if s.x_vertex[x] == t.n_vertices:
+            if vertex == t.n_vertices:
                 return x
+            slot = s.x_slot[x]
             if s.job_state[slot] == OPEN:
                 if (t.on_late[s.job_dag[slot]] != ABORT
                         or next_deadline(t, s, slot, -NEVER) >= now):
@@ -305,7 +307,7 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     x = peek(t, s, now)
     if x < 0:
         return -1
-    heappop(s.ready if s.ready and s.ready[0][4] == x else s.held_back)
+    heappop(s.held_back if s.held_back and s.held_back[0][4] == x else s.ready)
     start_on(s, x, worker, now)
     return x
 
@@ -370,8 +372,8 @@ def _put_back(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     s.x_left[x] += s.scalars[SWITCH_OVERHEAD] - (now - s.x_started[x])
     s.scalars[ORDER] += 1
     slot = s.x_slot[x]
-    k = key(t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], s.scalars[ORDER])
-    s.x_key[x] = (k[0], k[1], k[2], k[3], x)
+    s.x_key[x] = key(
+        t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], s.scalars[ORDER]) + (x,)
     s.x_state[x] = WAITING
     heappush(s.ready, s.x_key[x])
 

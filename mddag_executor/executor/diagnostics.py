@@ -220,11 +220,10 @@ class PoolWatch:
         failed = self._recorder is not None and self._recorder.writer.error is not None
         if failed:
             lost.append('the trace cannot be written')
-        scheduler = self._engine.scheduler
         values = {
-            'policy': scheduler.policy.name, 'workers': str(workers),
-            'idle_workers': str(scheduler.idle_workers), 'lent': str(self._pool.lent),
-            'queue': str(scheduler.queue_length), 'computing': str(self._registry.computing()),
+            'policy': self._engine.scheduler.policy.name, 'workers': str(workers),
+            'idle_workers': str(self._engine.idle_workers), 'lent': str(self._pool.lent),
+            'queue': str(self._engine.queue_length), 'computing': str(self._registry.computing()),
             'callbacks_per_s': f'{step["ran"] * 1e9 / passed:.1f}',
             'busy_ratio': f'{step["busy_ns"] / passed / workers:.3f}',
             'cpu_ratio': f'{cpu_used / passed:.3f}',

@@ -20,12 +20,18 @@ that times never decrease.  The engine and ``other_processes`` change the core's
     one.
 3.  *The core decides* what to run (``dispatch``), and handles the ends of executions
     (``finished``, ``suspended``, ``refused``, …): see ``core.rules``.
-4.  *Further decisions* of the core (verdicts, ends of jobs, executions dropped by an abort) are
+4.  *The bypass.*  While nothing is waiting, running or owning a callback group in the core, short
+    undeclared callbacks run one after the other, in the order in which they became ready, and the
+    core does not know of them.  It would choose the same.  As soon as there is anything else to
+    choose from (a declared or long callback, a second thread), ``_end_bypass`` reports the running
+    one and the waiting ones to the core.
+5.  *Further decisions* of the core (verdicts, ends of jobs, executions dropped by an abort) are
     counted, recorded and reported to the user (``verdicts``).
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from threading import get_native_id
 from typing import Any, TYPE_CHECKING
@@ -45,7 +51,7 @@ from mddag_executor.core.state import (
     SUSPENDED,
     WAITING,
 )
-from mddag_executor.executor.bounds import MOST
+from mddag_executor.executor.bounds import MOST, SHORT_CALLBACK_NS
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.entity import Entity, SUBSCRIPTION, TIMER
 from mddag_executor.executor.jobs import Announced, Jobs, NO_ORIGIN, Origin
@@ -98,6 +104,13 @@ class Engine:
         self.refusals = 0
         self.to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
+        # see 4. above: the execution that runs meanwhile, since when, and those that wait, whose
+        # ids (``Work.x``) are below -1
+        self._is_bypassed = self._may_bypass = False
+        self._bypassing: Work | None = None
+        self._bypassing_since = 0
+        self._lane: deque[Work] = deque()
+        self._last_id = -1
         self._complete = self.scheduler.complete
         self._take = self.scheduler.take
         self._work: dict[int, Work] = {}
@@ -185,12 +198,46 @@ class Engine:
             self._replace_oldest(work, now)
             return
         self.undeclared += 1
-        x = work.x = self.scheduler.ready_undeclared(
-            entity.ready, entity.group, entity.habit.holds, now)
         work.ready_ns = now
+        if self._is_bypassed or self._begin_bypass():
+            x = work.x = self._last_id = self._last_id - 1
+            entity.waiting[x] = None
+            self._lane.append(work)
+        else:
+            self._enqueue(work)
         entity.ready += 1
+
+    def _enqueue(self, work: Work) -> None:
+        entity = work.entity
+        x = work.x = self.scheduler.ready_undeclared(
+            entity.ready, entity.group, entity.habit.holds, work.ready_ns)
         entity.waiting[x] = None
         self._work[x] = work
+
+    def allow_bypass(self) -> None:
+        """Let undeclared executions bypass the core, if the policy runs them as they come."""
+        key, undeclared = self.scheduler.policy.key, self.tables.n_vertices
+        self._may_bypass = key(self.tables, undeclared, 0, 1, 0) < key(
+            self.tables, undeclared, 0, 0, 1)
+
+    def _begin_bypass(self) -> bool:
+        state = self._state
+        self._is_bypassed = (
+            self._may_bypass and not self.has_waiting
+            and state.scalars[N_IDLE] == self.n_workers and max(state.group_owner, default=-1) < 0)
+        return self._is_bypassed
+
+    def _end_bypass(self) -> None:
+        """Report to the core what has bypassed it."""
+        self._is_bypassed = False
+        work, self._bypassing = self._bypassing, None
+        if work is not None:
+            self._enqueue(work)
+            self._start_next(work.worker, self._bypassing_since)
+        lane, self._lane = self._lane, deque()
+        for work in lane:
+            del work.entity.waiting[work.x]
+            self._enqueue(work)
 
     def ran_at_once(self, entity: Entity) -> None:
         """Count an undeclared callback that was handled at once."""
@@ -285,6 +332,8 @@ class Engine:
         return True
 
     def _start(self, work: Work, x: int, now: int) -> None:
+        if self._is_bypassed:
+            self._end_bypass()
         entity, state = work.entity, self._state
         state.x_group[x] = entity.group
         state.x_holds[x] = entity.habit.holds
@@ -301,6 +350,8 @@ class Engine:
 
     def _replace_oldest(self, work: Work, now: int) -> None:
         """Drop the oldest message of an undeclared callback; the callback keeps its position."""
+        if self._is_bypassed:
+            self._end_bypass()
         entity = work.entity
         places = iter(entity.waiting)
         first, second = next(places), next(places, -1)
@@ -331,6 +382,8 @@ class Engine:
     def remove(self, entity: Entity, now: int) -> None:
         """Forget a destroyed entity: its waiting executions never run."""
         entity.removed = entity.may_be_gone = True
+        if self._is_bypassed:
+            self._end_bypass()
         for x in list(entity.waiting):
             self._drop(entity, x, 'destroyed', now)
 
@@ -340,18 +393,23 @@ class Engine:
     def has_waiting(self) -> bool:
         """Return whether an execution waits that a worker may be able to run."""
         state = self._state
-        return bool(state.ready or state.held_back or state.unpolled)
+        return bool(self._lane or state.ready or state.held_back or state.unpolled)
+
+    @property
+    def queue_length(self) -> int:
+        """Return the number of executions that wait, for a worker or for their group."""
+        return len(self._lane) + self.scheduler.queue_length
 
     def waits_since(self, now: int) -> int:
         """Return since when the most urgent of the ready executions has waited; now: none does."""
         ready = self._state.ready
-        work = self._work.get(ready[0][4]) if ready else None
+        work = self._lane[0] if self._lane else self._work.get(ready[0][4]) if ready else None
         return now if work is None else work.ready_ns
 
     @property
     def idle_workers(self) -> int:
         """Return the number of workers that run nothing."""
-        return self._state.scalars[N_IDLE]
+        return self._state.scalars[N_IDLE] - (self._bypassing is not None)
 
     def dispatch(self, worker: int, now: int) -> Work | None:
         """
@@ -359,30 +417,53 @@ class Engine:
 
         :param worker: the worker to use if it is idle; else the lowest idle one is used.
         """
-        state = self._state
-        if not (state.ready or state.held_back or state.unpolled):
-            return None
-        if state.worker_x[worker] >= 0:
-            if not state.scalars[N_IDLE]:
+        work = None
+        if self._is_bypassed:
+            if not self._lane:
                 return None
-            worker = state.worker_x.index(-1)
-        if self.holders:
-            state.overtaking[1] = self._may_be_overtaken(now)
+            entity = self._lane[0].entity
+            if (self._bypassing is None and entity.wall_ns <= SHORT_CALLBACK_NS
+                    and entity.gate is None):
+                work = self._bypassing = self._lane.popleft()
+                self._bypassing_since = now
+                del entity.waiting[work.x]
+                work.x = -1
+                work.worker = worker
+            else:
+                self._end_bypass()
+        if work is None:
+            state = self._state
+            if not (state.ready or state.held_back or state.unpolled):
+                return None
+            if state.worker_x[worker] >= 0:
+                if not state.scalars[N_IDLE]:
+                    return None
+                worker = state.worker_x.index(-1)
+            if self.holders:
+                state.overtaking[1] = self._may_be_overtaken(now)
+            work = self._start_next(worker, now)
+            if work is None:
+                return None
+            entity = work.entity
+        if entity.collect_more is not None:
+            collect, entity.collect_more = entity.collect_more, None
+            collect()
+        return work
+
+    def _start_next(self, worker: int, now: int) -> Work | None:
+        """Start the execution that the core chooses for an idle worker; None: there is none."""
+        state = self._state
         x = self._take(worker, now)
         if state.decisions:
             self._decided(now)
         if x < 0:
             return None
         work = self._work.pop(x)
-        entity = work.entity
-        entity.waiting.pop(x, None)  # a suspended one was removed before
+        work.entity.waiting.pop(x, None)  # a suspended one was removed before
         work.worker = worker
         if state.x_holds[x]:
             self.holders.append(work)
             self._holds_since = now
-        if entity.collect_more is not None:
-            collect, entity.collect_more = entity.collect_more, None
-            collect()
         return work
 
     def relative_deadline(self, entity: Entity) -> int:
@@ -396,6 +477,10 @@ class Engine:
 
     def may_start_more(self, now: int) -> bool:
         """Return whether an idle worker may be able to start an execution; True if in doubt."""
+        if self._is_bypassed:
+            if self._bypassing is None or not self._lane:
+                return bool(self._lane)
+            self._end_bypass()
         state = self._state
         ready, held_back = state.ready, state.held_back
         if not state.scalars[N_IDLE] or not (ready or held_back or state.unpolled):
@@ -467,12 +552,16 @@ class Engine:
 
     def lend(self, work: Work) -> None:
         """Free the worker of an execution that continues without one."""
+        if self._is_bypassed:
+            self._end_bypass()
         self._let_go(work)
         self.scheduler.lend(work.x)
 
     def resume(self, work: Work) -> None:
         """Make a suspended execution ready again; does nothing if it is not suspended."""
         if work.x >= 0 and self._state.x_state[work.x] == SUSPENDED:
+            if self._is_bypassed:
+                self._end_bypass()
             self.scheduler.resume(work.x)
 
     def leave_group(self, work: Work) -> None:
@@ -502,6 +591,12 @@ class Engine:
         entity = work.entity
         entity.ran += 1
         entity.busy_ns += end - start
+        if work is self._bypassing:
+            self._bypassing = None
+            entity.failed += failed
+            if self.record is not None:
+                self._record_run(work, start, end, vtid, worker)
+            return
         x, work.x = work.x, -1
         if work in self.holders:
             self.holders.remove(work)
@@ -540,6 +635,8 @@ class Engine:
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Take a running execution off its worker until ``resume``."""
+        if self._is_bypassed:
+            self._end_bypass()
         work.entity.busy_ns += end - start
         if self.record is not None:
             self._record_run(work, start, end, vtid, worker)
@@ -577,6 +674,8 @@ class Engine:
 
     def destroyed(self, work: Work, now: int) -> None:
         """End a dispatched execution that must not run: its job cannot complete any more."""
+        if self._is_bypassed:
+            self._end_bypass()
         x, work.x = work.x, -1
         self._let_go(work)
         if work.origin is not None:
@@ -676,9 +775,15 @@ class Engine:
                 yield f'execution {x} has state {state.x_state[x]}, its work is of {work.x}'
             elif (x in work.entity.waiting) != (state.x_started[x] < 0):
                 yield f'execution {x}, started at {state.x_started[x]}, is counted wrongly'
-        for entity in {work.entity for work in self._work.values()}:
-            if any(x not in self._work or self._work[x].entity is not entity
-                   for x in entity.waiting):
+        if self._is_bypassed:
+            if (state.ready or state.held_back or state.unpolled
+                    or state.scalars[N_IDLE] < self.n_workers or max(state.group_owner, default=-1) >= 0):
+                yield 'the core is bypassed, but not empty'
+        elif self._lane or self._bypassing:
+            yield 'executions bypass the core, which does not allow it'
+        known = {**self._work, **{work.x: work for work in self._lane}}
+        for entity in {work.entity for work in known.values()}:
+            if any(x not in known or known[x].entity is not entity for x in entity.waiting):
                 yield f'{[*entity.waiting]} are not all executions of one entity that wait'
             if entity.kind == SUBSCRIPTION and 0 < entity.depth < len(entity.waiting):
                 yield (f'{len(entity.waiting)} messages wait in a queue of depth '

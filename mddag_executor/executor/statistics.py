@@ -33,8 +33,8 @@ def statistics(
     with pool.lock:
         result = engine.verdicts.tally.result()
         stops = cast(Stops, engine.verdicts.stops.result())
-        waiting = engine.scheduler.queue_length
-        idle = engine.scheduler.idle_workers
+        waiting = engine.queue_length
+        idle = engine.idle_workers
         undeclared = engine.undeclared
         elsewhere = set() if engine.other_processes is None else engine.other_processes.elsewhere()
     elsewhere |= registry.elsewhere(process)

@@ -5,9 +5,10 @@ The worker threads: they wait for events, report them to the engine, and run its
 
 Theory of operation
 -------------------
-1.  *A turn.*  A worker thread reports the end of its last execution, collects arrivals, and asks
-    the engine for the next execution: all in one section under one lock.  If there is none, the
-    thread waits in the epoll (``loop``).  The kernel wakes exactly one thread for each event.
+1.  *A turn.*  A worker thread reports the end of its last execution, and asks the engine for the
+    next one: all in one section under one lock.  If there is none, the thread waits in the epoll
+    (``loop``).  When it wakes, it collects the arrivals and asks again.  The kernel wakes exactly
+    one thread for each event.
 2.  *No event is overlooked.*  When no thread waits in the epoll, a thread that has more to run
     polls it first, every ``SHORT_CALLBACK_NS``.  So an urgent arrival is known before the next
     choice.
@@ -159,6 +160,7 @@ class WorkerPool:
         fail: Callable[[BaseException], None], prepare_thread: Callable[[], None] | None = None,
     ) -> None:
         self.engine = engine
+        engine.allow_bypass()
         self.clock = clock
         self._offset = clock.offset_ns
         # reentrant only to know its owner: a signal handler may run inside
@@ -424,74 +426,100 @@ class WorkerPool:
 
     def _work(self, me: WorkerThread) -> None:
         """Take turns until the pool is closed."""
-        loop, turn, execute = self.loop, self._turn, self._execute
+        loop, receive, go_on, execute = self.loop, self._receive, self._go_on, self._execute
         me.permit.acquire()
         me.is_parked = False
         current.running = me
-        events: Events = []
+        found = go_on(me)
         while True:
-            if turn(me, events):
+            if found:
                 execute(me)
-                events = []
                 if not self.polling and self.now - self._polled_at > SHORT_CALLBACK_NS:
-                    events = loop.wait(0)
                     self._polled_at = self.now
+                    events = loop.wait(0)
+                    if events:
+                        receive(me, events)
+                found = go_on(me)
             elif me.is_parked:
                 if self._closed:
                     return
-                events = []
                 me.permit.acquire()
                 me.is_parked = False
+                found = go_on(me)
             else:
-                events = loop.wait()
+                found = receive(me, loop.wait())
 
     # --- a turn ----------------------------------------------------------------------------------
 
-    def _turn(self, me: WorkerThread, events: Events, is_last: bool = False) -> bool:
+    def _receive(self, me: WorkerThread, events: Events) -> bool:
         """
-        Report the last end, collect arrivals, and find the next execution: ``me.work``.
+        Handle events, and find the next execution if the thread has none: ``me.work``.
+
+        :return: as ``_go_on``.
+        """
+        arrived, asking, is_due = self.loop.sources(events)
+        if asking:
+            self._collect(asking)
+        if self._deferred:
+            self._do_deferred()
+        calls: list[Callable[[], None]] = []
+        with self.lock:
+            # inlined tick: saves a call for each execution
+            now = self.now = monotonic_ns() + self._offset
+            since = me.waits_since
+            if since:
+                me.waits_since = 0
+                self._polled_at = now
+                self.polling -= 1
+                if self._leaving and not self.polling:
+                    self._all_left.set()
+            self._bell_rings = False  # the waiting thread may have received it
+            self._collect(arrived)
+            now = self.now      # a recorded message is later than the turn began
+            if is_due or self.timers.has_new or self.timers.has_jumped:
+                if self.running:
+                    calls = self.due.handle(now, self._waited_since(since or now))
+                self.due.arm(now - self._offset)
+            found = me.work is None and not calls and self._choose(me, now, True)
+        if calls:
+            self._call(calls)
+            found = me.work is None and self._go_on(me)
+        if (is_due or not found) and self._miss_log.is_behind():
+            self._call([self._miss_log.write])
+        return found
+
+    def _go_on(self, me: WorkerThread, is_last: bool = False) -> bool:
+        """
+        Report the end of the thread's last execution, and find the next one: ``me.work``.
 
         :param is_last: run nothing more in this thread.
         :return: False: there is no execution, and the thread is to wait in the epoll or is parked.
         """
-        calls: list[Callable[[], None]] = []
-        timed: Sequence[Callable[[], None]] = ()
-        arrived: Sequence[ChannelSource] = ()
-        is_due = False
-        if events:
-            arrived, asking, is_due = self.loop.sources(events)
-            if asking:
-                self._collect(asking)
-            if self._deferred:
-                self._do_deferred()
+        engine = self.engine
+        settle = None
         with self.lock:
-            # inlined tick: saves a call for each execution
             now = self.now = monotonic_ns() + self._offset
-            work, since = me.work, me.waits_since
+            work: Any = me.work
             if work is not None:
-                self._report_end(me, work, now, calls)
-            elif since:
-                me.waits_since = 0
-                self.polling -= 1
-                if self._leaving and not self.polling:
-                    self._all_left.set()
-            if events:
-                self._bell_rings = False  # the waiting thread may have received it
-                self._collect(arrived)
-                now = self.now      # a recorded message is later than the turn began
-                is_due = is_due or self.timers.has_new or self.timers.has_jumped
-                if is_due and self.running:
-                    timed = self.due.handle(now, self._waited_since(since or now))
-            found = not is_last and not timed and self._choose(me, now, bool(events))
-            if (is_due or self.engine.deadlines.next < self.due.deadline
-                    or not found and (self.due.may_expire_early or self.engine.holders)):
+                me.work = None
+                if me.outcome is None and not me.has_lent:
+                    engine.finished(work, me.start, me.end, now, me.vtid, work.worker)
+                    if engine.to_ask_again:
+                        engine.ask_again()
+                else:
+                    settle = self._report_unusual_end(me, work, now)
+                if work.entity.removed:
+                    self.executor.wake()  # the registry can forget it now
+                if self.muting.until and not engine.holders:
+                    self.muting.end()
+                    self.due.arm(now - self._offset)  # muted timers have new due times
+            if is_last:
                 self.due.arm(now - self._offset)
-            if (is_due or not found) and self._miss_log.is_behind():
-                calls.append(self._miss_log.write)
-        if calls or timed:
-            self._call([*calls, *timed])
-            if timed:
-                return self._turn(me, [])
+            found = not is_last and self._choose(me, now, False)
+        if settle is not None:
+            self._call([settle])
+        if not found and self._miss_log.is_behind():
+            self._call([self._miss_log.write])
         return found
 
     def _collect(self, sources: Sequence[ChannelSource]) -> None:
@@ -532,7 +560,11 @@ class WorkerPool:
     def _choose(self, me: WorkerThread, now: int, has_events: bool) -> bool:
         """Set the next execution, or where to wait; return whether there is an execution."""
         engine = self.engine
+        due = self.due
         work = engine.dispatch(me.worker, now) if self.running else None
+        if (engine.deadlines.next < due.deadline
+                or work is None and (due.may_expire_early or engine.holders)):
+            due.arm(now - self._offset)
         if work is None:
             if me.thread is not None:  # else a visitor: the thread of a spin_once
                 self._rest(me, has_events)
@@ -543,15 +575,17 @@ class WorkerPool:
         if holders:
             if holders[0].entity.habit.mean_ns >= TURN_NS or self.muting.until:
                 self.muting.update(now)
-                self.due.arm(now - self._offset)  # timers that are muted no more may be due sooner
+                due.arm(now - self._offset)  # timers that are muted no more may be due sooner
             if engine.has_waiting:
-                self.due.check_holder(now - self._offset)
+                due.check_holder(now - self._offset)
         entity = work.entity
         if entity.wall_ns <= SHORT_CALLBACK_NS:
             self._leader = me
-            if not self.polling and not self.guard.is_set:
+            if self.guard.is_set:
+                pass
+            elif not self.polling:
                 self._admit()
-            elif not (self.guard.is_set or entity.habit.holds) and engine.has_waiting:
+            elif not (entity.habit.holds and holders) and engine.has_waiting:
                 self._guard(now - self._offset)
         elif not self.polling:
             self._admit()
@@ -637,32 +671,14 @@ class WorkerPool:
             tail = me.end - self._offset - me.published
             entity.tail_ns += (tail - entity.tail_ns) >> 3
 
-    def _report_end(
-        self, me: WorkerThread, work: Work, now: int, calls: list[Callable[[], None]]
-    ) -> None:
-        """
-        Report how a thread's execution ended; the caller holds the lock.
-
-        :param calls: receives the functions to call afterwards without the lock.
-        """
-        engine = self.engine
-        me.work = None
-        if me.outcome is None and not me.has_lent:
-            engine.finished(work, me.start, me.end, now, me.vtid, work.worker)
-            if engine.to_ask_again:
-                engine.ask_again()
-        else:
-            self._report_unusual_end(me, work, now, calls)
-        if work.entity.removed:
-            self.executor.wake()  # the registry can forget it now
-        if self.muting.until and not engine.holders:
-            self.muting.end()
-            self.due.arm(now - self._offset)  # timers that were muted have new due times
-
     def _report_unusual_end(
-        self, me: WorkerThread, work: Work, now: int, calls: list[Callable[[], None]]
-    ) -> None:
-        """Report an execution that was refused, waits, has failed, or has lent its worker."""
+        self, me: WorkerThread, work: Work, now: int
+    ) -> Callable[[], None] | None:
+        """
+        Report an execution that was refused, waits, has failed, or has lent its worker.
+
+        :return: what to call afterwards without the lock.
+        """
         engine, start, end = self.engine, me.start, me.end
         outcome, worker = me.outcome, work.worker
         me.outcome = None
@@ -670,8 +686,6 @@ class WorkerPool:
             worker = -1
             me.has_lent = False
             self._waiting_calls -= 1
-        if outcome is not None:
-            calls.append(partial(self._settle_end, work, outcome))
         if isinstance(outcome, Refused):
             engine.refused(work, now)
         elif outcome is None:
@@ -687,6 +701,7 @@ class WorkerPool:
             engine.finished(work, start, end, now, me.vtid, worker, True)
         if not isinstance(outcome, Refused):
             engine.ask_again()
+        return None if outcome is None else partial(self._settle_end, work, outcome)
 
     def _settle_end(self, work: Work, outcome: Any) -> None:
         """Resume a suspended execution later, or report an exception; without the lock."""
@@ -764,14 +779,14 @@ class WorkerPool:
             self._visitors.append(me)
         before, current.running = current.running, me
         try:
-            found = self._turn(me, events)
+            found = self._receive(me, events)
             while found:
                 self._execute(me)
                 is_refused = isinstance(me.outcome, Refused)
-                self._turn(me, [], is_last=True)
+                self._go_on(me, is_last=True)
                 if not is_refused:
                     return True
-                found = self._turn(me, [])
+                found = self._go_on(me)
             return False
         finally:
             current.running = before

@@ -139,6 +139,76 @@ nodes:
 """
 
 
+class Twin:
+    """An engine with entities of several kinds, each work of which has a number."""
+
+    def __init__(self, policy: str) -> None:
+        self.engine = Engine(
+            loads(GRAPH), 2, policy, default_deadline=10 ** 9, max_active_jobs=NEVER,
+            expire_after=NEVER)
+        group = self.engine.scheduler.new_group()
+        self.entities = [
+            Entity('waitable', None, '/n', None, of, depth, '')
+            for of, depth in ((-1, 0), (group, 2), (group, 1), (-1, 0), (-1, 1))]
+        for entity, holds in zip(self.entities, (False, True, False, True, False)):
+            entity.habit = GilHabit(holds)
+            entity.wall_ns = 0
+        self.entities[0].wall_ns = 10 ** 6
+        self.entities[4].source = 0
+        self.running: list[Work] = []
+        self.suspended: list[Work] = []
+        self.count = 0
+
+    def do(self, step: str, which: int, now: int) -> tuple[Any, ...]:
+        """Carry out one step; return what can be seen of it."""
+        engine, entity, started = self.engine, self.entities[which], None
+        if step == 'ready':
+            self.count += 1
+            work = Work(entity, print, (self.count,))
+            if entity.source < 0:
+                engine.ready(work, now)
+            else:
+                engine.timer_due(work, now, now)
+        elif step == 'dispatch':
+            started = engine.dispatch(which % 2, now)
+            self.running += [started] * (started is not None)
+        elif step == 'remove':
+            engine.remove(entity, now)
+            entity.removed = False
+        elif step == 'resume' and self.suspended:
+            engine.resume(self.suspended.pop(which % len(self.suspended)))
+        elif step in ('finish', 'fail', 'suspend', 'lend') and self.running:
+            work = self.running[which % len(self.running)]
+            if step == 'lend':
+                engine.lend(work)
+            else:
+                self.running.remove(work)
+            if step == 'suspend':
+                engine.suspended(work, now, now, 0, work.worker)
+                self.suspended.append(work)
+            elif step != 'lend':
+                engine.finished(work, now, now, now, 0, work.worker, step == 'fail')
+        engine.validate()
+        return (
+            started and (started.args, started.worker), engine.queue_length, engine.has_waiting,
+            engine.idle_workers, engine.may_start_more(now),
+            engine.scheduler.policy.polling or engine.waits_since(now),
+            [(len(each.waiting), each.ran, each.dropped, each.skipped, each.failed)
+             for each in self.entities])
+
+
+@examples(300)
+@given(st.sampled_from(sorted(POLICIES)), st.lists(st.tuples(st.sampled_from([
+    'ready', 'ready', 'ready', 'dispatch', 'dispatch', 'finish', 'finish', 'suspend', 'resume',
+    'lend', 'fail', 'remove']), st.integers(0, 4)), max_size=80))
+def test_what_bypasses_the_core_runs_as_the_core_would_run_it(policy, steps):
+    twins = Twin(policy), Twin(policy)
+    twins[1].engine.allow_bypass()
+    for now, step in enumerate(steps):
+        seen = [twin.do(*step, now) for twin in twins]
+        assert seen[0] == seen[1], step
+
+
 def busy_engine() -> Engine:
     """
     Return an engine in which something of each kind is under way.
