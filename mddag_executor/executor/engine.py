@@ -221,11 +221,15 @@ class Engine:
             self.tables, undeclared, 0, 0, 1)
 
     def _begin_bypass(self) -> bool:
-        state = self._state
-        self._is_bypassed = (
-            self._may_bypass and not self.has_waiting
-            and state.scalars[N_IDLE] == self.n_workers and max(state.group_owner, default=-1) < 0)
+        self._is_bypassed = self._may_bypass and self._is_core_empty()
         return self._is_bypassed
+
+    def _is_core_empty(self) -> bool:
+        """Return whether nothing is waiting, running on a worker or owning a group in the core."""
+        state = self._state
+        return not (
+            state.ready or state.held_back or state.unpolled
+            or state.scalars[N_IDLE] < self.n_workers or max(state.group_owner, default=-1) >= 0)
 
     def _end_bypass(self) -> None:
         """Report to the core what has bypassed it."""
@@ -775,12 +779,9 @@ class Engine:
                 yield f'execution {x} has state {state.x_state[x]}, its work is of {work.x}'
             elif (x in work.entity.waiting) != (state.x_started[x] < 0):
                 yield f'execution {x}, started at {state.x_started[x]}, is counted wrongly'
-        if self._is_bypassed:
-            if (state.ready or state.held_back or state.unpolled
-                    or state.scalars[N_IDLE] < self.n_workers or max(state.group_owner, default=-1) >= 0):
-                yield 'the core is bypassed, but not empty'
-        elif self._lane or self._bypassing:
-            yield 'executions bypass the core, which does not allow it'
+        if (self._is_bypassed or self._lane or self._bypassing) and not (
+                self._is_bypassed and self._is_core_empty()):
+            yield 'executions bypass the core, which has others'
         known = {**self._work, **{work.x: work for work in self._lane}}
         for entity in {work.entity for work in known.values()}:
             if any(x not in known or known[x].entity is not entity for x in entity.waiting):

@@ -275,6 +275,7 @@ BREAKS: dict[str, tuple[str, Callable[[Engine], Any]]] = {
         e._state.job_dag.index(0), 9)),
     'open jobs': ('jobs of DAG 0 are open', lambda e: e._state.n_open.__setitem__(0, 0)),
     'deadline': ('next deadline', lambda e: setattr(e.deadlines, 'next', 5)),
+    'bypass': ('bypass the core', lambda e: setattr(e, '_is_bypassed', True)),
 }
 
 
