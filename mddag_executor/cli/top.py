@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
+import math
 import shutil
 import sys
 import time
@@ -53,21 +54,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Listen and show."""
-    live = sys.stdout.isatty() and not args.once and common.wants_tables(args)
-    board = Board()
-    seconds = None if args.duration is None else args.duration / 1e9
-    with _listening(board) as spin:
-        try:
-            if args.once:
-                _wait(spin, board, args.timeout / 1e9)
-            elif live:
-                _show_live(_ticks(spin, board, seconds, args.timeout / 1e9), board)
-            else:
-                _print_now_and_then(
-                    _ticks(spin, board, seconds, args.timeout / 1e9), board,
-                    common.wants_tables(args))
-        except KeyboardInterrupt:
-            pass  # how one leaves it
+    board, wanted = Board(), common.wants_tables(args)
+    live = sys.stdout.isatty() and not args.once and wanted
+    # Ctrl-C is how one leaves it
+    with _listening(board) as spin, suppress(KeyboardInterrupt), (
+            _screen() if live else nullcontext()):
+        for _ in _ticks(spin, board, args.duration, args.timeout, args.once):
+            statuses = board.statuses()
+            if live:
+                columns, lines = shutil.get_terminal_size()
+                text = tables(statuses, columns) if statuses else _WAITING
+                shown = ''.join(f'{line}{_TO_END}\n' for line in text.splitlines()[:lines - 1])
+                print(f'{_HOME}{shown}{_BELOW}', end='', flush=True)
+            elif statuses and wanted and not args.once:
+                print(tables(statuses), flush=True)
     if (args.once or args.duration is not None) and not board.statuses():
         raise NothingHeard(
             f'{TOPIC}: no executor has published its state here: start one with '
@@ -77,49 +77,35 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _wait(spin: Callable[[float], None], board: Board, seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while not board.statuses() and time.monotonic() < end:
-        spin(0.1)
-    # what other processes publish within the same second is shown, too
-    end = min(end, time.monotonic() + INTERVAL_S)
-    while time.monotonic() < end:
-        spin(0.1)
-
-
-def _show_live(ticks: Iterator[None], board: Board) -> None:
-    print(_ENTER, end='')
-    try:
-        for _ in ticks:
-            columns, lines = shutil.get_terminal_size()
-            statuses = board.statuses()
-            text = tables(statuses, columns) if statuses else _WAITING
-            shown = ''.join(f'{line}{_TO_END}\n' for line in text.splitlines()[:lines - 1])
-            print(f'{_HOME}{shown}{_BELOW}', end='', flush=True)
-    finally:
-        print(_LEAVE, end='', flush=True)
-
-
-def _print_now_and_then(ticks: Iterator[None], board: Board, wanted: bool) -> None:
-    for _ in ticks:
-        statuses = board.statuses()
-        if statuses and wanted:
-            print(tables(statuses), flush=True)
-
-
 def _ticks(
-    spin: Callable[[float], None], board: Board, seconds: float | None, patience_s: float
+    spin: Callable[[float], None], board: Board, duration_ns: int | None, patience_ns: int,
+    once: bool = False,
 ) -> Iterator[None]:
-    """Listen; yield once an interval until the time is over, or nothing has arrived in time."""
-    begin = time.monotonic()
-    due = begin
-    while seconds is None or (passed := time.monotonic() - begin) < seconds:
+    """
+    Listen; yield once an interval until the time is over, or nothing has arrived in time.
+
+    :param once: what other processes publish within an interval of the first status is the end.
+    """
+    begin = due = time.monotonic()
+    end = math.inf if duration_ns is None or once else begin + duration_ns / 1e9
+    while (now := time.monotonic()) < end:
         spin(0.1)
-        if seconds is not None and passed > patience_s and not board.statuses():
+        if board.statuses():
+            end = min(end, now + INTERVAL_S) if once else end
+        elif (once or duration_ns is not None) and now - begin > patience_ns / 1e9:
             return
-        if time.monotonic() >= due:
+        if now >= due:
             due += INTERVAL_S
             yield
+
+
+@contextmanager
+def _screen() -> Iterator[None]:
+    print(_ENTER, end='')
+    try:
+        yield
+    finally:
+        print(_LEAVE, end='', flush=True)
 
 
 @contextmanager

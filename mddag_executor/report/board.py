@@ -9,7 +9,6 @@ The statuses are those of ``mddag_executor.executor.diagnostics``; others on the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 import time
 from typing import Any, NamedTuple
 
@@ -21,41 +20,25 @@ GONE_AFTER_S = 5.0
 MOST_STATUSES = 1000
 
 
-class Column(NamedTuple):
-    """
-    A column of a table: its title, and the field or the value of a status that it shows.
-
-    :ivar unit: ``ms`` or ``%`` (the value is a share), or empty.
-    """
-
-    title: str
-    key: str
-    unit: str = ''
-
-
-# The most important columns first: on a narrow terminal the last ones are left out.
-_DAG_COLUMNS = (
-    Column('DAG', 'name'), Column('state', 'level'), Column('results', 'window_results'),
-    Column('missed', 'window_missed'), Column('p99', 'response_p99_ms', 'ms'),
-    Column('of deadline', 'deadline_used_max', '%'), Column('p50', 'response_p50_ms', 'ms'),
-    Column('max', 'response_max_ms', 'ms'), Column('jobs', 'jobs'),
-    Column('period', 'period_ms', 'ms'), Column('least margin', 'margin_min_ms', 'ms'),
-    Column('demoted', 'demoted'), Column('worst window', 'worst_window'))
-_POOL_COLUMNS = (
-    Column('workers of', 'name'), Column('state', 'level'), Column('busy', 'busy_ratio', '%'),
-    Column('CPU', 'cpu_ratio', '%'), Column('idle', 'idle_workers'), Column('queue', 'queue'),
-    Column('dropped', 'dropped'), Column('per s', 'callbacks_per_s'),
-    Column('us each', 'cpu_us_per_callback'), Column('compute', 'computing'),
-    Column('skipped', 'skipped'), Column('no job', 'unattributed'))
-_MESSAGE = Column('message', 'message')
-_PROCESS = Column('process', 'process')
-_WORDS = ('process', 'name', 'level', 'message')
+# The key of each column by its title. The most important columns come first: on a narrow terminal
+# the last ones are left out.
+_DAG_COLUMNS = {
+    'DAG': 'name', 'state': 'level', 'results': 'window_results', 'missed': 'window_missed',
+    'p99': 'response_p99_ms', 'of deadline': 'deadline_used_max', 'p50': 'response_p50_ms',
+    'max': 'response_max_ms', 'jobs': 'jobs', 'period': 'period_ms',
+    'least margin': 'margin_min_ms', 'demoted': 'demoted', 'worst window': 'worst_window'}
+_POOL_COLUMNS = {
+    'workers of': 'name', 'state': 'level', 'busy': 'busy_ratio', 'CPU': 'cpu_ratio',
+    'idle': 'idle_workers', 'queue': 'queue', 'dropped': 'dropped', 'per s': 'callbacks_per_s',
+    'us each': 'cpu_us_per_callback', 'compute': 'computing', 'skipped': 'skipped',
+    'no job': 'unattributed'}
+_PROCESS, _MESSAGE = {'process': 'process'}, {'message': 'message'}
+_SHARES = ('deadline_used_max', 'busy_ratio', 'cpu_ratio')
 _LEAST = 3          # minimum number of columns
 _MOST_MESSAGES = 5  # messages of statuses that are not OK, below the tables
 
 
-@dataclass(frozen=True)
-class Status:
+class Status(NamedTuple):
     """A received status: process, name, level, message, values, and time of arrival (s)."""
 
     process: str
@@ -101,81 +84,61 @@ class Board:
     def statuses(self) -> list[Status]:
         """Return the statuses by process and name; those of silent processes are GONE."""
         now = self._clock()
-        found = []
-        for _, s in sorted(self._statuses.items()):
-            if now - s.came > GONE_AFTER_S:
-                s = Status(s.process, s.name, GONE, f'nothing heard for {now - s.came:.0f} s',
-                           s.values, s.came)
-            found.append(s)
-        return found
+        return [
+            s if now - s.came <= GONE_AFTER_S else s._replace(
+                level=GONE, message=f'nothing heard for {now - s.came:.0f} s')
+            for _, s in sorted(self._statuses.items())]
 
     def result(self) -> dict[str, Any]:
         """Return the statuses for JSON."""
         return {'statuses': [
-            {'process': s.process, 'name': s.name, 'level': s.level, 'message': s.message,
-             'values': s.values} for s in self.statuses()]}
-
-
-def of_dags(statuses: list[Status]) -> list[Status]:
-    """Return the statuses of DAGs: one list for all processes, DAG by DAG."""
-    return sorted((s for s in statuses if not s.is_pool), key=lambda s: (s.name, s.process))
-
-
-def of_pools(statuses: list[Status]) -> list[Status]:
-    """Return the statuses of workers."""
-    return [s for s in statuses if s.is_pool]
-
-
-def _cell(status: Status, column: Column) -> str:
-    """Return the cell of a status in a column."""
-    if column.key == 'name' and status.is_pool:
-        return printable(status.name.rpartition(': ')[0] or status.name)
-    if column.key in _WORDS:
-        return printable(getattr(status, column.key))
-    value = status.values.get(column.key) or '-'
-    try:
-        number = float(value)
-        if column.unit == '%':
-            return f'{100 * number:.0f} %'
-        if column.unit == 'ms':
-            return format_ns(round(number * 1e6), 3)
-        return f'{number:.0f}'
-    except (ValueError, OverflowError):
-        return printable(value)     # no number
-
-
-def columns_that_fit(
-    columns: Sequence[Column], rows: Sequence[Status], width: int
-) -> list[Column]:
-    """Return the columns that fit on a terminal; the process only if there are several."""
-    kept = [*([_PROCESS] if len({s.process for s in rows}) > 1 else []), *columns]
-
-    def needed(column: Column) -> int:
-        return max(len(column.title), *(len(_cell(s, column)) for s in rows), 0)
-
-    while len(kept) > _LEAST and sum(needed(column) + 2 for column in kept) - 2 > width:
-        kept.pop()
-    return kept
+            {key: value for key, value in s._asdict().items() if key != 'came'}
+            for s in self.statuses()]}
 
 
 def tables(statuses: list[Status], width: int | None = None) -> str:
     """
-    Return the tables of DAGs and workers.
+    Return the tables of DAGs (one for all processes) and workers.
 
     :param width: of a terminal: only the columns that fit, and the messages below; None: all.
     """
-    parts = []
-    for every, rows in ((_DAG_COLUMNS, of_dags(statuses)), (_POOL_COLUMNS, of_pools(statuses))):
-        columns = [_PROCESS, *every, _MESSAGE]
-        if width is not None:
-            columns = columns_that_fit(every, rows, width)
-        parts.append(table(
-            [column.title for column in columns],
-            ([_cell(s, column) for column in columns] for s in rows),
-            marked=[width is not None and s.level not in ('OK', GONE) for s in rows],
-            most=width))
+    dags = sorted((s for s in statuses if not s.is_pool), key=lambda s: (s.name, s.process))
+    parts = [_table(_DAG_COLUMNS, dags, width),
+             _table(_POOL_COLUMNS, [s for s in statuses if s.is_pool], width)]
     if width is not None:
         parts.append(''.join(
             printable(f'{s.level} {s.name}: {s.message}')[:width] + '\n'
             for s in [s for s in statuses if s.level != 'OK'][:_MOST_MESSAGES]))
     return '\n'.join(parts)
+
+
+def _table(keys: dict[str, str], rows: Sequence[Status], width: int | None) -> str:
+    """Return a table; on a terminal it has the process only if there are several."""
+    if width is None:
+        keys = {**_PROCESS, **keys, **_MESSAGE}
+    elif len({s.process for s in rows}) > 1:
+        keys = {**_PROCESS, **keys}
+    columns = [[title, *(_cell(s, key) for s in rows)] for title, key in keys.items()]
+    while width is not None and len(columns) > _LEAST and sum(
+            max(map(len, column)) + 2 for column in columns) - 2 > width:
+        columns.pop()
+    header, *body = zip(*columns)
+    return table(header, body, most=width,
+                 marked=[width is not None and s.level not in ('OK', GONE) for s in rows])
+
+
+def _cell(status: Status, key: str) -> str:
+    if key == 'name' and status.is_pool:
+        return printable(status.name.rpartition(': ')[0] or status.name)
+    if key in Status._fields:
+        return printable(getattr(status, key))
+    value = status.values.get(key) or '-'
+    try:
+        number = float(value)
+        if key in _SHARES:
+            return f'{100 * number:.0f} %'
+        if key.endswith('_ms'):
+            return format_ns(round(number * 1e6), 3)
+        return f'{number:.0f}'
+    except (ValueError, OverflowError):
+        return printable(value)     # no number

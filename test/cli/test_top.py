@@ -169,5 +169,5 @@ def test_no_process_to_hear(call):
     assert done.returncode == 2
     spent: list[float] = []
     board = Board()
-    list(_ticks(spent.append, board, 3600.0, 0.05))     # gives up long before an hour
+    list(_ticks(spent.append, board, 3600 * 10**9, 50_000_000))     # gives up long before an hour
     assert spent
