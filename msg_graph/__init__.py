@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from msg_graph.derive import load, loads
 from msg_graph.duration import DurationError, format_duration, parse_duration
-from msg_graph.errors import GraphError, GraphErrors
+from msg_graph.errors import GraphError
 from msg_graph.model import (
     Callback,
     Dag,
@@ -26,7 +26,7 @@ from msg_graph.model import (
 )
 
 __all__ = [
-    'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'GraphErrors', 'NO_GRAPH',
+    'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'NO_GRAPH',
     'Path', 'Process', 'QueueEdge', 'TaskSet', 'Vertex', 'WeaklyHard', 'format_duration', 'load',
     'loads', 'parse_duration',
 ]

@@ -29,7 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, DraftPath
-from msg_graph.errors import GraphError, shown
+from msg_graph.errors import GraphError, shown, ValueProblem
 from msg_graph.language import CALLBACK, GROUP, Name, NODE, SERVICE, TOPIC
 from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Sequence, Tree
 
@@ -96,11 +96,11 @@ class _Reader:
         return [item.text for item in items if isinstance(item, Scalar)]
 
     def name(self, tree: Mapping, key: str, what: Name, text: str | None = None) -> str:
-        text = self.text(tree, key) if text is None else text
-        wrong = what.check(text)
-        if wrong is not None:
-            raise GraphError(self._file, tree.line, f"'{key}': {wrong.problem}", wrong.remedy)
-        return text
+        try:
+            return what.check(self.text(tree, key) if text is None else text)
+        except ValueProblem as wrong:
+            raise GraphError(
+                self._file, tree.line, f"'{key}': {wrong.problem}", wrong.remedy) from None
 
     def node(self, tree: Mapping) -> DraftNode:
         node = DraftNode(self.name(tree, 'node_name', NODE))
@@ -151,8 +151,7 @@ class _Reader:
         name = self.text(tree, 'callback_group_name').rpartition('/')[2]
         if self.text(tree, 'callback_group_type') != 'mutually_exclusive' or len(members) < 2:
             return
-        if GROUP.check(name) is not None:
-            raise self.error(tree, f"'callback_group_name' {shown(name)} is no name")
+        self.name(tree, 'callback_group_name', GROUP, name)
         for callback in members:
             callback.group = name
 

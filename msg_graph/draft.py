@@ -365,7 +365,7 @@ class _Writer:
                      and (published == UNDEFINED or published in c.publishes)]
                     for node, taken, published in path.steps]
         if (len(choices) < 2 or any(len(fits) != 1 for fits in choices)
-                or PATH.check(path.name) is not None):
+                or not PATH.fits(path.name)):
             return []
         return [fits[0].key for fits in choices]
 

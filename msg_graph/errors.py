@@ -19,56 +19,36 @@ _LONGEST_SHOWN = 120
 
 class GraphError(Exception):
     """
-    A declaration that cannot be used.
+    A declaration that cannot be used, or several independent errors of one, the first one first.
 
-    ``str()`` gives one line, ``FILE[:LINE]: what is wrong: what to do``.
+    ``str()`` gives one line, ``FILE[:LINE]: what is wrong: what to do``, and how many more follow.
 
     :ivar file: the file's name as passed to ``load`` or ``loads``.
     :ivar line: line of the entry, counted from 1; None: of no single line.
     :ivar problem: what is wrong, naming the entry.
     :ivar remedy: what to do about it.
-    :ivar errors: all errors that were found together, this one first.
     """
 
-    def __init__(self, file: str, line: int | None, problem: str, remedy: str) -> None:
-        super().__init__(file, line, problem, remedy)
+    def __init__(
+        self, file: str, line: int | None, problem: str, remedy: str,
+        found: tuple[GraphError, ...] = (),
+    ) -> None:
+        super().__init__(file, line, problem, remedy, found)
         self.file = file
         self.line = line
         self.problem = problem
         self.remedy = remedy
+        self._found = found
 
     def __str__(self) -> str:
-        """Return the error as one line."""
         place = self.file if self.line is None else f'{self.file}:{self.line}'
-        return printable(f'{place}: {self.problem}: {self.remedy}')
+        more = f' (and {len(self._found) - 1} more)' if self._found else ''
+        return printable(f'{place}: {self.problem}: {self.remedy}') + more
 
     @property
     def errors(self) -> tuple[GraphError, ...]:
-        """Return this error, and those that were found with it."""
-        return (self,)
-
-
-class GraphErrors(GraphError):
-    """
-    Several independent errors of one declaration.
-
-    Used as a ``GraphError`` it is the first one; ``str()`` is one line.
-    """
-
-    def __init__(self, errors: tuple[GraphError, ...]) -> None:
-        first = errors[0]
-        super().__init__(first.file, first.line, first.problem, first.remedy)
-        self.args = (errors,)
-
-    @property
-    def errors(self) -> tuple[GraphError, ...]:
-        """Return the errors, in the order in which they were found."""
-        errors: tuple[GraphError, ...] = self.args[0]
-        return errors
-
-    def __str__(self) -> str:
-        """Return the first error as one line, and how many follow it."""
-        return f'{self.errors[0]} (and {len(self.errors) - 1} more)'
+        """Return the single errors, in the order in which they were found."""
+        return self._found or (self,)
 
 
 class ValueProblem(ValueError):
@@ -90,7 +70,9 @@ class ValueProblem(ValueError):
 
 def together(errors: Sequence[GraphError]) -> GraphError:
     """Return several errors, at least one, as one."""
-    return errors[0] if len(errors) == 1 else GraphErrors(tuple(errors))
+    first = errors[0]
+    return first if len(errors) == 1 else GraphError(
+        first.file, first.line, first.problem, first.remedy, tuple(errors))
 
 
 class Collector:

@@ -117,19 +117,16 @@ class _Resolver:
             raise top.error(
                 None, f'with all includes there are more than {MAX_SIZE} entries',
                 'include less, or split it into several graphs')
-        parts: dict[str, list[Tree]] = {'nodes': [], 'paths': []}
-        for place, each in enumerate(top.get('include'), 1):
-            inner = self._included(each, place, chain)
-            for key, items in parts.items():
-                items += _items(inner, key)
-        for key, items in parts.items():
+        inner = [self._included(each, place, chain)
+                 for place, each in enumerate(top.get('include'), 1)]
+        entries: dict[str, Tree] = {key: value for key, value in resolved.entries.items()
+                                    if key not in ('include', 'arguments')}
+        for key in ('nodes', 'paths'):
+            items = [item for each in inner for item in _items(each, key)]
             items += top.get(key) if key in top else ()
-        resolved.entries = {
-            key: value for key, value in resolved.entries.items()
-            if key not in ('include', 'arguments')} | {
-            key: Sequence(tree.file, tree.line, items) for key, items in parts.items() if items}
-        found: Mapping = resolved
-        return found
+            if items:
+                entries[key] = Sequence(tree.file, tree.line, items)
+        return Mapping(tree.file, tree.line, entries, tree.key_lines)
 
     def _included(self, tree: Tree, place: int, chain: Chain) -> Mapping:
         if isinstance(tree, Scalar):

@@ -45,9 +45,6 @@ _USE: Schema = {'type': 'string', 'pattern': ARGUMENT_USE}
 _ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
 _WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
 
-Check = Callable[[str], ValueProblem | None]
-"""Checks a text; returns what is wrong with it, or None."""
-
 
 @dataclass(frozen=True)
 class Name:
@@ -66,22 +63,26 @@ class Name:
         """Return whether it is a full name of the ROS graph, as of a node or topic."""
         return self.pattern is _ROS_NAME
 
-    def check(self, text: str) -> ValueProblem | None:
-        """Return what is wrong with a name, or None."""
+    def check(self, text: str) -> str:
+        """Return a name; raise ``ValueProblem`` if it is not valid."""
+        problem, remedy = '', ''
         if self.is_global and not text.startswith('/'):
-            return ValueProblem(f'{shown(text)} is not an absolute {self.what} name',
-                                f'write it in full, as {shown("/" + text.lstrip("~/"))}')
-        if not self.pattern.fullmatch(text):
-            if self.is_global:
-                return ValueProblem(
-                    f'{shown(text)} is not a valid {self.what} name',
-                    "use '/' and words of letters, digits and '_' that start with no digit")
-            return ValueProblem(f'{shown(text)} is no name for a {self.what}',
-                                "use letters, digits, '_', '-' and '.'")
-        if len(text) > self.longest:
-            return ValueProblem(f'the {self.what} name {shown(text)} is too long',
-                                f'use at most {self.longest} characters')
-        return None
+            problem = f'{shown(text)} is not an absolute {self.what} name'
+            remedy = f'write it in full, as {shown("/" + text.lstrip("~/"))}'
+        elif not self.pattern.fullmatch(text):
+            problem = f'{shown(text)} is not a valid {self.what} name'
+            remedy = ("use '/' and words of letters, digits and '_' that start with no digit"
+                      if self.is_global else "use letters, digits, '_', '-' and '.'")
+        elif len(text) > self.longest:
+            problem = f'the {self.what} name {shown(text)} is too long'
+            remedy = f'use at most {self.longest} characters'
+        if problem:
+            raise ValueProblem(problem, remedy)
+        return text
+
+    def fits(self, text: str) -> bool:
+        """Return whether a text is a valid name."""
+        return len(text) <= self.longest and self.pattern.fullmatch(text) is not None
 
     @property
     def schema(self) -> Schema:
@@ -264,8 +265,8 @@ def table(values: Kind, names: Name | None = None) -> Kind:
         given = value.entries if isinstance(value, Mapping) else ('NAME',)
         entry = Entry(value, where, dict.fromkeys(given, key))
         for each in given:
-            if names is not None and (wrong := names.check(each)) is not None:
-                raise entry.error(each, wrong.problem, wrong.remedy)
+            if names is not None:
+                scalar(names.check, {}).read(Scalar(entry.file, entry.line_of(each), each), where)
         return entry
 
     form = {'type': 'object', 'additionalProperties': values.schema}
@@ -276,29 +277,20 @@ def table(values: Kind, names: Name | None = None) -> Kind:
 
 # --- single values -------------------------------------------------------------------------------
 
-def text(check: Check, form: Schema, missing: str | None = None) -> Kind:
-    """Return the kind of a text that passes a check."""
-    def parse(text: str) -> str:
-        wrong = check(text)
-        if wrong is not None:
-            raise wrong
-        return text
-
-    return scalar(parse, form, missing)
-
-
 def name(what: Name) -> Kind:
     """Return the kind of a name."""
-    return text(what.check, what.schema)
+    return scalar(what.check, what.schema)
 
 
 def choice(*words: str, missing: str | None = None) -> Kind:
     """Return the kind of a choice of words."""
-    def check(word: str) -> ValueProblem | None:
-        return None if word in words else ValueProblem(
-            f'{shown(word)} is not known', did_you_mean(word, words, f'use {", ".join(words)}'))
+    def parse(word: str) -> str:
+        if word not in words:
+            raise ValueProblem(f'{shown(word)} is not known',
+                               did_you_mean(word, words, f'use {", ".join(words)}'))
+        return word
 
-    return text(check, {'anyOf': [{'enum': list(words)}, _USE]}, missing)
+    return scalar(parse, {'anyOf': [{'enum': list(words)}, _USE]}, missing)
 
 
 def time(least_ns: int = MICROSECOND) -> Kind:
@@ -350,33 +342,37 @@ def _weakly_hard(text: str) -> WeaklyHard:
 FORMAT = '1'
 
 
-def _check_format(given: str) -> ValueProblem | None:
-    return None if given == FORMAT else ValueProblem(
-        f'{shown(given)} is no known version of the format', f"write 'mddag: {FORMAT}'")
+def _format(given: str) -> str:
+    if given != FORMAT:
+        raise ValueProblem(
+            f'{shown(given)} is no known version of the format', f"write 'mddag: {FORMAT}'")
+    return given
 
 
-def _check_file(path: str) -> ValueProblem | None:
+def _file(path: str) -> str:
     if os.path.isabs(path) or path.startswith('~') or '\0' in path or not path:
-        return ValueProblem(f'{shown(path)} is no relative path',
-                            'write it as seen from the file that includes it')
-    return None
+        raise ValueProblem(f'{shown(path)} is no relative path',
+                           'write it as seen from the file that includes it')
+    return path
 
 
-def _check_read(text: str) -> ValueProblem | None:
+def _read(text: str) -> str:
     """Check an entry of ``reads``: a topic, or the name of a callback of the same node."""
     if ':' in text:
-        return ValueProblem(
+        raise ValueProblem(
             f'{shown(text)} names a callback with its node',
             'name the topic that is taken, or just the name of a callback of the same node')
     return (TOPIC if text.startswith('/') else CALLBACK).check(text)
 
 
-def _check_key(text: str) -> ValueProblem | None:
+def _key(text: str) -> str:
     """Check the key of a callback, ``/node:callback``."""
     node, colon, name = text.rpartition(':')
     if not colon:
-        return ValueProblem(f'{shown(text)} names no callback', "write '/node:callback'")
-    return NODE.check(node) or CALLBACK.check(name)
+        raise ValueProblem(f'{shown(text)} names no callback', "write '/node:callback'")
+    NODE.check(node)
+    CALLBACK.check(name)
+    return text
 
 
 # --- execution times -----------------------------------------------------------------------------
@@ -427,7 +423,7 @@ def _mapping(keys: dict[str, Key]) -> Schema:
 _TRUTH = scalar(_truth, {'anyOf': [{'type': 'boolean'}, _USE]}, plain=True)
 _WEAKLY_HARD = scalar(_weakly_hard, {
     'type': 'string', 'pattern': f'^(?:{_OF.pattern})$|{ARGUMENT_USE}', 'examples': ['1 of 100']})
-_VALUES = table(text(lambda _: None, {'type': ['string', 'number', 'boolean', 'null']}))
+_VALUES = table(scalar(str, {'type': ['string', 'number', 'boolean', 'null']}))
 _TOPICS = many(name(TOPIC), 0, different=True)
 
 QUANTILES = {
@@ -438,7 +434,7 @@ QUANTILES = {
 _EXECUTION_TIME = Kind(_read_execution_time, {'oneOf': [time().schema, _mapping(QUANTILES)]})
 
 FILE = {
-    'mddag': Key(text(_check_format, {'enum': [int(FORMAT), FORMAT]}),
+    'mddag': Key(scalar(_format, {'enum': [int(FORMAT), FORMAT]}),
                  'Version of the format.', needed=True),
     'arguments': Key(_VALUES,
                      'Arguments of this file, $(name) in its values, with their defaults.'),
@@ -454,7 +450,7 @@ FILE = {
     'paths': Key(_entries('path'), 'End-to-end paths over trigger and queue edges.'),
 }
 INCLUDE = {
-    'file': Key(text(_check_file, {'type': 'string'}), 'The file, as seen from this one.',
+    'file': Key(scalar(_file, {'type': 'string'}), 'The file, as seen from this one.',
                 needed=True),
     'namespace': Key(name(NODE), 'Put before all names of the included file.'),
     'remap': Key(table(name(TOPIC)), 'Names of the included file and what they become.'),
@@ -477,7 +473,7 @@ CALLBACK_KEYS = {
     **TRIGGERS,
     'period': Key(time(), 'Time between two releases of a source that is no timer.'),
     'publishes': Key(_TOPICS, 'The topics that it publishes.'),
-    'reads': Key(many(text(_check_read, {'anyOf': [TOPIC.schema, CALLBACK.schema]}), 0,
+    'reads': Key(many(scalar(_read, {'anyOf': [TOPIC.schema, CALLBACK.schema]}), 0,
                       different=True),
                  'Queue edges: topics that it takes messages from, and callbacks of its node '
                  'whose variables it reads. They never start it.'),
@@ -506,7 +502,7 @@ CALLBACK_KEYS = {
 }
 PATH_KEYS = {
     'name': Key(name(PATH), 'Name of the path.', needed=True),
-    'callbacks': Key(many(text(_check_key, {'type': 'string', 'pattern': (
+    'callbacks': Key(many(scalar(_key, {'type': 'string', 'pattern': (
         f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$|{ARGUMENT_USE}')}),
         2, different=True, too_few='give at least 2'),
         "The callbacks along it, each as '/node:callback'.", needed=True),

@@ -162,7 +162,7 @@ def _nodes(node: Node, found: Probe) -> None:
              for name, namespace in node.get_node_names_and_namespaces()
              if not name.startswith('_')]
     for full, count in sorted(Counter(names).items()):
-        if NODE.check(full) is not None:
+        if not NODE.fits(full):
             found.warn(f'{full}: left out, this is no valid node name')
             continue
         if count > 1:
@@ -181,7 +181,7 @@ def _nodes(node: Node, found: Probe) -> None:
                 found.warn(f'{full}: {error}')
                 continue
             target.update((each, types[0]) for each, types in listed
-                          if types and not is_background(each, full) and kind.check(each) is None)
+                          if types and not is_background(each, full) and kind.fits(each))
     found.publishers = Counter(
         topic for endpoints in found.nodes.values() for topic in endpoints.publishes)
 

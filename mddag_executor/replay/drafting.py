@@ -132,8 +132,8 @@ class System:
             node.callbacks.setdefault(callback.name, callback)
         for name, topics in self._publishers.items():
             unseen = [t for t, seen in topics.items()
-                      if not seen and not is_background(t, name) and TOPIC.check(t) is None]
-            if unseen and name not in nodes and NODE.check(name) is None:
+                      if not seen and not is_background(t, name) and TOPIC.fits(t)]
+            if unseen and name not in nodes and NODE.fits(name):
                 timer = DraftCallback(name, 'callback_0', 'timer', guessed=True)
                 nodes[name] = DraftNode(name, {timer.name: timer})
             if unseen:
@@ -177,7 +177,7 @@ class System:
         declared = () if self.task_set is None else self.task_set.callbacks
         taken = {*node.callbacks, *(c.name for c in declared if c.node == entity.node_name)}
         name = function_of(entity.symbol)
-        if name is None or CALLBACK.check(name) is not None:
+        if name is None or not CALLBACK.fits(name):
             names = [f'callback_{number}' for number in range(len(taken), 2 * len(taken) + 1)]
         else:
             names = [name, *(f'{name}_{number}' for number in range(2, len(taken) + 2))]
@@ -201,7 +201,7 @@ class System:
         callback.publishes.extend(
             t for t in dict.fromkeys(runs.topics)
             if t not in callback.publishes and not is_background(t, callback.node)
-            and TOPIC.check(t) is None)
+            and TOPIC.fits(t))
         callback.maybe = [t for t in callback.maybe if t not in callback.publishes]
         if callback.kind == 'sync':
             legs = [self._runs[number] for number, declared in self._declared.items()
@@ -264,12 +264,12 @@ def execution_time(took: Ints) -> tuple[ExecutionTime, int] | None:
 
 
 def _is_shown(entity: Callback) -> bool:
-    if NODE.check(entity.node_name) is not None:
+    if not NODE.fits(entity.node_name):
         return False
     if entity.kind == 'timer':
         return entity.period >= 1_000
     name = TOPIC if entity.kind == 'subscription' else SERVICE
-    return not is_background(entity.start, entity.node_name) and name.check(entity.start) is None
+    return not is_background(entity.start, entity.node_name) and name.fits(entity.start)
 
 
 def _from_declared(declared: Declared) -> DraftCallback:

@@ -111,7 +111,7 @@ def test_nodes_that_no_process_names_run_in_the_first():
     ([f'  one: [/a, /d] {MARK}'], "there is no node '/d'"),
     (['  one: [/a, /b]', f'  two: [/a] {MARK}'], "'/a' is in process 'one', too"),
     (['  one:', f'    - /a {MARK}'.replace('/a', '/aa')], "'/a'"),
-    ([f'  one/two: [/a] {MARK}'], 'no name for a process'),
+    ([f'  one/two: [/a] {MARK}'], 'not a valid process name'),
     ([f'  one: [/a, /a] {MARK}'], 'is listed twice'),
     ([f'  one: /a {MARK}'], 'write a list'),
 ])

@@ -171,7 +171,7 @@ def test_a_file_of_2021():
     (HEAD + node('/a', 'timer 0'), "'period_ns' is '0'"),
     (HEAD + node('/a', 'subscription x]'), 'topic name'),
     (HEAD + node('/a', 'timer 5').replace('timer_callback', 'magic'), "'magic' is not known"),
-    (HEAD + node('/a', 'timer 5').replace('/callback_0', '/c 0'), 'no name for a callback'),
+    (HEAD + node('/a', 'timer 5').replace('/callback_0', '/c 0'), 'not a valid callback name'),
 ])
 def test_what_is_no_architecture_file(text, problem):
     with pytest.raises(GraphError, match=re.escape(problem)) as caught:

@@ -151,7 +151,7 @@ def test_node_names(entry, says):
 @pytest.mark.parametrize('entries, says', [
     # names
     ([f'timer: 1ms {MARK}'], ["callback 1 of node '/a': 'name' is missing"]),
-    ([f'name: "a b" {MARK}'], ["'a b' is no name for a callback"]),
+    ([f'name: "a b" {MARK}'], ["'a b' is not a valid callback name"]),
     ([f'name: {"n" * 300} {MARK}'], ['too long']),
     # unknown keys
     (['name: t', f'subscribtion: /x {MARK}'],
@@ -215,7 +215,7 @@ def test_node_names(entry, says):
     (['name: t', 'timer: 1ms', f'publishes: /x {MARK}'], ['write a list, as [a, b]']),
     (['name: t', 'timer: 1ms', 'publishes:', '- /x', f'- x {MARK}'], ["'publishes': 'x' is not"]),
     (['name: t', 'timer: 1ms', 'publishes:', '- /x', f'- /x {MARK}'], ["'/x' is listed twice"]),
-    (['name: t', 'timer: 1ms', f'reads: [a b] {MARK}'], ["'a b' is no name for a callback"]),
+    (['name: t', 'timer: 1ms', f'reads: [a b] {MARK}'], ["'a b' is not a valid callback name"]),
     (['name: t', 'timer: 1ms', f'reads: ["/b:c"] {MARK}'], ['names a callback with its node']),
     (['name: t', 'timer: 1ms', f'reads: [/b c] {MARK}'], ['not a valid topic name']),
     # words
@@ -232,8 +232,8 @@ def test_node_names(entry, says):
     (['name: t', 'timer: 1ms', f'tolerate: 3 of 3 {MARK}'], ['and fewer than all']),
     (['name: t', 'timer: 1ms', f'tolerate: 0 of 3 {MARK}'], ['at least 1 miss']),
     (['name: t', 'timer: 1ms', f'max_active_jobs: 0 {MARK}'], ['from 1 to 1000000']),
-    (['name: t', 'timer: 1ms', f'group: a/b {MARK}'], ['no name for a callback group']),
-    (['name: t', 'timer: 1ms', f'dag: a@b {MARK}'], ['no name for a DAG']),
+    (['name: t', 'timer: 1ms', f'group: a/b {MARK}'], ['not a valid callback group name']),
+    (['name: t', 'timer: 1ms', f'dag: a@b {MARK}'], ['not a valid DAG name']),
     (['name: t', 'timer: 1ms', f'dag: [a] {MARK}'], ["'dag': a list is no single"]),
 ])
 def test_callback_entries(entries, says):
