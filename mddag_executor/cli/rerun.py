@@ -118,15 +118,16 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
         args.all_clocks, ros_args=tuple(args.ros_args))
     path, name = common.input_path(args.recording)
     with ExitStack() as files:
-        source = open_input(path, task_set, args.times, args.seed, name)
+        messages, times = open_input(path, task_set, args.times, args.seed, name)
         output: BinaryIO | None = None
         if args.output is not None:
             output = files.enter_context(common.output_file(args.output))
         trace = None
         if args.trace is not None:
             trace = files.enter_context(common.output_trace(args.trace))
-        run = Rerun(source, task_set, settings, output, trace, keep=args.expect is not None)
-        with Progress('running', (source.end - source.start) / 1e9) as line:
+        run = Rerun(
+            messages, times, task_set, settings, output, trace, keep=args.expect is not None)
+        with Progress('running', (messages.end - messages.start) / 1e9) as line:
             result = run.run(
                 lambda: programs(args.node, args.ros_args),
                 lambda done: line.update(done / 1e9))

@@ -81,11 +81,11 @@ def rerun(
     settings = Settings(
         defaults.workers(workers, task_set), cpus, policy, seed, all_clocks, patience_s,
         tuple(ros_args))
-    source = open_input(
+    messages, taken = open_input(
         os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)
     with ExitStack() as files:
         run = Rerun(
-            source, task_set, settings,
+            messages, taken, task_set, settings,
             None if output is None else files.enter_context(open(output, 'wb')),
             None if trace is None else os.fspath(trace))
         return run.run(lambda: programs(nodes, ros_args))

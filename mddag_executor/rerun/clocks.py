@@ -76,13 +76,11 @@ class VirtualTime:
     """
 
     def __init__(
-        self, loop: Loop, all_clocks: bool, simulated: bool, seed: int,
-        warn: Callable[[str], None],
+        self, loop: Loop, all_clocks: bool, simulated: bool, seed: int
     ) -> None:
         self._loop = loop
         self._all = all_clocks
         self._simulated = simulated
-        self._warn = warn
         self._random = random.Random(seed)
         self._threads: weakref.WeakKeyDictionary[threading.Thread, RunThread] = (
             weakref.WeakKeyDictionary())
@@ -182,7 +180,7 @@ class VirtualTime:
             return
         name = caller.f_code.co_filename
         effect = 'takes real time' if 'sleep' in what else 'is not the same in each run'
-        self._warn(f'{name}:{caller.f_lineno}: {what} {effect}: give --all-clocks')
+        self._loop.warn(f'{name}:{caller.f_lineno}: {what} {effect}: give --all-clocks')
 
     # --- random numbers --------------------------------------------------------------------------
 

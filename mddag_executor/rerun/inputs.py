@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.errors import UsageError
+from mddag_executor.recording.tables import Recording
 from mddag_executor.replay.bags import Bag, is_ordinary
 from mddag_executor.replay.load import LoadBuilder
 from mddag_executor.replay.run import open_recording
@@ -42,7 +43,7 @@ class RecordedMessage(NamedTuple):
 
 class MessageBag:
     """
-    A bag.
+    The messages of nodes in a recording; a trace may have none.
 
     :ivar start: when its first message came, ns; ``end``: the last.
     :ivar pauses: from when to when none came (see ``trace.times``).
@@ -55,10 +56,11 @@ class MessageBag:
         self.path = path
         self.name = name or path
         bag = Bag(path, (), name)
-        self.start, self.end = bag.start, bag.end
+        self.start, self.end = bag.start or 0, bag.end or 0
         self.pauses = [(before[1], after[0])
                        for before, after in pairwise(bag.stretches)]
-        self.topics = frozenset(bag.topics)
+        self.topics = frozenset(
+            topic for topic in bag.topics if bag.stretches and not topic.startswith('/trace/'))
         self.warnings = list(bag.warnings)
         self.kinds: dict[str, str] = {}
         self._file = tempfile.SpooledTemporaryFile(max_size=_IN_MEMORY, prefix='mddag-')
@@ -84,7 +86,7 @@ class MessageBag:
             raise RerunError(
                 f'{self.name}: {topic.name} is encoded as {topic.encoding or "nothing"}, which '
                 'ROS 2 nodes do not read: convert it, as with rosbags-convert')
-        if self.start is None or self.end is None or not self.start <= time <= self.end:
+        if not self.start <= time <= self.end:
             return  # of damage
         self.kinds[topic.name] = topic.message_type
         self._index.append(_Stored(
@@ -110,36 +112,11 @@ class _Stored(NamedTuple):
     size: int
 
 
-class RerunInput(NamedTuple):
-    """
-    What a run takes from recordings.
-
-    :ivar messages: the bag, if there is one.
-    :ivar times: how long callbacks and messages take.
-    """
-
-    name: str
-    start: int
-    end: int
-    messages: MessageBag | None
-    times: Durations
-
-    @property
-    def pauses(self) -> list[tuple[int, int]]:
-        """Return from when to when no messages came."""
-        return [] if self.messages is None else self.messages.pauses
-
-    @property
-    def topics(self) -> frozenset[str]:
-        """Return the topics that are recorded."""
-        return frozenset() if self.messages is None else self.messages.topics
-
-
 def open_input(
     path: str, task_set: TaskSet, times: str | None = None, seed: int = 0, name: str | None = None,
-) -> RerunInput:
+) -> tuple[MessageBag, Durations]:
     """
-    Open what a rerun begins with.
+    Open what a rerun begins with: messages, and how long callbacks and messages take.
 
     :param path: a bag, or a trace of this executor.
     :param times: ``recorded`` (as in that trace), ``declared`` (drawn with the seed), or a file: a
@@ -148,29 +125,31 @@ def open_input(
     :raises mddag_executor.errors.MddagError: if anything of it cannot be used.
     """
     name = name or path
-    bag = is_ordinary(path)
+    is_bag = is_ordinary(path)
     if times is None:
-        times = DECLARED if bag else RECORDED
-    if times == RECORDED and bag:
+        times = DECLARED if is_bag else RECORDED
+    if times == RECORDED and is_bag:
         raise UsageError(
             f'--times recorded: {name} is a bag, which does not say how long callbacks took: give '
             '--times declared, or a trace or a file of execution times')
-    run = None if bag else _recorded(path, task_set, name)
+    run = None if is_bag else open_recording(path, task_set, name)
     if times == DECLARED:
         taken = _fixed(task_set, draw_execution_times(task_set, seed, undeclared=0))
     elif times == RECORDED and run is not None:
-        taken = run.times
+        taken = _recorded(run, task_set)
     elif os.path.isdir(times) or _begins_as_mcap(times):
-        taken = _recorded(times, task_set, times).times
+        taken = _recorded(open_recording(times, task_set, times), task_set)
     else:
         with open(times, encoding='utf-8') as file:
             taken = _fixed(task_set, read_execution_times(task_set, file.read(), times))
-    messages = _messages(path, name)
-    if messages is not None and messages.start is not None and messages.end is not None:
-        return RerunInput(name, messages.start, messages.end, messages, taken)
-    if run is None:
-        raise UsageError(f'{name}: no message is recorded in it: record it with ros2 bag record')
-    return run._replace(times=taken)
+    messages = MessageBag(path, name)
+    if not messages.topics:
+        if run is None:
+            raise UsageError(
+                f'{name}: no message is recorded in it: record it with ros2 bag record')
+        messages.start, messages.end = min(run.begin, run.head.time or run.begin), run.end
+        messages.pauses = []
+    return messages, taken
 
 
 def _fixed(task_set: TaskSet, times: list[list[int]]) -> Durations:
@@ -178,26 +157,13 @@ def _fixed(task_set: TaskSet, times: list[list[int]]) -> Durations:
     return Durations(Tables.build(task_set), periodic_load(task_set, times, 1), recorded=False)
 
 
-def _messages(path: str, name: str) -> MessageBag | None:
-    """Return the messages of nodes that a recording has; None if it is only a trace."""
-    recording = MessageBag(path, name)
-    if all(topic.startswith('/trace/') for topic in recording.topics):
-        recording.close()
-        return None
-    return recording
+def _recorded(run: Recording, task_set: TaskSet) -> Durations:
+    """Return the times of each job of a recorded run."""
+    tables = Tables.build(task_set, max_active_jobs=NEVER)
+    builder = LoadBuilder(run, tables, run.head.workers, max(0, run.head.cpus))
+    return Durations(tables, builder.build().load, recorded=True)
 
 
 def _begins_as_mcap(path: str) -> bool:
     with open(path, 'rb') as file:
         return file.read(5) == b'\x89MCAP'
-
-
-def _recorded(path: str, task_set: TaskSet, name: str) -> RerunInput:
-    """Return what a recorded run has: from when to when it was, and its times."""
-    run = open_recording(path, task_set, name)
-    tables = Tables.build(task_set, max_active_jobs=NEVER)
-    head = run.head
-    builder = LoadBuilder(run, tables, head.workers, max(0, head.cpus))
-    return RerunInput(
-        name, min(run.begin, head.time or run.begin), run.end, None,
-        Durations(tables, builder.build().load, recorded=True))

@@ -112,6 +112,7 @@ class Loop:
     :ivar callbacks: how many callbacks have run.
     :ivar computing: shares CPUs and the interpreter, if they are limited.
     :ivar changed: whether there may be new entities, or some are gone.
+    :ivar warnings: what is not the same in each run, or doubtful, one line each.
     :ivar on_ended: called with rclpy's entity when its callback has ended.
     """
 
@@ -126,6 +127,7 @@ class Loop:
         self._pauses = pauses
         self.callbacks = 0
         self.changed = True
+        self.warnings: list[str] = []
         self.computing: SharedCpus | None = None
         self.on_ended: Callable[[Any], object] = lambda entity: None
         self.run_threads = RunThreads(self._step, over)
@@ -159,6 +161,11 @@ class Loop:
             function()
         else:
             self._foreign.append(function)
+
+    def warn(self, text: str) -> None:
+        """Add a warning, once."""
+        if text not in self.warnings:
+            self.warnings.append(text)
 
     def stop(self) -> None:
         """End the run at this instant, from any thread."""
@@ -426,12 +433,12 @@ class Loop:
             self._polls = 0
             self.wait(None, self.now + POLL_NS, 'for time to pass')
 
-    def blocked(self) -> list[str]:
-        """Return which callbacks wait for something that has not come."""
-        return [
-            f'{run_thread.execution.work.entity.name}: it still waits ({run_thread.place})'
-            for run_thread in self.run_threads.waiting
-            if run_thread.execution is not None and run_thread.deadline is None]
+    def warn_of_waiting(self) -> None:
+        """Warn of callbacks that wait for something that has not come."""
+        for run_thread in self.run_threads.waiting:
+            if run_thread.execution is not None and run_thread.deadline is None:
+                self.warn(f'{run_thread.execution.work.entity.name}: it still waits '
+                          f'({run_thread.place})')
 
 
 def _nothing() -> None:

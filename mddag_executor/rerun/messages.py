@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Messages from publishers to subscriptions, without a middleware.
+Messages from publishers, and from the recording, to subscriptions, without a middleware.
 
 Theory of operation
 -------------------
@@ -10,7 +10,11 @@ which lets it *leave* later. Then it is an output of the run, and goes to all su
 topic whose QoS fits: each gets a message of its own, after the transport time.
 
 A recorded message goes to the subscriptions of its topic at its recorded time, unless a node of
-the run publishes on the topic: then the node's messages count.
+the run publishes on the topic: then the node's messages count. What is loaded of the recording are
+the topics that nodes subscribe to, and those that they publish, to be compared. If a node
+subscribes to another topic later, its messages are loaded then and arrive from then on. If a node
+subscribes to ``/clock``, and it is neither recorded nor published by a node, it gives virtual
+time.
 
 Which job does a message belong to?  That of the execution that has sent it. A recorded one starts
 a job if its subscription is its DAG's source. Otherwise it enters the job
@@ -20,7 +24,7 @@ that its header's stamp names, or one of its own (see ``executor.other_processes
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -30,53 +34,57 @@ from mddag_executor.executor.jobs import header_stamp, Origin
 from mddag_executor.executor.work import Work
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError
-from mddag_executor.rerun.loop import ARRIVED, Loop, Sent
+from mddag_executor.rerun.inputs import MessageBag, RecordedMessage
+from mddag_executor.rerun.loop import ARRIVED, Loop, RECORDED, Sent
 from mddag_executor.rerun.message_types import canonical, type_name
 from mddag_executor.rerun.outputs import Outputs
 from mddag_executor.trace.groups import PUBLICATION
 from msg_graph import TaskSet
-from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, qos_check_compatible, QoSCompatibility
 from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+
+CLOCK = '/clock'
+CLOCK_EVERY_NS = 10_000_000
+"""How often ``/clock`` gives the time."""
 
 
 class Inlet:
     """A subscription of a node of the run."""
 
-    __slots__ = ('entity', 'topic', 'kind', 'raw', 'with_info', 'received')
+    __slots__ = ('entity', 'kind', 'raw', 'with_info', 'received')
 
     def __init__(self, entity: Entity) -> None:
         subscription = entity.rclpy
         self.entity = entity
-        self.topic = entity.label
         self.kind = subscription.msg_type
         self.raw = subscription.raw
         self.with_info = callback_type(subscription) is WITH_INFO
         self.received = 0
 
-    @property
-    def latched(self) -> bool:
-        """Return whether it wants messages from before it was there."""
-        return bool(self.entity.rclpy.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
-
 
 class Outlet:
-    """A publisher of a node of the run."""
+    """
+    A publisher of a node of the run.
 
-    __slots__ = ('publisher', 'topic', 'kind', 'inlets', 'count', 'kept', 'channel')
+    :ivar inlets: those whose QoS fits; None: to be found out.
+    :ivar kept: what later subscriptions get, with the times of publication.
+    """
+
+    __slots__ = ('publisher', 'topic', 'kind', 'inlets', 'count', 'kept')
 
     def __init__(self, publisher: Any) -> None:
         self.publisher = publisher
         self.topic: str = publisher.topic_name
         self.kind = publisher.msg_type
-        # those whose QoS fits; None: to be found out
         self.inlets: list[Inlet] | None = None
         self.count = 0
         qos = publisher.qos_profile
-        latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        # for later subscriptions
-        self.kept: deque[tuple[int, bytes]] = deque(maxlen=max(1, qos.depth) if latched else 0)
+        self.kept: deque[tuple[int, bytes]] = deque(
+            maxlen=max(1, qos.depth) if _is_latched(qos) else 0)
 
     def fits(self, inlet: Inlet) -> bool:
         """Return whether a subscription gets what is published."""
@@ -85,79 +93,81 @@ class Outlet:
         return bool(found != QoSCompatibility.ERROR) and inlet.kind is self.kind
 
 
+def _is_latched(qos: Any) -> bool:
+    return bool(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+
+
 class Messages:
     """
     Carries messages.
 
-    :ivar offered: the topics on which nodes of the run publish.
+    :ivar nodes: of the run.
+    :ivar inlets: the subscriptions of the nodes, by topic.
+    :ivar offered: the topics on which they publish, each with its publishers.
     """
 
     def __init__(
-        self, loop: Loop, times: Durations, outputs: Outputs, task_set: TaskSet,
-        warn: Callable[[str], None],
+        self, loop: Loop, recording: MessageBag, times: Durations, outputs: Outputs,
+        task_set: TaskSet,
     ) -> None:
-        self._loop = loop
+        self.loop = loop
+        self.nodes: Sequence[Node] = ()
+        self.inlets: dict[str, list[Inlet]] = {}
+        self.offered: dict[str, list[Outlet]] = {}
         self._engine = loop.engine
+        self._recording = recording
         self._release_from = [dag.release_from for dag in task_set.dags]
         self._times = times
         self._outputs = outputs
-        self._warn = warn
         self._outlets: dict[Any, Outlet] = {}
-        self._inlets: dict[str, list[Inlet]] = {}
-        self._known: dict[int, Inlet] = {}
+        # the last recorded message of each topic, with its publication
         self._last: dict[str, tuple[int, bytes]] = {}
-        self.offered: dict[str, Any] = {}
-        self._publishers: dict[str, int] = {}
+        self._has_begun = self._gives_clock = False
         self._sequence = 0
 
     # --- publishers and subscriptions ------------------------------------------------------------
 
-    def refresh(self, nodes: Iterable[Any], subscriptions: Iterable[Entity]) -> None:
+    def refresh(self, nodes: Sequence[Node], subscriptions: Iterable[Entity]) -> None:
         """Update which subscriptions and publishers there are."""
-        known, self._known = self._known, {}
+        self.nodes = nodes
+        known = {inlet.entity: inlet for inlets in self.inlets.values() for inlet in inlets}
         new = []
-        self._inlets = {}
+        self.inlets = {}
         for entity in subscriptions:
-            inlet = known.get(id(entity))
-            if inlet is None or inlet.entity is not entity:
+            inlet = known.get(entity)
+            if inlet is None:
                 inlet = Inlet(entity)
                 new.append(inlet)
-            self._known[id(entity)] = inlet
-            self._inlets.setdefault(inlet.topic, []).append(inlet)
+            self.inlets.setdefault(entity.label, []).append(inlet)
+        for publisher in (each for node in nodes for each in node.publishers):
+            if alive(publisher):
+                self._outlet(publisher)
         # a destroyed publisher serves no late subscription
         self._outlets = {p: outlet for p, outlet in self._outlets.items() if alive(p)}
+        self.offered = {}
         for outlet in self._outlets.values():
             outlet.inlets = None
-        self.offered, self._publishers = {}, {}
-        for node in nodes:
-            for publisher in node.publishers:
-                try:
-                    topic = publisher.topic_name
-                except InvalidHandle:
-                    continue  # destroyed meanwhile
-                self.offered.setdefault(topic, publisher.msg_type)
-                self._publishers[topic] = self._publishers.get(topic, 0) + 1
+            self.offered.setdefault(outlet.topic, []).append(outlet)
         for inlet in new:
-            if inlet.latched:
+            if _is_latched(inlet.entity.rclpy.qos_profile):
                 self._deliver_kept(inlet)
+        if not self._gives_clock and CLOCK in self.inlets and (
+                CLOCK not in self._recording.topics and CLOCK not in self.offered):
+            self._gives_clock = True
+            self._publish_time()
+        if self._has_begun:
+            self._load()
 
     def _deliver_kept(self, inlet: Inlet) -> None:
         """Give a subscription what was published before it was there, as far as that is kept."""
-        for outlet in self._outlets.values():
-            if outlet.topic == inlet.topic and outlet.kept and outlet.fits(inlet):
+        topic = inlet.entity.label
+        for outlet in self.offered.get(topic, ()):
+            if outlet.kept and outlet.fits(inlet):
                 for stamp, data in outlet.kept:
                     self._arrive(inlet, data, stamp, None)
-        recorded = self._last.get(inlet.topic)
-        if recorded is not None and inlet.topic not in self.offered:
-            self._arrive(inlet, recorded[1], recorded[0], None)
-
-    def inlets(self, topic: str) -> list[Inlet]:
-        """Return the subscriptions of a topic."""
-        return self._inlets.get(topic, [])
-
-    def topics(self) -> dict[str, Any]:
-        """Return the topics that nodes of the run subscribe to, with their types."""
-        return {topic: inlets[0].kind for topic, inlets in self._inlets.items()}
+        if topic in self._last and topic not in self.offered:
+            stamp, data = self._last[topic]
+            self._arrive(inlet, data, stamp, None)
 
     def _outlet(self, publisher: Any) -> Outlet:
         outlet = self._outlets.get(publisher)
@@ -167,8 +177,19 @@ class Messages:
 
     def _inlets_of(self, outlet: Outlet) -> list[Inlet]:
         if outlet.inlets is None:
-            outlet.inlets = [i for i in self.inlets(outlet.topic) if outlet.fits(i)]
+            outlet.inlets = [i for i in self.inlets.get(outlet.topic, ()) if outlet.fits(i)]
         return outlet.inlets
+
+    def subscription_count(self, publisher: Publisher) -> int:
+        """Return how many subscribe to a publisher's topic: nodes, and the rerun itself."""
+        self.loop.refresh_now()
+        return 1 + len(self._inlets_of(self._outlet(publisher)))
+
+    def publisher_count(self, subscription: Any) -> int:
+        """Return how many publish to a subscription: nodes of the run, or the recording."""
+        self.loop.refresh_now()
+        topic = subscription.topic_name
+        return len(self.offered.get(topic, ())) or int(topic in self._last)
 
     # --- what nodes publish ----------------------------------------------------------------------
 
@@ -182,38 +203,23 @@ class Messages:
             data = msg
         else:
             raise TypeError(f'Expected {publisher.msg_type}, got {type(msg)}')
-        if self._loop.run_threads.current() is None:
-            self._warn(
+        if self.loop.run_threads.current() is None:
+            self.loop.warn(
                 f'{outlet.topic}: a thread publishes on it that is not of the run: when '
                 'that happens depends on the machine')
-        current = self._loop.current
+        current = self.loop.current
         if current is not None:
             current.work.entity.publishes.add(outlet.topic)
-        self._loop.send(Sent(
+        self.loop.send(Sent(
             partial(self._leave, outlet, data), partial(self._record, outlet),
             partial(self._earliest, outlet)))
-
-    def subscription_count(self, publisher: Publisher) -> int:
-        """Return how many subscribe to a publisher's topic: nodes, and the rerun itself."""
-        self._loop.refresh_now()
-        return 1 + len(self._inlets_of(self._outlet(publisher)))
-
-    def publisher_count(self, subscription: Any) -> int:
-        """Return how many publish to a subscription: nodes of the run, or the recording."""
-        self._loop.refresh_now()
-        topic = subscription.topic_name
-        return self.publishers(topic) or int(topic in self._last)
-
-    def publishers(self, topic: str) -> int:
-        """Return how many publishers nodes of the run have on a topic."""
-        return self._publishers.get(topic, 0)
 
     def _record(self, outlet: Outlet, thread: int) -> None:
         """Record a publication."""
         if self._engine.record is not None:
             self._sequence += 1
             self._engine.record(
-                PUBLICATION, self._loop.now, thread, id(outlet.publisher), self._sequence)
+                PUBLICATION, self.loop.now, thread, id(outlet.publisher), self._sequence)
 
     def _earliest(self, outlet: Outlet, origin: Origin, release: int) -> int:
         """Return when the first subscription gets a message, after its execution's end."""
@@ -232,34 +238,69 @@ class Messages:
         self, outlet: Outlet, data: bytes, origin: Origin | None, release: int, end: int
     ) -> None:
         """Send a message to the outputs and to the subscriptions."""
-        now = self._loop.now
+        now = self.loop.now
         self._outputs.add(now, outlet.topic, outlet.kind, data, outlet.publisher)
         outlet.count += 1
         if outlet.kept.maxlen:
             outlet.kept.append((now, data))
         for inlet in self._inlets_of(outlet):
             time = end + self._delay(inlet, origin, release)
+            arrive = partial(self._arrive, inlet, data, now, origin, outlet.count)
             if time <= now:
-                self._arrive(inlet, data, now, origin, outlet.count)
+                arrive()
             else:
-                self._loop.at(
-                    time, ARRIVED, self._arrive, inlet, data, now, origin, outlet.count)
+                self.loop.at(time, ARRIVED, arrive)
 
-    # --- what arrives ----------------------------------------------------------------------------
+    # --- what is recorded ------------------------------------------------------------------------
 
-    def recorded(self, topic: str, data: bytes, published: int) -> None:
-        """Deliver a message of the recording."""
+    def begin(self) -> None:
+        """Deliver what is recorded, from now on."""
+        self._has_begun = True
+        self._load()
+
+    def _load(self) -> None:
+        """Load the messages that nodes need by now, and begin to deliver them."""
+        recording = self._recording
+        new = recording.load({*self.inlets, *self.offered})
+        for topic, inlets in self.inlets.items():
+            recorded, wanted = recording.kinds.get(topic), type_name(inlets[0].kind)
+            if recorded not in (None, wanted) and topic not in self.offered:
+                raise RerunError(
+                    f'{recording.name}: {topic} was recorded as {recorded}, and the node '
+                    f'subscribes to it as {wanted}: record it again, or correct the node')
+        if new:
+            self._deliver_next(recording.messages(new, self.loop.now))
+
+    def _deliver_next(self, coming: Iterator[RecordedMessage]) -> None:
+        def deliver(message: RecordedMessage) -> None:
+            self._recorded(message.topic, message.data, message.published)
+            self._deliver_next(coming)
+
+        for message in coming:
+            self.loop.at(message.time, RECORDED, deliver, message)
+            break
+
+    def _recorded(self, topic: str, data: bytes, published: int) -> None:
         if topic in self.offered:
             return  # the node's count
         self._last[topic] = published, data
-        for inlet in self.inlets(topic):
+        for inlet in self.inlets.get(topic, ()):
             self._arrive(inlet, data, published, None)
+
+    def _publish_time(self) -> None:
+        now = self.loop.now
+        stamp = Time(nanoseconds=now).to_msg()
+        self._recorded(CLOCK, serialize_message(Clock(clock=stamp)), now)
+        if now + CLOCK_EVERY_NS < self.loop.end:
+            self.loop.at(now + CLOCK_EVERY_NS, RECORDED, self._publish_time)
+
+    # --- what arrives ----------------------------------------------------------------------------
 
     def _arrive(
         self, inlet: Inlet, data: bytes, source_stamp: int, origin: Origin | None, number: int = 0
     ) -> None:
         """Have a subscription's callback run with a message."""
-        entity, now, engine = inlet.entity, self._loop.now, self._engine
+        entity, now, engine = inlet.entity, self.loop.now, self._engine
         if entity.removed:
             return
         message = self._message(inlet, data)
@@ -274,27 +315,24 @@ class Messages:
                 'source_timestamp': source_stamp, 'received_timestamp': now,
                 'publication_sequence_number': number,
                 'reception_sequence_number': inlet.received}
-        work = Work(entity, entity.rclpy.callback, args)
         release = stamp = -1
         if entity.source >= 0:
             release, stamp = self._release(entity, message, source_stamp)
         elif origin is None and entity.remote_publishers:
-            stamp = header_stamp(message)
-            release = now
+            release, stamp = now, header_stamp(message)
             if stamp < 0:
                 stamp = now  # a job of its own
         if engine.record is not None:
             engine.taken(entity, message, source_stamp, now)
-        engine.arrived(work, origin, release, stamp, now)
+        engine.arrived(Work(entity, entity.rclpy.callback, args), origin, release, stamp, now)
 
     def _release(self, entity: Entity, message: Any, source_stamp: int) -> tuple[int, int]:
         """Return the release of the job that a message starts, and the stamp that names it."""
-        engine, now = self._engine, self._loop.now
-        kind = self._release_from[engine.tables.dag_of[entity.source]]
+        kind = self._release_from[self._engine.tables.dag_of[entity.source]]
         stamp = header_stamp(message)
         if kind == 'header_stamp' and stamp >= 0:
             return stamp, stamp
-        return source_stamp if kind == 'source_timestamp' else now, stamp
+        return source_stamp if kind == 'source_timestamp' else self.loop.now, stamp
 
     def _message(self, inlet: Inlet, data: bytes) -> Any:
         if inlet.raw:
@@ -303,7 +341,7 @@ class Messages:
             return deserialize_message(data, inlet.kind)
         except Exception as error:
             raise RerunError(
-                f'{inlet.topic}: a message of it does not decode as {type_name(inlet.kind)}, at '
-                f'{(self._loop.now - self._loop.start) / 1e9:.6f} s '
+                f'{inlet.entity.label}: a message of it does not decode as '
+                f'{type_name(inlet.kind)}, at {(self.loop.now - self.loop.start) / 1e9:.6f} s '
                 f'({" ".join(str(error).split())[:120]}): record it with the type that the node '
                 'has') from None

@@ -37,19 +37,18 @@ from mddag_executor.executor.work import Work
 from mddag_executor.hosting.host import Guest
 from mddag_executor.hosting.loading import describe, Program, ros_arguments
 from mddag_executor.replacements import instead, Replacements
-from mddag_executor.rerun.actions import Actions
 from mddag_executor.rerun.clocks import VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.discovery import Discovery
+from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.executor import NodeHolder, RerunHost
-from mddag_executor.rerun.inputs import RerunInput
+from mddag_executor.rerun.inputs import MessageBag
 from mddag_executor.rerun.loop import ENDED, Loop
-from mddag_executor.rerun.messages import Messages
+from mddag_executor.rerun.messages import CLOCK, Messages
 from mddag_executor.rerun.outputs import Output, Outputs, VirtualTraceWriter
-from mddag_executor.rerun.player import CLOCK, Player
+from mddag_executor.rerun.requests import Requests
 from mddag_executor.rerun.run_threads import Stalled
-from mddag_executor.rerun.services import Services
 from mddag_executor.rerun.shared_cpus import SharedCpus
 from mddag_executor.rerun.timers import Timers
 from mddag_executor.text import counted
@@ -140,16 +139,16 @@ class Rerun:
     """
 
     def __init__(
-        self, source: RerunInput, task_set: TaskSet, settings: Settings,
+        self, recording: MessageBag, times: Durations, task_set: TaskSet, settings: Settings,
         output: BinaryIO | None = None, trace: str | None = None, keep: bool = True,
     ) -> None:
-        self._source = source
+        self._recording = recording
+        self._times = times
         self._task_set = task_set
         self._settings = settings
         self._trace = trace
         self._replacements = Replacements()
-        self.warnings: list[str] = []
-        self._outputs = Outputs(output, None if keep else source.topics)
+        self._outputs = Outputs(output, None if keep else recording.topics)
         self._programs: Callable[[], Sequence[Program]] = tuple
         self._failed: list[Guest] = []
         self._hosted: set[str] = set()
@@ -158,7 +157,7 @@ class Rerun:
     # --- parts -----------------------------------------------------------------------------------
 
     def _make(self, context: Any) -> None:
-        settings, source, task_set = self._settings, self._source, self._task_set
+        settings, recording, task_set = self._settings, self._recording, self._task_set
         writer = None if self._trace is None else VirtualTraceWriter(self._trace)
         self._engine = Engine(
             task_set, settings.workers, settings.policy, default_deadline=DEFAULT_DEADLINE_NS,
@@ -168,8 +167,8 @@ class Rerun:
             task_set, self._engine.tables, self._engine.scheduler, self._engine.jobs,
             task_set.dags)
         self._loop = loop = Loop(
-            self._engine, source.times, source.start, source.end, source.pauses, self._refresh,
-            self._begin, self._over)
+            self._engine, self._times, recording.start, recording.end, recording.pauses,
+            self._refresh, self._begin, self._over)
         self._recorder = None if writer is None else Recorder(
             writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE_NS,
             MAX_ACTIVE_JOBS, _TraceTime(loop), writer, settings.cpus or 0,
@@ -178,19 +177,11 @@ class Rerun:
         self._holders = self._held()
         if settings.cpus is not None or self._holders:
             loop.computing = SharedCpus(
-                self._engine, settings.cpus, source.times.python, loop.start, loop.ended)
+                self._engine, settings.cpus, self._times.python, loop.start, loop.ended)
         self._registry = Registry(task_set, self._engine, self._engine.leave_group)
-        self._messages = Messages(
-            loop, source.times, self._outputs, task_set, self._warn)
-        self._player = Player(loop, self._messages, source.messages)
-        self._services = Services(loop, self._holder, self._warn)
-        self._actions = Actions(
-            loop, self._holder, lambda: self._registry.by_id, self._warn)
-        recording = source.messages
-        self._discovery = Discovery(
-            loop, self._holder, self._messages, source.topics,
-            lambda: {} if recording is None else recording.kinds, self._warn)
-        self._timers = Timers(loop, source.times.first_release)
+        self._messages = Messages(loop, recording, self._times, self._outputs, task_set)
+        self._requests = Requests(loop, self._holder)
+        self._timers = Timers(loop, self._times.first_release)
         self._host = RerunHost(loop)
         if self._recorder is not None:
             self._recorder.entities((), [self._holder.task_entity])
@@ -200,13 +191,9 @@ class Rerun:
         held, vertices = set(), self._task_set.vertices
         for place, vertex in enumerate(vertices):
             declared = vertex.callback.holds_interpreter
-            if self._source.times.holds(place) if declared is None else declared:
+            if self._times.holds(place) if declared is None else declared:
                 held.add(vertex.callback.key)
         return held
-
-    def _warn(self, text: str) -> None:
-        if text not in self.warnings:
-            self.warnings.append(text)
 
     # --- the run ---------------------------------------------------------------------------------
 
@@ -246,21 +233,19 @@ class Rerun:
                     self._recorder.close(loop.now)
         self._check_programs()
         if not self._hosted:
-            self._warn(self._none_hosted())
+            self._loop.warn(self._none_hosted())
         self._outputs.finish()
         return self._result(time.monotonic() - self._begun)
 
     def _install(self) -> None:
         replace = self._replacements.replace
         messages = self._messages
-        virtual = self._virtual = VirtualTime(
-            self._loop, self._settings.all_clocks, CLOCK in self._source.topics,
-            self._settings.seed, self._warn)
-        virtual.install(replace)
-        self._timers.install(self._replacements)
-        self._services.install(self._replacements)
-        self._actions.install(self._replacements)
-        self._discovery.install(self._replacements)
+        self._virtual = VirtualTime(
+            self._loop, self._settings.all_clocks, CLOCK in self._recording.topics,
+            self._settings.seed)
+        self._virtual.install(replace)
+        for each in (self._timers, self._requests, Discovery(messages, self._recording)):
+            each.install(self._replacements)
         replace(GuardCondition, 'trigger', self._trigger)
         replace(Publisher, 'publish', instead(messages.publish))
         replace(Publisher, 'get_subscription_count', instead(messages.subscription_count))
@@ -299,23 +284,23 @@ class Rerun:
         if all(guest.is_complete for guest in self._host.guests) and not self._hosted:
             raise RerunError(self._none_hosted())
         self._check_topics()
-        if self._source.pauses:
-            self._warn(f'{self._source.name}: timers do not fire in '
-                       f'{counted(len(self._source.pauses), "pause")} of over a minute without '
+        if self._recording.pauses:
+            self._loop.warn(f'{self._recording.name}: timers do not fire in '
+                       f'{counted(len(self._recording.pauses), "pause")} of over a minute without '
                        'any message')
-        self._player.begin()
+        self._messages.begin()
 
     def _none_hosted(self) -> str:
         text = unbound_text(self._task_set, self._registry.unbound(), self._registry)
         return f'{text}: give the nodes that it declares, with the same names'
 
     def _check_topics(self) -> None:
-        known = {*self._source.topics, *self._messages.offered, CLOCK}
+        known = {*self._recording.topics, *self._messages.offered, CLOCK}
         for callback in self._task_set.callbacks:
             for topic in callback.topics:
                 if callback.key in self._hosted and topic not in known:
                     raise RerunError(
-                        f'{self._source.name}: {topic}, which {callback.key} needs, is not '
+                        f'{self._recording.name}: {topic}, which {callback.key} needs, is not '
                         'recorded: record it, or run the node that publishes it with --node')
 
     def _refresh(self) -> None:
@@ -333,24 +318,24 @@ class Rerun:
             entity.since = now
             if entity.callback is not None and entity.callback.key in self._holders:
                 entity.habit.holds = 1
-            if entity.kind == WAITABLE and not self._actions.knows(entity.rclpy) and (
+            if entity.kind == WAITABLE and not self._requests.knows(entity.rclpy) and (
                     not is_qos_event(entity.rclpy)):
-                self._warn(f'{entity.name}: a waitable of its own kind, which never gets ready')
+                self._loop.warn(
+                    f'{entity.name}: a waitable of its own kind, which never gets ready')
         for entity in gone:
             engine.remove(entity, now)
         self._timers.refresh(registry.timers())
-        self._services.refresh(registry.by_id.values())
+        self._requests.refresh(registry.by_id)
         if self._recorder is not None:
             self._recorder.entities(nodes, added)
         self._messages.refresh(nodes, registry.subscriptions())
-        self._player.refresh()
 
     # --- the end ---------------------------------------------------------------------------------
 
     def _over(self) -> None:
         """Judge what is open; then let programs end, whose context has ended."""
         self._failed = [guest for guest in self._host.guests if guest.error is not None]
-        self.warnings += self._loop.blocked()
+        self._loop.warn_of_waiting()
         self._engine.finish(self._loop.now)
         self._host.shut_down()
 
@@ -368,21 +353,17 @@ class Rerun:
             ) from guest.error
         for guest in self._host.guests:
             if guest.error is not None and not isinstance(guest.error, _ENDS):
-                self._warn(
+                self._loop.warn(
                     f'--node {guest.program.spec}: after the end of the run its main raised '
                     f'{describe(guest.error)}')
 
     def _result(self, elapsed_s: float) -> Result:
-        loop, recording = self._loop, self._source.messages
-        recorded: list[Difference] = []
-        both: set[str] = set()
-        if recording is not None:
-            both = set(recording.topics & self._outputs.counts.keys() - _OF_ALL_NODES)
-            recorded = differences(
-                [each for each in self._outputs.messages if each.topic in both],
-                recording.messages(both), loop.start)
-            recording.close()
-            self.warnings = [*recording.warnings, *self.warnings]
+        loop, recording = self._loop, self._recording
+        both = set(recording.topics & self._outputs.counts.keys() - _OF_ALL_NODES)
+        recorded = differences(
+            [each for each in self._outputs.messages if each.topic in both],
+            recording.messages(both), loop.start)
+        recording.close()
         verdicts = {
             'policy': self._settings.policy, 'workers': self._settings.workers,
             'preemptive': False, 'duration_ns': loop.now - loop.start,
@@ -390,7 +371,7 @@ class Rerun:
         return Result(
             self._outputs.digest, self._outputs.messages, self._outputs.counts, loop.callbacks,
             self._started_s, loop.start, loop.now - loop.start, elapsed_s, verdicts, sorted(both),
-            recorded, self.warnings)
+            recorded, [*recording.warnings, *loop.warnings])
 
 
 class _TraceTime(TraceClock):

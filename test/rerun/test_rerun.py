@@ -21,7 +21,7 @@ from mddag_executor.rerun import (
     Result,
 )
 from mddag_executor.rerun.durations import Durations
-from mddag_executor.rerun.inputs import MessageBag, RerunInput
+from mddag_executor.rerun.inputs import MessageBag
 from mddag_executor.rerun.run import Rerun, Settings
 from mddag_executor.simulate import Load
 from msg_graph import load
@@ -142,10 +142,9 @@ class Early(Durations):
 
 @pytest.mark.parametrize('cpus', [None, 2])
 def test_what_was_published_early_leaves_early(bag, graph, cpus):
-    recording = MessageBag(bag)
-    source = RerunInput('bag', recording.start, recording.end, recording, Early(
-        Tables.build(load(str(graph))), Load([], [], [], [], [0], [0]), recorded=True))
-    result = Rerun(source, load(str(graph)), Settings(workers=2, cpus=cpus)).run(
+    task_set = load(str(graph))
+    times = Early(Tables.build(task_set), Load([], [], [], [], [0], [0]), recorded=True)
+    result = Rerun(MessageBag(bag), times, task_set, Settings(workers=2, cpus=cpus)).run(
         lambda: programs([Filter, Sink]))
     assert [time for time, _ in published(result, '/filtered')][:2] == [6, 106]
     # Nobody takes it in this DAG: it leaves at the end.

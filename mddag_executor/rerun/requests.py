@@ -1,0 +1,242 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Services and actions between nodes of the run, without a middleware.
+
+Theory of operation
+-------------------
+What a client or server sends is copied, and goes to the other side when the callback that sends it
+ends or waits. A request to a service or action that no node of the run offers is never answered,
+and a warning says so.
+
+rclpy's action clients and servers do all by themselves but for sending (methods of their handles)
+and taking: they get what they would have taken. Goals are known by the middleware's own
+bookkeeping, which stays in use; results do not expire.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import copy
+from functools import partial
+import itertools
+from typing import Any
+
+from mddag_executor.executor.compat import (
+    alive,
+    attach_futures,
+    complete_request,
+    service_name,
+)
+from mddag_executor.executor.entity import Entity, SERVICE
+from mddag_executor.executor.work import Work
+from mddag_executor.replacements import instead, Replacements
+from mddag_executor.rerun.compat import (
+    action_handle,
+    CLIENT_HANDLE,
+    feedback_callback,
+    goal_states,
+    new_request,
+    SERVER_HANDLE,
+)
+from mddag_executor.rerun.loop import Loop
+from rclpy.client import Client
+from rclpy.service import Service
+from rclpy.task import Future
+
+Header = tuple[Any, int]
+"""What a request's header is to a server: the client that has sent it, and its number."""
+
+
+class Requests:
+    """
+    Carries what clients and servers of services and actions send.
+
+    :param executor: runs the callbacks of futures.
+    """
+
+    def __init__(self, loop: Loop, executor: Any) -> None:
+        self._loop = loop
+        self._executor = executor
+        self._numbers = itertools.count(1)
+        self._entities: dict[int, Entity] = {}
+        self._services: dict[str, Entity] = {}
+        # clients and servers of actions with their names, by the id of their handles
+        self._actions: dict[int, tuple[str, Any]] = {}
+
+    def refresh(self, entities: dict[int, Entity]) -> None:
+        """Update which entities there are, by the id of those of rclpy."""
+        self._entities = entities
+        self._services = {e.label: e for e in entities.values() if e.kind == SERVICE}
+
+    def install(self, replacements: Replacements) -> None:
+        """Have clients and servers use this."""
+        from rclpy.action.client import ActionClient  # late: it loads much
+        from rclpy.action.server import ActionServer
+        replace = replacements.replace
+        replace(Client, 'call_async', instead(self.call_async))
+        replace(Client, 'call', instead(self.call))
+        replace(Client, 'service_is_ready', instead(self.is_offered))
+        replace(Client, 'wait_for_service', instead(self.wait_for_service))
+        replace(Service, 'send_response', instead(self.send_response))
+        replace(ActionClient, '__init__', self._made)
+        replace(ActionServer, '__init__', self._made)
+        replace(ActionClient, 'wait_for_server', instead(self.wait_for_server))
+        replace(CLIENT_HANDLE, 'is_action_server_available',
+                instead(lambda handle: bool(self._peers(handle))))
+        replace(SERVER_HANDLE, 'publish_feedback', instead(self._feedback))
+        replace(SERVER_HANDLE, 'publish_status', instead(self._status))
+        for kind in ('goal', 'cancel', 'result'):
+            replace(CLIENT_HANDLE, f'send_{kind}_request',
+                    instead(partial(self._ask_action, kind)))
+            replace(SERVER_HANDLE, f'send_{kind}_response',
+                    instead(partial(self._answer_action, kind)))
+
+    def _wait(self, until: Callable[[], bool], timeout_sec: float | None, what: str,
+              lends: bool = False) -> bool:
+        return self._loop.wait(until, self._loop.deadline_after(timeout_sec), f'for {what}', lends)
+
+    def _send(self, content: Any, deliver: Callable[[Any], None]) -> None:
+        """Deliver a copy of something when the callback that runs ends, or else at once."""
+        self._loop.call_at_end(partial(deliver, copy.deepcopy(content)))
+
+    # --- services --------------------------------------------------------------------------------
+
+    def is_offered(self, client: Client) -> bool:
+        """Return whether a node of the run offers a client's service."""
+        entity = self._services.get(service_name(client))
+        return entity is not None and not entity.removed
+
+    def wait_for_service(self, client: Client, timeout_sec: float | None = None) -> bool:
+        """Wait until a client's service is offered."""
+        return self._wait(
+            lambda: self.is_offered(client), timeout_sec, f'service {service_name(client)}')
+
+    def call_async(self, client: Any, request: Any) -> Future:
+        """Send a request; return the future of its response."""
+        if not isinstance(request, client.srv_type.Request):
+            raise TypeError()
+        with client.handle:  # else it has been destroyed
+            pass
+        number = next(self._numbers)
+        future = new_request(client, number)
+        self._send(request, partial(self._ask, client, number))
+        return future
+
+    def call(self, client: Client, request: Any, timeout_sec: float | None = None) -> Any:
+        """Send a request and wait for its response; None if it does not come in time."""
+        future = self.call_async(client, request)
+        if not self._wait(
+                future.done, timeout_sec, f'service {service_name(client)}', lends=True):
+            client.remove_pending_request(future)
+        error = future.exception()
+        if error is not None:
+            raise error
+        return future.result()
+
+    def _ask(self, client: Client, number: int, request: Any) -> None:
+        if not self.is_offered(client):
+            self._loop.warn(f'{service_name(client)}: it is called, and no node of the run offers '
+                            'this service')
+            return
+        entity = self._services[service_name(client)]
+        service = entity.rclpy
+        work = Work(
+            entity, service.callback, (request, service.srv_type.Response()),
+            partial(service.send_response, header=(client, number)))
+        engine, now = self._loop.engine, self._loop.now
+        if entity.source >= 0:
+            engine.arrived(work, None, now, -1, now)
+        else:
+            engine.ready(work, now)
+
+    def send_response(self, service: Any, response: Any, header: Header) -> None:
+        """Send a response."""
+        if not isinstance(response, service.srv_type.Response):
+            raise TypeError()
+        self._send(response, partial(self._answer, *header))
+
+    def _answer(self, client: Client, number: int, response: Any) -> None:
+        if alive(client):
+            complete_request(client, number, response, self._executor)
+
+    # --- actions ---------------------------------------------------------------------------------
+
+    def _made(self, original: Callable[..., None]) -> Callable[..., None]:
+        """Return a constructor that keeps by which name an action is known."""
+        def construct(
+            waitable: Any, node: Any, action_type: Any, action_name: str, *args: Any, **more: Any
+        ) -> None:
+            original(waitable, node, action_type, action_name, *args, **more)
+            name = node.resolve_service_name(f'{action_name}/_action/send_goal')
+            self._actions[id(action_handle(waitable))] = (
+                name.removesuffix('/_action/send_goal'), waitable)
+
+        return construct
+
+    def knows(self, waitable: Any) -> bool:
+        """Return whether a waitable is an action client or server."""
+        return any(each is waitable for _, each in self._actions.values())
+
+    def _peers(self, handle: Any) -> list[Any]:
+        """Return the clients of an action server, or the servers of an action client."""
+        name, _ = self._actions[id(handle)]
+        return [each for known, each in self._actions.values()
+                if known == name and id(each) in self._entities
+                and type(action_handle(each)) is not type(handle)]
+
+    def wait_for_server(self, client: Any, timeout_sec: float | None = None) -> bool:
+        """Wait until a client's action is offered."""
+        handle = action_handle(client)
+        return self._wait(lambda: bool(self._peers(handle)), timeout_sec,
+                          f'action {self._actions[id(handle)][0]}')
+
+    def _ask_action(self, kind: str, handle: Any, request: Any) -> int:
+        number = next(self._numbers)
+        name, client = self._actions[id(handle)]
+
+        def deliver(request: Any) -> None:
+            servers = self._peers(handle)
+            if servers:
+                self._take(servers[0], {kind: ((client, number), request)})
+            else:
+                self._loop.warn(
+                    f'{name}: it is called, and no node of the run offers this action')
+
+        self._send(request, deliver)
+        return number
+
+    def _answer_action(self, kind: str, handle: Any, header: Header, response: Any) -> None:
+        client, number = header
+        self._send(response, lambda response: self._take(client, {kind: (number, response)}))
+
+    def _feedback(self, handle: Any, message: Any) -> None:
+        def deliver(message: Any) -> None:
+            for client in self._peers(handle):
+                callback = feedback_callback(client, message)
+                if callback is not None:
+                    self._ready(client, callback, copy.deepcopy(message))
+
+        self._send(message, deliver)
+
+    def _status(self, handle: Any) -> None:
+        from action_msgs.msg import GoalStatus, GoalStatusArray
+        _, server = self._actions[id(handle)]
+
+        def deliver(message: Any) -> None:
+            for client in self._peers(handle):
+                self._take(client, {'status': message})
+
+        self._send(GoalStatusArray(status_list=[
+            GoalStatus(goal_info=info, status=status) for info, status in goal_states(server)]),
+            deliver)
+
+    def _take(self, waitable: Any, data: dict[str, Any]) -> None:
+        attach_futures(waitable, self._executor)
+        self._ready(waitable, waitable.execute, data)
+
+    def _ready(self, waitable: Any, function: Callable[[Any], Any], argument: Any) -> None:
+        entity = self._entities.get(id(waitable))
+        if entity is not None and not entity.removed:
+            engine = self._loop.engine
+            engine.ready(Work(entity, function, (argument,)), self._loop.now)
