@@ -19,9 +19,10 @@ with topics and services with names.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Collection
 from difflib import get_close_matches
 from heapq import heappop, heappush
+from operator import eq
 import re
 from typing import NamedTuple
 
@@ -128,7 +129,7 @@ def is_period(period_ns: int, declared_ns: int) -> bool:
     return abs(declared_ns - period_ns) <= _PERIOD_TOLERANCE * declared_ns
 
 
-def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
+def meant(callback: Callback, undeclared: Collection[Entity]) -> str | None:
     """
     Return the entity that an unbound declared callback probably means, as a question.
 
@@ -136,28 +137,23 @@ def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
     timer of its node with another period, and an entity of a node or topic with a similar name;
     also the only entity with the same start.
     """
-    undeclared = list(undeclared)
-    timers = []
-    for wanted in entities_of(callback):
-        for other in undeclared:
-            if other.kind != wanted.kind or not _same_below(other.node, wanted.node):
-                continue
-            if wanted.kind == 'timer':
-                timers.append(other)
-            elif other.node != wanted.node and _same_below(other.start, wanted.start):
+    pairs = [(wanted, other) for wanted in entities_of(callback) for other in undeclared
+             if other.kind == wanted.kind]
+    pairs.sort(key=lambda pair: abs((pair[1].period_ns or 0) - (pair[0].period_ns or 0)))
+    for wanted, other in pairs:
+        if not _same_below(other.node, wanted.node):
+            continue
+        if other.node != wanted.node:
+            if _starts_alike(other, wanted, _same_below):
                 return f'did you mean the node {shown(other.node)}?'
-            elif other.start != wanted.start and _same_below(other.start, wanted.start):
-                return f'did you mean the {_WORDS[other.kind]} {shown(other.start)}?'
-    period = callback.timer_period_ns or 0
-    for other in sorted(timers, key=lambda each: abs((each.period_ns or 0) - period)):
-        if other.node == callback.node:
+        elif wanted.kind == 'timer':
             return f'did you mean its timer of {format_duration(other.period_ns or 0)}?'
-        if is_period(other.period_ns or 0, period):
-            return f'did you mean the node {shown(other.node)}?'
+        elif other.start != wanted.start and _same_below(other.start, wanted.start):
+            return f'did you mean the {_WORDS[other.kind]} {shown(other.start)}?'
     for wanted in entities_of(callback):
-        alike = [other for other in undeclared if other.kind == wanted.kind]
+        alike = [other for each, other in pairs if each == wanted]
         nodes = sorted({other.node for other in alike if other.node != wanted.node
-                        and _starts_alike(other, wanted)})
+                        and _starts_alike(other, wanted, eq)})
         if found := get_close_matches(wanted.node, nodes, 1) or nodes[:len(nodes) == 1]:
             return f'did you mean the node {shown(found[0])}?'
         starts = {other.start for other in alike if other.node == wanted.node}
@@ -166,9 +162,12 @@ def meant(callback: Callback, undeclared: Iterable[Entity]) -> str | None:
     return None
 
 
-def _starts_alike(entity: Entity, other: Entity) -> bool:
-    return entity.start == other.start and (
-        entity.kind != 'timer' or is_period(entity.period_ns or 0, other.period_ns or 0))
+def _starts_alike(
+    entity: Entity, declared: Entity, alike: Callable[[str, str], bool]
+) -> bool:
+    if declared.kind == 'timer':
+        return is_period(entity.period_ns or 0, declared.period_ns or 0)
+    return alike(entity.start, declared.start)
 
 
 def _same_below(name: str, other: str) -> bool:

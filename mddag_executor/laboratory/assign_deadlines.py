@@ -29,9 +29,10 @@ from typing import Any, NamedTuple
 
 from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.acceptance import wilson, Z_95
-from mddag_executor.laboratory.evaluate import compiling_pays, evaluate
+from mddag_executor.laboratory.evaluate import evaluate, plain_s
 from mddag_executor.laboratory.experiment import Experiment
 from mddag_executor.laboratory.tasks import tasks_of
+from mddag_executor.simulate.schedule import compiling_pays
 from msg_graph import TaskSet
 from msg_graph.duration import whole_us
 from msg_graph.edit import with_deadlines
@@ -161,7 +162,7 @@ def search(
     if runs < least_runs(target):
         raise UsageError(f'--target {target:g}: {runs} runs cannot show it: give --runs '
                           f'{least_runs(target)} or more')
-    compiled = compiling_pays((experiment,), runs * _USUAL_SCALES, jobs)
+    compiled = compiling_pays(plain_s((experiment,), runs * _USUAL_SCALES) / jobs)
     tried: list[tuple[float, Measured]] = []
 
     def acceptance(scale: float, seed: int) -> Measured:

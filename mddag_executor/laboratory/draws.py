@@ -25,7 +25,8 @@ import zlib
 
 from mddag_executor.core import rad_offsets
 from mddag_executor.errors import InputError
-from msg_graph import ExecutionTime, TaskSet
+from mddag_executor.simulate.workload import check_execution_times
+from msg_graph import TaskSet
 from msg_graph.duration import DAY
 from msg_graph.model import topological_order
 import numpy as np
@@ -93,21 +94,12 @@ class Draws:
 
     def __init__(self, task_set: TaskSet, seed: int, samples: Samples | None = None) -> None:
         self._seed = seed
-        self._pickers: list[Callable[[Floats], Times]] = []
-        for vertex in task_set.vertices:
-            callback = vertex.callback
-            if samples is not None:
-                self._pickers.append(partial(_from_measured, samples[callback.key]))
-            elif callback.execution_time is None:
-                raise InputError(
-                    task_set.file, f'{callback.key} declares no execution_time',
-                    'add one, or give --samples FILE.npz', line=callback.line)
-            elif callback.execution_time.quantiles_ns[-1] <= 0:
-                raise InputError(
-                    task_set.file, f'the execution_time of {callback.key} is 0',
-                    'give a time above zero', line=callback.line)
-            else:
-                self._pickers.append(partial(_from_table, callback.execution_time))
+        if samples is None:
+            check_execution_times(task_set, ', or give --samples FILE.npz')
+        self._pickers: list[Callable[[Floats], Times]] = [
+            partial(_from_table, vertex.callback.execution_time) if samples is None
+            else partial(_from_measured, samples[vertex.callback.key])
+            for vertex in task_set.vertices]
 
     def times(self, first: int, count: int) -> Times:
         """Return the execution times of ``count`` runs from number ``first`` on."""
@@ -126,7 +118,7 @@ def _from_measured(values: Times, uniform: Floats) -> Times:
     return values[(uniform * len(values)).astype(np.int64)]
 
 
-def _from_table(table: ExecutionTime, uniform: Floats) -> Times:
+def _from_table(table: Any, uniform: Floats) -> Times:
     """Do what ``ExecutionTime.draw`` does for many numbers, with the same results to the bit."""
     percent = np.array(table.percent, dtype=np.float64)
     quantiles = np.array(table.quantiles_ns, dtype=np.int64)

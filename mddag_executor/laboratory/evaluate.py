@@ -37,7 +37,7 @@ from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.laboratory.acceptance import Evaluation
 from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.experiment import Chunk, Evaluator, Experiment, STRIDE
-from mddag_executor.simulate.schedule import SOON_S
+from mddag_executor.simulate.schedule import compiling_pays, PLAIN_S, SOON_S
 
 Submit = Callable[[int, int], 'Future[Chunk]']
 """Starts a number of runs from a place on."""
@@ -46,7 +46,6 @@ MOST_RUNS = 10 ** 7
 _CHUNK_COMPILED, _CHUNK_PLAIN = 250, 10     # a fraction of a second each
 _MOST_CHUNKS = 20_000
 _CONNECT_S, _WORKER_S = 5, 10               # what a Dask scheduler and its first worker may need
-_PLAIN_S = 6e-6                             # about the plain core's time for each vertex job
 
 
 def evaluate(
@@ -76,11 +75,11 @@ def evaluate(
     experiments = (experiment,) if isinstance(experiment, Experiment) else tuple(experiment)
     _check(experiments, runs, first_run)
     if compiled is None:
-        compiled = compiling_pays(experiments, runs, jobs)
+        compiled = compiling_pays(plain_s(experiments, runs) / jobs)
     elif compiled:
         from mddag_executor.simulate.compiled import check_available
         check_available()
-    if not compiled and dask is None and _plain_s(experiments, runs) < SOON_S:
+    if not compiled and dask is None and plain_s(experiments, runs) < SOON_S:
         jobs = 1  # it is done before other processes have started
     evaluator = Evaluator(experiments, runs, first_run, compiled)
     for each in experiments:
@@ -105,19 +104,12 @@ def _check(experiments: Sequence[Experiment], runs: int, first_run: int) -> None
             f'first run: {first_run} is out of range: give 0 to {STRIDE - MOST_RUNS - 1}')
 
 
-def compiling_pays(experiments: Sequence[Experiment], runs: int, jobs: int) -> bool:
-    """Return whether the compiled core is faster for so many runs of each experiment."""
-    from mddag_executor.simulate.compiled import pays
-    plain_s = _plain_s(experiments, runs) / jobs
-    return plain_s > SOON_S and pays(plain_s)
-
-
-def _plain_s(experiments: Sequence[Experiment], runs: int) -> float:
+def plain_s(experiments: Sequence[Experiment], runs: int) -> float:
     """Return about how long all runs take with the plain core, one at a time."""
     vertex_jobs = sum(
         -(-experiment.duration_ns // dag.period_ns) * len(dag.vertices)
         for experiment in experiments for dag in experiment.task_set.dags)
-    return vertex_jobs * len(experiments[0].policies) * _PLAIN_S * runs
+    return vertex_jobs * len(experiments[0].policies) * PLAIN_S * runs
 
 
 def _collect(

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from mddag_executor import defaults
 from mddag_executor.core import Tables
-from mddag_executor.errors import InputError, UsageError
-from mddag_executor.text import counted
+from mddag_executor.errors import UsageError
+from mddag_executor.simulate.workload import check_execution_times
 from msg_graph import Dag, ExecutionTime, TaskSet
 from msg_graph.model import path_lengths, topological_order
 
@@ -54,11 +54,16 @@ def tasks_of(task_set: TaskSet, budget: str = 'max') -> list[Task]:
 
     :param budget: which value of each execution time counts: ``max``, ``p99`` or ``mean``.
     """
+    if budget not in defaults.BUDGETS:
+        raise UsageError(f"budget '{budget}': there is no such budget: choose one of "
+                         f'{", ".join(defaults.BUDGETS)}')
+    check_execution_times(task_set)
     tables = Tables.build(task_set)
     tasks = []
     for dag in task_set.dags:
         first = tables.first_vertex[dag.index]
-        costs = _costs(task_set, dag, budget)
+        costs = [_budget(vertex.callback.execution_time, budget)  # type: ignore[arg-type]
+                 for vertex in dag.vertices]
         lengths = path_lengths(dag, costs)
         sinks = tuple((i, dag.vertices[i].deadline_ns or 0, lengths[i]) for i in dag.sinks)
         tasks.append(Task(
@@ -69,33 +74,10 @@ def tasks_of(task_set: TaskSet, budget: str = 'max') -> list[Task]:
     return tasks
 
 
-def _costs(task_set: TaskSet, dag: Dag, budget: str) -> list[int]:
-    costs = []
-    for vertex in dag.vertices:
-        time = vertex.callback.execution_time
-        if time is None:
-            raise _unknown(task_set)
-        costs.append(_budget(time, budget))
-    return costs
-
-
-def _unknown(task_set: TaskSet) -> InputError:
-    missing = [callback for callback in task_set.callbacks if callback.execution_time is None]
-    first, others = missing[0], len(missing) - 1
-    also = f' (and {counted(others, "more callback")})' if others else ''
-    return InputError(first.file or task_set.file,
-                      f'{first.key}{also} declares no execution_time', 'add one', first.line)
-
-
 def _budget(time: ExecutionTime, budget: str) -> int:
     if budget == 'max':
         return time.quantiles_ns[-1]
-    if budget == 'p99':
-        return time.draw(0.99)
-    if budget == 'mean':
-        return time.mean_ns
-    raise UsageError(
-        f"budget '{budget}': there is no such budget: choose one of {', '.join(defaults.BUDGETS)}")
+    return time.draw(0.99) if budget == 'p99' else time.mean_ns
 
 
 def _latest(dag: Dag, costs: list[int]) -> list[int]:

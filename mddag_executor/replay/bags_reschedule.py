@@ -25,12 +25,12 @@ import random
 from typing import Any, NamedTuple
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS
-from mddag_executor.errors import InputError
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import Recording, RELEASES, rows, sort_by
 from mddag_executor.replay.bags import Bag, BagError, UNKNOWN
 from mddag_executor.replay.reschedule import Reschedule, reschedule
+from mddag_executor.simulate.workload import check_execution_times
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
@@ -177,10 +177,7 @@ def reschedule_bag(
     :param options: as for ``reschedule``; a bag has no overheads.
     """
     if times is None:
-        missing = [c for c in (v.callback for v in task_set.vertices) if c.execution_time is None]
-        if missing:
-            raise InputError(task_set.file, f'{missing[0].key} declares no execution_time',
-                             'add one, or give --execution-times FILE', missing[0].line)
+        check_execution_times(task_set, ', or give --execution-times FILE')
     run = read_bag(path, task_set, name)
     counts = np.bincount(run.releases['dag'], minlength=len(task_set.dags)).tolist()
     generator = random.Random(seed)

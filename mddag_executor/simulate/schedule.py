@@ -18,7 +18,7 @@ from mddag_executor.simulate.load import as_list, as_lists, Load
 from mddag_executor.simulate.machine import Machine
 
 # Approximate time of plain Python per execution, without and with a machine, to choose the faster.
-_PLAIN_S, _STOPS_S = 10e-6, 50e-6
+PLAIN_S, _STOPS_S = 10e-6, 50e-6
 SOON_S = 1.0
 """For less time, loading compiled code does not pay."""
 
@@ -124,11 +124,16 @@ def prepare(tables: Tables, load: Load, settings: Settings, runs: int = 1) -> bo
     """Return whether ``runs`` runs are faster compiled; if so, compile, or load the code."""
     executions = runs * len(load.times) * max(1, tables.n_vertices // max(1, tables.n_dags))
     stops = len(load.holds) > 0 or settings.cpus is not None
-    plain_s = executions * (_STOPS_S if stops else _PLAIN_S)
+    if not compiling_pays(executions * (_STOPS_S if stops else PLAIN_S)):
+        return False
+    from mddag_executor.simulate import compiled
+    compiled.prepare()
+    return True
+
+
+def compiling_pays(plain_s: float) -> bool:
+    """Return whether compiled code is faster for work that takes plain Python this long."""
     if plain_s < SOON_S:
         return False
     from mddag_executor.simulate import compiled
-    if not compiled.pays(plain_s):
-        return False
-    compiled.prepare()
-    return True
+    return compiled.pays(plain_s)

@@ -19,11 +19,28 @@ from typing import Any
 from mddag_executor.core import processes_of
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.simulate.load import Load
-from msg_graph import Dag, ExecutionTime, TaskSet
+from mddag_executor.text import counted
+from msg_graph import Dag, ExecutionTime, TaskSet, Vertex
 from msg_graph.duration import DAY, MICROSECOND
 
 _FORMAT = 'write {"DAG": {"/node:callback": microseconds}}'
 _LONGEST_US = DAY // MICROSECOND
+
+
+def check_execution_times(task_set: TaskSet, otherwise: str = '') -> None:
+    """
+    Check that each callback declares an execution time.
+
+    :param otherwise: what else to do about it, as ``, or give --samples FILE.npz``.
+    :raises InputError: it names the first one that does not.
+    """
+    missing = [each for each in task_set.callbacks if each.execution_time is None]
+    if missing:
+        others = f' (and {counted(len(missing) - 1, "more callback")})' if missing[1:] else ''
+        raise InputError(
+            missing[0].file or task_set.file,
+            f'{missing[0].key}{others} declares no execution_time', f'add one{otherwise}',
+            missing[0].line)
 
 
 def draw_execution_times(
@@ -37,25 +54,17 @@ def draw_execution_times(
     :return: one list for each DAG, by local vertex index; the same seed gives the same draw.
     :raises InputError: if a callback declares no execution time.
     """
+    if undeclared is None:
+        check_execution_times(task_set, ', or give --execution-times FILE')
     generator = random.Random(seed)
-    times = []
-    for dag in task_set.dags:
-        row = []
-        for vertex in dag.vertices:
-            # Drawn even if nothing is declared: then declaring one more time changes no other
-            # draw.
-            share = generator.random()
-            times_of_callback = vertex.callback.execution_time
-            if times_of_callback is None and undeclared is not None:
-                row.append(undeclared)
-                continue
-            if times_of_callback is None:
-                raise InputError(
-                    task_set.file, f'{vertex.callback.key} declares no execution_time',
-                    'add one, or give --execution-times FILE', vertex.callback.line)
-            row.append(times_of_callback.draw(share))
-        times.append(row)
-    return times
+
+    def draw(vertex: Vertex) -> int:
+        # Drawn even if nothing is declared: then declaring one more time changes no other draw.
+        share = generator.random()
+        time = vertex.callback.execution_time
+        return undeclared or 0 if time is None else time.draw(share)
+
+    return [[draw(vertex) for vertex in dag.vertices] for dag in task_set.dags]
 
 
 def read_execution_times(task_set: TaskSet, text: str, name: str) -> list[list[int]]:
