@@ -99,7 +99,7 @@ def run_declared(spec: Spec) -> dict[str, Any]:
     # rclpy's EventsExecutor advances a timer before it queues the call, so the due time of a call
     # in a backlog is unknown: only messages are counted there.
     if spec.executor != 'events':
-        starts += [start for delays in workload.ledger.delays for start in list(delays)]
+        starts += [start for delays in workload.ledger.delays.values() for start in list(delays)]
     latencies = within(starts, *(reading.at_ns for reading in workload.ledger.window))
     if spec.process is not None:
         return {'ledger': vars(workload.ledger), 'latencies': latencies}

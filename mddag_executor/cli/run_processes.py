@@ -155,7 +155,7 @@ def _place(
     from mddag_executor.laboratory.placement import packed
     from mddag_executor.simulate.workload import draw_execution_times
     times = draw_execution_times(task_set, args.seed, undeclared=0) if plan is None else [
-        [plan.execution_ns(v.dag, v.index) for v in dag.vertices] for dag in task_set.dags]
+        [plan.execution_ns(v) for v in dag.vertices] for dag in task_set.dags]
     declared = {callback.node for callback in task_set.callbacks}
     return with_processes(task_set, packed(task_set, n, times, [
         group for each in together if (group := [node for node in each if node in declared])]))

@@ -107,9 +107,9 @@ class ExecutionPlan:
         """Return the resulting normalised utilisation: sum(C / T) / workers."""
         return normalised(self.task_set, self._times, self.workers)
 
-    def execution_ns(self, dag: int, vertex: int) -> int:
-        """Return the execution time of a vertex, by DAG index and local index, ns."""
-        return self._times[dag][vertex]
+    def execution_ns(self, vertex: Vertex) -> int:
+        """Return the execution time of a vertex, ns."""
+        return self._times[vertex.dag][vertex.index]
 
     def body(self, vertex: Vertex) -> Body:
         """Return the emulation of a vertex."""
@@ -141,9 +141,10 @@ class Ledger:
     """
     The observations of a run of synthetic nodes; as JSON, its ``vars`` are for ``of_processes``.
 
-    * ``durations[dag][vertex]``: the duration of each body (ns).
-    * ``completions[dag][vertex]``, of a sink: (release, completion) in ns since the epoch.
-    * ``delays[dag]``, of a timer that is a source: its start, and the delay since its release.
+    * ``durations``, by vertex: the duration of each body (ns).
+    * ``completions``, by sink: (release, completion) in ns since the epoch.
+    * ``delays``, by DAG whose source is a timer: its start, and the delay since its release.
+    * ``first_release``, by DAG: ns since the epoch.
     * ``misattributed``: vertex name, release by the message and by the executor, if they differ.
     * ``unattributed``: the names of vertices that ran without a job.
     * ``dropped_joins``: the names of the vertices of dropped joins.
@@ -153,16 +154,16 @@ class Ledger:
     """
 
     def __init__(self, task_set: TaskSet, keep: int | None = None) -> None:
-        self.durations: list[list[deque[int]]] = [
-            [deque(maxlen=keep) for _ in d.vertices] for d in task_set.dags]
-        self.completions: list[list[deque[tuple[int, int]]]] = [
-            [deque(maxlen=keep) for _ in d.vertices] for d in task_set.dags]
-        self.delays: list[deque[tuple[int, int]]] = [
-            deque(maxlen=keep) for _ in task_set.dags]
+        self.durations: dict[str, deque[int]] = {
+            v.name: deque(maxlen=keep) for v in task_set.vertices}
+        self.completions: dict[str, deque[tuple[int, int]]] = {
+            v.name: deque(maxlen=keep) for v in task_set.vertices if v.deadline_ns is not None}
+        self.delays: dict[str, deque[tuple[int, int]]] = {
+            dag.name: deque(maxlen=keep) for dag in task_set.dags}
         self.misattributed: deque[tuple[str, int, int]] = deque(maxlen=keep)
         self.unattributed: deque[str] = deque(maxlen=keep)
         self.dropped_joins: deque[str] = deque(maxlen=keep)
-        self.first_release: list[int | None] = [None for _ in task_set.dags]
+        self.first_release: dict[str, int] = {}
         self.window = Reading(0, 0, ()), Reading(0, 0, ())
         self.warm_up_ns = 0
         self.clock_offset_ns = epoch_offset_ns()
@@ -176,7 +177,7 @@ class Ledger:
         return Reading(
             at_ns=time.monotonic_ns() + self.clock_offset_ns,
             cpu_ns=time.process_time_ns(),
-            bodies=[len(vertex) for dag in self.durations for vertex in dag])
+            bodies=[len(durations) for durations in self.durations.values()])
 
     @classmethod
     def of_processes(cls, task_set: TaskSet, parts: Sequence[dict[str, Any]]) -> Ledger:
@@ -188,13 +189,10 @@ class Ledger:
         """
         whole = cls(task_set)
         for part in parts:
-            for dag, first in enumerate(part['first_release']):
-                if first is not None:
-                    whole.first_release[dag] = first
-                whole.delays[dag].extend(part['delays'][dag])
-                for name in ('durations', 'completions'):
-                    for vertex, entries in zip(getattr(whole, name)[dag], part[name][dag]):
-                        vertex.extend(entries)
+            whole.first_release.update(part['first_release'])
+            for name in ('durations', 'completions', 'delays'):
+                for key, entries in part[name].items():
+                    getattr(whole, name)[key].extend(entries)
             for name in ('misattributed', 'unattributed', 'dropped_joins'):
                 getattr(whole, name).extend(part[name])
             for name in ('busy_below_ns', 'warm_up_ns'):
@@ -234,7 +232,8 @@ def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:
         'warm_up_ns': ledger.warm_up_ns, **sums,
         'on_time_ratio': sums['on_time'] / due if due else None,
         **_throughput(ledger, plan, start, end),
-        'source_delay_us': quantiles_us([d for delays in ledger.delays for _, d in list(delays)]),
+        'source_delay_us': quantiles_us([
+            delay for delays in ledger.delays.values() for _, delay in list(delays)]),
         'attribution': {
             'wrong': len(ledger.misattributed), 'none': len(ledger.unattributed)},
         'incomplete_joins_dropped': len(ledger.dropped_joins), 'dags': dags}
@@ -252,11 +251,11 @@ def totals(sinks: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> dict[str, Any]:
     """Return one sink's verdicts about the deadlines within ]start, end]."""
     deadline, period = vertex.deadline_ns or 0, dag.period_ns
-    first = ledger.first_release[dag.index]
+    first = ledger.first_release.get(dag.name)
     if first is None:
         return judge_sink(deadline, (), {})
     completed: dict[int, int] = {}
-    for release, completion in list(ledger.completions[dag.index][vertex.index]):
+    for release, completion in list(ledger.completions[vertex.name]):
         job = (release - first + min(_EARLY_NS, period // 4)) // period
         completed.setdefault(first + job * period, completion)
     first_job = max(0, (start - deadline - first) // period + 1)
@@ -290,10 +289,10 @@ def _throughput(
     callbacks = sum(counts)
     cpu = end.cpu_ns - start.cpu_ns
     # CPU time of the emulation itself is execution, not overhead.
-    times = [plan.execution_ns(v.dag, v.index) for v in plan.task_set.vertices]
-    bodies = [plan.body(v) for v in plan.task_set.vertices]
-    cpu -= sum(n * t for v, (n, t) in enumerate(zip(counts, times))
-               if bodies[v] != 'sleep' or t <= ledger.busy_below_ns)
+    cpu -= sum(
+        count * planned for vertex, count in zip(plan.task_set.vertices, counts)
+        if (planned := plan.execution_ns(vertex)) <= ledger.busy_below_ns
+        or plan.body(vertex) != 'sleep')
     seconds = (end.at_ns - start.at_ns) / 1e9
     return {
         'callbacks': callbacks,
@@ -309,8 +308,7 @@ def _taken(ledger: Ledger, plan: ExecutionPlan) -> float:
     """
     total = 0.0
     for vertex in plan.task_set.vertices:
-        durations = ledger.durations[vertex.dag][vertex.index]
-        mean = sum(durations) / len(durations) if durations else plan.execution_ns(
-            vertex.dag, vertex.index)
+        durations = ledger.durations[vertex.name]
+        mean = sum(durations) / len(durations) if durations else plan.execution_ns(vertex)
         total += mean / plan.task_set.dags[vertex.dag].period_ns
     return total / plan.workers

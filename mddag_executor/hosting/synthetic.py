@@ -14,9 +14,8 @@ Theory of operation
    in the leg that receives the last of the messages with equal stamps.  Incomplete joins of the
    last ``JOIN_LIMIT`` jobs are kept; older ones are dropped and counted.
 3. *Releases.*  Under this package's executor a source gets its release from ``current_job``.
-   Under another executor it is the nominal due time of the timer.  rcl keeps timers on an exact
-   grid, start plus n periods, and skips missed periods, so the release of a call is the next due
-   time that the timer reported at the previous call.  A late call does not make a release later.
+   Under another executor it is the nominal due time of the timer: rcl's next call time at the
+   previous call.  A late call does not make a release later.
 4. *Sensors.*  Sources that are no timers get a stand-in sensor.  One thread (node
    ``/mddag_sensors``, with publishers and clients only, not on any executor, so it occupies no
    worker) publishes on their topics or calls their services at the nominal releases.  A service's
@@ -42,6 +41,7 @@ import time
 from typing import Any
 
 from mddag_executor.executor.jobs import header_stamp
+from mddag_executor.executor.listeners import NextCall
 from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.hosting.bodies import (
     Emulate,
@@ -116,8 +116,8 @@ class Role:
         self._execution_ns = execution_ns
         self._publishers = publishers
         self._emulate = emulate
-        self._durations = ledger.durations[vertex.dag][vertex.index]
-        self._completions = ledger.completions[vertex.dag][vertex.index]
+        self._durations = ledger.durations[vertex.name]
+        self._completions = ledger.completions.get(vertex.name)
         self._lock = threading.Lock()
 
     def is_whole(self, release: int, sender: str) -> bool:
@@ -142,45 +142,37 @@ class Role:
         message.frame_id = self._sender
         for publisher in self._publishers:
             publisher.publish(message)
-        if self.vertex.deadline_ns is not None:
+        if self._completions is not None:
             self._completions.append((release, monotonic_ns() + self._ledger.clock_offset_ns))
 
 
 class Grid:
-    """
-    Nominal due times of a started timer, ns since the epoch.
-
-    ``release`` is to be called once in each call of the timer.
-    """
+    """Nominal due times of a timer, ns since the epoch."""
 
     def __init__(self, timer: Timer, clock_offset_ns: int) -> None:
         self._timer = timer
         self._offset = clock_offset_ns
-        self._period = timer.timer_period_ns
+        with timer.handle:
+            self._next_call = NextCall(timer.handle.pointer)
+        self._next = 0
         self._lock = threading.Lock()
-        # Of several readings the one with the least time between the clocks is the best.
-        readings = []
-        for _ in range(3):
-            before = time.monotonic_ns()
-            left = timer.time_until_next_call()
-            after = time.monotonic_ns()
-            readings.append((after - before, (before + after) // 2 + left))
-        self._first = self._next = min(readings)[1]
 
-    @property
-    def first_release(self) -> int:
-        """Return the first due time."""
-        return int(self._first + self._offset)
+    def start(self) -> int:
+        """Start the timer; return its first due time, one period from now."""
+        self._timer.reset()
+        self._advance()
+        return self._next + self._offset
 
     def release(self) -> int:
-        """Return the due time of this call of the timer."""
+        """Return the due time of a call of the timer; to be called once in each of them."""
         with self._lock:
             release = self._next
-            left = self._timer.time_until_next_call()
-            if left is not None:  # else it was cancelled meanwhile
-                periods = round((time.monotonic_ns() + left - self._first) / self._period)
-                self._next = self._first + periods * self._period
-        return int(release + self._offset)
+            self._advance()
+        return release + self._offset
+
+    def _advance(self) -> None:
+        with self._timer.handle:
+            self._next = self._next_call.read() or self._next  # it may be cancelled meanwhile
 
 
 def callback_of(
@@ -230,7 +222,7 @@ def attributed(role: Role, release: int, ledger: Ledger, current_job: CurrentJob
 class Sensor:
     """Stand-in for the senders of messages and requests to sources that are no timers."""
 
-    dags: list[int]
+    dags: list[str]
     period_ns: int
     send: Callable[[int], None]
 
@@ -283,8 +275,8 @@ class SyntheticWorkload:
         self._vertices: dict[str, list[Vertex]] = {}
         for vertex in task_set.vertices:
             self._vertices.setdefault(vertex.callback.key, []).append(vertex)
-        self.timers: dict[int, Timer] = {}
-        self._grids: dict[int, Grid] = {}
+        self.timers: dict[str, Timer] = {}
+        self._grids: dict[str, Grid] = {}
         self._sensors: dict[str, Sensor] = {}
         self._sensor_thread: threading.Thread | None = None
         self._stop = threading.Event()
@@ -350,24 +342,21 @@ class SyntheticWorkload:
         :param wake: wakes the executor: a wait set that already waits does not notice a timer's
             start.
         """
-        first = self.ledger.first_release
         for dag in self.timers:
             self.start_timer(dag)
-            first[dag] = self._grids[dag].first_release
         wake()
         if self._sensors:
             now = time.monotonic_ns() + self.ledger.clock_offset_ns
             for sensor in self._sensors.values():
                 for dag in sensor.dags:
-                    first[dag] = now + _LEAD_NS + sensor.period_ns
+                    self.ledger.first_release[dag] = now + _LEAD_NS + sensor.period_ns
             self._sensor_thread = threading.Thread(
                 target=self._run_sensors, name='mddag_sensors', daemon=True)
             self._sensor_thread.start()
 
-    def start_timer(self, dag: int) -> None:
+    def start_timer(self, dag: str) -> None:
         """Start the timer that releases a DAG, one period from now."""
-        self.timers[dag].reset()
-        self._grids[dag] = Grid(self.timers[dag], self.ledger.clock_offset_ns)
+        self.ledger.first_release[dag] = self._grids[dag].start()
 
     def stop(self) -> None:
         """
@@ -389,7 +378,7 @@ class SyntheticWorkload:
     def _run_sensors(self) -> None:
         sensors = list(self._sensors.values())
         first = self.ledger.first_release
-        due = [(first[sensor.dags[0]] or 0, i) for i, sensor in enumerate(sensors)]
+        due = [(first[sensor.dags[0]], i) for i, sensor in enumerate(sensors)]
         while True:
             release, index = min(due)
             left = release - self.ledger.clock_offset_ns - time.monotonic_ns()
@@ -428,26 +417,29 @@ class SyntheticWorkload:
             self._publishers[key] = node.create_publisher(Header, topic, QOS)
         return self._publishers[key]
 
+    def _dag(self, vertex: Vertex) -> str:
+        return self.task_set.dags[vertex.dag].name
+
     def _role(self, vertex: Vertex, publishers: list[Publisher]) -> Role:
-        name = self.task_set.dags[vertex.dag].name
+        name = self._dag(vertex)
         senders = [f'{name}#{index}' for index in vertex.predecessors]
         return Role(
             vertex, senders or [SENSOR + topic for topic in vertex.callback.topics],
-            f'{name}#{vertex.index}', self.plan.execution_ns(vertex.dag, vertex.index),
+            f'{name}#{vertex.index}', self.plan.execution_ns(vertex),
             publishers, self._emulate[self.plan.body(vertex)], self.ledger)
 
     def _add_timer(
         self, node: Node, group: CallbackGroup, callback: Callback, role: Role
     ) -> None:
-        dag = role.vertex.dag
-        grids, current_job = self._grids, self._current_job
+        dag = self._dag(role.vertex)
+        current_job = self._current_job
         offset = self.ledger.clock_offset_ns
         delays = self.ledger.delays[dag]
 
         def on_timer() -> None:
             start = time.monotonic_ns() + offset
             job = current_job()
-            release = grids[dag].release() if job is None else job.release_ns
+            release = grid.release() if job is None else job.release_ns
             delays.append((start, start - release))
             role.execute(stamped(release), release)
 
@@ -457,6 +449,7 @@ class SyntheticWorkload:
         # Once more, exactly: seconds as a float may lose a nanosecond.
         timer.timer_period_ns = callback.timer_period_ns or 0
         self.timers[dag] = timer
+        grid = self._grids[dag] = Grid(timer, offset)
 
     def _add_service(
         self, node: Node, group: CallbackGroup, callback: Callback, role: Role
@@ -498,7 +491,7 @@ class SyntheticWorkload:
             sensor = self._sensors[start]
             # The shorter of two periods applies.
             sensor.period_ns = min(sensor.period_ns, period)
-            sensor.dags.append(vertex.dag)
+            sensor.dags.append(self._dag(vertex))
 
     def _messages(self, topic: str) -> Callable[[int], None]:
         assert self._sensor_node is not None

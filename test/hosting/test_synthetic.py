@@ -14,9 +14,7 @@ from mddag_executor.executor.executor import MultiDeadlineExecutor
 from mddag_executor.hosting.bodies import spinner
 from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Reading
 from mddag_executor.hosting.session import Session
-from mddag_executor.hosting.synthetic import (
-    SyntheticWorkload,
-)
+from mddag_executor.hosting.synthetic import SyntheticWorkload
 from msg_graph import load, loads, TaskSet
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -76,13 +74,13 @@ def autoware():
 
 
 def drawn(task_set: TaskSet, plan: ExecutionPlan) -> list[list[int]]:
-    return [[plan.execution_ns(d.index, v.index) for v in d.vertices] for d in task_set.dags]
+    return [[plan.execution_ns(v) for v in d.vertices] for d in task_set.dags]
 
 
 def test_scaling_gives_the_utilisation_asked_for(autoware):
     workers = 7
     plan = ExecutionPlan(autoware, 1, 0.6, workers)
-    total = sum(plan.execution_ns(v.dag, v.index) / autoware.dags[v.dag].period_ns
+    total = sum(plan.execution_ns(v) / autoware.dags[v.dag].period_ns
                 for v in autoware.vertices)
     assert total / workers == pytest.approx(0.6, abs=1e-6)
     assert plan.utilisation == pytest.approx(0.6, abs=1e-6)
@@ -184,13 +182,13 @@ def test_every_release_reaches_every_sink(task_set, ros_context):
             assert sink['response_ns']['min'] >= 0
     # Each sink knows the release of its job exactly: the completions are on the nominal grid.
     for dag in task_set.dags:
-        first = workload.ledger.first_release[dag.index]
-        ran = len(workload.ledger.durations[dag.index][dag.source])
-        for index in dag.sinks:
+        first = workload.ledger.first_release[dag.name]
+        ran = len(workload.ledger.durations[dag.vertices[dag.source].name])
+        for name in (dag.vertices[sink].name for sink in dag.sinks):
             # A busy machine may skip releases and make jobs late, but what began is not lost;
             # some are open at the end.
-            assert ran - 2 <= len(workload.ledger.completions[dag.index][index]) <= ran
-            for release, _ in workload.ledger.completions[dag.index][index]:
+            assert ran - 2 <= len(workload.ledger.completions[name]) <= ran
+            for release, _ in workload.ledger.completions[name]:
                 late = (release - first + MS) % dag.period_ns - MS
                 if dag.vertices[dag.source].callback.kind == 'timer':
                     assert abs(late) < MS / 2
@@ -211,12 +209,12 @@ def test_every_nominal_release_whose_deadline_lies_in_the_window_is_due():
     task_set = loads(SINGLE)
     ledger = Ledger(task_set)
     first = 1_700_000_000 * 1000 * MS
-    ledger.first_release[0] = first
+    ledger.first_release['/a'] = first
     # Jobs 0 to 9, deadlines at first + 150, 250, … ms.  The window holds jobs 1 to 8: it begins
     # at the deadline of job 0 and ends at that of job 8.
     for job, response in {0: 10, 1: 150, 2: 151, 3: 20, 5: 250, 6: 30, 8: 40, 9: 50}.items():
         release = first + job * 100 * MS
-        ledger.completions[0][0].append((release, release + response * MS))
+        ledger.completions['/a:a'].append((release, release + response * MS))
     ledger.window = reading(first + 150 * MS), reading(first + 950 * MS)
     result = measure(ledger, ExecutionPlan(task_set))
     sink = result['dags']['/a']['sinks']['/a:a']
@@ -239,11 +237,11 @@ nodes:
     for vertex, (begin, end) in enumerate(((100, 300), (150, 350))):
         ledger = Ledger(task_set)
         if vertex == 0:
-            ledger.first_release[0] = 0
+            ledger.first_release['/a'] = 0
         for job in range(40):
-            ledger.durations[0][vertex].append(ms)
+            ledger.durations[('/a:t', '/b:s')[vertex]].append(ms)
             if vertex == 1:
-                ledger.completions[0][1].append((job * 10 * ms, (job * 10 + job % 8) * ms))
+                ledger.completions['/b:s'].append((job * 10 * ms, (job * 10 + job % 8) * ms))
         bodies = [0, 0]
         bodies[vertex] = 20
         ledger.window = Reading(begin * ms, 0, (0, 0)), Reading(end * ms, 8 * ms, bodies)
