@@ -11,44 +11,28 @@ several entries (publishers, cycles, sinks, …).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import chain
 
 from msg_graph.duration import format_duration
 from msg_graph.errors import Collector, did_you_mean, for_each, listed, shown
 from msg_graph.include import as_text, read, resolve
 from msg_graph.language import CALLBACK_KEYS, Entry, FILE, NODE_KEYS, PATH_KEYS, TRIGGERS
-from msg_graph.model import Callback, Path, Process
+from msg_graph.model import Callback, Path, Process, TaskSet
 from msg_graph.yamltext import Tree
 import yaml
 
 _WIDTH = 75
 
 
-@dataclass(frozen=True, slots=True)
-class Declaration:
+def parse_declaration(
+    text: str, file: str, path: str | None = None
+) -> tuple[TaskSet, dict[str, Entry]]:
     """
-    A declaration as written in its files; callbacks in the order of the file.
-
-    :ivar text: the text of the file, or of all files as one.
-    :ivar entries: the entry of each callback, by its key, and of each path, by its name, with
-        their lines.
-    """
-
-    file: str
-    text: str
-    workers: int | None
-    callbacks: list[Callback]
-    paths: list[Path]
-    processes: tuple[Process, ...]
-    entries: dict[str, Entry]
-
-
-def parse_declaration(text: str, file: str, path: str | None = None) -> Declaration:
-    """
-    Return the declaration in a YAML text, with what it includes.
+    Return the declaration in a YAML text, with what it includes: a task set without DAGs yet.
 
     :param path: its file; None: it cannot include any.
+    :return: the task set, and the entries of each callback, by its key, and each path, by its
+        name.
     """
     tree = read(text, file)
     resolved = resolve(tree, path)
@@ -62,7 +46,7 @@ def parse_declaration(text: str, file: str, path: str | None = None) -> Declarat
     paths = found(_paths, top, entries)
     found.check()
     processes = read_processes(top, (callback.node for callback in callbacks))
-    return Declaration(file, text, workers, callbacks, paths, processes, entries)
+    return TaskSet((), tuple(callbacks), (), tuple(paths), workers, file, text, processes), entries
 
 
 def read_processes(top: Entry, nodes: Iterable[str]) -> tuple[Process, ...]:

@@ -41,19 +41,19 @@ Rules 1, 2, 3 and 6 concern callbacks (``_Links``), the others make vertices.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import gc
 from graphlib import CycleError, TopologicalSorter
 from itertools import pairwise
 from os import fspath, PathLike
 from typing import Any
 
-from msg_graph.declaration import Declaration, parse_declaration
+from msg_graph.declaration import parse_declaration
 from msg_graph.draft import with_blanks
 from msg_graph.errors import Collector, did_you_mean, for_each, GraphError, listed, shown
-from msg_graph.language import CALLBACK_KEYS
+from msg_graph.language import CALLBACK_KEYS, Entry
 from msg_graph.model import Callback, Dag, Path, QueueEdge, TaskSet, Vertex
 from msg_graph.yamltext import decode, MAX_BYTES
 
@@ -99,8 +99,8 @@ def loads(
     text = decode(text, name) if isinstance(text, bytes) else text
     try:
         with no_garbage():
-            return derive_task_set(
-                parse_declaration(text, name, None if path is None else fspath(path)),
+            return _derived(
+                *parse_declaration(text, name, None if path is None else fspath(path)),
                 without_deadline)
     except GraphError as error:
         raise with_blanks(error, text, name) from None
@@ -123,39 +123,31 @@ def no_garbage() -> Iterator[None]:
             gc.enable()
 
 
-def derive_task_set(
-    declaration: Declaration, without_deadline: list[str] | None = None
+def _derived(
+    declared: TaskSet, entries: dict[str, Entry], without_deadline: list[str] | None
 ) -> TaskSet:
-    """
-    Return the task set of a declaration.
-
-    :param without_deadline: receives the keys of the sinks without a deadline; None: they are
-        errors.
-    """
-    links = _Links(declaration)
-    callbacks = declaration.callbacks
+    """Return the task set of a declaration, as ``parse_declaration`` returns it."""
+    links = _Links(declared.callbacks, entries)
     found = Collector()
-    found(for_each, callbacks, links.check_start)
-    queue_edges = found(for_each, [(each, read) for each in callbacks for read in each.reads],
-                        links.queue_edge)
+    found(for_each, declared.callbacks, links.check_start)
+    queue_edges = found(
+        for_each, [(each, read) for each in declared.callbacks for read in each.reads],
+        links.queue_edge)
     found.check()
     order = found(links.order)
-    found(for_each, callbacks, lambda each: links.check_end(each, without_deadline))
-    found(for_each, declaration.paths, links.check_path)
+    found(for_each, declared.callbacks, lambda each: links.check_end(each, without_deadline))
+    found(for_each, declared.paths, links.check_path)
     found.check()
-    return TaskSet(
-        dags=_dags(links, _vertices(links, order)), callbacks=tuple(callbacks),
-        queue_edges=tuple(queue_edges), paths=tuple(declaration.paths),
-        workers=declaration.workers, file=declaration.file, text=declaration.text,
-        processes=declaration.processes)
+    return replace(
+        declared, queue_edges=tuple(queue_edges), dags=_dags(links, _vertices(links, order)))
 
 
 class _Links:
     """Publishers and subscribers by topic; callbacks are places in the file."""
 
-    def __init__(self, declaration: Declaration) -> None:
-        self.entries = declaration.entries
-        self.callbacks = declaration.callbacks
+    def __init__(self, callbacks: Sequence[Callback], entries: dict[str, Entry]) -> None:
+        self.entries = entries
+        self.callbacks = callbacks
         self._by_key = {callback.key: callback for callback in self.callbacks}
         self.publishers: dict[str, list[int]] = {}
         self._started: dict[str, list[int]] = {}
@@ -409,7 +401,7 @@ def _dag_names(links: _Links, sources: list[int]) -> dict[int, str]:
 
 
 def _dag(
-    callbacks: list[Callback], source: int, name: str, index: int, members: list[_Vertex],
+    callbacks: Sequence[Callback], source: int, name: str, index: int, members: list[_Vertex],
     is_single: list[bool],
 ) -> Dag:
     """Return a DAG; ``is_single`` says by callback whether it is only one vertex of all DAGs."""
