@@ -28,7 +28,7 @@ help:
 	@echo 'make test-kilted  the tests of what runs ROS, with ROS 2 Kilted, in $(KILTED)/'
 	@echo 'make check-fresh  make demo and make test in new installations of Debian (CHECK_FRESH=...)'
 	@echo 'make nightly    make mutations, soak, stress and fuzz, and 20 times the random examples'
-	@echo 'make mutations  break the executor in 27 ways, each of which a test must notice'
+	@echo 'make mutations  break the executor on purpose; a test must notice each change'
 	@echo 'make soak       the Autoware workload with random faults for SOAK_SECONDS (600)'
 	@echo 'make stress     deadline misses reported to all kinds of handlers, STRESS_SECONDS (20) each'
 	@echo 'make fuzz       read damaged traces and bags for FUZZ_SECONDS (600) each'
