@@ -116,18 +116,22 @@ class Usual(NamedTuple):
     lags: Ints
 
 
+STARTED = np.dtype([
+    ('vertex', 'i4'), ('leg', 'i2'), ('job', 'i8'), ('ready', 'i8'), ('start', 'i8'),
+    ('group', 'i8')])
+"""Columns of a started execution; ``group``: how long it waited for its callback group, ns."""
+
+
 class Never(NamedTuple):
     """
     What is known of executions that never ran.
 
     :ivar dropped: by vertex and job the reason why the execution was dropped.
-    :ivar started: executions that were started: vertex, job, ready, start.
-    :ivar group: how long each of these waited for its callback group, ns.
+    :ivar started: executions that were started, a table of ``STARTED``.
     """
 
     dropped: dict[tuple[int, int], str]
     started: Table
-    group: Ints
 
     def waiting(self, vertices: Ints, times: Ints) -> Ints:
         """Return by vertex the job whose execution waited at the given time, or -1."""
@@ -300,8 +304,7 @@ def _pending(
     pending = np.flatnonzero(spans['kind'] == _PENDING)
     started = never.started if len(pending) else never.started[:0]
     waiting = {(vertex, job): (ready, start, group) for vertex, job, ready, start, group in zip(
-        *(started[name].tolist() for name in ('vertex', 'job', 'ready', 'start')),
-        never.group.tolist())}
+        *(started[name].tolist() for name in ('vertex', 'job', 'ready', 'start', 'group')))}
     before = never.waiting(spans['vertex'][pending], spans['end'][pending])
     for i, waiting_job in zip(pending.tolist(), before.tolist()):
         miss, vertex, _, begin, end, _ = spans[i].item()

@@ -21,7 +21,7 @@ from mddag_executor.core import legs_of, POLICIES
 from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.recording.tables import Ints, pick, Recording, rows_by, Table, VERTEX
+from mddag_executor.recording.tables import Ints, Recording, rows, rows_by, Table, VERTEX
 from mddag_executor.replay.causes import (
     behind,
     CAUSES,
@@ -36,6 +36,7 @@ from mddag_executor.replay.causes import (
     RAN_LONG,
     RAN_USUALLY,
     SKIPPED,
+    STARTED,
     to_explain,
     Usual,
 )
@@ -55,7 +56,9 @@ class Explanation:
     def __init__(self, recording: Recording, judged: Judged, chains: Chains) -> None:
         self._recording, self._task_set = recording, recording.task_set
         self._tables, self._who = judged.tables, recording.who
-        self._rows = ran(recording)
+        # without misses there is nothing to explain
+        self._executions = recording.executions[:None if len(judged.missed) else 0]
+        self._rows = ran(self._executions)
         policy = POLICIES.get(recording.head.policy)
         # with several processes it is unknown whose workers were busy
         self._workers = recording.head.workers if recording.declared and \
@@ -64,7 +67,7 @@ class Explanation:
         self.stops = self._stops()
         missed, links = self._missed(judged, chains)
         pool = self._pool(missed)
-        self._never = Never(self._dropped(), *self._started(chains.waited))
+        self._never = Never(self._dropped(), self._started(chains.waited))
         self.found = find(
             missed, links, pool, self._usual(), self._never,
             np.array([*self._tables.dag_of, 0], dtype=np.int64),
@@ -107,7 +110,7 @@ class Explanation:
 
     def _pool(self, missed: Table) -> Pool:
         """Return what ran and what stalled during the misses."""
-        table, rows = self._recording.executions, self._rows
+        table, rows = self._executions, self._rows
         on_workers = rows[table['worker'][rows] >= 0]
         start, end = table['start'][on_workers], table['end'][on_workers]
         # undeclared callbacks may hold the GIL, too: a trace does not say
@@ -124,7 +127,7 @@ class Explanation:
 
     def _usual(self) -> Usual:
         """Return the usual times of callbacks and releases."""
-        task_set, table = self._task_set, self._recording.executions
+        task_set, table = self._task_set, self._executions
         place = np.array([*task_set.places_of_vertices(), 0], dtype=np.int64)
         longest = [_NO_END if v.callback.execution_time is None
                    else v.callback.execution_time.quantiles_ns[-1] for v in task_set.vertices]
@@ -147,30 +150,26 @@ class Explanation:
         return {(vertex, job): reasons[reason] for vertex, job, reason in zip(
             *(drops[name].tolist() for name in ('vertex', 'job', 'reason')))}
 
-    def _started(self, in_group: Ints) -> tuple[Table, Ints]:
-        """
-        Return the executions that were started, and sources that waited until an abort.
-
-        :return: with them, how long they waited for their callback groups.
-        """
-        recording, table = self._recording, self._recording.executions
-        which = (table['vertex'] >= 0) & (table['start'] >= 0)
-        started, in_group = pick(table, which), in_group[which]
+    def _started(self, in_group: Ints) -> Table:
+        """Return the executions that were started, and sources that waited until an abort."""
+        recording, table = self._recording, self._executions
+        which = np.flatnonzero((table['vertex'] >= 0) & (table['start'] >= 0))
+        started = rows(STARTED, len(which), group=in_group[which], **{
+            name: table[name][which] for name in ('vertex', 'leg', 'job', 'ready', 'start')})
         aborted = {
             (self._tables.dag_of[vertex], job): (vertex, time)
             for _, vertex, job, time, reason in recording.drops.tolist()
             if recording.drop_reasons[reason] == 'aborted'
             and not self._task_set.vertices[vertex].predecessors}
         if not aborted:
-            return started, in_group
+            return started
         # a release that was skipped at the time of the abort was skipped before it
         waited = [(vertex, job, noticed, time + 1) for dag, job, noticed in zip(*(
             recording.releases[name].tolist() for name in ('dag', 'job', 'noticed')))
             if (dag, job) in aborted for vertex, time in [aborted[dag, job]]]
-        sources = np.zeros(len(waited), dtype=started.dtype)
-        for name, column in zip(('vertex', 'job', 'ready', 'start'), zip(*waited)):
-            sources[name] = column
-        return np.concatenate([started, sources]), np.r_[in_group, np.zeros(len(sources), int)]
+        sources = rows(STARTED, len(waited), **dict(zip(
+            ('vertex', 'job', 'ready', 'start'), zip(*waited))))
+        return np.concatenate([started, sources])
 
     def _stops(self) -> list[tuple[int, int]]:
         """Return the stops of the machine, each from the last event before it."""
@@ -197,7 +196,7 @@ class Explanation:
         chosen = to_explain(self.found)
         if not len(chosen):
             return self._waited
-        table, rows = self._recording.executions, self._rows
+        table, rows = self._executions, self._rows
         of_vertex = {vertex: callback for callback, vertex in self._vertices().items()}
         number = self._who.groups
 

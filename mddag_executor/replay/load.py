@@ -199,7 +199,8 @@ class LoadBuilder:
 
     def _take_pieces(self, n_workers: int) -> None:
         """Find the dispatch times of pieces; keep undeclared pieces."""
-        table, rows = self._recording.executions, ran(self._recording)
+        table = self._recording.executions
+        rows = ran(table)
         piece = table[rows]
         vertex, row = piece['vertex'].astype(np.int64), self._row[rows]
         first, ready = piece['piece'] == 0, piece['ready'].copy()

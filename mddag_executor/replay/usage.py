@@ -28,9 +28,8 @@ NAMES = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
 _MEASURED = NAMES.index('measured')
 
 
-def ran(recording: Recording) -> Ints:
+def ran(table: Table) -> Ints:
     """Return the rows of ``executions`` that have a start and an end, in order of their ends."""
-    table = recording.executions
     rows = np.flatnonzero((table['start'] >= 0) & (table['end'] >= 0))
     end = table['end'][rows]
     if (end[1:] < end[:-1]).any():
@@ -50,7 +49,7 @@ def group_waits(recording: Recording) -> Ints:
     number = {callback: group for callback, group in recording.who.groups.items() if group >= 0}
     if not number:
         return waited
-    rows = np.r_[ran(recording), np.flatnonzero((table['start'] >= 0) & (table['end'] < 0))]
+    rows = np.r_[ran(table), np.flatnonzero((table['start'] >= 0) & (table['end'] < 0))]
     callbacks = np.array(sorted(number), dtype=np.int64)
     at = look_up(callbacks, table['callback'][rows])
     known = at >= 0
@@ -125,7 +124,8 @@ class Usage:
         # by global vertex the index of its callback; the last entry is for undeclared ones
         self._place = np.array([*task_set.places_of_vertices(), len(self._places)])
         self._table = np.zeros((len(NAMES), len(self._places) + 1), dtype=np.int64)
-        table, rows = recording.executions, ran(recording)
+        table = recording.executions
+        rows = ran(table)
         #: By worker how long it ran callbacks, ns.
         self.by_worker: dict[int, int] = {}
         if len(rows):

@@ -65,7 +65,7 @@ def executions(replay: Replay, rows: Ints | None = None) -> tuple[list[Column], 
     :param rows: only these rows.
     """
     recording, judged = replay.recording, replay.judged
-    rows = ran(recording) if rows is None else rows
+    rows = ran(recording.executions) if rows is None else rows
     release, known = _releases(replay, rows)
     ready = recording.executions['ready'][rows]
     order = sort_by(np.where(known, release, ready))

@@ -38,7 +38,8 @@ class Timeline:
         self, recording: Recording, judged: Judged, most: int = MOST_EXECUTIONS,
         block: int = BLOCK,
     ) -> None:
-        table, rows = recording.executions, ran(recording)
+        table = recording.executions
+        rows = ran(table)
         on_workers = rows[table['worker'][rows] >= 0]
         self.busy_over_time = PoolUse(
             table['start'][on_workers], table['end'][on_workers], _FIRST_STEP)
