@@ -104,6 +104,8 @@ class Executions(NamedTuple):
     runs: Ints
     start: Ints
     topics: Ints
+    vertex: Ints
+    job: Ints
 
 
 class Flows(NamedTuple):
@@ -148,7 +150,10 @@ class Paths:
         place = np.where(self._vertex >= 0, self._place[self._vertex], NONE).astype(np.int16)
         self._of_place = rows_by(place, len(self._places))
         self._first = _first_pieces(table)
-        self._start, self._end = table['start'].copy(), table['end'].copy()
+        # by callback its executions, and the rows of their pieces in order of their ends
+        keys = dict.fromkeys(key for path in self.paths for key in path.callbacks)
+        self._ran = {key: self._of_callback(key) for key in keys}
+        self._ended = {key: self._ends_of(key) for key in keys}
         self._published()
         # messages that running callbacks took themselves, by execution
         self._took = self._first[recording.takes['execution']], recording.takes['message']
@@ -184,8 +189,7 @@ class Paths:
         else:       # publications are not recorded
             parts = []
             for callback in self._task_set.callbacks:
-                mine = self._of_place[self._places[callback.key]]
-                mine = mine[(self._end[mine] >= 0) & (self._start[mine] >= 0)]
+                mine, _ = self._ends_of(callback.key)
                 parts += [(mine, self._topics[topic]) for topic in callback.publishes
                           if topic in self._topics]
             by = np.concatenate([mine for mine, _ in parts] or [self._first[:0]])
@@ -199,9 +203,9 @@ class Paths:
         chosen = chosen[sort_by(time[chosen])]
         run = np.where(by >= 0, self._first[by], NONE)
         # by topic its publications
-        columns = np.stack([each[chosen] for each in (place, node, run, message, time)])
-        self._sent = [columns[:, mine] for mine in rows_by(
-            topic[chosen].astype(np.int16), len(self._topics))]
+        self._sent = [
+            np.stack([each[chosen[mine]] for each in (place, node, run, message, time)])
+            for mine in rows_by(topic[chosen].astype(np.int16), len(self._topics))]
 
     def _message(self, job: Any, vertex: Any, topic: Any) -> Ints:
         """Return the numbers of the messages that vertices publish in jobs."""
@@ -211,8 +215,10 @@ class Paths:
     def _of_callback(self, key: str) -> Executions:
         """Return the executions of a callback."""
         table, mine = self._table, self._of_place[self._places[key]]
-        mine = mine[(self._first[mine] == mine) & (self._start[mine] >= 0)]
-        mine = mine[sort_by(self._start[mine])]
+        mine = mine[(self._first[mine] == mine) & (table['start'][mine] >= 0)]
+        start = table['start'][mine]
+        order = sort_by(start)
+        mine, start = mine[order], start[order]
         if not self._task_set.callback(key).topics:
             topics = np.full(len(mine), NONE)
         else:
@@ -220,7 +226,15 @@ class Paths:
             names = [self._recording.who.topic(callback) for callback in different.tolist()]
             topics = np.array([self._topics.get(name, -2) if name else NONE
                                for name in names], dtype=np.int64)[which]
-        return Executions(mine, self._start[mine], topics)
+        return Executions(mine, start, topics, self._vertex[mine], table['job'][mine])
+
+    def _ends_of(self, key: str) -> tuple[Ints, Ints]:
+        """Return the rows of a callback's pieces that ended, in order of time; and the times."""
+        table, mine = self._table, self._of_place[self._places[key]]
+        mine = mine[(table['start'][mine] >= 0) & (table['end'][mine] >= 0)]
+        end = table['end'][mine]
+        order = sort_by(end)
+        return mine[order], end[order]
 
     def flows(self, number: int) -> Flows:
         """Return the flows of a path."""
@@ -230,16 +244,18 @@ class Paths:
         """Return the steps of a path, a table of ``STEPS``."""
         path, path_hops = self.paths[number], self.hops[number]
         steps = _Steps()
+        step_of = np.full(len(self._table), NONE)   # by execution its step at the position
         before: tuple[_Timeline, _Timeline] | None = None
         messages = np.empty((0, 3), dtype=np.int64)
         for position, key in enumerate(path.callbacks):
             callback = self._task_set.callback(key)
             hop = path_hops[position - 1] if position else None
-            ran = self._of_callback(key)
+            ran = self._ran[key]
             if hop is not None and hop.kind == 'trigger':
                 # otherwise another leg of a sync callback
                 fits = np.isin(ran.topics, [NONE, *(self._topics[t] for t in hop.topics)])
-                ran = Executions(*(each[fits] for each in ran))
+                if not fits.all():
+                    ran = Executions(*(each[fits] for each in ran))
             parent = np.full(len(ran.runs), NONE)
             if hop is not None and before is not None:
                 if hop.kind == 'trigger':
@@ -255,26 +271,26 @@ class Paths:
                 mine = at != NONE
                 parent[at[mine]] = _as_of_each(
                     messages, taken[mine], np.full(int(mine.sum()), _NEVER))
-            step = steps.add(position, parent, True, ran.start)
+            step = step_of[ran.runs] = steps.add(position, parent, True, ran.start)
             topics = [self._topics[t] for t in path_hops[position].topics] \
                 if position < len(path_hops) else []
-            before = self._done(steps, callback, ran, step), _Timeline(
+            before = self._done(steps, callback, step_of), _Timeline(
                 np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
             if topics:
-                sent, messages = self._publish(steps, position, callback, ran, step, topics)
+                made = _Timeline(ran.start, step)
+                sent, messages = self._publish(steps, position, callback, made, step_of, topics)
                 before = before[0], sent
+            step_of[ran.runs] = NONE
         return steps.table()
 
     def _messages_for(self, before: str, ran: Executions) -> list[Ints]:
         """Return the messages that may have started executions; later entries have priority."""
-        table = self._table
         if self._recording.links:
-            return [table['message'][ran.runs]]
+            return [self._table['message'][ran.runs]]
         found: list[Ints] = []
-        vertices, vertex, job = self._task_set.vertices, self._vertex[ran.runs], table['job'][
-            ran.runs]
-        for v in np.unique(vertex).tolist():
-            mine = vertex == v
+        vertices = self._task_set.vertices
+        for v in np.unique(ran.vertex).tolist():
+            mine = ran.vertex == v
             for local in vertices[v].predecessors:
                 publisher = v - vertices[v].index + local
                 if vertices[publisher].callback.key != before:
@@ -284,38 +300,37 @@ class Paths:
                         topic = self._topics[name]
                         fits = mine & ((ran.topics == topic) | (ran.topics == NONE))
                         found.append(np.where(
-                            fits, self._message(job, publisher, topic), -2))
+                            fits, self._message(ran.job, publisher, topic), -2))
         return found
 
-    def _done(
-        self, steps: _Steps, callback: Callback, ran: Executions, step: Ints
-    ) -> _Timeline:
+    def _done(self, steps: _Steps, callback: Callback, step_of: Ints) -> _Timeline:
         """Note when executions ended."""
-        ended = self._of_place[self._places[callback.key]]
-        ended = ended[(self._start[ended] >= 0) & (self._end[ended] >= 0)]
-        ended = ended[sort_by(self._end[ended])]
-        at = look_up(ran.runs, self._first[ended])
-        of = np.where(at != NONE, step[at], NONE) if len(step) else np.full(len(at), NONE)
-        steps.end(of[of != NONE], self._end[ended][of != NONE])
-        counts = (of != NONE) | (callback.kind != 'sync')
-        return _Timeline(self._end[ended][counts], of[counts])
+        ended, times = self._ended[callback.key]
+        of = step_of[self._first[ended]]
+        known = of != NONE
+        steps.end(of[known], times[known])
+        if callback.kind != 'sync':
+            return _Timeline(times, of)
+        return _Timeline(times[known], of[known])
 
     def _publish(
-        self, steps: _Steps, position: int, callback: Callback, ran: Executions, step: Ints,
+        self, steps: _Steps, position: int, callback: Callback, ran: _Timeline, step_of: Ints,
         topics: list[int],
     ) -> tuple[_Timeline, Ints]:
-        """Make the steps of the publications at a position; return times and messages."""
+        """
+        Make the steps of the publications at a position; return times and messages.
+
+        :param ran: the steps of the executions; ``step_of``: the same by row.
+        """
         sent = np.concatenate([self._sent[topic] for topic in topics], axis=1)
         if len(topics) > 1:
             sent = sent[:, sort_by(sent[4])]
         mine = (sent[0] == self._places[callback.key]) | (
             (sent[0] == NONE) & (sent[1] == self._nodes[callback.node]))
         place, _, run, message, time = sent[:, mine]
-        at = look_up(ran.runs, run)
-        parent = np.where((place != NONE) & (at != NONE), step[at], NONE) if len(step) \
-            else np.full(len(at), NONE)
+        parent = np.where((place != NONE) & (run != NONE), step_of[run], NONE)
         latest = (parent == NONE) & ((callback.kind == 'sync') | (place == NONE))
-        parent[latest] = _Timeline(ran.start, step).as_of(time[latest], before=True)
+        parent[latest] = ran.as_of(time[latest], before=True)
         made = steps.add(position, parent, False, time)
         known = (made != NONE) & (message != NONE)
         return _Timeline(time, made), np.column_stack((message, time, made))[known]
