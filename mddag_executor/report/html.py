@@ -100,11 +100,9 @@ def write(file: BinaryIO, data: ReportData) -> None:
     """Write a report."""
     from bokeh.embed import components
     from bokeh.resources import Resources
-    from mddag_executor.report.html_plots import figures
+    from mddag_executor.report.html_plots import figures, THEME
     prepared = prepare(data)
-    drawn = figures(data, prepared)
-    roots = (drawn.overview, drawn.workers, drawn.callbacks, *drawn.histograms)
-    script, divisions = components(roots)
+    script, divisions = components(figures(data, prepared), theme=THEME)
     library = Resources(mode='inline', components=['bokeh']).render_js()
     for part in _page(data, prepared, library, script, list(divisions)):
         file.write(part.encode('utf-8', 'backslashreplace'))

@@ -9,11 +9,10 @@ The page's script ``html.js`` moves the timelines to a missed deadline.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from bokeh.colors import RGB
 from bokeh.models import (
-    BasicTickFormatter,
     ColumnDataSource,
     CustomJSTickFormatter,
     FixedTicker,
@@ -25,6 +24,7 @@ from bokeh.models import (
 )
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
+from bokeh.themes import Theme
 from mddag_executor.replay.usage import PoolUse
 from mddag_executor.report.html_data import COLOURS, label, Line, Prepared, ReportData, seconds
 from mddag_executor.report.tables import short_names
@@ -35,49 +35,32 @@ MOST_HISTOGRAMS = 30
 _LEFT = 270             # room for the labels, the same in all timelines, so that they align
 _LINE = 16              # height of a line of a timeline, pixels
 _TOOLTIP = ('<div style="max-width:46em"><b>@a</b><br>@b<br>@c<br>@d</div>')
-_FONT = '11px'
 _ZOOM = 'xpan,xbox_zoom,xzoom_in,xzoom_out,reset,save'
 _RED, _BLUE = '#d7191c', '#3182bd'
 _EDGES = tuple(RGB.from_hex_string(colour).darken(0.1).to_hex() for colour in COLOURS)
-_RIGHT = 24             # room for half of the last label of the time axis
 
 
-class Figures(NamedTuple):
-    """The figures of a report; ``histograms`` by sink."""
+THEME = Theme(json={'attrs': {
+    'Plot': {'outline_line_color': '#bbbbbb', 'min_border_right': 24},  # half of the last label
+    'Toolbar': {'logo': None}, 'Title': {'text_font_size': '12px'},
+    'Axis': {'axis_label_text_font_style': 'normal', 'axis_label_text_font_size': '12px',
+             'major_label_text_font_size': '11px', 'minor_tick_line_color': None},
+    'BasicTickFormatter': {'use_scientific': False}}})
 
-    overview: Any
-    workers: Any
-    callbacks: Any
-    histograms: list[Any]
 
-
-def figures(data: ReportData, prepared: Prepared) -> Figures:
-    """Return the figures of a report."""
+def figures(data: ReportData, prepared: Prepared) -> list[Any]:
+    """Return the figures of a report: overview, timelines by worker and callback, histograms."""
     duration = max(1, data.duration_ns) / 1e9
     time = Range1d(
         start=0, end=duration, bounds=(-0.2 * duration, 1.2 * duration), name='timeline_range')
     gaps = [(seconds(data, left), seconds(data, right)) for left, right in data.timeline.gaps]
     executions = ColumnDataSource(prepared.executions, name='executions')
     marks = ColumnDataSource(prepared.marks, name='marks')
-    return Figures(
+    return [
         _overview(data, time),
         _timeline('workers', prepared.worker_lines, time, gaps, executions, marks),
         _timeline('callbacks', prepared.lines, time, gaps, executions, marks),
-        _histograms(data))
-
-
-def _style(plot: Any, grid: bool = True) -> None:
-    plot.toolbar.logo = None
-    plot.min_border_right = _RIGHT
-    plot.outline_line_color = '#bbbbbb'
-    for axis in (*plot.xaxis, *plot.yaxis):
-        axis.axis_label_text_font_style = 'normal'
-        axis.axis_label_text_font_size = '12px'
-        axis.major_label_text_font_size = _FONT
-        axis.minor_tick_line_color = None
-    plot.title.text_font_size = '12px'
-    if not grid:
-        plot.ygrid.grid_line_color = None
+        *_histograms(data)]
 
 
 _TICKS = """
@@ -86,11 +69,6 @@ const [scale, unit] = span >= 2 ? [1, 's'] : span >= 2e-3 ? [1e3, 'ms'] : [1e6, 
 const digits = Math.min(6, Math.max(0, 1 - Math.floor(Math.log10(span * scale))));
 return `${(tick * scale).toFixed(digits)} ${unit}`;
 """
-
-
-def _seconds(plot: Any, what: str) -> None:
-    plot.xaxis.axis_label = what
-    plot.xaxis.formatter = BasicTickFormatter(use_scientific=False)
 
 
 def _overview(data: ReportData, time: Range1d) -> Any:
@@ -108,12 +86,11 @@ def _overview(data: ReportData, time: Range1d) -> Any:
     plot.quad(left=edges[:-1][late], right=edges[1:][late], bottom=workers * 1.02,
               top=workers * 1.08, fill_color=_RED, line_color=_RED, line_width=3)
     plot.yaxis.axis_label = 'busy workers'
-    _seconds(plot, 'time (s)')
+    plot.xaxis.axis_label = 'time (s)'
     tool = RangeTool(x_range=time)
     tool.overlay.fill_color = '#888888'      # on light and dark pages
     tool.overlay.fill_alpha = 0.2
     plot.add_tools(tool)
-    _style(plot)
     return plot
 
 
@@ -146,37 +123,28 @@ def _timeline(
         plot.add_layout(BoxAnnotation(
             left=0, right=0, fill_color=colour, fill_alpha=0.35, line_color=None,
             level='underlay', visible=False, name=f'{name}_{kind}'))
-    _wheel(plot)
+    # without Ctrl the wheel scrolls the page
+    plot.toolbar.active_scroll = WheelZoomTool(dimensions='width', modifiers='ctrl')
+    plot.add_tools(plot.toolbar.active_scroll)
     bars = plot.hbar(y=name, left='left', right='right', height=0.8, source=executions,
                      fill_color=_by_class(COLOURS), line_color=_by_class(_EDGES), line_width=0.5)
     plot.add_tools(HoverTool(renderers=[bars], tooltips=_TOOLTIP, point_policy='follow_mouse'))
     marked = plot.scatter('x', name, source=marks, marker='inverted_triangle', size=9,
                           fill_color=_RED, line_color='#ffffff')
     plot.add_tools(HoverTool(renderers=[marked], tooltips=_TOOLTIP))
-    _lines(plot, lines)
+    plot.yaxis.ticker = FixedTicker(ticks=[line.y for line in lines])
+    plot.yaxis.major_label_overrides = {line.y: line.label for line in lines}
+    plot.yaxis.major_tick_line_color = None
+    plot.yaxis.name = f'{name}_axis'
     plot.xaxis.axis_label = 'time'
     plot.xaxis.formatter = CustomJSTickFormatter(code=_TICKS, args={'range': time})
-    _style(plot, grid=False)
+    plot.ygrid.grid_line_color = None
     return plot
 
 
 def _by_class(palette: Sequence[str]) -> Any:
     return {'field': 'class', 'transform': LinearColorMapper(
         palette=list(palette), low=-0.5, high=len(palette) - 0.5)}
-
-
-def _wheel(plot: Any) -> None:
-    """Zoom with Ctrl and the wheel; without Ctrl the wheel scrolls the page."""
-    tool = WheelZoomTool(dimensions='width', modifiers='ctrl')
-    plot.add_tools(tool)
-    plot.toolbar.active_scroll = tool
-
-
-def _lines(plot: Any, lines: list[Line]) -> None:
-    plot.yaxis.ticker = FixedTicker(ticks=[line.y for line in lines])
-    plot.yaxis.major_label_overrides = {line.y: line.label for line in lines}
-    plot.yaxis.major_tick_line_color = None
-    plot.yaxis.name = f'{plot.name}_axis'
 
 
 def _histograms(data: ReportData) -> list[Any]:
@@ -219,8 +187,6 @@ def _histogram(title: str, tally: Any) -> Any:
     plot.x_range.end = max(deadline * 1.06, float((left + width).max()) * 1.02) / scale
     plot.xaxis.axis_label = f'response time ({unit})'
     plot.yaxis.axis_label = 'jobs'
-    plot.yaxis.formatter = BasicTickFormatter(use_scientific=False)
-    _style(plot)
     return plot
 
 

@@ -11,6 +11,8 @@ from typing import Any
 
 from mddag_executor.replay import replay
 from mddag_executor.report import html
+from mddag_executor.report.html_tables import MOST_ROWS
+import msg_graph
 import pytest
 
 from . import runs
@@ -188,3 +190,30 @@ def test_the_table_of_misses_leads_to_them(browser, large):
     wanted = browser.execute_script('return mddag.missed[3].text')
     browser.execute_script('document.querySelector("[data-miss=\'3\']").click()')
     wait_for(lambda: status(browser) == wanted)
+
+
+def test_many_sinks_are_shown_on_demand_and_found(browser, tmp_path):
+    task_set = msg_graph.loads('mddag: 1\nnodes:\n' + ''.join(
+        f'  - node: /n{i}\n    callbacks: '
+        f'[{{name: t, timer: {10 + i}ms, deadline: 9ms, execution_time: {10 + i}us}}]\n'
+        for i in range(60)), 'g.yaml')
+    load, run = runs.simulated(task_set, ms=200, utilisation=0.2)
+    opened(browser, write(tmp_path / 'report.html', html.of_run(task_set, load, run)))
+
+    def shown() -> list[str]:
+        names = browser.execute_script("""
+            return [...document.querySelectorAll('#mddag-sinks tbody tr')].filter(
+              (row) => row.offsetHeight > 0).map((row) => row.cells[0].textContent);""")
+        assert isinstance(names, list)
+        return names
+
+    assert len(shown()) == MOST_ROWS
+    browser.find_element('id', 'mddag-search').send_keys('/N5')
+    assert sorted(shown()) == ['/n5', *(f'/n5{i}' for i in range(10))]
+    browser.find_element('id', 'mddag-search').send_keys('\b\b\b')
+    assert len(shown()) == 60
+    browser.execute_script('document.querySelector("#mddag-sinks th").click()')
+    assert shown() == sorted(f'/n{i}' for i in range(60))
+    browser.refresh()
+    browser.find_element('id', 'mddag-all-sinks').click()
+    assert len(shown()) == 60 and complaints(browser) == []
