@@ -30,7 +30,8 @@ AGAIN_NS = 5_000_000
 """
 How often unannounced changes are checked.
 
-These are a callback group that has refused an execution, and the end of a context.
+These are a callback group that has refused an execution and, every 20th time, the end of a
+context.
 """
 
 MOST_YIELD_NS = 2_000_000

@@ -76,12 +76,13 @@ class DueTimes:
         Handle everything due by now; return the functions to call without the lock.
 
         :param now: the time on the trace's clock.
-        :param since: since when a thread has waited in the epoll, on the trace's clock; or now.
+        :param since: since when the calling thread has waited in the epoll, on the trace's clock;
+            or now.
         """
         pool, monotonic = self._pool, now - self._offset
-        self._notice_stop(monotonic, since - self._offset)
+        self._notice_stop(monotonic, since)
         if monotonic > self._check_context_at:  # a context that was only destroyed is not reported
-            self._check_context_at = monotonic + AGAIN_NS
+            self._check_context_at = monotonic + 20 * AGAIN_NS
             if is_over(pool.executor.context):
                 pool.executor.wake()
         self._timer.at = 0
@@ -104,22 +105,24 @@ class DueTimes:
         if not pool.running:
             self._timer.arm(0)
             return
-        offset = self._offset
+        offset, muting, check = self._offset, pool.muting, self._gil_check
         self._timers.has_new = False
-        at = [pool.muting.next_timer()]
+        timer = muting.next_timer()
+        first = timer or NEVER
         if deadline < NEVER:
-            at.append(deadline - offset + 1)
+            first = min(first, deadline - offset + 1)
         if self._calls:
-            at.append(self._calls[0][0])
-        at.append(pool.muting.until and pool.muting.until - offset)
-        check = self._gil_check
+            first = min(first, self._calls[0][0])
+        if muting.until:
+            first = min(first, muting.until - offset)
         if self._engine.holders and self._engine.has_waiting:
             self._watch_holder(now)
-            at.append(check.at)
+            first = min(first, check.at or NEVER)
         elif check.at:
             check.end()
-        first = min(filter(None, at), default=0)
-        self.may_expire_early = first != at[0]
+        if first == NEVER:
+            first = 0
+        self.may_expire_early = first != timer
         if first != self._timer.at:
             self._timer.arm(first)
 
@@ -172,8 +175,9 @@ class DueTimes:
         at, cpu = self._timer.at, process_time_ns()
         seen, used = self._seen
         self._seen = now, cpu
-        if at:
-            late = now - max(at, seen, since) - (cpu - used)
+        if at and now - max(at, seen) >= STOP_NS:
+            waited = self._pool.waited_since(since) - self._offset
+            late = now - max(at, seen, waited) - (cpu - used)
             if late >= STOP_NS:
                 self._engine.verdicts.stopped(now - late + self._offset, now + self._offset)
 

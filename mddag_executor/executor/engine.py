@@ -232,7 +232,7 @@ class Engine:
             or state.scalars[N_IDLE] < self.n_workers or max(state.group_owner, default=-1) >= 0)
 
     def _end_bypass(self) -> None:
-        """Report to the core what has bypassed it."""
+        """Report to the core what has bypassed it, if anything has."""
         self._is_bypassed = False
         work, self._bypassing = self._bypassing, None
         if work is not None:
@@ -354,8 +354,7 @@ class Engine:
 
     def _replace_oldest(self, work: Work, now: int) -> None:
         """Drop the oldest message of an undeclared callback; the callback keeps its position."""
-        if self._is_bypassed:
-            self._end_bypass()
+        self._end_bypass()
         entity = work.entity
         places = iter(entity.waiting)
         first, second = next(places), next(places, -1)
@@ -386,8 +385,7 @@ class Engine:
     def remove(self, entity: Entity, now: int) -> None:
         """Forget a destroyed entity: its waiting executions never run."""
         entity.removed = entity.may_be_gone = True
-        if self._is_bypassed:
-            self._end_bypass()
+        self._end_bypass()
         for x in list(entity.waiting):
             self._drop(entity, x, 'destroyed', now)
 
@@ -556,16 +554,14 @@ class Engine:
 
     def lend(self, work: Work) -> None:
         """Free the worker of an execution that continues without one."""
-        if self._is_bypassed:
-            self._end_bypass()
+        self._end_bypass()
         self._let_go(work)
         self.scheduler.lend(work.x)
 
     def resume(self, work: Work) -> None:
         """Make a suspended execution ready again; does nothing if it is not suspended."""
         if work.x >= 0 and self._state.x_state[work.x] == SUSPENDED:
-            if self._is_bypassed:
-                self._end_bypass()
+            self._end_bypass()
             self.scheduler.resume(work.x)
 
     def leave_group(self, work: Work) -> None:
@@ -639,8 +635,7 @@ class Engine:
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Take a running execution off its worker until ``resume``."""
-        if self._is_bypassed:
-            self._end_bypass()
+        self._end_bypass()
         work.entity.busy_ns += end - start
         if self.record is not None:
             self._record_run(work, start, end, vtid, worker)
@@ -678,8 +673,7 @@ class Engine:
 
     def destroyed(self, work: Work, now: int) -> None:
         """End a dispatched execution that must not run: its job cannot complete any more."""
-        if self._is_bypassed:
-            self._end_bypass()
+        self._end_bypass()
         x, work.x = work.x, -1
         self._let_go(work)
         if work.origin is not None:

@@ -17,6 +17,7 @@ be read.
 
 from __future__ import annotations
 
+from array import array
 import ctypes
 import os
 import time
@@ -57,8 +58,8 @@ _until_next_call = _rcl.rcl_timer_get_time_until_next_call
 _until_next_call.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
 _until_next_call.restype = ctypes.c_int
 
-_timer_settime = _libc.timerfd_settime
-_timer_settime.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p]
+# without errno and conversions of arguments: half the time, for each timer that is due
+_timer_settime = ctypes.PyDLL(None).timerfd_settime
 
 
 class ListenerError(MddagError):
@@ -126,17 +127,18 @@ class TimerFd:
     :ivar at: that time, monotonic ns; 0: none is set.
     """
 
-    __slots__ = ('fd', 'at', '_time')
+    __slots__ = ('fd', 'at', '_time', '_address')
 
     def __init__(self) -> None:
         self.fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self.fd < 0:
             raise OSError(ctypes.get_errno(), 'timerfd_create')
         self.at = 0
-        self._time = (ctypes.c_long * 4)()  # interval, then time: seconds, nanoseconds
+        self._time = array('q', (0, 0, 0, 0))  # interval, then time: seconds, nanoseconds
+        self._address = ctypes.c_void_p(self._time.buffer_info()[0])
 
     def arm(self, at: int) -> None:
         """Set the time (monotonic ns); 0: none."""
         self.at = at
         self._time[2], self._time[3] = divmod(at, 1_000_000_000)
-        _timer_settime(self.fd, 1, self._time, None)  # 1: TFD_TIMER_ABSTIME
+        _timer_settime(self.fd, 1, self._address, None)  # 1: TFD_TIMER_ABSTIME

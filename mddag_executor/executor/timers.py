@@ -63,7 +63,7 @@ class TimerSource(EntitySource):
         self._queue = queue
         with self.handle:
             self._next_call = NextCall(self.handle.pointer)
-        self._until, self._call, self.period = timer_functions(timer)
+        self.until, self._call, self.period = timer_functions(timer)
         self._clock: Any = timer.clock
         self._is_steady = timer.clock.clock_type == ClockType.STEADY_TIME
         self.may_be_simulated = timer.clock.clock_type == ClockType.ROS_TIME
@@ -105,7 +105,7 @@ class TimerSource(EntitySource):
 
     def is_due(self) -> bool:
         """Return whether rcl reports it due."""
-        until = self._until()
+        until = self.until()
         return until is not None and until <= 0
 
     def call(self) -> Work | None:
@@ -261,12 +261,17 @@ class TimerQueue:
         """Call a timer if rcl reports it due, and push its next due time."""
         if source.simulated:  # since the last jump of its clock, which ``fire`` checks first
             return self._fire_simulated(source)
-        due, now = source.next_due(), _now()
-        if due is None:
+        due, now, until = source.due, _now(), source.until()
+        if until is None:
             return None
-        if due > now:  # it was reset, or its period has changed
-            self._push(source, due)
-            return None
+        if abs(now + until - due) > TOLERANCE_NS:  # it was reset, or its clock was set
+            new = source.next_due()
+            if new is None:
+                return None
+            if new > now:
+                self._push(source, new)
+                return None
+            due = new
         work = source.call()
         period = source.period()
         after: int | None = due + period

@@ -478,7 +478,7 @@ class WorkerPool:
             now = self.now      # a recorded message is later than the turn began
             if is_due or self.timers.has_new or self.timers.has_jumped:
                 if self.running:
-                    calls = self.due.handle(now, self._waited_since(since or now))
+                    calls = self.due.handle(now, since or now)
                 self.due.arm(now - self._offset)
             found = me.work is None and not calls and self._choose(me, now, True)
         if calls:
@@ -530,7 +530,7 @@ class WorkerPool:
             else:
                 self.loop.announce(source)
 
-    def _waited_since(self, mine: int) -> int:
+    def waited_since(self, mine: int) -> int:
         """
         Return since when any thread has waited in the epoll.
 
@@ -630,7 +630,8 @@ class WorkerPool:
         work: Any = me.work
         entity = work.entity
         habit, gate = entity.habit, entity.gate
-        must_check = entity.may_be_gone or not self.is_current
+        must_check = not self.is_current or (
+            entity.may_be_gone and work.ready_ns != self.now)  # else it was just checked
         measurement = None
         if habit.rests < 1 or self.engine.record is not None:
             measurement = Measurement(habit)
