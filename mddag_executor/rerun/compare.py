@@ -16,7 +16,7 @@ Floating-point numbers are equal within a tolerance ``x`` if their difference is
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-import math
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 from mddag_executor.rerun.inputs import RecordedMessage
@@ -92,21 +92,13 @@ def _difference(
     counts = len(found), len(expected)
     timing: Difference | None = None
     for number, (one, other) in enumerate(zip(found, expected)):
-        at = one.time - start
-        if other.kind != type_name(one.kind):
-            return Difference(topic, CONTENT, number, at, 'its type', other.kind,
-                              type_name(one.kind), *counts)
-        for path, a, b, is_time in _fields(one, other, tolerance):
+        for path, got, wanted, is_time in _fields(one, other, start, tolerance):
             difference = Difference(
-                topic, TIMING if is_time else CONTENT, number, at, path, _shown(b),
-                _shown(a), *counts)
+                topic, TIMING if is_time else CONTENT, number, one.time - start, path, wanted,
+                got, *counts)
             if not is_time:
                 return difference
             timing = timing or difference
-        if timing is None and one.time != other.time:
-            timing = Difference(
-                topic, TIMING, number, at, '',
-                f'{(other.time - start) / 1e9:.6f} s', f'{at / 1e9:.6f} s', *counts)
     if len(found) == len(expected):
         return timing
     if timing is not None:
@@ -119,60 +111,50 @@ def _difference(
 
 
 def _fields(
-    one: Output, other: RecordedMessage, tolerance: float
-) -> Iterator[tuple[str, Any, Any, bool]]:
-    if one.data == other.data:
-        return
-    try:
-        expected = deserialize_message(other.data, one.kind)
-    except Exception:
-        yield 'its content', 'a message', 'what does not decode', False
-        return
-    yield from _unequal('', deserialize_message(one.data, one.kind), expected, False, tolerance)
+    one: Output, other: RecordedMessage, start: int, tolerance: float
+) -> Iterator[tuple[str, str, str, bool]]:
+    """Yield how messages differ: path of the field, both values, whether it is of a time."""
+    if other.kind != type_name(one.kind):
+        yield 'its type', type_name(one.kind), other.kind, False
+    elif one.data != other.data:
+        try:
+            expected = deserialize_message(other.data, one.kind)
+        except Exception:
+            yield 'its content', 'a message', 'what does not decode', False
+        else:
+            yield from _unequal(
+                '', deserialize_message(one.data, one.kind), expected, False, tolerance)
+    if one.time != other.time:
+        got, wanted = (f'{(each.time - start) / 1e9:.6f} s' for each in (one, other))
+        yield '', got, wanted, True
 
 
 def _unequal(
     path: str, a: Any, b: Any, is_time: bool, tolerance: float
-) -> Iterator[tuple[str, Any, Any, bool]]:
-    """Yield the fields that differ: path, both values, whether it is of a time."""
+) -> Iterator[tuple[str, str, str, bool]]:
+    """Yield the fields that differ."""
     if hasattr(a, 'get_fields_and_field_types'):
-        kind = type_name(type(a))
-        is_time = is_time or kind == 'builtin_interfaces/msg/Time'
+        is_time = is_time or type_name(type(a)) == 'builtin_interfaces/msg/Time'
         for name in a.get_fields_and_field_types():
             yield from _unequal(
                 f'{path}.{name}' if path else name, getattr(a, name), getattr(b, name),
                 is_time, tolerance)
     elif isinstance(a, (str, bytes)) or not hasattr(a, '__len__'):
         if not _same(a, b, tolerance):
-            yield path, a, b, is_time
+            yield path, _shown(a), _shown(b), is_time
     elif len(a) != len(b):
-        yield f'the length of {path}', len(a), len(b), is_time
-    elif not _same_array(a, b):
+        yield f'the length of {path}', _shown(len(a)), _shown(len(b)), is_time
+    elif not hasattr(a, 'tobytes') or a.tobytes() != b.tobytes():
         for i, (x, y) in enumerate(zip(a, b)):
             yield from _unequal(f'{path}[{i}]', x, y, is_time, tolerance)
 
 
 def _same(a: Any, b: Any, tolerance: float) -> bool:
-    if a == b:
+    if a == b or a != a and b != b:  # only NaN is not itself
         return True
-    try:
-        if math.isnan(a) and math.isnan(b):
-            return True
-        difference = abs(a - b)
-    except TypeError:
+    if isinstance(a, Integral) or not isinstance(a, Real):
         return False
-    if not tolerance or float(a).is_integer() and isinstance(a, int):
-        return False
-    limit = tolerance * max(1.0, abs(a), abs(b))
-    return bool(difference <= limit)
-
-
-def _same_array(a: Any, b: Any) -> bool:
-    """Return whether arrays are the same, without comparing each number."""
-    try:
-        return bool(a.tobytes() == b.tobytes())
-    except AttributeError:
-        return bool(type(a) is bytes and a == b)
+    return bool(abs(a - b) <= tolerance * max(1.0, abs(a), abs(b)))
 
 
 def _shown(value: Any) -> str:

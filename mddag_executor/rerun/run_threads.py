@@ -27,6 +27,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 import sys
 import threading
 import time
@@ -42,6 +43,13 @@ _END_S = 2.0
 """RunThreads have this much real time to end when the run is over."""
 
 
+def _locked() -> threading.Lock:
+    lock = threading.Lock()
+    lock.acquire()
+    return lock
+
+
+@dataclass(eq=False, slots=True)
 class RunThread:
     """
     A thread of the run, and what it waits for.
@@ -49,24 +57,18 @@ class RunThread:
     :ivar until: returns whether that has come true; None: it waits for a time, or for the end.
     :ivar deadline: the virtual time at which it waits no longer; None: there is none.
     :ivar execution: what it runs: kept for the thread that drives the run.
+    :ivar lock: free when it has the turn.
     :ivar ended: whether its function has ended.
     """
 
-    __slots__ = ('name', 'until', 'deadline', 'place', 'execution', 'came_true', 'lock', 'ident',
-                 'leaves', 'ended')
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.until: Callable[[], bool] | None = None
-        self.deadline: int | None = None
-        self.place = ''
-        self.execution: Any = None
-        self.came_true = False
-        self.lock = threading.Lock()
-        self.lock.acquire()
-        self.ident = 0
-        self.leaves = False
-        self.ended = False
+    name: str
+    until: Callable[[], bool] | None = None
+    deadline: int | None = None
+    place: str = ''
+    execution: Any = None
+    lock: threading.Lock = field(default_factory=_locked)
+    ident: int = 0
+    ended: bool = False
 
 
 class Stalled(Exception):
@@ -94,8 +96,7 @@ class RunThreads:
         self._ready: deque[RunThread] = deque()
         self.waiting: list[RunThread] = []
         self._here = threading.local()
-        self._done = threading.Lock()
-        self._done.acquire()
+        self._finished = threading.Event()
         self.over = False
         self.error: BaseException | None = None
 
@@ -125,8 +126,7 @@ class RunThreads:
             self._give(self._idle.pop())
             return
         driver = RunThread('driver')
-        self.owner = driver
-        driver.lock.release()
+        self._give(driver)
         threading.Thread(
             target=self._run_driver, args=(driver,), daemon=True, name='mddag-rerun').start()
 
@@ -155,37 +155,31 @@ class RunThreads:
             self.over = True
 
     def _drive(self, me: RunThread) -> None:
-        while not me.leaves:
+        while not self._finished.is_set():
             run_thread = self._next()
             if run_thread is not None:
                 self._idle.append(me)
                 self._give(run_thread)
                 me.lock.acquire()
             elif self.over:
-                self._finish(me)
+                self._finish()
             elif not self._step():
                 self._end()
 
     def _next(self) -> RunThread | None:
-        """Return a run thread that goes on now."""
         if self._ready:
             return self._ready.popleft()
         for place, run_thread in enumerate(self.waiting):
             if self.over or run_thread.until is not None and run_thread.until():
-                del self.waiting[place]
-                run_thread.came_true = not self.over
-                return run_thread
+                return self.waiting.pop(place)
         return None
 
-    def _finish(self, me: RunThread) -> None:
+    def _finish(self) -> None:
         """Let all threads that drive end: no run thread waits any more."""
-        me.leaves = True
-        for each in self._idle:
-            each.leaves = True
-            each.lock.release()
-        self._idle.clear()
         self.owner = None
-        self._done.release()
+        self._finished.set()
+        for each in self._idle:
+            each.lock.release()
 
     # --- what run threads do ---------------------------------------------------------------------
 
@@ -220,11 +214,10 @@ class RunThreads:
         if self.over:
             return False
         run_thread.until, run_thread.deadline, run_thread.place = until, deadline, place
-        run_thread.came_true = False
         self.waiting.append(run_thread)
         self._pass_on()
         run_thread.lock.acquire()
-        return run_thread.came_true
+        return until is not None and not self.over and until()
 
     def has_waiting(self, thread: threading.Thread | None) -> bool:
         """Return whether a thread is a run thread that waits."""
@@ -250,7 +243,7 @@ class RunThreads:
         Run all until the run is over, watched by the calling thread, which is no run_thread.
 
         :param patience_s: a run thread that waits for this long is stuck.
-        :param progress: what it returns changes as long as the run goes on.
+        :param progress: returns what changes as long as the run goes on.
         :param tick: called now and then.
         :raises Stalled: if a run thread has stalled; its thread is left behind.
         :raises BaseException: what ended the run.
@@ -259,7 +252,7 @@ class RunThreads:
         watch = _StallWatch(self, progress, patience_s)
         ending_at = 0.0
         try:
-            while not self._done.acquire(timeout=_CHECK_S):
+            while not self._finished.wait(_CHECK_S):
                 tick()
                 if not self.over:
                     watch.check()
@@ -292,25 +285,25 @@ class _StallWatch:
         self._waited_s = self._computed_s = 0.0
 
     def check(self) -> None:
-        now, cpu_s, owner = time.monotonic(), time.process_time(), self._run_threads.owner
-        passed_s = min(now - self._checked_at, _LONGEST_CHECK_S)
-        computes = cpu_s - self._cpu_s > _LITTLE * passed_s
-        before, self._owner = self._owner, owner
-        self._checked_at, self._cpu_s = now, cpu_s
+        before = self._checked_at, self._cpu_s, self._owner
+        self._checked_at, self._cpu_s = time.monotonic(), time.process_time()
+        owner = self._owner = self._run_threads.owner
+        passed_s = min(self._checked_at - before[0], _LONGEST_CHECK_S)
         seen = self._progress()
         if owner is None or seen != self._seen:
             self._seen, self._waited_s, self._computed_s = seen, 0.0, 0.0
-        elif owner is not before:
-            pass
-        elif computes:
+        elif owner is not before[2]:
+            return
+        elif self._cpu_s - before[1] > _LITTLE * passed_s:
             self._waited_s = 0.0  # a busy machine gives it little CPU time now and then
             self._computed_s += passed_s
-            if self._computed_s > _COMPUTES * self._patience_s:
-                raise Stalled(owner, 'computing', _COMPUTES * self._patience_s)
         else:
             self._waited_s += passed_s
-            if self._waited_s > self._patience_s:
-                raise Stalled(owner, 'blocking', self._patience_s)
+        for what, seconds, most in (
+                ('blocking', self._waited_s, self._patience_s),
+                ('computing', self._computed_s, _COMPUTES * self._patience_s)):
+            if owner is not None and seconds > most:
+                raise Stalled(owner, what, most)
 
 
 def code_position(ident: int) -> str:
@@ -320,11 +313,9 @@ def code_position(ident: int) -> str:
     while frame is not None:
         name = frame.f_code.co_filename
         here = f'{name}:{frame.f_lineno}'
-        if not found:
-            found = here
-        module = frame.f_globals.get('__name__', '')
-        if not is_library(module):
+        if not is_library(frame.f_globals.get('__name__', '')):
             return here
+        found = found or here
         frame = frame.f_back
     return found
 

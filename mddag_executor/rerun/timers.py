@@ -16,9 +16,11 @@ the recording ends.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
-from mddag_executor.executor.compat import ends_sleep, with_timer_info
+from mddag_executor.executor.compat import alive, ends_sleep, with_timer_info
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.timers import ZERO_PERIOD_NS
 from mddag_executor.executor.work import Work
@@ -28,15 +30,13 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.timer import Timer
 
 
+@dataclass(eq=False, slots=True)
 class _TimerState:
-    """What is kept for a timer: when it is due next (-1: never), and was last."""
+    """A timer: when it is due next (-1: never), and was last."""
 
-    __slots__ = ('entity', 'due', 'last')
-
-    def __init__(self, entity: Entity, now: int) -> None:
-        self.entity = entity
-        self.due = -1
-        self.last = now
+    entity: Entity
+    last: int
+    due: int = -1
 
 
 class Timers:
@@ -49,7 +49,7 @@ class Timers:
     def __init__(self, loop: Loop, first_release: Callable[[int], int | None]) -> None:
         self._loop = loop
         self._first_release = first_release
-        self._known: dict[int, _TimerState] = {}
+        self._known: dict[Timer, _TimerState] = {}
 
     def install(self, replacements: Replacements) -> None:
         """Have what nodes do with their timers count in virtual time."""
@@ -64,23 +64,22 @@ class Timers:
             return make
 
         replace = replacements.replace
-        replace(Timer, 'reset', then(self.reset))
-        replace(Timer, 'cancel', then(self.cancelled))
-        replace(Timer, 'time_until_next_call', instead(self.until_next))
-        replace(Timer, 'time_since_last_call', instead(self.since_last))
-        replace(Timer, 'is_ready', instead(lambda timer: self.until_next(timer) == 0))
+        replace(Timer, 'reset', then(self._reset))
+        replace(Timer, 'cancel', then(self._cancelled))
+        replace(Timer, 'time_until_next_call', instead(self._until_next))
+        replace(Timer, 'time_since_last_call', instead(self._since_last))
+        replace(Timer, 'is_ready', instead(lambda timer: self._until_next(timer) == 0))
 
     def refresh(self, entities: Iterable[Entity]) -> None:
         """Update which timers there are."""
         before, self._known = self._known, {}
-        now = self._loop.now
         for entity in entities:
-            known = before.get(id(entity.rclpy))
-            if known is None or known.entity.rclpy is not entity.rclpy:
-                known = _TimerState(entity, now)
+            known = before.get(entity.rclpy)
+            if known is None:
+                known = _TimerState(entity, self._loop.now)
                 self._schedule(known, self._first_due(entity))
             known.entity = entity
-            self._known[id(entity.rclpy)] = known
+            self._known[entity.rclpy] = known
 
     def _first_due(self, entity: Entity) -> int:
         now, period = self._loop.now, _period(entity.rclpy)
@@ -92,61 +91,55 @@ class Timers:
         return first if first >= now else now + (first - now) % period
 
     def _schedule(self, known: _TimerState, due: int) -> None:
-        """Have a timer fire at a time, unless it is cancelled."""
-        try:
-            known.due = -1 if known.entity.rclpy.is_canceled() else due
-        except InvalidHandle:
-            known.due = -1
+        """Have a timer fire at a time, unless it is cancelled or destroyed."""
+        known.due = -1
+        with suppress(InvalidHandle):
+            if not known.entity.rclpy.is_canceled():
+                known.due = due
         if 0 <= known.due < self._loop.end:
             self._loop.at(self._loop.after_pause(due), TIMER, self._fire, known, due)
 
     def _fire(self, known: _TimerState, due: int) -> None:
         timer, engine, now = known.entity.rclpy, self._loop.engine, self._loop.now
-        if known.due != due or self._known.get(id(timer)) is not known:
+        if known.due != due or self._known.get(timer) is not known or not alive(timer):
             return  # it was reset or cancelled meanwhile, or is gone
-        try:
-            period = _period(timer)
-            self._schedule(known, due + ((now - due) // period + 1) * period)
-        except InvalidHandle:
-            return
+        period = _period(timer)
+        self._schedule(known, due + ((now - due) // period + 1) * period)
         if known.due < 0:
             return
-        info = {'expected_call_time': due, 'actual_call_time': now}
-        callback = timer.callback
         known.last = now
+        callback = timer.callback
         if callback is None:
             return
         if ends_sleep(callback):
             callback()
             return
-        work = Work(known.entity, with_timer_info(timer, callback, info))
-        engine.timer_due(work, now, now)
+        info = {'expected_call_time': due, 'actual_call_time': now}
+        engine.timer_due(Work(known.entity, with_timer_info(timer, callback, info)), now, now)
 
     # --- what nodes do with them -----------------------------------------------------------------
 
-    def reset(self, timer: Timer) -> None:
-        """Note that a timer was reset."""
-        known = self._known.get(id(timer))
+    def _reset(self, timer: Timer) -> None:
+        known = self._known.get(timer)
         if known is not None:
             known.last = self._loop.now
             self._schedule(known, self._loop.now + _period(timer))
 
-    def cancelled(self, timer: Timer) -> None:
-        """Note that a timer was cancelled."""
-        known = self._known.get(id(timer))
+    def _cancelled(self, timer: Timer) -> None:
+        known = self._known.get(timer)
         if known is not None:
             known.due = -1
 
-    def until_next(self, timer: Timer) -> int | None:
+    def _until_next(self, timer: Timer) -> int | None:
         """Return how long it is until a timer is due; None if it is cancelled."""
         if timer.is_canceled():
             return None
-        known = self._known.get(id(timer))
+        known = self._known.get(timer)
         return _period(timer) if known is None or known.due < 0 else known.due - self._loop.now
 
-    def since_last(self, timer: Timer) -> int:
+    def _since_last(self, timer: Timer) -> int:
         """Return how long ago a timer was due last, or was made."""
-        known = self._known.get(id(timer))
+        known = self._known.get(timer)
         return 0 if known is None else self._loop.now - known.last
 
 
