@@ -25,6 +25,7 @@ In other threads everything is as always, except a node's clock.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 import queue
 import random
@@ -35,6 +36,7 @@ from typing import Any, ClassVar
 import uuid
 import weakref
 
+from mddag_executor.replacements import Replacements
 from mddag_executor.rerun.loop import Loop
 from mddag_executor.rerun.run_threads import is_library, RunThread
 from rclpy.clock import Clock, ROSClock
@@ -75,18 +77,18 @@ class VirtualTime:
     :param simulated: whether the recording has ``/clock``.
     """
 
-    def __init__(
-        self, loop: Loop, all_clocks: bool, simulated: bool, seed: int
-    ) -> None:
+    def __init__(self, loop: Loop, all_clocks: bool, simulated: bool, seed: int) -> None:
         self._loop = loop
         self._all = all_clocks
         self._simulated = simulated
+        self._seed = seed
         self._random = random.Random(seed)
         self._threads: weakref.WeakKeyDictionary[threading.Thread, RunThread] = (
             weakref.WeakKeyDictionary())
 
-    def install(self, replace: Callable[[Any, str, Callable[[Any], Any]], None]) -> None:
-        """Put it in place."""
+    def install(self, replacements: Replacements) -> None:
+        """Put it in place, with all random numbers beginning with the seed."""
+        replace = replacements.replace
         replace(Clock, 'now', self._clock_now)
         replace(Clock, 'sleep_until', self._sleep_until)
         replace(threading.Condition, 'wait', self._condition_wait)
@@ -95,22 +97,19 @@ class VirtualTime:
         # The one in C waits without asking anybody; pools of threads are built on it.
         replace(queue, 'SimpleQueue', lambda original: vars(queue)['_PySimpleQueue'])
         replace(uuid, 'uuid4', _replaced)
-        replace(random.Random, 'seed', self._seed)
+        replace(random.Random, 'seed', self._seeding)
         # that of the module is a method of a generator, bound before
         replace(random, 'seed', lambda original: partial(random.Random.seed, original.__self__))
-        try:
-            from numpy.random import bit_generator
-        except ImportError:
-            pass
-        else:  # what all of numpy's generators begin with that get no seed
-            replace(bit_generator, 'randbits', self._randbits)
+        random.seed(self._seed)
+        with suppress(ImportError):
+            import numpy.random
+            # what all of numpy's generators begin with that get no seed
+            replace(numpy.random.bit_generator, 'randbits', self._randbits)
+            numpy.random.seed(self._seed % 2 ** 32)
         for name in (*_READS, 'sleep'):
             replace(time, name, _replaced)
         _Replaced.run = self
-
-    def uninstall(self) -> None:
-        """Have the functions of ``time`` give real time again."""
-        _Replaced.run = None
+        replacements.callback(setattr, _Replaced, 'run', None)
 
     # --- clocks ----------------------------------------------------------------------------------
 
@@ -184,7 +183,7 @@ class VirtualTime:
 
     # --- random numbers --------------------------------------------------------------------------
 
-    def _seed(self, original: Callable[..., None]) -> Callable[..., None]:
+    def _seeding(self, original: Callable[..., None]) -> Callable[..., None]:
         def seed(generator: random.Random, a: Any = None, version: int = 2) -> None:
             if a is None and self._is_asked_by_node():
                 a = self._random.getrandbits(128)

@@ -32,6 +32,7 @@ from mddag_executor.executor.compat import alive, callback_type, WITH_INFO
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import header_stamp, Origin
 from mddag_executor.executor.work import Work
+from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError
 from mddag_executor.rerun.inputs import MessageBag, RecordedMessage
@@ -44,6 +45,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, qos_check_compatible, QoSCompatibility
 from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.subscription import Subscription
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
@@ -125,6 +127,14 @@ class Messages:
         self._has_begun = self._gives_clock = False
         self._sequence = 0
 
+    def install(self, replacements: Replacements) -> None:
+        """Have publishers and subscriptions use this."""
+        replace = replacements.replace
+        replace(Publisher, 'publish', instead(self._publish))
+        replace(Publisher, 'get_subscription_count', instead(self._subscription_count))
+        replace(Publisher, 'wait_for_all_acked', instead(lambda *args, **more: True))
+        replace(Subscription, 'get_publisher_count', instead(self._publisher_count))
+
     # --- publishers and subscriptions ------------------------------------------------------------
 
     def refresh(self, nodes: Sequence[Node], subscriptions: Iterable[Entity]) -> None:
@@ -180,12 +190,12 @@ class Messages:
             outlet.inlets = [i for i in self.inlets.get(outlet.topic, ()) if outlet.fits(i)]
         return outlet.inlets
 
-    def subscription_count(self, publisher: Publisher) -> int:
+    def _subscription_count(self, publisher: Publisher) -> int:
         """Return how many subscribe to a publisher's topic: nodes, and the rerun itself."""
         self.loop.refresh_now()
         return 1 + len(self._inlets_of(self._outlet(publisher)))
 
-    def publisher_count(self, subscription: Any) -> int:
+    def _publisher_count(self, subscription: Any) -> int:
         """Return how many publish to a subscription: nodes of the run, or the recording."""
         self.loop.refresh_now()
         topic = subscription.topic_name
@@ -193,7 +203,7 @@ class Messages:
 
     # --- what nodes publish ----------------------------------------------------------------------
 
-    def publish(self, publisher: Any, msg: Any) -> None:
+    def _publish(self, publisher: Any, msg: Any) -> None:
         """Publish a message, in place of ``Publisher.publish``."""
         with publisher.handle:  # else it has been destroyed
             outlet = self._outlet(publisher)

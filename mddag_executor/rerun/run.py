@@ -16,7 +16,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 import gc
 import os
-import random
 import sys
 import time
 from typing import Any, BinaryIO
@@ -36,7 +35,7 @@ from mddag_executor.executor.waitables import is_qos_event
 from mddag_executor.executor.work import Work
 from mddag_executor.hosting.host import Guest
 from mddag_executor.hosting.loading import describe, Program, ros_arguments
-from mddag_executor.replacements import instead, Replacements
+from mddag_executor.replacements import Replacements
 from mddag_executor.rerun.clocks import VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.discovery import Discovery
@@ -57,9 +56,7 @@ import rclpy
 from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException
 from rclpy.guard_condition import GuardCondition
-from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import Subscription
 from rclpy.utilities import get_default_context, try_shutdown
 
 PATIENCE_S = 30.0
@@ -147,110 +144,55 @@ class Rerun:
         self._task_set = task_set
         self._settings = settings
         self._trace = trace
-        self._replacements = Replacements()
         self._outputs = Outputs(output, None if keep else recording.topics)
-        self._programs: Callable[[], Sequence[Program]] = tuple
         self._failed: list[Guest] = []
         self._hosted: set[str] = set()
-        self._begun = self._started_s = 0.0
+        self._started_s = 0.0
 
     # --- parts -----------------------------------------------------------------------------------
 
     def _make(self, context: Any) -> None:
         settings, recording, task_set = self._settings, self._recording, self._task_set
         writer = None if self._trace is None else VirtualTraceWriter(self._trace)
-        self._engine = Engine(
+        self._engine = engine = Engine(
             task_set, settings.workers, settings.policy, default_deadline=DEFAULT_DEADLINE_NS,
             max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER_NS,
             record=None if writer is None else writer.record)
-        self._engine.other_processes = OtherProcesses(
-            task_set, self._engine.tables, self._engine.scheduler, self._engine.jobs,
-            task_set.dags)
+        engine.other_processes = self._other_processes = OtherProcesses(
+            task_set, engine.tables, engine.scheduler, engine.jobs, task_set.dags)
         self._loop = loop = Loop(
-            self._engine, self._times, recording.start, recording.end, recording.pauses,
-            self._refresh, self._begin, self._over)
-        self._recorder = None if writer is None else Recorder(
-            writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE_NS,
-            MAX_ACTIVE_JOBS, _TraceTime(loop), writer, settings.cpus or 0,
-            on_late=self._engine.on_late)
+            engine, self._times, recording.start, recording.end, recording.pauses, self._refresh,
+            self._begin, self._over)
         self._holder = NodeHolder(context, loop)
-        self._holders = self._held()
+        self._recorder = None
+        if writer is not None:
+            self._recorder = Recorder(
+                writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE_NS,
+                MAX_ACTIVE_JOBS, _TraceTime(loop), writer, settings.cpus or 0,
+                on_late=engine.on_late)
+            self._recorder.entities((), [self._holder.task_entity])
+        # the callbacks that hold the interpreter, declared or else recorded
+        self._holders = {
+            vertex.callback.key for place, vertex in enumerate(task_set.vertices)
+            if (self._times.holds(place) if vertex.callback.holds_interpreter is None
+                else vertex.callback.holds_interpreter)}
         if settings.cpus is not None or self._holders:
             loop.computing = SharedCpus(
-                self._engine, settings.cpus, self._times.python, loop.start, loop.ended)
-        self._registry = Registry(task_set, self._engine, self._engine.leave_group)
+                engine, settings.cpus, self._times.python, loop.start, loop.ended)
+        self._registry = Registry(task_set, engine, engine.leave_group)
         self._messages = Messages(loop, recording, self._times, self._outputs, task_set)
         self._requests = Requests(loop, self._holder)
         self._timers = Timers(loop, self._times.first_release)
         self._host = RerunHost(loop)
-        if self._recorder is not None:
-            self._recorder.entities((), [self._holder.task_entity])
 
-    def _held(self) -> set[str]:
-        """Return the callbacks that hold the interpreter, declared or else recorded."""
-        held, vertices = set(), self._task_set.vertices
-        for place, vertex in enumerate(vertices):
-            declared = vertex.callback.holds_interpreter
-            if self._times.holds(place) if declared is None else declared:
-                held.add(vertex.callback.key)
-        return held
-
-    # --- the run ---------------------------------------------------------------------------------
-
-    def run(
-        self, programs: Callable[[], Sequence[Program]], tick: Callable[[int], None] | None = None
-    ) -> Result:
-        """
-        Run the programs from the start of the recording to its end.
-
-        :param programs: finds them, with virtual time in place.
-        :param tick: gets now and then how far the run is, ns.
-        :raises RerunError: on whatever keeps it from going on.
-        """
-        self._begun = time.monotonic()
-        arguments = sys.argv  # each program has its own
-        self._programs = programs
-        with _context(self._settings.ros_args) as context:
-            publishing.install()
-            self._make(context)
-            loop = self._loop
-            try:
-                self._install()
-                with self._host:
-                    self._seed()
-                    loop.run_threads.run(
-                        self._settings.patience_s,
-                        lambda: (loop.now, loop.callbacks, len(self._host.guests)),
-                        lambda: tick(loop.now - loop.start) if tick is not None else None)
-            except Stalled as stuck:
-                raise self._blocked(stuck) from None
-            finally:
-                self._virtual.uninstall()
-                self._replacements.close()
-                gc.unfreeze()
-                sys.argv = arguments
-                if self._recorder is not None:
-                    self._recorder.close(loop.now)
-        self._check_programs()
-        if not self._hosted:
-            self._loop.warn(self._none_hosted())
-        self._outputs.finish()
-        return self._result(time.monotonic() - self._begun)
-
-    def _install(self) -> None:
-        replace = self._replacements.replace
-        messages = self._messages
-        self._virtual = VirtualTime(
+    def _install(self, replacements: Replacements) -> None:
+        virtual = VirtualTime(
             self._loop, self._settings.all_clocks, CLOCK in self._recording.topics,
             self._settings.seed)
-        self._virtual.install(replace)
-        for each in (self._timers, self._requests, Discovery(messages, self._recording)):
-            each.install(self._replacements)
-        replace(GuardCondition, 'trigger', self._trigger)
-        replace(Publisher, 'publish', instead(messages.publish))
-        replace(Publisher, 'get_subscription_count', instead(messages.subscription_count))
-        replace(Publisher, 'wait_for_all_acked', instead(lambda *args, **more: True))
-        replace(Subscription, 'get_publisher_count', instead(messages.publisher_count))
+        for each in (virtual, self._timers, self._requests, self._messages,
+                     Discovery(self._messages, self._recording)):
+            each.install(replacements)
+        replacements.replace(GuardCondition, 'trigger', self._trigger)
 
     def _trigger(self, original: Callable[[GuardCondition], None]) -> Callable[..., None]:
         def trigger(guard: GuardCondition) -> None:
@@ -262,47 +204,6 @@ class Rerun:
 
         return trigger
 
-    def _seed(self) -> None:
-        random.seed(self._settings.seed)
-        try:
-            import numpy
-        except ImportError:
-            return
-        numpy.random.seed(self._settings.seed % 2 ** 32)
-
-    def _begin(self) -> None:
-        """Start the programs, one after the other; each runs until it waits for something."""
-        self._host.start(
-            self._holder, self._programs(), ros_arguments(self._settings.ros_args),
-            self._loop.stop)
-        self._loop.at(self._loop.start, ENDED, self._started)
-
-    def _started(self) -> None:
-        """Begin to deliver, when each program waits for something."""
-        self._started_s = time.monotonic() - self._begun
-        gc.freeze()  # else each full collection visits all objects of the nodes
-        if all(guest.is_complete for guest in self._host.guests) and not self._hosted:
-            raise RerunError(self._none_hosted())
-        self._check_topics()
-        if self._recording.pauses:
-            self._loop.warn(f'{self._recording.name}: timers do not fire in '
-                       f'{counted(len(self._recording.pauses), "pause")} of over a minute without '
-                       'any message')
-        self._messages.begin()
-
-    def _none_hosted(self) -> str:
-        text = unbound_text(self._task_set, self._registry.unbound(), self._registry)
-        return f'{text}: give the nodes that it declares, with the same names'
-
-    def _check_topics(self) -> None:
-        known = {*self._recording.topics, *self._messages.offered, CLOCK}
-        for callback in self._task_set.callbacks:
-            for topic in callback.topics:
-                if callback.key in self._hosted and topic not in known:
-                    raise RerunError(
-                        f'{self._recording.name}: {topic}, which {callback.key} needs, is not '
-                        'recorded: record it, or run the node that publishes it with --node')
-
     def _refresh(self) -> None:
         """Update which entities there are."""
         nodes = self._holder.ordered_nodes()
@@ -311,9 +212,7 @@ class Rerun:
         hosted = registry.hosted()
         self._hosted |= hosted
         if added or gone:
-            assert engine.other_processes is not None
-            engine.other_processes.host(
-                hosted, registry.subscriptions(), engine.record, now)
+            self._other_processes.host(hosted, registry.subscriptions(), engine.record, now)
         for entity in added:
             entity.since = now
             if entity.callback is not None and entity.callback.key in self._holders:
@@ -330,6 +229,82 @@ class Rerun:
             self._recorder.entities(nodes, added)
         self._messages.refresh(nodes, registry.subscriptions())
 
+    # --- the run ---------------------------------------------------------------------------------
+
+    def run(
+        self, programs: Callable[[], Sequence[Program]], tick: Callable[[int], None] | None = None
+    ) -> Result:
+        """
+        Run the programs from the start of the recording to its end.
+
+        :param programs: finds them, with virtual time in place.
+        :param tick: gets now and then how far the run is, ns.
+        :raises RerunError: on whatever keeps it from going on.
+        """
+        self._begun = time.monotonic()
+        self._programs = programs
+        arguments = sys.argv  # each program has its own
+        with _context(self._settings.ros_args) as context:
+            publishing.install()
+            self._make(context)
+            loop = self._loop
+            try:
+                with Replacements() as replacements:
+                    self._install(replacements)
+                    with self._host:
+                        loop.run_threads.run(
+                            self._settings.patience_s,
+                            lambda: (loop.now, loop.callbacks, len(self._host.guests)),
+                            lambda: tick(self._passed_ns()) if tick is not None else None)
+            except Stalled as stuck:
+                raise RerunError(
+                    f'{loop.here()}: {stuck}, at {self._passed_ns() / 1e9:.6f} s of the run: let '
+                    'it wait with rclpy or threading, give --all-clocks if it sleeps, or correct '
+                    'it') from None
+            finally:
+                gc.unfreeze()
+                sys.argv = arguments
+                if self._recorder is not None:
+                    self._recorder.close(loop.now)
+        self._check_programs()
+        if not self._hosted:
+            loop.warn(self._none_hosted())
+        self._outputs.finish()
+        return self._result(time.monotonic() - self._begun)
+
+    def _passed_ns(self) -> int:
+        return self._loop.now - self._loop.start
+
+    def _begin(self) -> None:
+        """Start the programs, one after the other; each runs until it waits for something."""
+        self._host.start(
+            self._holder, self._programs(), ros_arguments(self._settings.ros_args),
+            self._loop.stop)
+        self._loop.at(self._loop.start, ENDED, self._started)
+
+    def _started(self) -> None:
+        """Begin to deliver, when each program waits for something."""
+        self._started_s = time.monotonic() - self._begun
+        gc.freeze()  # else each full collection visits all objects of the nodes
+        if all(guest.is_complete for guest in self._host.guests) and not self._hosted:
+            raise RerunError(self._none_hosted())
+        name, pauses = self._recording.name, self._recording.pauses
+        known = {*self._recording.topics, *self._messages.offered, CLOCK}
+        for callback in self._task_set.callbacks:
+            for topic in callback.topics:
+                if callback.key in self._hosted and topic not in known:
+                    raise RerunError(
+                        f'{name}: {topic}, which {callback.key} needs, is not '
+                        'recorded: record it, or run the node that publishes it with --node')
+        if pauses:
+            self._loop.warn(f'{name}: timers do not fire in {counted(len(pauses), "pause")} of '
+                            'over a minute without any message')
+        self._messages.begin()
+
+    def _none_hosted(self) -> str:
+        text = unbound_text(self._task_set, self._registry.unbound(), self._registry)
+        return f'{text}: give the nodes that it declares, with the same names'
+
     # --- the end ---------------------------------------------------------------------------------
 
     def _over(self) -> None:
@@ -339,18 +314,11 @@ class Rerun:
         self._engine.finish(self._loop.now)
         self._host.shut_down()
 
-    def _blocked(self, stuck: Stalled) -> RerunError:
-        at = (self._loop.now - self._loop.start) / 1e9
-        return RerunError(
-            f'{self._loop.here()}: {stuck}, at {at:.6f} s of the run: let it wait with rclpy or '
-            'threading, give --all-clocks if it sleeps, or correct it')
-
     def _check_programs(self) -> None:
         for guest in self._failed:
             assert guest.error is not None
             raise CallbackFailed(
-                f'--node {guest.program.spec}', guest.error, self._loop.now - self._loop.start
-            ) from guest.error
+                f'--node {guest.program.spec}', guest.error, self._passed_ns()) from guest.error
         for guest in self._host.guests:
             if guest.error is not None and not isinstance(guest.error, _ENDS):
                 self._loop.warn(
@@ -358,20 +326,20 @@ class Rerun:
                     f'{describe(guest.error)}')
 
     def _result(self, elapsed_s: float) -> Result:
-        loop, recording = self._loop, self._recording
-        both = set(recording.topics & self._outputs.counts.keys() - _OF_ALL_NODES)
+        loop, recording, outputs = self._loop, self._recording, self._outputs
+        both = set(recording.topics & outputs.counts.keys() - _OF_ALL_NODES)
         recorded = differences(
-            [each for each in self._outputs.messages if each.topic in both],
+            [each for each in outputs.messages if each.topic in both],
             recording.messages(both), loop.start)
         recording.close()
         verdicts = {
             'policy': self._settings.policy, 'workers': self._settings.workers,
-            'preemptive': False, 'duration_ns': loop.now - loop.start,
+            'preemptive': False, 'duration_ns': self._passed_ns(),
             **self._engine.verdicts.tally.result()}
         return Result(
-            self._outputs.digest, self._outputs.messages, self._outputs.counts, loop.callbacks,
-            self._started_s, loop.start, loop.now - loop.start, elapsed_s, verdicts, sorted(both),
-            recorded, [*recording.warnings, *loop.warnings])
+            outputs.digest, outputs.messages, outputs.counts, loop.callbacks, self._started_s,
+            loop.start, self._passed_ns(), elapsed_s, verdicts, sorted(both), recorded,
+            [*recording.warnings, *loop.warnings])
 
 
 class _TraceTime(TraceClock):
@@ -393,7 +361,7 @@ def _context(ros_args: Sequence[str]) -> Iterator[Any]:
         raise RerunError(
             'rclpy: it is initialised already: call rclpy.shutdown before, a rerun has a context '
             'of its own')
-    before = {name: os.environ[name] for name in (_NO_DISCOVERY,) if name in os.environ}
+    before = os.environ.get(_NO_DISCOVERY)
     os.environ[_NO_DISCOVERY] = 'OFF'
     try:
         rclpy.init(
@@ -404,7 +372,8 @@ def _context(ros_args: Sequence[str]) -> Iterator[Any]:
         ) from error
     finally:
         del os.environ[_NO_DISCOVERY]
-        os.environ.update(before)
+        if before is not None:
+            os.environ[_NO_DISCOVERY] = before
     try:
         yield get_default_context()
     finally:
