@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from itertools import pairwise
+from operator import itemgetter
 import os
 import tempfile
 from typing import NamedTuple
@@ -65,7 +66,8 @@ class MessageBag:
         self.kinds: dict[str, str] = {}
         self._file = tempfile.SpooledTemporaryFile(max_size=_IN_MEMORY, prefix='mddag-')
         self._loaded: set[str] = set()
-        self._index: list[_Stored] = []
+        # of each message in the file: its times, its topic, where it is and how long
+        self._index: list[tuple[int, int, Topic, int, int]] = []
 
     def close(self) -> None:
         """Let go of the messages."""
@@ -78,7 +80,7 @@ class MessageBag:
             return wanted
         self._loaded |= wanted
         Bag(self.path, sorted(wanted), self.name, self._keep)
-        self._index.sort(key=lambda stored: stored.time)
+        self._index.sort(key=itemgetter(0))
         return wanted
 
     def _keep(self, topic: Topic, time: int, published: int, data: bytes) -> None:
@@ -89,7 +91,7 @@ class MessageBag:
         if not self.start <= time <= self.end:
             return  # of damage
         self.kinds[topic.name] = topic.message_type
-        self._index.append(_Stored(
+        self._index.append((
             time, published if published >= 0 else time, topic, self._file.seek(0, 2), len(data)))
         self._file.write(data)
 
@@ -100,16 +102,6 @@ class MessageBag:
                 self._file.seek(place)
                 yield RecordedMessage(
                     time, published, topic.name, topic.message_type, self._file.read(size))
-
-
-class _Stored(NamedTuple):
-    """A message in the temporary file: its times, its topic, where it is and how long."""
-
-    time: int
-    published: int
-    topic: Topic
-    place: int
-    size: int
 
 
 def open_input(

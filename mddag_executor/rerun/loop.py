@@ -32,7 +32,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from heapq import heappop, heappush
 import itertools
@@ -82,20 +82,18 @@ class Sent:
     early: Callable[[Origin, int], int] = lambda origin, release: 0
 
 
+@dataclass(eq=False, slots=True)
 class Execution:
     """A callback that runs, or has run for real and not ended in virtual time."""
 
-    __slots__ = ('work', 'start', 'sent', 'worker', 'thread', 'waits_for', 'origin', 'release')
-
-    def __init__(self, work: Work, start: int, release: int) -> None:
-        self.work = work
-        self.start = start
-        self.sent: list[Sent] = []
-        self.worker = work.worker
-        self.thread = work.worker + 1
-        self.waits_for: Any = None
-        self.origin = work.origin
-        self.release = release
+    work: Work
+    start: int
+    worker: int
+    thread: int
+    origin: Origin | None
+    release: int
+    sent: list[Sent] = field(default_factory=list)
+    waits_for: Any = None
 
 
 class Loop:
@@ -106,8 +104,8 @@ class Loop:
     :param end: when the recording ends.
     :param pauses: from when to when it has no messages.
     :param refresh: brings up to date which entities there are.
-    :param begin: is called once, in the first run thread: it starts the programs; ``over``: at the
-        end, before the run threads end that still wait.
+    :param begin: starts the programs; ``over``: is called at the end, before the run threads end
+        that still wait.
     :ivar now: the virtual time.
     :ivar callbacks: how many callbacks have run.
     :ivar computing: shares CPUs and the interpreter, if they are limited.
@@ -133,15 +131,14 @@ class Loop:
         self.run_threads = RunThreads(self._step, over)
         self._times = times
         self._refresh = refresh
-        self._begin: Callable[[], None] | None = begin
         self._events: list[tuple[int, int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._order = itertools.count()
         self._foreign: deque[Callable[[], None]] = deque()
         self._current: Execution | None = None
-        self._resumed: set[Work] = set()
         self._at_once = 0
         self._stopped = False
         self._polled_at = self._polls = self._ask_at = 0
+        self.at(start, ENDED, begin)
 
     # --- what is to happen -----------------------------------------------------------------------
 
@@ -187,10 +184,6 @@ class Loop:
 
     def _step(self) -> bool:
         """Do the next thing; False: there is none."""
-        if self._begin is not None:
-            begin, self._begin = self._begin, None
-            begin()
-            return True
         while self._foreign:
             self._foreign.popleft()()
         self.refresh_now()
@@ -218,7 +211,7 @@ class Loop:
                 return True
         if engine.has_waiting and engine.interpreter_holder() and now >= self._ask_at:
             self._ask_at = now + POLL_NS
-            self.at(self._ask_at, TIMER, _nothing)  # it may overtake by then
+            self.at(self._ask_at, TIMER, lambda: None)  # it may overtake by then
         return self._advance(deadline)
 
     def refresh_now(self) -> None:
@@ -257,7 +250,7 @@ class Loop:
                 'time: declare their execution_time')
         origin = work.origin
         release = 0 if origin is None else self.engine.release_of(work)
-        execution = Execution(work, self.now, release)
+        execution = Execution(work, self.now, work.worker, work.worker + 1, origin, release)
         takes = self._execution_time(work, origin, release)
         if self.computing is not None:
             self.computing.waits(work)
@@ -269,7 +262,7 @@ class Loop:
             work.entity.habit.took(takes, takes)
         waited = self.now > execution.start
         if self.computing is not None and execution.worker >= 0 and not waited:
-            self.computing.begin(execution, work, takes, [
+            self.computing.begin(execution, takes, [
                 (max(0, takes + early), partial(self._leave, sent, execution, early))
                 for early, sent in self._take_early(execution, takes)])
             return
@@ -280,7 +273,7 @@ class Loop:
         heappush(self._events, (end, ENDED, order, self.ended, (execution, end)))
 
     def _call(self, execution: Execution) -> bool:
-        """Call what an execution calls; return whether it ran."""
+        """Run an execution's callback; return whether it ran."""
         work = execution.work
         entity = work.entity
         self._current = execution
@@ -307,15 +300,9 @@ class Loop:
         origin = execution.origin
         if origin is None or not takes:
             return []
-        found, kept = [], []
-        for sent in execution.sent:
-            early = sent.early(origin, execution.release)
-            if early < 0:
-                found.append((early, sent))
-            else:
-                kept.append(sent)
-        execution.sent = kept
-        return found
+        all_sent = [(sent.early(origin, execution.release), sent) for sent in execution.sent]
+        execution.sent = [sent for early, sent in all_sent if early >= 0]
+        return [each for each in all_sent if each[0] < 0]
 
     def _leave(self, sent: Sent, execution: Execution, early: int) -> None:
         """Let something leave before its execution ends."""
@@ -324,21 +311,14 @@ class Loop:
 
     def _execution_time(self, work: Work, origin: Origin | None, release: int) -> int:
         """Return how long a callback takes: its first piece all of it, a sync its last leg."""
-        if origin is None:
+        if origin is None or work.coroutine is not None:
             return 0
-        if work in self._resumed:
-            self._resumed.discard(work)
-            return 0
-        if not self._is_last_leg(work, origin):
-            return 0
-        return self._times.execution(origin.dag, origin.vertex, release)
-
-    def _is_last_leg(self, work: Work, origin: Origin) -> bool:
-        """Return whether the end of a running execution completes its vertex."""
         state, tables = self.engine.scheduler.state, self.engine.tables
         first = state.job_base[origin.slot] + tables.region_offset[origin.vertex]
-        return all(state.x_state[x] == DONE
-                   for x in range(first, first + tables.n_legs[origin.vertex]) if x != work.x)
+        legs = range(first, first + tables.n_legs[origin.vertex])
+        if any(state.x_state[x] != DONE for x in legs if x != work.x):
+            return 0
+        return self._times.execution(origin.dag, origin.vertex, release)
 
     def ended(self, execution: Execution, now: int) -> None:
         """End an execution in virtual time, or suspend it."""
@@ -351,7 +331,6 @@ class Loop:
             self.on_ended(work.entity.rclpy)
         else:
             engine.suspended(work, start, now, execution.thread, worker)
-            self._resumed.add(work)
             self._resume_when_done(work, waits_for)
         for each in execution.sent:
             each.leave(execution.origin, execution.release, now)
@@ -439,7 +418,3 @@ class Loop:
             if run_thread.execution is not None and run_thread.deadline is None:
                 self.warn(f'{run_thread.execution.work.entity.name}: it still waits '
                           f'({run_thread.place})')
-
-
-def _nothing() -> None:
-    pass

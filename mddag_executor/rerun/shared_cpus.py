@@ -49,8 +49,7 @@ class SharedCpus:
         begins(self._state, self._machine, work.x, 0, -1, False)
 
     def begin(
-        self, what: Any, work: Work, takes: int,
-        leaving: list[tuple[int, Callable[[], None]]],
+        self, execution: Any, takes: int, leaving: list[tuple[int, Callable[[], None]]],
     ) -> None:
         """
         Have an execution run on its worker.
@@ -58,14 +57,14 @@ class SharedCpus:
         :param takes: how long, if nothing keeps it; of that it computes ``work.cpu_ns``.
         :param leaving: what is to be done before its end, and how far it is then.
         """
-        state, x = self._state, work.x
+        state, work, x = self._state, execution.work, execution.work.x
         state.x_left[x] += takes - state.x_cost[x]  # else the core cannot say how far it is
         state.x_cost[x] = takes
         begins(state, self._machine, x, takes, work.cpu_ns, False)
-        self._running[work.worker] = what
+        self._running[work.worker] = execution
         if leaving:
-            self._places[work.x] = sorted(leaving, key=lambda each: each[0], reverse=True)
-            self._leaves_next(work.x)
+            self._places[x] = sorted(leaving, key=lambda each: each[0], reverse=True)
+            self._leaves_next(x)
 
     def _leaves_next(self, x: int) -> None:
         """Give the machine how far an execution is when something of it leaves next."""
@@ -83,8 +82,8 @@ class SharedCpus:
     def share(self, now: int) -> None:
         """Decide which executions go on."""
         share(self._engine.tables, self._state, self._machine, now, self._finish_at)
-        for worker, what in enumerate(self._running):
-            if what is None:
+        for worker, execution in enumerate(self._running):
+            if execution is None:
                 self._finish_at[worker] = NEVER
 
     def go_on(self, now: int) -> bool:
@@ -98,8 +97,8 @@ class SharedCpus:
         for worker, time in enumerate(self._finish_at):
             if time <= now:
                 self._finish_at[worker] = NEVER
-                what, self._running[worker] = self._running[worker], None
-                self._places.pop(what.work.x, None)
-                self._ended(what, now)
+                execution, self._running[worker] = self._running[worker], None
+                self._places.pop(execution.work.x, None)
+                self._ended(execution, now)
                 return True
         return False
