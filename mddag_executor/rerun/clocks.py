@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 import queue
 import random
 import sys
@@ -46,26 +46,17 @@ from rclpy.time import Time
 _READS = ('time', 'time_ns', 'monotonic', 'monotonic_ns', 'perf_counter', 'perf_counter_ns')
 
 
-class _Replaced:
-    """
-    The functions that replace those of ``time`` and ``uuid4``, and the run that they call.
-
-    They are made once: a module that imports one keeps it for later runs.
-    """
-
-    run: ClassVar[VirtualTime | None] = None
-    functions: ClassVar[dict[str, Callable[..., Any]]] = {}
-
-
+@cache
 def _replaced(original: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that calls the current run instead of the original."""
-    function = _Replaced.functions.get(original.__name__)
-    if function is None:
-        def function(*args: Any) -> Any:
-            run = _Replaced.run
-            return original(*args) if run is None else run.call(original, args)
+    """
+    Return a function that calls the current run instead of the original.
 
-        _Replaced.functions[original.__name__] = function
+    It is made once: a module that imports it keeps it for later runs.
+    """
+    def function(*args: Any) -> Any:
+        run = VirtualTime.current
+        return original(*args) if run is None else run.call(original, args)
+
     return function
 
 
@@ -73,9 +64,12 @@ class VirtualTime:
     """
     Puts virtual time in the place of the machine's.
 
+    :cvar current: that of the current run.
     :param all_clocks: whether steady and system clocks are virtual, too.
     :param simulated: whether the recording has ``/clock``.
     """
+
+    current: ClassVar[VirtualTime | None] = None
 
     def __init__(self, loop: Loop, all_clocks: bool, simulated: bool, seed: int) -> None:
         self._loop = loop
@@ -108,8 +102,8 @@ class VirtualTime:
             numpy.random.seed(self._seed % 2 ** 32)
         for name in (*_READS, 'sleep'):
             replace(time, name, _replaced)
-        _Replaced.run = self
-        replacements.callback(setattr, _Replaced, 'run', None)
+        VirtualTime.current = self
+        replacements.callback(setattr, VirtualTime, 'current', None)
 
     # --- clocks ----------------------------------------------------------------------------------
 

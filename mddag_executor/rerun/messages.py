@@ -19,12 +19,16 @@ time.
 Which job does a message belong to?  That of the execution that has sent it. A recorded one starts
 a job if its subscription is its DAG's source. Otherwise it enters the job
 that its header's stamp names, or one of its own (see ``executor.other_processes``).
+
+Nodes that ask for the ROS graph find the nodes of the run, and what is recorded, at once, not
+after some time as in the middleware. Questions that are not answered here go to the middleware,
+and a warning says that the answer is not the same in each run.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -52,6 +56,11 @@ from rosgraph_msgs.msg import Clock
 CLOCK = '/clock'
 CLOCK_EVERY_NS = 10_000_000
 """How often ``/clock`` gives the time."""
+_OTHERS = (
+    'get_publisher_names_and_types_by_node', 'get_subscriber_names_and_types_by_node',
+    'get_service_names_and_types_by_node', 'get_client_names_and_types_by_node',
+    'get_service_names_and_types', 'get_publishers_info_by_topic',
+    'get_subscriptions_info_by_topic', 'count_clients', 'count_services')
 
 
 class Inlet:
@@ -103,18 +112,16 @@ class Messages:
     """
     Carries messages.
 
-    :ivar nodes: of the run.
-    :ivar inlets: the subscriptions of the nodes, by topic.
-    :ivar offered: the topics on which they publish, each with its publishers.
+    :ivar offered: the topics on which nodes of the run publish, each with its publishers.
     """
 
     def __init__(
         self, loop: Loop, recording: MessageBag, times: Durations, outputs: Outputs,
         task_set: TaskSet,
     ) -> None:
-        self.loop = loop
-        self.nodes: Sequence[Node] = ()
-        self.inlets: dict[str, list[Inlet]] = {}
+        self._loop = loop
+        self._nodes: Sequence[Node] = ()
+        self._inlets: dict[str, list[Inlet]] = {}
         self.offered: dict[str, list[Outlet]] = {}
         self._engine = loop.engine
         self._recording = recording
@@ -134,21 +141,29 @@ class Messages:
         replace(Publisher, 'get_subscription_count', instead(self._subscription_count))
         replace(Publisher, 'wait_for_all_acked', instead(lambda *args, **more: True))
         replace(Subscription, 'get_publisher_count', instead(self._publisher_count))
+        replace(Node, 'get_topic_names_and_types', instead(self._topics))
+        replace(Node, 'count_publishers', instead(self._count_publishers))
+        replace(Node, 'count_subscribers', instead(self._count_subscribers))
+        replace(Node, 'get_node_names', instead(self._node_names))
+        replace(Node, 'get_node_names_and_namespaces', instead(self._node_names_and_namespaces))
+        for name in _OTHERS:
+            if name in vars(Node):
+                replace(Node, name, self._asking)
 
     # --- publishers and subscriptions ------------------------------------------------------------
 
     def refresh(self, nodes: Sequence[Node], subscriptions: Iterable[Entity]) -> None:
         """Update which subscriptions and publishers there are."""
-        self.nodes = nodes
-        known = {inlet.entity: inlet for inlets in self.inlets.values() for inlet in inlets}
+        self._nodes = nodes
+        known = {inlet.entity: inlet for inlets in self._inlets.values() for inlet in inlets}
         new = []
-        self.inlets = {}
+        self._inlets = {}
         for entity in subscriptions:
             inlet = known.get(entity)
             if inlet is None:
                 inlet = Inlet(entity)
                 new.append(inlet)
-            self.inlets.setdefault(entity.label, []).append(inlet)
+            self._inlets.setdefault(entity.label, []).append(inlet)
         for publisher in (each for node in nodes for each in node.publishers):
             if alive(publisher):
                 self._outlet(publisher)
@@ -161,7 +176,7 @@ class Messages:
         for inlet in new:
             if _is_latched(inlet.entity.rclpy.qos_profile):
                 self._deliver_kept(inlet)
-        if not self._gives_clock and CLOCK in self.inlets and (
+        if not self._gives_clock and CLOCK in self._inlets and (
                 CLOCK not in self._recording.topics and CLOCK not in self.offered):
             self._gives_clock = True
             self._publish_time()
@@ -187,17 +202,52 @@ class Messages:
 
     def _inlets_of(self, outlet: Outlet) -> list[Inlet]:
         if outlet.inlets is None:
-            outlet.inlets = [i for i in self.inlets.get(outlet.topic, ()) if outlet.fits(i)]
+            outlet.inlets = [i for i in self._inlets.get(outlet.topic, ()) if outlet.fits(i)]
         return outlet.inlets
+
+    # --- questions about the ROS graph -----------------------------------------------------------
+
+    def _asking(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def ask(node: Node, *args: Any, **more: Any) -> Any:
+            self._loop.warn(
+                f'{node.get_fully_qualified_name()}: {original.__name__} asks the middleware, '
+                'which does not find the same in each run')
+            return original(node, *args, **more)
+
+        return ask
+
+    def _topics(self, node: Node, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
+        self._loop.refresh_now()
+        kinds = {topic: {kind} for topic, kind in self._recording.kinds.items()}
+        for found in (self._inlets, self.offered):
+            for topic, (first, *_) in found.items():
+                kinds.setdefault(topic, set()).add(type_name(first.kind))
+        return [(topic, sorted(names)) for topic, names in sorted(kinds.items())]
+
+    def _count_publishers(self, node: Node, topic_name: str) -> int:
+        self._loop.refresh_now()
+        topic = node.resolve_topic_name(topic_name)
+        return len(self.offered.get(topic, ())) or int(topic in self._recording.topics)
+
+    def _count_subscribers(self, node: Node, topic_name: str) -> int:
+        self._loop.refresh_now()
+        return len(self._inlets.get(node.resolve_topic_name(topic_name), ()))
+
+    def _node_names(self, node: Node) -> list[str]:
+        return [name for name, _ in self._node_names_and_namespaces(node)]
+
+    def _node_names_and_namespaces(self, node: Node) -> list[tuple[str, str]]:
+        self._loop.refresh_now()
+        return [(each.get_name(), each.get_namespace()) for each in self._nodes]
 
     def _subscription_count(self, publisher: Publisher) -> int:
         """Return how many subscribe to a publisher's topic: nodes, and the rerun itself."""
-        self.loop.refresh_now()
+        self._loop.refresh_now()
         return 1 + len(self._inlets_of(self._outlet(publisher)))
 
     def _publisher_count(self, subscription: Any) -> int:
         """Return how many publish to a subscription: nodes of the run, or the recording."""
-        self.loop.refresh_now()
+        self._loop.refresh_now()
         topic = subscription.topic_name
         return len(self.offered.get(topic, ())) or int(topic in self._last)
 
@@ -213,14 +263,14 @@ class Messages:
             data = msg
         else:
             raise TypeError(f'Expected {publisher.msg_type}, got {type(msg)}')
-        if self.loop.run_threads.current() is None:
-            self.loop.warn(
+        if self._loop.run_threads.current() is None:
+            self._loop.warn(
                 f'{outlet.topic}: a thread publishes on it that is not of the run: when '
                 'that happens depends on the machine')
-        current = self.loop.current
+        current = self._loop.current
         if current is not None:
             current.work.entity.publishes.add(outlet.topic)
-        self.loop.send(Sent(
+        self._loop.send(Sent(
             partial(self._leave, outlet, data), partial(self._record, outlet),
             partial(self._earliest, outlet)))
 
@@ -229,7 +279,7 @@ class Messages:
         if self._engine.record is not None:
             self._sequence += 1
             self._engine.record(
-                PUBLICATION, self.loop.now, thread, id(outlet.publisher), self._sequence)
+                PUBLICATION, self._loop.now, thread, id(outlet.publisher), self._sequence)
 
     def _earliest(self, outlet: Outlet, origin: Origin, release: int) -> int:
         """Return when the first subscription gets a message, after its execution's end."""
@@ -248,7 +298,7 @@ class Messages:
         self, outlet: Outlet, data: bytes, origin: Origin | None, release: int, end: int
     ) -> None:
         """Send a message to the outputs and to the subscriptions."""
-        now = self.loop.now
+        now = self._loop.now
         self._outputs.add(now, outlet.topic, outlet.kind, data, outlet.publisher)
         outlet.count += 1
         if outlet.kept.maxlen:
@@ -259,7 +309,7 @@ class Messages:
             if time <= now:
                 arrive()
             else:
-                self.loop.at(time, ARRIVED, arrive)
+                self._loop.at(time, ARRIVED, arrive)
 
     # --- what is recorded ------------------------------------------------------------------------
 
@@ -271,15 +321,15 @@ class Messages:
     def _load(self) -> None:
         """Load the messages that nodes need by now, and begin to deliver them."""
         recording = self._recording
-        new = recording.load({*self.inlets, *self.offered})
-        for topic, inlets in self.inlets.items():
+        new = recording.load({*self._inlets, *self.offered})
+        for topic, inlets in self._inlets.items():
             recorded, wanted = recording.kinds.get(topic), type_name(inlets[0].kind)
             if recorded not in (None, wanted) and topic not in self.offered:
                 raise RerunError(
                     f'{recording.name}: {topic} was recorded as {recorded}, and the node '
                     f'subscribes to it as {wanted}: record it again, or correct the node')
         if new:
-            self._deliver_next(recording.messages(new, self.loop.now))
+            self._deliver_next(recording.messages(new, self._loop.now))
 
     def _deliver_next(self, coming: Iterator[RecordedMessage]) -> None:
         def deliver(message: RecordedMessage) -> None:
@@ -287,22 +337,22 @@ class Messages:
             self._deliver_next(coming)
 
         for message in coming:
-            self.loop.at(message.time, RECORDED, deliver, message)
+            self._loop.at(message.time, RECORDED, deliver, message)
             break
 
     def _recorded(self, topic: str, data: bytes, published: int) -> None:
         if topic in self.offered:
             return  # the node's count
         self._last[topic] = published, data
-        for inlet in self.inlets.get(topic, ()):
+        for inlet in self._inlets.get(topic, ()):
             self._arrive(inlet, data, published, None)
 
     def _publish_time(self) -> None:
-        now = self.loop.now
+        now = self._loop.now
         stamp = Time(nanoseconds=now).to_msg()
         self._recorded(CLOCK, serialize_message(Clock(clock=stamp)), now)
-        if now + CLOCK_EVERY_NS < self.loop.end:
-            self.loop.at(now + CLOCK_EVERY_NS, RECORDED, self._publish_time)
+        if now + CLOCK_EVERY_NS < self._loop.end:
+            self._loop.at(now + CLOCK_EVERY_NS, RECORDED, self._publish_time)
 
     # --- what arrives ----------------------------------------------------------------------------
 
@@ -310,7 +360,7 @@ class Messages:
         self, inlet: Inlet, data: bytes, source_stamp: int, origin: Origin | None, number: int = 0
     ) -> None:
         """Have a subscription's callback run with a message."""
-        entity, now, engine = inlet.entity, self.loop.now, self._engine
+        entity, now, engine = inlet.entity, self._loop.now, self._engine
         if entity.removed:
             return
         message = self._message(inlet, data)
@@ -342,7 +392,7 @@ class Messages:
         stamp = header_stamp(message)
         if kind == 'header_stamp' and stamp >= 0:
             return stamp, stamp
-        return source_stamp if kind == 'source_timestamp' else self.loop.now, stamp
+        return source_stamp if kind == 'source_timestamp' else self._loop.now, stamp
 
     def _message(self, inlet: Inlet, data: bytes) -> Any:
         if inlet.raw:
@@ -352,6 +402,6 @@ class Messages:
         except Exception as error:
             raise RerunError(
                 f'{inlet.entity.label}: a message of it does not decode as '
-                f'{type_name(inlet.kind)}, at {(self.loop.now - self.loop.start) / 1e9:.6f} s '
+                f'{type_name(inlet.kind)}, at {(self._loop.now - self._loop.start) / 1e9:.6f} s '
                 f'({" ".join(str(error).split())[:120]}): record it with the type that the node '
                 'has') from None

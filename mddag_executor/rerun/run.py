@@ -38,7 +38,6 @@ from mddag_executor.hosting.loading import describe, Program, ros_arguments
 from mddag_executor.replacements import Replacements
 from mddag_executor.rerun.clocks import VirtualTime
 from mddag_executor.rerun.compare import Difference, differences
-from mddag_executor.rerun.discovery import Discovery
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.executor import NodeHolder, RerunHost
@@ -189,8 +188,7 @@ class Rerun:
         virtual = VirtualTime(
             self._loop, self._settings.all_clocks, CLOCK in self._recording.topics,
             self._settings.seed)
-        for each in (virtual, self._timers, self._requests, self._messages,
-                     Discovery(self._messages, self._recording)):
+        for each in (virtual, self._timers, self._requests, self._messages):
             each.install(replacements)
         replacements.replace(GuardCondition, 'trigger', self._trigger)
 
