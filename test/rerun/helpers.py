@@ -1,16 +1,20 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A bag, and a graph for it."""
+"""A bag, a graph for it, and a node that notes what it sees."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from mcap.writer import Writer
+from mddag_executor.rerun import rerun, Result
 from mddag_executor.rerun.message_types import definition, type_name
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
 from rclpy.serialization import serialize_message
+from std_msgs.msg import Header
 
 START = 1_700_000_000_000_000_000
 MS = 1_000_000
@@ -48,3 +52,40 @@ def write_bag(path: Path, messages: Iterable[tuple[int, str, Any]]) -> str:
             writer.add_message(channels[topic], START + time, data, START + time)
         writer.finish()
     return str(path)
+
+
+Seen = list[tuple[float, Any]]
+
+
+class Filter(Node):
+    """The declared node; what it does with each message is given."""
+
+    def __init__(self, take: Callable[[Filter, int], Any], **more: Any) -> None:
+        super().__init__('filter', **more)
+        self.group = ReentrantCallbackGroup()
+        self.seen: Seen = []
+        self.create_subscription(
+            Header, '/points', lambda message: take(self, int(message.frame_id)), 10,
+            callback_group=self.group)
+
+    def note(self, what: Any) -> None:
+        """Note something with the virtual time, ms after the start."""
+        self.seen.append(((self.get_clock().now().nanoseconds - START) / MS, what))
+
+
+def run_filter(
+    bag: str, graph: Path, take: Callable[[Filter, int], Any] = lambda node, number: None,
+    *others: Any,
+    fill: Callable[[Filter], Any] = lambda node: None, **more: Any,
+) -> tuple[Seen, Result]:
+    """Rerun the node; return what it noted."""
+    nodes: list[Filter] = []
+
+    def make():
+        node = Filter(take)
+        fill(node)
+        nodes.append(node)
+        return node
+
+    result = rerun(bag, graph, [make, *others], **more)
+    return nodes[0].seen, result

@@ -28,14 +28,13 @@ from msg_graph import load
 import numpy
 import pytest
 import rclpy
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Float64, Header, String
 
-from .helpers import GRAPH, MS, START, write_bag
+from .helpers import GRAPH, MS, run_filter, START, write_bag
 
 GAIN = 2.0
 
@@ -153,48 +152,21 @@ def test_what_was_published_early_leaves_early(bag, graph, cpus):
 
 # --- timers, seeds, what is kept -----------------------------------------------------------------
 
-def node_with(function: Callable[[Node], None], name: str = 'filter') -> Callable[[], Node]:
-    def make():
-        node = rclpy.create_node(name)
-        function(node)
-        return node
-
-    return make
-
-
 def test_timers_fire_at_their_virtual_times(bag, graph):
-    seen: list[float] = []
-
     def fill(node):
-        node.create_subscription(Header, '/points', lambda message: None, 10)
-
         def tick():
-            seen.append((node.get_clock().now().nanoseconds - START) / MS)
-            if len(seen) == 3:
+            node.note('first')
+            if len(node.seen) == 3:
                 timer.timer_period_ns = 500 * MS
-            elif len(seen) == 5:
+            elif len(node.seen) == 5:
                 timer.cancel()
-                node.create_timer(0.3, again)
-
-        def again():
-            seen.append(-(node.get_clock().now().nanoseconds - START) / MS)
+                node.create_timer(0.3, lambda: node.note('second'))
 
         timer = node.create_timer(0.03, tick)
 
-    rerun(bag, graph, [node_with(fill)])
-    assert seen == [30, 60, 90, 120, 620, -920, -1220, -1520, -1820]
-
-
-def test_random_numbers_are_those_of_the_seed(bag, graph):
-    seen: list[float] = []
-
-    def fill(node):
-        node.create_subscription(
-            Header, '/points', lambda message: seen.append(random.random()), 10)
-
-    for seed in (1, 1, 2):
-        rerun(bag, graph, [node_with(fill)], seed=seed)
-    assert seen[:20] == seen[20:40] != seen[40:]
+    seen, _ = run_filter(bag, graph, fill=fill)
+    assert seen == [(time, 'first') for time in (30, 60, 90, 120, 620)] + [
+        (time, 'second') for time in (920, 1220, 1520, 1820)]
 
 
 def seeded(function: Callable[[], None]) -> float:
@@ -203,19 +175,16 @@ def seeded(function: Callable[[], None]) -> float:
 
 
 @pytest.mark.parametrize('draw', [
+    random.random,
     lambda: random.Random().random(),
     lambda: seeded(random.seed),
     lambda: numpy.random.default_rng().random(),
     lambda: numpy.random.RandomState().random_sample(),
 ])
-def test_generators_without_a_seed_get_one(bag, graph, draw):
+def test_random_numbers_are_those_of_the_seed(bag, graph, draw):
     seen: list[float] = []
-
-    def fill(node):
-        node.create_subscription(Header, '/points', lambda message: seen.append(draw()), 10)
-
     for seed in (1, 1, 2):
-        rerun(bag, graph, [node_with(fill)], seed=seed)
+        run_filter(bag, graph, lambda node, number: seen.append(draw()), seed=seed)
     assert len({*seen[:20]}) == 20
     assert seen[:20] == seen[20:40]
     assert not {*seen[:20]} & {*seen[40:]}
@@ -228,74 +197,64 @@ def test_nothing_happens_in_a_pause_of_the_recording(tmp_path, graph):
     bag = write_bag(tmp_path / 'in.mcap', [
         (time * MS, '/points', Header(frame_id=str(time)))
         for time in (0, 100, later + 7, later + 107)])
-    ticks: list[float] = []
-    woken: list[float] = []
-
     def fill(node):
-        def now():
-            return (node.get_clock().now().nanoseconds - START) / MS
-
         def sleep():
             for _ in range(3):
                 node.get_clock().sleep_for(Duration(seconds=4))
-                woken.append(now())
+                node.note('woken')
 
-        node.create_subscription(Header, '/points', lambda message: None, 10)
-        node.create_timer(
-            0.03, lambda: ticks.append(now()), callback_group=ReentrantCallbackGroup())
+        node.create_timer(0.03, lambda: node.note('tick'), callback_group=node.group)
         threading.Thread(target=sleep, daemon=True).start()
 
-    result = rerun(bag, graph, [node_with(fill)])
+    seen, result = run_filter(bag, graph, fill=fill)
     # At once, and then in the phase of before: 300 days are a multiple of 30 ms.
-    assert ticks == [30, 60, 90, later + 7, later + 30, later + 60, later + 90]
-    assert woken == [4000, 8000, later + 7]
+    assert [time for time, what in seen if what == 'tick'] == [
+        30, 60, 90, later + 7, later + 30, later + 60, later + 90]
+    assert [time for time, what in seen if what == 'woken'] == [4000, 8000, later + 7]
     assert result.warnings == [
         f'{bag}: timers do not fire in 1 pause of over a minute without any message']
 
 
 def test_a_message_is_as_it_was_published(bag, graph):
     """Who publishes may change a message afterwards, and who receives it has one of his own."""
-    seen: list[str] = []
+    received: list[str] = []
 
-    def publishing(node):
-        publisher = node.create_publisher(String, '/names', 10)
-        message = String()
+    def fill(node):
+        node.names = node.create_publisher(String, '/names', 10)
+        node.message = String()
 
-        def take(header):
-            message.data = header.frame_id
-            publisher.publish(message)
-            message.data = 'changed'
+    def take(node, number):
+        node.message.data = str(number)
+        node.names.publish(node.message)
+        node.message.data = 'changed'
 
-        node.create_subscription(Header, '/points', take, 10)
-
-    def taking(node):
+    def other():
         def take(message):
-            seen.append(message.data)
+            received.append(message.data)
             message.data = 'mine'
 
+        node = rclpy.create_node('other')
         node.create_subscription(String, '/names', take, 10)
         node.create_subscription(String, '/names', take, 10)
+        return node
 
-    rerun(bag, graph, [node_with(publishing), node_with(taking, 'other')])
-    assert seen == [str(i) for i in range(20) for _ in range(2)]
+    run_filter(bag, graph, take, other, fill=fill)
+    assert received == [str(i) for i in range(20) for _ in range(2)]
 
 
 def test_late_subscriptions_get_what_is_latched(bag, graph):
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    seen: list[str] = []
 
-    def fill(node):
-        node.create_publisher(String, '/map', latched).publish(String(data='a map'))
+    def take(node, number):
+        if number == 3:
+            node.create_subscription(String, '/map', lambda m: node.note(m.data), latched)
+            node.create_subscription(String, '/map', lambda m: node.note('?'), 10)
 
-        def take(message):
-            if message.frame_id == '3':
-                node.create_subscription(String, '/map', lambda m: seen.append(m.data), latched)
-                node.create_subscription(String, '/map', lambda m: seen.append('?'), 10)
-
-        node.create_subscription(Header, '/points', take, 10)
-
-    rerun(bag, graph, [node_with(fill)])
-    assert seen == ['a map']
+    seen, _ = run_filter(
+        bag, graph, take,
+        fill=lambda node: node.create_publisher(String, '/map', latched).publish(
+            String(data='a map')))
+    assert [what for _, what in seen] == ['a map']
 
 
 # --- comparing -----------------------------------------------------------------------------------
@@ -318,9 +277,8 @@ def test_a_changed_constant_is_found(bag, graph, tmp_path, monkeypatch):
 
 def test_a_circle_that_takes_no_time(bag, graph):
     def fill(node):
-        publisher = node.create_publisher(Header, '/round', 10)
-        node.create_subscription(Header, '/round', publisher.publish, 10)
-        node.create_subscription(Header, '/points', publisher.publish, 10)
+        node.round = node.create_publisher(Header, '/round', 10)
+        node.create_subscription(Header, '/round', node.round.publish, 10)
 
     with pytest.raises(RerunError, match='virtual time does not advance after 0.010000 s'):
-        rerun(bag, graph, [node_with(fill)])
+        run_filter(bag, graph, lambda node, number: node.round.publish(Header()), fill=fill)

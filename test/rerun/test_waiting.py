@@ -4,11 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 import inspect
-from pathlib import Path
 import queue
 import socket
 import subprocess
@@ -19,7 +17,7 @@ from typing import Any
 
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
-from mddag_executor.rerun import rerun, Result
+from mddag_executor.rerun import rerun
 import pytest
 import rclpy
 from rclpy.action import ActionClient, ActionServer, CancelResponse
@@ -33,42 +31,7 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
-from .helpers import MS, START, write_bag
-
-Seen = list[tuple[float, Any]]
-
-
-class Filter(Node):
-    """The declared node; what it does with each message is given."""
-
-    def __init__(self, take: Callable[[Filter, int], Any], **more: Any) -> None:
-        super().__init__('filter', **more)
-        self.group = ReentrantCallbackGroup()
-        self.seen: Seen = []
-        self.create_subscription(
-            Header, '/points', lambda message: take(self, int(message.frame_id)), 10,
-            callback_group=self.group)
-
-    def note(self, what: Any) -> None:
-        """Note something with the virtual time, ms after the start."""
-        self.seen.append(((self.get_clock().now().nanoseconds - START) / MS, what))
-
-
-def run_filter(
-    bag: str, graph: Path, take: Callable[[Filter, int], Any], *others: Any,
-    fill: Callable[[Filter], None] = lambda node: None, **more: Any,
-) -> tuple[Seen, Result]:
-    """Rerun the node; return what it noted."""
-    nodes: list[Filter] = []
-
-    def make():
-        node = Filter(take)
-        fill(node)
-        nodes.append(node)
-        return node
-
-    result = rerun(bag, graph, [make, *others], **more)
-    return nodes[0].seen, result
+from .helpers import Filter, MS, run_filter, write_bag
 
 
 def server(answers_after_ms: float | None = None) -> Node:
@@ -227,7 +190,7 @@ def test_an_action(bag, graph):
 # --- programs ------------------------------------------------------------------------------------
 
 def test_a_program_with_a_loop_of_its_own(bag, graph):
-    seen: Seen = []
+    seen: list[Any] = []
 
     def main():
         rclpy.init()
