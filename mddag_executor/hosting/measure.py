@@ -31,15 +31,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-import math
 import random
 import time
 from typing import Any, Literal, NamedTuple
 
 from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.core.tally import quantiles_us, SinkTally
-from mddag_executor.errors import MddagError
-from mddag_executor.simulate.workload import draw_execution_times
+from mddag_executor.simulate.workload import draw_execution_times, scale_execution_times
 from mddag_executor.simulate.workload import utilisation as normalised
 from msg_graph import Dag, TaskSet, Vertex
 from msg_graph.model import path_lengths
@@ -50,10 +48,6 @@ BODIES: tuple[Body, ...] = ('sleep', 'spin', 'native')
 
 _EARLY_NS = 1_000_000
 """How much before its nominal time a release may be noted, ns: clocks are read twice."""
-
-
-class PlanError(MddagError):
-    """An execution plan that cannot be made from this declaration."""
 
 
 class Infeasible(NamedTuple):
@@ -73,7 +67,7 @@ class ExecutionPlan:
     :param utilisation: normalised utilisation to scale to; None: the draw is not scaled.
     :param workers: the number of workers for normalisation.
     :param mode: the emulation: one of ``BODIES``, or ``mixed``, which draws it for each callback.
-    :raises PlanError: when a utilisation is requested and no execution time is declared.
+    :raises UsageError: when a utilisation is requested and no execution time is declared.
     """
 
     def __init__(
@@ -88,19 +82,9 @@ class ExecutionPlan:
         self.workers = workers
         self.mode: Mode = mode
         self.task_set = task_set
-        drawn = draw_execution_times(task_set, seed, undeclared=0)
-        self.factor = 1.0
+        self._times = draw_execution_times(task_set, seed, undeclared=0)
         if utilisation is not None:
-            if not (utilisation > 0 and math.isfinite(utilisation)):
-                raise PlanError(
-                    f'utilisation {utilisation}: this is not a number above zero: give one as 0.6')
-            before = normalised(task_set, drawn, workers)
-            if before == 0:
-                raise PlanError(
-                    f'{task_set.file}: no callback has an execution time, so there is nothing to '
-                    'scale: declare execution_time, or leave the utilisation out')
-            self.factor = utilisation / before
-        self._times = [[round(c * self.factor) for c in dag] for dag in drawn]
+            self._times = scale_execution_times(task_set, self._times, workers, utilisation)
 
     @property
     def utilisation(self) -> float:

@@ -102,7 +102,7 @@ def measure_peer(
     :param executor: ``single``, ``multi`` or ``events``.
     :param seconds: duration of the measurement, after ``WARM_UP_S``.
     :raises ChildError: when the run cannot be made.
-    :raises mddag_executor.hosting.measure.PlanError: when no execution time is declared.
+    :raises mddag_executor.errors.UsageError: when no execution time is declared.
     """
     task_set = load(graph)
     plan = ExecutionPlan(task_set, seed, utilisation, workers, mode)

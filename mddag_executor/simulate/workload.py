@@ -136,7 +136,9 @@ def scale_execution_times(
         raise UsageError(
             f'utilisation {target}: it is not a number above zero: give one, as 0.6')
     if now == 0:
-        raise UsageError('utilisation: all execution times are 0: give times to scale')
+        raise UsageError(
+            f'{task_set.file}: no callback has an execution time, so there is nothing to scale: '
+            'declare execution_time, or leave the utilisation out')
     factor = target / now
     return [[round(time * factor) for time in row] for row in times]
 

@@ -8,8 +8,8 @@ import signal
 import subprocess
 import sys
 
+from mddag_executor.errors import UsageError
 from mddag_executor.hosting.child import ChildError, CrashError, run_child
-from mddag_executor.hosting.measure import PlanError
 from mddag_executor.hosting.peers import measure_peer
 from msg_graph import GraphError
 import pytest
@@ -40,7 +40,7 @@ def test_what_is_wrong_is_one_line(tmp_path):
         measure_peer('multi', str(tmp_path / 'bad.yaml'), 2, seconds=1.0, seed=0, utilisation=0.1,
                      mode='sleep')
     (tmp_path / 'untimed.yaml').write_text(GRAPH.replace(', execution_time: 1ms', ''))
-    with pytest.raises(PlanError, match='untimed.yaml: no callback has an execution time'):
+    with pytest.raises(UsageError, match='untimed.yaml: no callback has an execution time'):
         measure_peer('multi', str(tmp_path / 'untimed.yaml'), 2, seconds=1.0, seed=0,
                      utilisation=0.1, mode='sleep')
 
