@@ -33,6 +33,7 @@ from rclpy.subscription import Subscription
 from rclpy.task import Future, Task
 from rclpy.time_source import TimeSource
 import rclpy.timer
+from rclpy.waitable import Waitable
 
 RCLError: type[Exception] = _rclpy.RCLError
 """The error of rcl. From 7.1.8 on it is also ``rclpy.subscription.RCLError``."""
@@ -44,7 +45,7 @@ RCL_ERRORS = (InvalidHandle, RCLError)
 def alive(entity: Any) -> bool:
     """Return whether a node or an entity has not been destroyed."""
     try:
-        with entity.handle:
+        with entity if isinstance(entity, Waitable) else entity.handle:
             return True
     except InvalidHandle:
         return False

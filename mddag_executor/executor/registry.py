@@ -63,17 +63,6 @@ def _listed(node: Node, name: str) -> list[Any]:
     return found
 
 
-_TopicsOf = Callable[[Entity], set[str]]
-
-
-def _topics_published(entity: Entity) -> set[str]:
-    return entity.publishes
-
-
-def _topics_received(entity: Entity) -> set[str]:
-    return {entity.topic} if entity.ready else set()
-
-
 class Registry:
     """
     The records of all entities of the executor's nodes.
@@ -104,9 +93,10 @@ class Registry:
         # destroyed entities with unfinished executions, and the counts of earlier ones
         self._retired: list[Entity] = []
         self._past: dict[str, dict[str, Any]] = {}
-        # by kind and declared callback: the topics of retired entities
-        self._past_topics: dict[_TopicsOf, dict[str, set[str]]] = {
-            _topics_published: {}, _topics_received: {}}
+        # by declared callback: the topics that its entities, also removed ones, have published
+        # (they share the set), and have got messages of
+        self._published: dict[str, set[str]] = {c.key: set() for c in self.declared}
+        self._received: dict[str, set[str]] = {c.key: set() for c in self.declared}
         self._undeclared: dict[binding.Entity, None] = {}
         self._names: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
 
@@ -182,32 +172,24 @@ class Registry:
         for entity in retired:
             if entity.is_through():
                 entity.count_into(self._past)
-                if entity.callback is not None:
-                    for topics_of, past in self._past_topics.items():
-                        past.setdefault(entity.callback.key, set()).update(topics_of(entity))
+                self._note_received(entity)
             else:
                 self._retired.append(entity)
 
     def publishes(self) -> dict[str, set[str]]:
         """Return on which topics each declared callback has published."""
-        return self._topics(self.declared, _topics_published)
+        return {key: set(topics) for key, topics in self._published.items()}
 
     def came(self) -> dict[str, set[str]]:
         """Return of which topics each sync has got messages."""
-        syncs = [callback for callback in self.declared if callback.kind == 'sync']
-        return self._topics(syncs, _topics_received)
-
-    def _topics(
-        self, callbacks: Iterable[Callback], topics_of: _TopicsOf
-    ) -> dict[str, set[str]]:
-        """Return by callback the topics of its entities, also of removed ones."""
         with self._counting:
-            past = self._past_topics[topics_of]
-            found = {callback.key: set(past.get(callback.key, ())) for callback in callbacks}
             for entity in (*self._retired, *self.by_id.values()):
-                if entity.callback is not None and entity.callback.key in found:
-                    found[entity.callback.key] |= topics_of(entity)
-        return found
+                self._note_received(entity)
+            return {c.key: set(self._received[c.key]) for c in self.declared if c.kind == 'sync'}
+
+    def _note_received(self, entity: Entity) -> None:
+        if entity.callback is not None and entity.ready:
+            self._received[entity.callback.key].add(entity.topic)
 
     def counts(self) -> dict[str, dict[str, Any]]:
         """Return the counts of all entities, also removed ones, by callback (see ``Entity``)."""
@@ -289,10 +271,8 @@ class Registry:
                 label = service_name(rclpy_entity)
             elif kind == GUARD:
                 label = 'condition'
-        except Exception as error:
-            if type(error).__name__ == 'InvalidHandle':
-                return None  # destroyed after it was listed
-            raise
+        except InvalidHandle:
+            return None  # destroyed after it was listed
         bindable = binding.Entity(node, kind, '' if kind == TIMER else label, period)
         if kind in (TIMER, SUBSCRIPTION, SERVICE) and self._binder is not None:
             callback = self._binder.bind(bindable)
@@ -314,6 +294,7 @@ class Registry:
         if callback is not None:
             assert self._task_set is not None
             link(entity, self._task_set, self._tables, topic)
+            entity.publishes = self._published[callback.key]
             if kind == TIMER and entity.source >= 0:
                 dag = self._tables.dag_of[entity.source]
                 entity.depth = self._tables.source_depth(dag)

@@ -181,21 +181,13 @@ def call_with_living(
     :return: the result; None when none is left.
     """
     before = len(entities) + 1
-    while 0 < len(living := [each for each in entities if _is_alive(each)]) < before:
+    while 0 < len(living := [each for each in entities if compat.alive(each.rclpy)]) < before:
         before = len(living)
         try:
             return call(living)
         except InvalidHandle:
             pass
     return None
-
-
-def _is_alive(entity: Entity) -> bool:
-    try:
-        with entity.rclpy:
-            return True
-    except InvalidHandle:
-        return False
 
 
 def is_qos_event(waitable: Waitable) -> bool:
@@ -348,14 +340,7 @@ class WaitSetThread:
 
     def _build(self, entities: list[Entity]) -> FilledSet:
         own = [self._guard] + ([self._signals] if self._signals is not None else [])
-        alive = []
-        for entity in entities:
-            try:
-                held = entity.rclpy if isinstance(entity.rclpy, Waitable) else entity.rclpy.handle
-                with held:
-                    alive.append(entity.rclpy)
-            except InvalidHandle:
-                continue
+        alive = [each.rclpy for each in entities if compat.alive(each.rclpy)]
         return FilledSet(
             self._context, [each for each in alive if isinstance(each, Waitable)],
             [*own, *(each for each in alive if not isinstance(each, Waitable))])

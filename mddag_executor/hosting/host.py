@@ -42,14 +42,13 @@ import time
 from typing import Any
 import weakref
 
-from mddag_executor.executor.compat import executor_kept
+from mddag_executor.executor.compat import alive, executor_kept
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
 from mddag_executor.hosting.guest_signals import GuestSignals
 from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
 from mddag_executor.replacements import instead, Replacements
 import rclpy
 from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
@@ -270,10 +269,7 @@ class Host:
         if self.executor is None:
             raise RuntimeError('a module spins a node while it is imported')
         for each in [] if guest is None else list(guest.nodes):
-            try:
-                with each.handle:
-                    pass
-            except InvalidHandle:  # it was destroyed
+            if not alive(each):
                 self.release(each, guest)
         if self._is_ending() or self.is_over(guest):
             return
