@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 import json
 import math
 import random
@@ -159,20 +160,10 @@ def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns
         (job * dag.period_ns, dag.index, job)
         for dag in task_set.dags
         for job in range(-(-duration_ns // dag.period_ns)))
-    bases = []
-    costs: list[int] = []
-    for row in times:
-        bases.append(len(costs))
-        costs.extend(row)
-    holds = declared_holds(task_set)
+    holds = [number * int(vertex.callback.holds_interpreter or False)
+             for number, vertex in zip(processes_of(task_set), task_set.vertices)]
     return Load(
-        [r[0] for r in releases], [r[1] for r in releases], [r[2] for r in releases],
-        costs, bases, [0] * len(bases), [], [each for row in holds for each in row])
-
-
-def declared_holds(task_set: TaskSet) -> list[list[int]]:
-    """Return by DAG the interpreter that each vertex holds, 0: none; empty if no vertex does."""
-    number = iter(processes_of(task_set))
-    holds = [[next(number) * int(vertex.callback.holds_interpreter or False)
-              for vertex in dag.vertices] for dag in task_set.dags]
-    return holds if any(map(any, holds)) else []
+        [each[0] for each in releases], [each[1] for each in releases],
+        [each[2] for each in releases], costs=[time for row in times for time in row],
+        cost_base=list(accumulate(map(len, times), initial=0))[:-1],
+        cost_stride=[0] * len(times), holds=holds if any(holds) else [])
