@@ -16,7 +16,7 @@ The uniform numbers of run r of seed s come from a counter-based generator (Phil
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ import zlib
 from mddag_executor.core import rad_offsets
 from mddag_executor.errors import InputError
 from mddag_executor.simulate.workload import check_execution_times
-from msg_graph import TaskSet
+from msg_graph import Dag, TaskSet
 from msg_graph.duration import DAY
 from msg_graph.model import topological_order
 import numpy as np
@@ -132,13 +132,19 @@ def _from_table(table: Any, uniform: Floats) -> Times:
     return np.maximum(drawn, 1)
 
 
+def _by_dag(task_set: TaskSet, times: Times) -> Iterator[tuple[Dag, Times]]:
+    """Yield each DAG with the columns of its vertices."""
+    first = 0
+    for dag in task_set.dags:
+        yield dag, times[:, first:first + len(dag.vertices)]
+        first += len(dag.vertices)
+
+
 def utilisations(task_set: TaskSet, times: Times, workers: int) -> Floats:
     """Return each run's normalised utilisation: sum of execution time over period, by workers."""
     total = np.zeros(len(times))
-    first = 0
-    for dag in task_set.dags:
-        total += times[:, first:first + len(dag.vertices)].sum(axis=1) / dag.period_ns
-        first += len(dag.vertices)
+    for dag, of_dag in _by_dag(task_set, times):
+        total += of_dag.sum(axis=1) / dag.period_ns
     return total / workers
 
 
@@ -164,15 +170,14 @@ def feasible(
     demand = np.zeros(len(times), dtype=np.float64)
     latest = np.zeros(len(times)) if horizon else _waiting(
         task_set, times, workers, duration_ns, overhead_ns)
-    first = 0
-    for dag in task_set.dags:
+    for dag, of_dag in _by_dag(task_set, times):
         offsets = rad_offsets(dag)
         lengths = np.empty((len(dag.vertices), len(times)), dtype=np.int64)
         # a vertex that has been preempted is dispatched again
         overheads = 2 * overhead_ns * len(dag.vertices)
         for index in topological_order(dag):
             vertex = dag.vertices[index]
-            lengths[index] = times[:, first + index]
+            lengths[index] = of_dag[:, index]
             if vertex.predecessors:
                 lengths[index] += lengths[list(vertex.predecessors)].max(axis=0)
             if vertex.deadline_ns is not None and vertex.deadline_ns <= duration_ns:
@@ -181,8 +186,7 @@ def feasible(
                     late &= lengths[index] + overheads + latest < duration_ns
                 possible &= ~late
             jobs = max(0, (duration_ns - offsets[index]) // dag.period_ns + 1)
-            demand += float(jobs) * times[:, first + index]
-        first += len(dag.vertices)
+            demand += float(jobs) * of_dag[:, index]
     return possible & (demand <= float(workers) * duration_ns) if horizon else possible
 
 
@@ -199,11 +203,7 @@ def _waiting(
         callback.group is not None or callback.holds_interpreter
         for callback in task_set.callbacks)
     work = np.zeros(len(times))
-    first = 0
-    for dag in task_set.dags:
-        jobs = -(-duration_ns // dag.period_ns)
-        end = first + len(dag.vertices)
-        work += jobs * (times[:, first:end] + 2 * overhead_ns).sum(axis=1)
-        first = end
+    for dag, of_dag in _by_dag(task_set, times):
+        work += -(-duration_ns // dag.period_ns) * (of_dag + 2 * overhead_ns).sum(axis=1)
     waiting: Floats = work / (1 if shared else workers)
     return waiting

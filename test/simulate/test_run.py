@@ -13,7 +13,7 @@ from typing import Any
 
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
-from mddag_executor.errors import UsageError
+from mddag_executor.errors import InputError, UsageError
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import (
@@ -29,7 +29,7 @@ from mddag_executor.simulate import (
     START,
     utilisation,
 )
-from msg_graph import loads, TaskSet
+from msg_graph import load, loads, TaskSet
 import pytest
 
 from ..core.task_sets import Case, cases, declaration, examples
@@ -110,6 +110,14 @@ def test_a_seed_draws_the_same_for_ever():
     """The draw is part of results that people publish: it must not change."""
     assert draw_execution_times(two_dags(), 1) == [[2_000, 2_695], [2_528, 1_000]]
     assert draw_execution_times(two_dags(), 2) == [[2_000, 2_896], [1_113, 1_000]]
+
+
+def test_a_callback_without_a_time_is_named_with_its_own_file(tmp_path):
+    (tmp_path / 'part.yaml').write_text(
+        'mddag: 1\nnodes:\n- node: /n\n  callbacks:\n  - {name: t, timer: 1ms, deadline: 1ms}\n')
+    (tmp_path / 'top.yaml').write_text('mddag: 1\ninclude: [part.yaml]\n')
+    with pytest.raises(InputError, match='part.yaml:5: /n:t declares no execution_time: add one'):
+        draw_execution_times(load(tmp_path / 'top.yaml'), 0)
 
 
 def test_utilisation_and_its_scaling():
