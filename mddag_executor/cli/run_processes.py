@@ -89,7 +89,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         signals.end_of(supervisor)
         supervisor.run(names, None if args.duration is None else args.duration / 1e9)
         parts = [left(folder, run.process.pid) for run in supervisor.runs]
-    results = [(run.name, each) for run, each in zip(supervisor.runs, parts) if each is not None]
+    results = {run.name: each for run, each in zip(supervisor.runs, parts) if each is not None}
     result = {
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
         'policy': args.policy, 'on_late': args.on_late,

@@ -123,50 +123,29 @@ def never_due(dags: Mapping[str, Any]) -> list[str]:
 
 
 def of_processes(
-    task_set: TaskSet, results: Iterable[tuple[str, Mapping[str, Any]]]
+    task_set: TaskSet, results: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
     """
     Combine the verdicts of a run's processes (``Tally.result``).
 
-    A sink is judged in its node's process, a job counted in its source's.  A restarted process has
-    several results; their response times have no common quantiles.
+    A sink is judged in its node's process, a job counted in its source's.
 
-    :param results: the name of the process, and its result.
+    :param results: by process, of those that have left one.
     """
-    results = list(results)
     dags: dict[str, Any] = {}
+    nothing: Mapping[str, Any] = {'jobs': 0, 'sinks': {}}
     for dag in task_set.dags:
-        home = task_set.process_of(dag.vertices[dag.source].callback.node)
-        sinks = {}
-        for index in dag.sinks:
-            vertex = dag.vertices[index]
-            judge = task_set.process_of(vertex.callback.node)
-            parts = [r['dags'][dag.name]['sinks'].get(vertex.name)
-                     for name, r in results if name == judge]
-            sinks[vertex.name] = _added(vertex.deadline_ns or 0, [p for p in parts if p])
-        dags[dag.name] = {'jobs': sum(r['dags'][dag.name]['jobs']
-                                      for name, r in results if name == home), 'sinks': sinks}
-    misses = [r['first_miss'] for _, r in results if r['first_miss'] is not None]
+        parts = {name: result['dags'][dag.name] for name, result in results.items()}
+        part_of = [parts.get(str(task_set.process_of(v.callback.node)), nothing)
+                   for v in dag.vertices]
+        dags[dag.name] = {'jobs': part_of[dag.source]['jobs'], 'sinks': {
+            vertex.name: part_of[vertex.index]['sinks'].get(vertex.name)
+            or SinkTally(vertex.deadline_ns or 0, None).result()
+            for vertex in (dag.vertices[sink] for sink in dag.sinks)}}
+    misses = [r['first_miss'] for r in results.values() if r['first_miss'] is not None]
     first = min(misses, key=lambda miss: int(miss['deadline_ns']), default=None)
     return {'deadline_missed': first is not None, 'first_miss': first,
             'never_due': never_due(dags), 'dags': dags}
-
-
-def _added(deadline: int, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the combined result of one sink."""
-    if len(parts) == 1:
-        return dict(parts[0])
-    result = SinkTally(deadline, None).result()
-    for part in parts:
-        for key in ('completed', 'late', 'overdue', 'expired', 'failed', 'aborted', 'dropped',
-                    'demoted'):
-            if key in part:
-                result[key] = result.get(key, 0) + part[key]
-        if 'tolerate' in part:
-            worst = result.get('tolerate', part['tolerate'])['worst']
-            result['tolerate'] = {
-                **part['tolerate'], 'worst': max(worst, part['tolerate']['worst'])}
-    return result
 
 
 class Latest:

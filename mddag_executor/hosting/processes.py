@@ -29,7 +29,7 @@ Theory of operation
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 import json
@@ -56,8 +56,8 @@ _LOOK_S = 0.02
 _BAD_INPUT = 2
 LEAD_NS = 100_000_000
 
-Results = Sequence[tuple[str, Mapping[str, Any]]]
-"""The name and the result of each process that has left a result."""
+Results = Mapping[str, Mapping[str, Any]]
+"""The result of each process that has left one, by name."""
 
 
 class ProcessError(MddagError):
@@ -328,13 +328,12 @@ def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) ->
 
     :param plan: of the synthetic nodes, if the run has such.
     """
-    parts = [result for _, result in results]
+    parts = list(results.values())
     callbacks: dict[str, dict[str, Any]] = {}
     for part in parts:  # executors' internal callbacks may share a name
         for name, counts in part['callbacks'].items():
             add_counts(callbacks, name, counts)
     ledgers = [part['ledger'] for part in parts if part['ledger'] is not None]
-    every = {process.name for process in task_set.processes}
     return {
         **of_processes(task_set, results),
         'stops': {key: sum(part['stops'][key] for part in parts)
@@ -348,34 +347,29 @@ def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) ->
         'never_ran': [c.key for c in task_set.callbacks
                       if not callbacks.get(c.key, {'ran': 0})['ran']],
         # the window that all of them measured
-        'measured': None if plan is None or {
-            name for name, part in results if part['ledger'] is not None} != every else measure(
-                Ledger.of_processes(task_set, ledgers), plan),
+        'measured': None if plan is None or len(ledgers) < len(task_set.processes) else measure(
+            Ledger.of_processes(task_set, ledgers), plan),
         'drift': [each.result() for each in drift(task_set, _observed(task_set, results))]}
 
 
 def _observed(task_set: TaskSet, results: Results) -> Observed:
     """Return the observations of the whole system: releases, where they happened."""
-    whole = Observed()
-    homes = {dag.vertices[dag.source].callback.key: task_set.process_of(
-        dag.vertices[dag.source].callback.node) for dag in task_set.dags}
-    undeclared: list[Entity] = []
+    parts = {name: result['observed'] for name, result in results.items()}
+    got, ran = Counter[str](), Counter[str]()
     publishes: dict[str, set[str]] = {}
     came: dict[str, set[str]] = {}
-    for name, result in results:
-        part = result['observed']
-        whole.duration_ns = max(whole.duration_ns, part['duration_ns'])
-        for key, releases in part['releases'].items():
-            if homes.get(key) == name:
-                whole.releases[key] = Releases(**releases)
-        for name_of in ('got', 'ran'):
-            sums = getattr(whole, name_of)
-            for key, count in part[name_of].items():
-                sums[key] = sums.get(key, 0) + count
-        for name_of, found in (('publishes', publishes), ('came', came)):
-            for key, topics in part[name_of].items():
+    for part in parts.values():
+        got.update(part['got'])
+        ran.update(part['ran'])
+        for found, here in ((publishes, part['publishes']), (came, part['came'])):
+            for key, topics in here.items():
                 found.setdefault(key, set()).update(topics)
-        undeclared += [Entity(*entity) for entity in part['undeclared']]
-    whole.publishes, whole.came = {**publishes}, {**came}
-    whole.undeclared = undeclared
-    return whole
+    releases = {}
+    for source in (dag.vertices[dag.source].callback for dag in task_set.dags):
+        home = parts.get(str(task_set.process_of(source.node)))
+        if home is not None:
+            releases[source.key] = Releases(**home['releases'][source.key])
+    return Observed(
+        duration_ns=max((part['duration_ns'] for part in parts.values()), default=0),
+        releases=releases, got=got, ran=ran, came=came, publishes={**publishes},
+        undeclared=[Entity(*each) for part in parts.values() for each in part['undeclared']])
