@@ -33,6 +33,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 import json
+import math
 import os
 from pathlib import Path
 import signal
@@ -77,14 +78,13 @@ class Run:
 
     :ivar name: of the process in the declaration.
     :ivar status: its exit status, negative for a signal; None while it runs.
-    :ivar asked: it was sent SIGTERM; ``killed``: it did not end, and was killed.
+    :ivar asked: it was sent SIGTERM.
     """
 
     name: str
     process: subprocess.Popen[bytes]
     status: int | None = None
     asked: bool = False
-    killed: bool = False
     _words: deque[str] = field(default_factory=lambda: deque(maxlen=50))
     _errors: list[str] = field(default_factory=list)
     _threads: list[threading.Thread] = field(default_factory=list)
@@ -137,8 +137,8 @@ class Supervisor:
         self._on_end = on_end
         self._lock = threading.Lock()
         self._stop = False
-        self._asked_at: float | None = None
-        self._over_at: float | None = None
+        self._ask_at = math.inf
+        self._kill_at: float | None = None
 
     def stop(self, hurried: bool = False) -> None:
         """End the run; from any thread, also from a signal handler."""
@@ -163,7 +163,7 @@ class Supervisor:
                     if run.status is None and run.process.poll() is not None:
                         is_over = seconds is not None and now - begin >= seconds
                         self._ended(run, now, is_over)
-                self._end_if_asked(now)
+                self._end_if_due(now)
         finally:
             for run in self.runs:
                 if run.status is None:
@@ -216,31 +216,28 @@ class Supervisor:
         if run.status == _BAD_INPUT and not run.asked:
             raise ProcessError(f'process {run.name}: {run.said.removeprefix("error: ")}')
         self._on_end(run)
-        if is_over and not run.died and self._over_at is None:
-            self._over_at = now
+        if is_over and not run.died:
+            self._ask_at = min(self._ask_at, now + END_TIMEOUT_S)
         if not self._goes_on and (run.died or not is_over):
             self._stop = True
 
-    def _end_if_asked(self, now: float) -> None:
+    def _end_if_due(self, now: float) -> None:
         """Send SIGTERM to all processes once the run is over; kill those that do not end then."""
         running = [run for run in self.runs if run.status is None]
-        late = self._over_at is not None and now - self._over_at > END_TIMEOUT_S
-        if (self._stop or late) and self._asked_at is None:
-            self._asked_at = now
+        if self._kill_at is None and (self._stop or now > self._ask_at):
+            self._kill_at = now + END_TIMEOUT_S
             for run in running:
                 if not self._stop:
                     self._print(f'warning: process {run.name} has not ended with the others: it '
                                 'is asked to', self._err)
                 run.asked = True
                 run.process.terminate()
-            self._stop = True
-        elif self._asked_at is not None and now - self._asked_at > END_TIMEOUT_S:
+        elif self._kill_at is not None and now > self._kill_at:
             for run in running:
-                if not run.killed:
-                    self._print(f'warning: process {run.name} has not ended within '
-                                f'{END_TIMEOUT_S:g} s: it is killed', self._err)
-                    run.killed = True
-                    run.process.kill()
+                self._print(f'warning: process {run.name} has not ended within '
+                            f'{END_TIMEOUT_S:g} s: it is killed', self._err)
+                run.process.kill()
+                self._ended(run, now, is_over=True)
 
 
 @dataclass(frozen=True)
