@@ -136,35 +136,6 @@ def end_lines(found: Recording) -> list[str]:
     return lines
 
 
-class _Kind:
-    """The rows of one kind of event, and their positions in the file."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self.rows: list[Table] = []
-        self.places: list[Ints] = []
-
-    def add(self, found: Table, places: Ints) -> None:
-        self.rows.append(found)
-        self.places.append(places)
-
-    def joined(self) -> tuple[Table, Ints]:
-        """Return the rows as one table with the type of the first part."""
-        if not self.rows:
-            return _blank(self._name, 0), np.empty(0, dtype=np.int64)
-        names = self.rows[0].dtype.names
-        assert names is not None
-        kind = np.dtype([(each, np.result_type(*(part.dtype[each] for part in self.rows)))
-                         for each in names])
-        table = np.empty(sum(map(len, self.rows)), dtype=kind)
-        at = 0
-        for part in self.rows:
-            for each in names:
-                table[each][at:at + len(part)] = part[each]
-            at += len(part)
-        return table, np.concatenate(self.places)
-
-
 class _Source:
     """Reads one trace."""
 
@@ -178,7 +149,8 @@ class _Source:
         self._who = who
         #: The times of the core's events, by position in the order.
         self.seen_at = np.empty(0, dtype=np.int64)
-        self._kinds: dict[str, _Kind] = {}
+        # by kind of event its rows, and their positions in the file
+        self._kinds: dict[str, tuple[Growing, list[Ints]]] = {}
         # executions; positions of their dispatches, ends and completions; times of the latter
         self._executions = Growing(EXECUTIONS)
         self._dispatch_at: list[Ints] = []
@@ -219,7 +191,7 @@ class _Source:
             if None in event:
                 self._strange[f'{event[0]} without some of its fields'] += 1
             elif event[0] in _NUMBERS:
-                self._kind(event[0]).add(_one_row(event), np.array([place]))
+                self._add(event[0], _one_row(event), np.array([place]))
             else:
                 self._others.append((place, event))
         if all(kind in columns and columns[kind].size for kind in (_DISPATCH, _START, _END)):
@@ -230,10 +202,21 @@ class _Source:
     def _keep(self, batch: Batch, column: Column) -> None:
         if len(column.at):
             kind, found, places = batch.table(column)
-            self._kind(kind[0]).add(found, places)
+            self._add(kind[0], found, places)
 
-    def _kind(self, name: str) -> _Kind:
-        return self._kinds.setdefault(name, _Kind(name))
+    def _add(self, name: str, found: Table, places: Ints) -> None:
+        kind = _row_type(name)
+        table, all_places = self._kinds.setdefault(name, (Growing(kind), []))
+        table.add(rows(kind, len(found), **{field: found[field] for field in kind.names or ()}))
+        all_places.append(places)
+
+    def _pop(self, name: str) -> tuple[Table, Ints]:
+        """Return the rows of a kind of event, and their positions in the file; forget them."""
+        grown, places = self._kinds.pop(name, (Growing(_row_type(name)), []))
+        table = grown.table()
+        if name in _CORE:
+            self._last_seen = max(self._last_seen, int(table['timestamp'].max(initial=0)))
+        return table, np.concatenate([*places, np.empty(0, dtype=np.int64)])
 
     def _adjacent(self, batch: Batch, columns: dict[str, Column]) -> None:
         """Remove adjacent events of executions (rule 2)."""
@@ -325,16 +308,16 @@ class _Source:
         executions, complete_at, seen = self._all_executions()
         found.executions = executions
         found.publications = self._publications(executions)
-        released, released_at = self._kind(_RELEASE).joined()
+        released, released_at = self._pop(_RELEASE)
         found.releases, released_at = self._releases(released, released_at)
         found.job_ends, ends_at = self._job_ends()
         found.misses = self._misses()
         found.demotions = self._demotions()
-        stops, _ = self._kind(_STOP).joined()
+        stops, _ = self._pop(_STOP)
         found.notices_stops = earliest(stops['end'])
         stops = stops[stops['begin'] < stops['end']]    # the first one is empty: stops are noticed
         found.stops = rows(STOPS, len(stops), start=stops['begin'], end=stops['end'])
-        found.lost = sum(self._kind(_LOST).joined()[0]['count'].tolist())
+        found.lost = sum(self._pop(_LOST)[0]['count'].tolist())
         self._set_end(found)
         self._put_in_order(found, [
             (found.releases, found.releases['noticed'], released_at),
@@ -360,7 +343,7 @@ class _Source:
         end_at = _joined(self._end_at, rest_at)
         complete_at = _joined(self._complete_at, none)
         seen = _joined(self._seen, none)
-        self._last_seen = int(seen.max(initial=0))
+        self._last_seen = max(self._last_seen, int(seen.max(initial=0)))
         table = self._executions.table()
         more, more_at, more_seen = self._completions(table, dispatch_at, complete_at, seen)
         _pieces(table, end_at)
@@ -374,7 +357,7 @@ class _Source:
 
     def _by_thread(self) -> tuple[Table, Ints, Ints]:
         """Return executions of events that are not adjacent, and positions of begins and ends."""
-        found = [self._kind(kind).joined() for kind in (_DISPATCH, _START, _END)]
+        found = [self._pop(kind) for kind in (_DISPATCH, _START, _END)]
         dispatch = found[0][0]
         line = _Line([each for each, _ in found], [at for _, at in found])
         is_dispatch, is_end = line.kind == 0, line.kind == 2
@@ -403,7 +386,7 @@ class _Source:
         self, table: Table, dispatch_at: Ints, complete_at: Ints, seen: Ints
     ) -> tuple[Table, Ints, Ints]:
         """Assign the other completions to executions; return those without execution."""
-        complete, at = self._kind(_COMPLETE).joined()
+        complete, at = self._pop(_COMPLETE)
         if not len(complete):
             return rows(EXECUTIONS), at, at
         ended = np.flatnonzero((table['end'] >= 0) & (complete_at < 0))
@@ -453,7 +436,7 @@ class _Source:
         return more, at[rest], complete['timestamp'][rest].astype(np.int64)
 
     def _publications(self, executions: Table) -> Table:
-        published, _ = self._kind(_PUBLISH).joined()
+        published, _ = self._pop(_PUBLISH)
         time = published['timestamp'].astype(np.int64)
         if (time[1:] < time[:-1]).any():
             order = np.argsort(time, kind='stable')
@@ -492,7 +475,7 @@ class _Source:
     def _job_ends(self) -> tuple[Table, Ints]:
         tables, places = [rows(JOB_ENDS)], [np.empty(0, dtype=np.int64)]
         for kind, reason in _JOB_ENDS.items():
-            found, at = self._kind(kind).joined()
+            found, at = self._pop(kind)
             good = (found['dag'] >= 0) & (found['dag'] < len(self._task_set.dags))
             self._left_out(kind, 'of a DAG that is not declared', ~good)
             vertex = np.full(len(found), UNKNOWN)
@@ -506,21 +489,20 @@ class _Source:
         return np.concatenate(tables), np.concatenate(places)
 
     def _misses(self) -> Table:
-        found, _ = self._kind(_DEADLINE).joined()
+        found, _ = self._pop(_DEADLINE)
         dag, vertex = self._numbering.of(found['dag'], found['vertex'])
         return rows(MISSES, len(found), dag=dag, vertex=vertex, job=found['job'],
                     deadline=found['deadline'], completed=found['completed'])
 
     def _demotions(self) -> Table:
-        found, _ = self._kind(_DEMOTE).joined()
+        found, _ = self._pop(_DEMOTE)
         dag, vertex = self._numbering.of(found['dag'], found['vertex'])
         return rows(DEMOTIONS, len(found), dag=dag, vertex=vertex, job=found['job'],
                     time=found['timestamp'])
 
     def _set_end(self, found: Recording) -> None:
         """Find the end of the run, and process events that are not in tables."""
-        last = max([0, self._last_seen, *(
-            int(part['timestamp'].max()) for kind in _CORE for part in self._kind(kind).rows)])
+        last = self._last_seen
         drops, reasons, hosted = [], dict[str, int](), []
         for place, event in self._others:
             if event[0] == _DROP:
@@ -536,7 +518,7 @@ class _Source:
         vertex, job, time, reason = zip(*drops) if drops else ((), (), (), ())
         found.drops = rows(DROPS, len(drops), vertex=vertex, job=job, time=time, reason=reason)
         found.drop_reasons = tuple(reasons)
-        judging, judging_at = self._kind(_JUDGE_FROM).joined()
+        judging, judging_at = self._pop(_JUDGE_FROM)
         changes = []
         for now, release, place in zip(*(each.tolist() for each in (
                 judging['timestamp'], judging['release'], judging_at))):
@@ -549,7 +531,7 @@ class _Source:
         last = min(last, NEVER - 1)     # a run without end cannot be rescheduled
         found.end = found.judged_until = last
         self._shutdown_at: tuple[int, int] | None = None
-        shutdown, shutdown_at = self._kind(_SHUTDOWN).joined()
+        shutdown, shutdown_at = self._pop(_SHUTDOWN)
         if len(shutdown):
             now, judged = int(shutdown['timestamp'][0]), int(shutdown['end'][0])
             if last <= now < NEVER and 0 <= judged <= now:
@@ -585,7 +567,7 @@ class _Source:
         places = np.concatenate([
             complete_at[done], *(at for _, _, at in core),
             np.array([place for _, place in single], dtype=np.int64)])
-        rank = np.empty(len(times), dtype=np.int64)
+        rank = np.empty(len(times), dtype=np.int32)
         in_order = sort_by(times, places)
         rank[in_order] = np.arange(len(times))
         self.seen_at = times[in_order]
@@ -745,15 +727,12 @@ def running_at(executions: Table, thread: Ints, time: Ints) -> Ints:
     return found
 
 
-def _blank(name: str, length: int) -> Table:
-    """Return rows of a kind of event that has only numbers."""
-    return np.zeros(length, dtype=[
-        (field, 'u8' if kind == 'uint64' else 'i8')
-        for field, kind in (*PREAMBLE, *EVENTS[name].fields)])
+def _row_type(name: str) -> np.dtype[Any]:
+    """Return the type of rows of a kind of event that has only numbers."""
+    return np.dtype([(field, 'u8' if kind == 'uint64' else 'i8')
+                     for field, kind in (*PREAMBLE, *EVENTS[name].fields)])
 
 
 def _one_row(event: Event) -> Table:
-    table = _blank(event[0], 1)
-    for name, value in zip(table.dtype.names or (), event[1:]):
-        table[name] = value
-    return table
+    kind = _row_type(event[0])
+    return rows(kind, 1, **dict(zip(kind.names or (), event[1:])))

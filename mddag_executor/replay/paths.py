@@ -56,6 +56,7 @@ from typing import Any, Literal, NamedTuple
 
 from mddag_executor.recording.tables import (
     EXECUTIONS,
+    Growing,
     Ints,
     last_of,
     look_up,
@@ -375,15 +376,18 @@ class _Steps:
 
     def __init__(self) -> None:
         self._n = 0
-        self._parts: list[tuple[int, Ints, bool, Ints]] = []
+        self._rows = Growing(STEPS)
         self._ends: list[tuple[Ints, Ints]] = []
 
     def add(self, position: int, parent: Ints, is_run: bool, times: Ints) -> Ints:
         """Add steps that have a parent, or begin the path; return their numbers."""
         wanted = (parent != NONE) | (position == 0)
         numbers = np.where(wanted, self._n + np.cumsum(wanted) - 1, NONE)
-        self._n += int(wanted.sum())
-        self._parts.append((position, parent[wanted], is_run, times[wanted]))
+        n = int(wanted.sum())
+        self._n += n
+        self._rows.add(rows(
+            STEPS, n, parent=parent[wanted], position=position, is_run=is_run, time=times[wanted],
+            end=NONE))
         return numbers
 
     def end(self, steps: Ints, times: Ints) -> None:
@@ -392,13 +396,7 @@ class _Steps:
 
     def table(self) -> Table:
         """Return the steps as a table of ``STEPS``."""
-        lengths = [len(parent) for _, parent, *_ in self._parts]
-        table = np.zeros(self._n, dtype=STEPS)
-        table['position'] = np.repeat([position for position, *_ in self._parts], lengths)
-        table['is_run'] = np.repeat([is_run for *_, is_run, _ in self._parts], lengths)
-        table['parent'] = np.concatenate([parent for _, parent, *_ in self._parts])
-        table['time'] = np.concatenate([times for *_, times in self._parts])
-        table['end'] = NONE
+        table = self._rows.table()
         for steps, times in self._ends:
             table['end'][steps] = times
         return table
