@@ -23,7 +23,7 @@ that times never decrease.  The engine and ``other_processes`` change the core's
 4.  *The bypass.*  While nothing is waiting, running or owning a callback group in the core, short
     undeclared callbacks run one after the other, in the order in which they became ready, and the
     core does not know of them.  It would choose the same.  As soon as there is anything else to
-    choose from (a declared or long callback, a second thread), ``_end_bypass`` reports the running
+    choose from (a declared or long callback, a second thread), ``_core`` reports the running
     one and the waiting ones to the core.
 5.  *Further decisions* of the core (verdicts, ends of jobs, executions dropped by an abort) are
     counted, recorded and reported to the user (``verdicts``).
@@ -231,17 +231,19 @@ class Engine:
             state.ready or state.held_back or state.unpolled
             or state.scalars[N_IDLE] < self.n_workers or max(state.group_owner, default=-1) >= 0)
 
-    def _end_bypass(self) -> None:
-        """Report to the core what has bypassed it, if anything has."""
-        self._is_bypassed = False
-        work, self._bypassing = self._bypassing, None
-        if work is not None:
-            self._enqueue(work)
-            self._start_next(work.worker, self._bypassing_since)
-        lane, self._lane = self._lane, deque()
-        for work in lane:
-            del work.entity.waiting[work.x]
-            self._enqueue(work)
+    def _core(self) -> Scheduler:
+        """Return the core, after the end of the bypass: everything is reported to it."""
+        if self._is_bypassed:
+            self._is_bypassed = False
+            work, self._bypassing = self._bypassing, None
+            if work is not None:
+                self._enqueue(work)
+                self._start_next(work.worker, self._bypassing_since)
+            lane, self._lane = self._lane, deque()
+            for work in lane:
+                del work.entity.waiting[work.x]
+                self._enqueue(work)
+        return self.scheduler
 
     def ran_at_once(self, entity: Entity) -> None:
         """Count an undeclared callback that was handled at once."""
@@ -336,12 +338,10 @@ class Engine:
         return True
 
     def _start(self, work: Work, x: int, now: int) -> None:
-        if self._is_bypassed:
-            self._end_bypass()
         entity, state = work.entity, self._state
         state.x_group[x] = entity.group
         state.x_holds[x] = entity.habit.holds
-        self.scheduler.ready(x, now)
+        self._core().ready(x, now)
         work.x = x
         work.ready_ns = now
         entity.ready += 1
@@ -354,7 +354,7 @@ class Engine:
 
     def _replace_oldest(self, work: Work, now: int) -> None:
         """Drop the oldest message of an undeclared callback; the callback keeps its position."""
-        self._end_bypass()
+        self._core()
         entity = work.entity
         places = iter(entity.waiting)
         first, second = next(places), next(places, -1)
@@ -385,7 +385,7 @@ class Engine:
     def remove(self, entity: Entity, now: int) -> None:
         """Forget a destroyed entity: its waiting executions never run."""
         entity.removed = entity.may_be_gone = True
-        self._end_bypass()
+        self._core()
         for x in list(entity.waiting):
             self._drop(entity, x, 'destroyed', now)
 
@@ -432,7 +432,7 @@ class Engine:
                 work.x = -1
                 work.worker = worker
             else:
-                self._end_bypass()
+                self._core()
         if work is None:
             state = self._state
             if not (state.ready or state.held_back or state.unpolled):
@@ -482,7 +482,7 @@ class Engine:
         if self._is_bypassed:
             if self._bypassing is None or not self._lane:
                 return bool(self._lane)
-            self._end_bypass()
+            self._core()
         state = self._state
         ready, held_back = state.ready, state.held_back
         if not state.scalars[N_IDLE] or not (ready or held_back or state.unpolled):
@@ -554,15 +554,14 @@ class Engine:
 
     def lend(self, work: Work) -> None:
         """Free the worker of an execution that continues without one."""
-        self._end_bypass()
+        core = self._core()
         self._let_go(work)
-        self.scheduler.lend(work.x)
+        core.lend(work.x)
 
     def resume(self, work: Work) -> None:
         """Make a suspended execution ready again; does nothing if it is not suspended."""
         if work.x >= 0 and self._state.x_state[work.x] == SUSPENDED:
-            self._end_bypass()
-            self.scheduler.resume(work.x)
+            self._core().resume(work.x)
 
     def leave_group(self, work: Work) -> None:
         """Note that an execution's callback group has let it run (see ``work``)."""
@@ -635,12 +634,12 @@ class Engine:
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Take a running execution off its worker until ``resume``."""
-        self._end_bypass()
+        core = self._core()
         work.entity.busy_ns += end - start
         if self.record is not None:
             self._record_run(work, start, end, vtid, worker)
         self._let_go(work)
-        self.scheduler.suspend(work.x)
+        core.suspend(work.x)
         self._work[work.x] = work
 
     def refused(self, work: Work, now: int) -> None:
@@ -673,12 +672,12 @@ class Engine:
 
     def destroyed(self, work: Work, now: int) -> None:
         """End a dispatched execution that must not run: its job cannot complete any more."""
-        self._end_bypass()
+        core = self._core()
         x, work.x = work.x, -1
         self._let_go(work)
         if work.origin is not None:
-            self.scheduler.give_up(work.origin.slot, EXPIRED, now)
-        self.scheduler.complete(x, now)
+            core.give_up(work.origin.slot, EXPIRED, now)
+        core.complete(x, now)
         self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'destroyed', now)
         self._decided(now)
 

@@ -111,10 +111,16 @@ client.completed = getattr(client, 'completed', 0) + 1
         future.set_result(response)""")], of(
         'test_each_runs.py', 'test_each_of_many_runs_once[of_services]')),
     Case('coroutines_not_resumed', [(
-        'executor/engine.py', 'self.scheduler.resume(work.x)', 'pass')], [
+        'executor/engine.py', 'self._core().resume(work.x)', 'pass')], [
         *of('test_each_runs.py', 'test_each_of_many_runs_once[of_coroutines]'),
         *of('test_like_rclpy.py',
             'test_a_coroutine_goes_on_in_the_step_after_its_future_is_done')], every=True),
+    Case('what_bypasses_the_core_stays_unknown', [(
+        'executor/engine.py', 'self._start_next(work.worker, self._bypassing_since)', 'pass')],
+        of('test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
+    Case('core_bypassed_while_it_has_others', [(
+        'executor/engine.py', 'self._may_bypass and self._is_core_empty()', 'self._may_bypass')],
+        of('test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
     Case('tasks_go_on_by_themselves_as_well', [(
         'executor/compat.py', 'def _add_resume_callback(', 'def _not_called(')], of(
         'test_newer_rclpy.py', 'test_a_task_awaits_one_future_after_another[await-own]')),
