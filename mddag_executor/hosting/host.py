@@ -43,6 +43,7 @@ from typing import Any
 import weakref
 
 from mddag_executor.executor.compat import alive, executor_kept
+from mddag_executor.executor.registry import snapshot
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
 from mddag_executor.hosting.guest_signals import GuestSignals
 from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
@@ -55,7 +56,6 @@ from rclpy.node import Node
 import rclpy.utilities
 
 START_TIMEOUT_S = 10.0
-_ENTITIES = ('timers', 'subscriptions', 'services', 'clients', 'guards', 'waitables')
 
 
 @dataclass(eq=False)
@@ -292,8 +292,9 @@ class Host:
             return False
         if entity not in self._node_of:
             self._node_of.update({
-                each: weakref.ref(node) for node in self.executor.get_nodes()
-                for name in _ENTITIES for each in getattr(node, name)})
+                each: weakref.ref(node)
+                for node, lists in snapshot(self.executor.get_nodes()).items()
+                for some in lists for each in some})
         node = self._node_of.get(entity, lambda: None)()
         executor = None if node is None else node.executor
         return isinstance(executor, GuestExecutor) and executor.callback_ended(error)

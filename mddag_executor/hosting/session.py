@@ -17,6 +17,7 @@ that thread owns the event's inner lock; ``set`` would then wait for that lock f
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 import math
 import threading
 import time
@@ -44,6 +45,9 @@ class Session:
     :param executor: any rclpy executor, with or without nodes.
     :param spin: spins it; by default ``executor.spin``.
     :param on_end: called when its end begins.
+    :ivar error: the exception that has ended the run.
+    :ivar clean: whether all callbacks have ended; one that does not is left running.
+    :ivar stopped: whether the run is to end.
     """
 
     def __init__(
@@ -56,7 +60,7 @@ class Session:
         self._ended = False
         self._on_end = on_end
         self._patience_s = END_TIMEOUT_S
-        self._stopped = False
+        self.stopped = False
         self._bell = threading.Lock()
         self._bell.acquire()
         self._spin = executor.spin if spin is None else spin
@@ -89,29 +93,20 @@ class Session:
         """
         if hurried:
             self._patience_s = HURRIED_END_TIMEOUT_S
-        self._stopped = True
-        try:
+        self.stopped = True
+        with suppress(RuntimeError):  # it is released already
             self._bell.release()
-        except RuntimeError:
-            pass  # it is released already
-
-    @property
-    def stopped(self) -> bool:
-        """Return whether the run is to end."""
-        return self._stopped
 
     def wait(self, seconds: float | None, tick: Tick | None = None) -> bool:
         """Wait, for ever with None; return whether the run is to end."""
-        begin = time.monotonic()
-        while True:
-            passed = time.monotonic() - begin
-            left = 0.5 if seconds is None else min(0.5, seconds - passed)
-            if left > 0 and not self._stopped:
-                self._bell.acquire(True, left)
-            if left <= 0 or self._stopped:
-                return self._stopped
-            if tick is not None:
-                tick(time.monotonic() - begin)
+        begin = now = time.monotonic()
+        end = math.inf if seconds is None else begin + seconds
+        while now < end and not self.stopped:
+            self._bell.acquire(True, min(0.5, end - now))
+            now = time.monotonic()
+            if tick is not None and not self.stopped:
+                tick(now - begin)
+        return self.stopped
 
     def wait_until_matched(
         self, unmatched: Callable[[], list[str]], patience_s: float = MATCH_TIMEOUT_S
@@ -137,11 +132,7 @@ class Session:
                     'ROS_DOMAIN_ID and the network')
 
     def end(self) -> None:
-        """
-        Shut the executor down, once.
-
-        ``clean`` is whether all callbacks have ended; one that does not is left running.
-        """
+        """Shut the executor down, once."""
         self.stop()
         if self._ended:
             return
