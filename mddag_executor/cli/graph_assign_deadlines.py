@@ -89,10 +89,10 @@ def _lines(
     from mddag_executor.report.tables import short_names
     short = short_names(vertex.name for vertex in task_set.vertices if vertex.deadline_ns)
     rows: list[list[Cell]] = [
-        [dag.name if i == 0 else '', short[dag.vertices[sink].name], format_ns(dag.period_ns),
+        [dag.name, short[dag.vertices[sink].name], format_ns(dag.period_ns),
          format_ns(deadlines[dag.vertices[sink].callback.key])]
-        for dag in task_set.dags for i, sink in enumerate(dag.sinks)]
-    yield table(['DAG', 'sink', 'period', 'deadline'], rows)
+        for dag in task_set.dags for sink in dag.sinks]
+    yield table(['DAG', 'sink', 'period', 'deadline'], rows, grouped=1)
     low, high = measured.interval
     own = '' if found is None else ', none of which the search used'
     if found is not None:

@@ -48,7 +48,8 @@ def main(args: argparse.Namespace) -> int:
     task_set = common.load_graph(args.graph)
     result = check_result(task_set)
     warn(*_warnings(task_set, result))
-    common.show(args, result, (table(_HEADER, _rows(result)), _summary(task_set, result)))
+    common.show(args, result, (
+        table(_HEADER, _rows(result), grouped=5), _summary(task_set, result)))
     return 0
 
 
@@ -132,18 +133,17 @@ def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
 
 
 def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
-    """Yield a row for each sink; the first one of a DAG has the figures of the whole DAG."""
+    """Yield a row for each sink, which begins with the figures of its DAG."""
     from mddag_executor.report.tables import short_names
     short = short_names(sink for dag in result['dags'].values() for sink in dag['sinks'])
     for name, dag in result['dags'].items():
         path, load = dag['critical_path_ns'], dag['load']
-        row: list[Cell] = [
+        of_dag: list[Cell] = [
             name, format_ns(dag['period_ns']), len(dag['vertices']),
             None if path is None else format_ns(path),
             None if load is None else f'{load:.4f}']
         for sink, deadline in dag['sinks'].items():
-            yield [*row, short[sink], format_ns(deadline)]
-            row = [''] * len(row)
+            yield [*of_dag, short[sink], format_ns(deadline)]
 
 
 def _summary(task_set: TaskSet, result: dict[str, Any]) -> str:

@@ -34,8 +34,7 @@ from mddag_executor.cli import common, options, verdicts
 from mddag_executor.cli.stuck import dump_when_stuck
 from mddag_executor.cli.text import Progress, warn
 from mddag_executor.errors import MddagError, UsageError, UserCodeError
-from mddag_executor.report.live_runs import summary
-from mddag_executor.report.tables import sink_table
+from mddag_executor.report.live_runs import live_lines
 from mddag_executor.report.text import listed
 from msg_graph import loads, NO_GRAPH
 
@@ -126,13 +125,8 @@ def main(args: argparse.Namespace) -> int:
     elif task_set.processes:
         task_set = replace(task_set, processes=())
     result, error = run_here(args, task_set)
-    report(args, result)
-    return _end(error, status(args, result))
-
-
-def status(args: argparse.Namespace, result: dict[str, Any]) -> int:
-    """Return the exit status of a run in which nothing failed."""
-    return verdicts.exit_status(args, result['dags'], result['file'] or 'mddag run')
+    common.show(args, result, live_lines(result))
+    return _end(error, verdicts.exit_status(args, result['dags'], result['file'] or 'mddag run'))
 
 
 def part(args: argparse.Namespace) -> int:
@@ -452,14 +446,3 @@ class Signals:
             signal.default_int_handler(number, frame)
         if self._session is not None:
             self._session.stop(hurried=True)
-
-
-def report(args: argparse.Namespace, result: dict[str, Any]) -> bool:
-    """Write the result; return whether tables were printed."""
-    shown = common.write_result(args, result)
-    if shown and result['dags']:
-        print(sink_table(result['dags']))
-    if shown:
-        for line in summary(result):
-            print(line)
-    return shown

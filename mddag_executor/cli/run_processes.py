@@ -19,11 +19,11 @@ import tempfile
 from typing import Any
 
 from mddag_executor import defaults
-from mddag_executor.cli import common
-from mddag_executor.cli.run import report, Signals, status, warn_of
+from mddag_executor.cli import common, verdicts
+from mddag_executor.cli.run import Signals, warn_of
 from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
-from mddag_executor.report.live_runs import ended_line
+from mddag_executor.report.live_runs import live_lines
 from msg_graph import TaskSet
 from msg_graph.edit import load_processes, with_processes
 from msg_graph.errors import listed, shown
@@ -103,11 +103,9 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
             'trace': _trace_of_dead(_trace(args.trace, run.name)) if part is None
             else part['trace']}
             for run, part in zip(supervisor.runs, parts)]}
-    if report(args, result):
-        for process in result['processes']:
-            if process['died']:
-                print(ended_line(process))
-    return EXIT_DIED if any(run.died for run in supervisor.runs) else status(args, result)
+    common.show(args, result, live_lines(result))
+    return EXIT_DIED if any(run.died for run in supervisor.runs) else verdicts.exit_status(
+        args, result['dags'], task_set.file)
 
 
 def _warn_of_contested(task_set: TaskSet) -> None:

@@ -44,14 +44,10 @@ def sinks_table(mostly: Sequence[Mapping[str, Any]]) -> str:
     """Return a table of the causes of each sink, and where most of that time went."""
     names = short_names({name for each in mostly for name in (
         each['sink'], each['vertex'], each['behind']) if name is not None})
-    rows: list[list[Cell]] = []
-    for each, before in zip(mostly, [None, *mostly]):
-        same = before is not None and before['sink'] == each['sink']
-        rows.append([
-            '' if same else names[each['sink']], each['cause'],
-            each['missed'], format_ns(each['ns'], 3) if each['ns'] else None,
-            *(None if each[key] is None else names[each[key]] for key in ('vertex', 'behind'))])
-    return table(('sink', 'cause', 'misses', 'mean', 'mostly at', 'mostly behind'), rows)
+    return table(('sink', 'cause', 'misses', 'mean', 'mostly at', 'mostly behind'), ([
+        names[each['sink']], each['cause'], each['missed'],
+        format_ns(each['ns'], 3) if each['ns'] else None,
+        *(names.get(each[key]) for key in ('vertex', 'behind'))] for each in mostly), grouped=1)
 
 
 def stalls_table(stalls: Sequence[Mapping[str, int]], start: int) -> str:

@@ -97,21 +97,8 @@ def prepare(data: ReportData) -> Prepared:
     names = [printable(name) for name in of['vertex'].names]
     lines, ys, n_hidden = _lines(data, names)
 
-    slack = verdicts['deadline'] - verdicts['completed']
-    share = np.where(verdicts['completed'] < 0, -np.inf,
-                     slack / np.maximum(1, verdicts['deadline'] - verdicts['release']))
-    leads_to = _least_slack(data, table, share)
-    colour = np.where(leads_to < 0, len(COLOURS) - 1,
-                      np.searchsorted(_SHARES, np.append(share, 0)[leads_to], 'right'))
-    missed = np.flatnonzero(verdicts['kind'] != SINK_IN_TIME)
-    marked_at = np.where(
-        verdicts['completed'] < 0, verdicts['deadline'], verdicts['completed'])
-    missed = missed[np.argsort(marked_at[missed], kind='stable')]
-    done = verdicts['completed'][missed] >= 0
-    worst = missed[np.lexsort((
-        verdicts['deadline'][missed], np.where(done, slack[missed], 0), done))[:MOST_MISSES]]
-    worst = worst[np.lexsort((verdicts['sink'][worst], verdicts['release'][worst]))]
-
+    leads_to, colour = _verdicts_of(data, table)
+    missed, marked_at, worst = _missed(verdicts)
     workers, n = table['worker'].astype(np.int32), data.result['workers']
     on = np.where((workers >= 0) & (workers < n), workers, n)
     spare = int((on == n).any())
@@ -125,7 +112,7 @@ def prepare(data: ReportData) -> Prepared:
          'job': table['job'].astype(np.float64),
          'release': np.where(known, seconds(data, of['release_ns'].values), np.nan),
          'verdict': leads_to.astype(np.int32), 'class': colour.astype(np.int32)},
-        {'x': seconds(data, marked_at[missed]), 'workers': np.zeros(len(missed)),
+        {'x': seconds(data, marked_at), 'workers': np.zeros(len(missed)),
          'callbacks': ys[verdicts['sink'][missed]], 'verdict': missed.astype(np.int32)},
         lines, _worker_lines(data, spare), n_hidden, verdicts[worst],
         _meta(data, names, worst.tolist()))
@@ -136,9 +123,33 @@ def seconds(data: ReportData, times: Any) -> Any:
     return (times - (data.replay.recording.start or 0)) / 1e9
 
 
-def _least_slack(data: ReportData, table: Table, share: Any) -> Ints:
-    """Return by execution the shown verdict with the least slack that it leads to; -1: none."""
+def _missed(verdicts: Table) -> tuple[Ints, Ints, Ints]:
+    """
+    Return the missed deadlines (rows of ``verdicts``), and the times of their marks, in order.
+
+    Also return the worst ones, in the order of their releases.
+    """
+    missed = np.flatnonzero(verdicts['kind'] != SINK_IN_TIME)
+    deadline, completed = verdicts['deadline'][missed], verdicts['completed'][missed]
+    done = completed >= 0
+    worst = missed[np.lexsort((deadline, np.where(done, deadline - completed, 0), done))]
+    worst = worst[:MOST_MISSES]
+    marked_at = np.where(done, completed, deadline)
+    order = np.argsort(marked_at, kind='stable')
+    return missed[order], marked_at[order], worst[
+        np.lexsort((verdicts['sink'][worst], verdicts['release'][worst]))]
+
+
+def _verdicts_of(data: ReportData, table: Table) -> tuple[Ints, Ints]:
+    """
+    Return by execution the row of the shown verdict with the least slack that it leads to.
+
+    It is -1 without such a verdict. Also return the index of the colour.
+    """
     verdicts, first_vertex = data.timeline.verdicts, data.replay.judged.tables.first_vertex
+    share = np.where(
+        verdicts['completed'] < 0, -np.inf, (verdicts['deadline'] - verdicts['completed'])
+        / np.maximum(1, verdicts['deadline'] - verdicts['release']))
     found, least = np.full(len(table), -1), np.full(len(table), np.inf)
     for dag, first in zip(data.replay.task_set.dags, first_vertex):
         for sink in dag.sinks:
@@ -148,7 +159,8 @@ def _least_slack(data: ReportData, table: Table, share: Any) -> Ints:
             mine, judged = mine[at >= 0], judged[at[at >= 0]]
             nearer = share[judged] < least[mine]
             found[mine[nearer]], least[mine[nearer]] = judged[nearer], share[judged[nearer]]
-    return found
+    return found, np.where(
+        found < 0, len(COLOURS) - 1, np.searchsorted(_SHARES, least, 'right'))
 
 
 def _before(dag: Dag, sink: int) -> list[int]:

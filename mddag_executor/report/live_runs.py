@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Lines of text about a live run, below the table of its sinks."""
+"""The table of a live run, and lines of text below it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,24 @@ from pathlib import Path
 from typing import Any
 
 from mddag_executor.core.tally import counts, total
-from mddag_executor.report.tables import drift_lines, never_due_lines, percent, verdicts_line
+from mddag_executor.report.tables import (
+    drift_lines,
+    never_due_lines,
+    percent,
+    sink_table,
+    verdicts_line,
+)
 from mddag_executor.report.text import listed, printable
 from mddag_executor.text import counted
 
 
-def summary(result: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines below the table of a run; without a declaration there is no table."""
-    yield verdicts_line(result['dags']) if result['dags'] else (
-        'no declaration was given, so no deadline was judged')
+def live_lines(result: dict[str, Any]) -> Iterator[str]:
+    """Yield the table of a run's sinks (there is none without a declaration), and the lines."""
+    if result['dags']:
+        yield sink_table(result['dags'])
+        yield verdicts_line(result['dags'])
+    else:
+        yield 'no declaration was given, so no deadline was judged'
     stops = result['stops']
     if stops['misses']:
         yield (f'{stops["misses"]} of {total(result["dags"]).missed} misses '
@@ -28,7 +37,7 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
         yield from _absent(result['dags'])
     measured = result['measured']
     if measured is not None:
-        yield from measured_lines(measured)
+        yield from _measured_lines(measured)
     callbacks = result['callbacks']
     for one, many, numbers in (
             ('dropped', 'dropped', result['dropped']),
@@ -61,6 +70,10 @@ def summary(result: dict[str, Any]) -> Iterator[str]:
         path = printable(result['trace']['path'])
         yield (f'to judge it: mddag graph from-trace {path} --accept -o graph.yaml, then '
                f'mddag replay {path} graph.yaml')
+    for process in result.get('processes', ()):
+        if process['died']:
+            yield printable(f'process {process["name"]} {process["how"]}: '
+                            f'{process["said"] or "it said nothing"}')
 
 
 def _absent(dags: dict[str, Any]) -> Iterator[str]:
@@ -74,13 +87,7 @@ def _absent(dags: dict[str, Any]) -> Iterator[str]:
                f'replay of the traces shows why): {listed(absent)}')
 
 
-def ended_line(process: dict[str, Any]) -> str:
-    """Return the line about a process that has died."""
-    return printable(f'process {process["name"]} {process["how"]}: '
-                     f'{process["said"] or "it said nothing"}')
-
-
-def measured_lines(measured: dict[str, Any]) -> Iterator[str]:
+def _measured_lines(measured: dict[str, Any]) -> Iterator[str]:
     """Yield the lines with the measurements of the synthetic nodes."""
     yield (
         f'measured by the nodes, {measured["window_ns"] / 1e9:.1f} s after a warm-up of '

@@ -71,13 +71,9 @@ def sink_table(dags: Mapping[str, Any]) -> str:
     """
     header, cells = sink_columns(dags)
     found = worst_first(dags)
-    rows: list[list[Cell]] = []
-    above = None
-    for sink in found:
-        rows.append(['' if sink.dag == above else sink.dag, sink.shown_name, *cells(sink)])
-        above = sink.dag
-    return table(('DAG', 'sink', *header), rows,
-                 marked=[not is_kept(sink.result) for sink in found])
+    return table(('DAG', 'sink', *header),
+                 ([sink.dag, sink.shown_name, *cells(sink)] for sink in found),
+                 marked=[not is_kept(sink.result) for sink in found], grouped=1)
 
 
 def sink_columns(dags: Mapping[str, Any]) -> tuple[list[str], Callable[[Sink], list[Cell]]]:

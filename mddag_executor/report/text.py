@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 import os
 import re
 import sys
@@ -82,7 +83,7 @@ def is_coloured(stream: TextIO | None = None) -> bool:
 
 def table(
     header: Sequence[str], rows: Iterable[Sequence[Cell]], marked: Sequence[bool] = (),
-    most: int | None = None,
+    most: int | None = None, grouped: int = 0,
 ) -> str:
     """
     Return an aligned table; columns of numbers (also with a unit) are right-aligned.
@@ -94,11 +95,15 @@ def table(
     :param rows: their cells; None is printed as `-`, a float with two decimals
     :param marked: rows that are red if colours are available
     :param most: maximum width instead of these
+    :param grouped: number of columns on the left that are empty if the first one is as above
     """
     body = [[_cell(cell) for cell in row] for row in rows]
     for row in body:
         if len(row) != len(header):
             raise ValueError(f'a row of {len(row)} cells under {len(header)} titles')
+    for above, row in [*pairwise(body)][::-1] if grouped else ():
+        if row[0] == above[0]:
+            row[:grouped] = [''] * grouped
     columns = list(zip(*body)) if body else [() for _ in header]
     right = [bool(column) and all(_NUMBER.fullmatch(cell) for cell in column)
              for column in columns]

@@ -10,7 +10,7 @@ from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor.statistics import Watch
 from mddag_executor.replay import open_recording
 from mddag_executor.replay.drift import drift_of
-from mddag_executor.report.live_runs import summary
+from mddag_executor.report.live_runs import live_lines
 from msg_graph import loads
 import pytest
 from rclpy.action import ActionClient, ActionServer
@@ -210,6 +210,6 @@ nodes:
         assert wait_for(lambda: callbacks().get('/sink:hear', {}).get('incompatible_qos'))
     assert callbacks()['/sink:hear']['incompatible_qos'] == 'RELIABILITY'
     assert callbacks()['/source:tick']['incompatible_qos'] is None
-    lines = list(summary({**executor.statistics(), 'measured': None}))
+    lines = list(live_lines({**executor.statistics(), 'measured': None}))
     assert ('1 callback without messages, as a publisher has an incompatible QoS: '
             '/sink:hear (RELIABILITY)') in lines
