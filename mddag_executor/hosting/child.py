@@ -27,7 +27,7 @@ from msg_graph import GraphError
 _PR_SET_PDEATHSIG = 1
 
 Tick = Callable[[float], None]
-"""Called every half second with the seconds since the start of the child."""
+"""Called every half second with the seconds since the start of the run."""
 
 
 class ChildError(MddagError):

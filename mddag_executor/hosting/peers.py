@@ -19,7 +19,7 @@ from typing import Any
 from mddag_executor.hosting.child import ChildError, run_child, Tick
 from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Mode
 from mddag_executor.hosting.session import Session
-from mddag_executor.hosting.synthetic import no_job, SyntheticWorkload
+from mddag_executor.hosting.synthetic import no_job, SyntheticWorkload, WARM_UP_S
 from msg_graph import load
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
@@ -28,7 +28,6 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import ok as context_ok
 
-WARM_UP_S = 1.0
 PATIENCE_S = 90.0
 """The time of a process in addition to its window and warm-up: discovery and the end."""
 

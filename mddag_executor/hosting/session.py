@@ -23,15 +23,13 @@ import threading
 import time
 
 from mddag_executor.errors import MddagError
+from mddag_executor.hosting.child import Tick
 from mddag_executor.text import counted
 from rclpy.executors import Executor, ExternalShutdownException
 
 END_TIMEOUT_S = 5.0
 HURRIED_END_TIMEOUT_S = 0.5
 MATCH_TIMEOUT_S = 30.0
-
-Tick = Callable[[float], None]
-"""Called repeatedly with the seconds since the start of the run."""
 
 
 class SessionError(MddagError):

@@ -50,8 +50,9 @@ from mddag_executor.hosting.bodies import (
     spinner,
     typical_oversleep_ns,
 )
+from mddag_executor.hosting.child import Tick
 from mddag_executor.hosting.measure import Body, ExecutionPlan, Ledger
-from mddag_executor.hosting.session import Session, Tick
+from mddag_executor.hosting.session import Session
 from msg_graph import Callback, TaskSet, Vertex
 from rcl_interfaces.srv import ListParameters
 from rclpy.callback_groups import (
