@@ -19,10 +19,9 @@ and every few milliseconds during a spin.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 import threading
 import types
-from typing import Any, Protocol
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.executor.compat import awaited
 from mddag_executor.executor.entity import Entity, TIMER
@@ -30,35 +29,16 @@ from mddag_executor.executor.jobs import Origin
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 
-
-class RunningThread(Protocol):
-    """A thread in which a callback runs, as used by rclpy's wrapped methods."""
-
-    work: Work | None
-    engine: Any
-    pool: Any
-    published: int
-
-    def publishes(self, state: Any, msg: Any) -> None:
-        """Note that the callback publishes."""
-
-    def is_short(self) -> bool:
-        """Return whether it runs a callback that will probably end soon."""
-
-    def lend(self) -> AbstractContextManager[None]:
-        """Lend its worker while entered: the callback waits."""
-
-    @property
-    def job(self) -> tuple[str, int, int] | None:
-        """Return DAG, index and release of the job whose callback runs; None: no job."""
+if TYPE_CHECKING:
+    from mddag_executor.executor.workers import WorkerThread
 
 
 class _Current(threading.local):
-    running: RunningThread | None = None
+    running: WorkerThread | None = None
 
 
 current = _Current()
-"""Of the calling thread: ``running``, its ``RunningThread`` while a callback runs in it."""
+"""Of the calling thread: ``running``, its ``WorkerThread`` while a callback runs in it."""
 
 
 class QuickCallback:
