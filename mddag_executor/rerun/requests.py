@@ -222,14 +222,15 @@ class Requests:
     def _status(self, handle: Any) -> None:
         from action_msgs.msg import GoalStatus, GoalStatusArray
         _, server = self._actions[id(handle)]
+        # made here, so that it needs no copy, which would take long: goals do not expire
+        message = GoalStatusArray(status_list=[
+            GoalStatus(goal_info=info, status=status) for info, status in goal_states(server)])
 
-        def deliver(message: Any) -> None:
+        def deliver() -> None:
             for client in self._peers(handle):
                 self._take(client, {'status': message})
 
-        self._send(GoalStatusArray(status_list=[
-            GoalStatus(goal_info=info, status=status) for info, status in goal_states(server)]),
-            deliver)
+        self._loop.call_at_end(deliver)
 
     def _take(self, waitable: Any, data: dict[str, Any]) -> None:
         attach_futures(waitable, self._executor)
