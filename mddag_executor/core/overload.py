@@ -14,15 +14,20 @@ docs/run.md names the sources.
 
 from __future__ import annotations
 
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 
 from mddag_executor.core.jobs import demotes, judge
-from mddag_executor.core.queues import add_stale
+from mddag_executor.core.queues import add_stale, is_stale
 from mddag_executor.core.state import (
+    CHECK_AT,
     DEADLINE_KEYS,
     ELSEWHERE,
+    N_IDLE,
+    N_STALE,
     OPEN,
+    PREEMPTIVE,
     QueueEntry,
+    REFUSES,
     SINK_DEMOTED,
     START_KEYS,
     State,
@@ -110,11 +115,7 @@ def _late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
         begin += len(s.demoted[vertex]) * s.mean[vertex]
     elif s.x_started[x] >= 0:  # it was preempted
         begin -= s.x_cost[x] - s.x_left[x]
-    refused = is_refused(t, s, vertex)
-    if refused and now > s.refused_until[process] and s.refused_late[process] > 0:
-        s.refused_late[process] = 0
-        admit(t, s)
-        refused = is_refused(t, s, vertex)
+    refused = _is_still_refused(t, s, vertex, now)
     patience = REFUSED_PATIENCE if refused else LATE_PATIENCE
     deadline = NEVER
     start = NEVER
@@ -157,6 +158,7 @@ def admit(t: Tables, s: State) -> None:
     A driver calls this at the begin and when the execution times have changed.
     """
     changed = False
+    s.scalars[REFUSES] = 0
     for process in range(1, len(s.overtaking)):
         workers = len(s.worker_x)
         if len(s.pool) > 0:
@@ -174,6 +176,8 @@ def admit(t: Tables, s: State) -> None:
                 break
         changed = changed or refused != s.refused_below[process]
         s.refused_below[process] = refused
+        s.reserved_from[process] = -NEVER
+        s.scalars[REFUSES] = max(s.scalars[REFUSES], refused)
     if changed:
         for vertex in range(t.n_vertices):
             set_start(t, s, vertex)
@@ -197,6 +201,65 @@ def is_refused(t: Tables, s: State, vertex: int) -> bool:
     """Return whether jobs are refused at a vertex in its process, for more important ones."""
     return (t.importance[vertex] < s.refused_below[_process(t, s, vertex)]
             and demotes(t, s, t.dag_of[vertex]))
+
+
+def _is_still_refused(t: Tables, s: State, vertex: int, now: int) -> bool:
+    """Return whether jobs are refused at a vertex now: because of a late job only for a while."""
+    process = _process(t, s, vertex)
+    if now > s.refused_until[process] and s.refused_late[process] > 0:
+        s.refused_late[process] = 0
+        admit(t, s)
+    return is_refused(t, s, vertex)
+
+
+def leaves_room(t: Tables, s: State, x: int, now: int) -> bool:
+    """
+    Return whether an execution ends before its interpreter or worker is reserved (rule 14).
+
+    Only refused ones may have to wait, and until the release that counts for their order.
+    """
+    vertex = s.x_vertex[x]
+    if (s.x_started[x] >= 0 or not _is_still_refused(t, s, vertex, now)
+            or now >= s.x_key[x][0] - t.dag_deadline[t.dag_of[vertex]]
+            or s.holder[vertex] == 0 and (s.scalars[N_IDLE] > 1 or s.scalars[PREEMPTIVE] != 0)):
+        return True
+    process = _process(t, s, vertex)
+    if now > s.reserved_from[process]:
+        s.reserved_from[process] = _next_start(t, s, process, now)
+    if now + s.mean[vertex] <= s.reserved_from[process]:
+        return True
+    s.scalars[CHECK_AT] = min(s.scalars[CHECK_AT], s.reserved_from[process] + 1)
+    return False
+
+
+def _next_start(t: Tables, s: State, process: int, now: int) -> int:
+    """Return until when the next job must start that is not refused and can be in time."""
+    first = NEVER
+    for dag in range(t.n_dags):
+        source = t.source[dag]
+        if not is_refused(t, s, source) and _process(t, s, source) == process:
+            for i in range(t.first_reach[source], t.first_reach[source + 1]):
+                start = s.next_release[dag] + s.reach_by[i]
+                if s.reach_by[i] >= 0 and start >= now:
+                    first = min(first, start)
+    return first
+
+
+def return_reserved(t: Tables, s: State, now: int) -> None:
+    """Put the deferred executions that may start now into the ready queue."""
+    s.scalars[CHECK_AT] = NEVER
+    kept = 0
+    for i in range(len(s.reserved)):
+        entry = s.reserved[i]
+        if is_stale(s, entry):
+            s.scalars[N_STALE] -= 1
+        elif leaves_room(t, s, entry[4], now):
+            heappush(s.ready, entry)
+        else:
+            s.reserved[kept] = entry
+            kept += 1
+    del s.reserved[kept:]
+    heapify(s.reserved)
 
 
 def _process(t: Tables, s: State, vertex: int) -> int:

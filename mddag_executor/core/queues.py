@@ -60,7 +60,7 @@ def add_stale(s: State) -> None:
 
 def _sweep(s: State) -> None:
     """Remove stale entries from all queues when they are the larger part: memory is bounded."""
-    length = len(s.ready) + len(s.held_back)
+    length = len(s.ready) + len(s.held_back) + len(s.reserved)
     for group in range(len(s.group_heap)):
         length += len(s.group_heap[group])
     for entity in range(len(s.entity_queue)):
@@ -69,6 +69,7 @@ def _sweep(s: State) -> None:
         return
     _keep_valid(s, s.ready)
     _keep_valid(s, s.held_back)
+    _keep_valid(s, s.reserved)
     for group in range(len(s.group_heap)):
         _keep_valid(s, s.group_heap[group])
     for entity in range(len(s.entity_queue)):

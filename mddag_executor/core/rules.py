@@ -88,7 +88,10 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     the least importance is refused, as many as necessary, but never the highest.  Less importance
     than that of a sink that missed a deadline is refused for ``REFUSED_PATIENCE`` of its relative
     deadlines, too.  Refused jobs (of DAGs that ``DEMOTE``) count as released that many relative
-    deadlines later.
+    deadlines later.  Until then their executions leave room (``State.reserved``): without
+    preemption, one that would need the interpreter or the last idle worker beyond the latest
+    start of the next job that is not refused, expected one period after its last release, waits
+    for that job, or until it is later than that.
 """
 
 from __future__ import annotations
@@ -103,7 +106,7 @@ from mddag_executor.core.jobs import (
     next_deadline,
     outdate_sink,
 )
-from mddag_executor.core.overload import demote, note_miss
+from mddag_executor.core.overload import demote, leaves_room, note_miss, return_reserved
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import (
     add_stale,
@@ -117,6 +120,7 @@ from mddag_executor.core.queues import (
 from mddag_executor.core.state import (
     ABORTED,
     add_slot,
+    CHECK_AT,
     COMPLETED,
     DISPATCH_OVERHEAD,
     DONE,
@@ -134,6 +138,8 @@ from mddag_executor.core.state import (
     POLLING,
     PREEMPTIVE,
     PROPAGATE,
+    QueueEntry,
+    REFUSES,
     RUNNING,
     SINK_IN_TIME,
     SINK_LATE,
@@ -249,9 +255,11 @@ def peek(t: Tables, s: State, now: int) -> int:
 
     Entries that cannot be next leave the queue: dropped and aborted executions for good, those
     with a busy group into the group's heap (rule 4) or to the next poll (rule 9), those that may
-    not start into the heap of deferred ones (rules 11 and 12).  Late ones are demoted (rule 7).
+    not start into a heap of deferred ones (rules 11, 12 and 14).  Late ones are demoted (rule 7).
     """
     again = True
+    if s.scalars[CHECK_AT] < NEVER:
+        return_reserved(t, s, now)
     while True:
         queue = s.ready
         if s.held_back or s.scalars[N_STALE] > 0:
@@ -277,10 +285,11 @@ def peek(t: Tables, s: State, now: int) -> int:
                 continue
             if ((s.pool or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
                     and not may_start(t, s, entry)):
-                heappop(queue)
-                heappush(s.held_back, entry)
-                if group >= 0 and s.group_owner[group] == -1:
-                    _release_group(s, group)  # others of the group may go first
+                _defer(s, queue, s.held_back)
+                queue = next_queue(t, s, False)
+                continue
+            if s.scalars[REFUSES] > 0 and not leaves_room(t, s, x, now):
+                _defer(s, queue, s.reserved)
                 queue = next_queue(t, s, False)
                 continue
             if vertex == t.n_vertices:
@@ -300,6 +309,15 @@ def peek(t: Tables, s: State, now: int) -> int:
             return -1
         again = False  # a poll that finds only busy groups is the last
         poll(t, s)
+
+
+def _defer(s: State, queue: list[QueueEntry], to: list[QueueEntry]) -> None:
+    """Move the first of a queue to another one; others of its callback group may go first."""
+    entry = heappop(queue)
+    heappush(to, entry)
+    group = s.x_group[entry[4]]
+    if group >= 0 and s.group_owner[group] == -1:
+        _release_group(s, group)
 
 
 def take(t: Tables, s: State, worker: int, now: int) -> int:

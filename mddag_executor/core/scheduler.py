@@ -152,7 +152,8 @@ class Scheduler:
         """Return the number of executions that wait, for a worker or for their group."""
         waiting = sum(len(heap) for heap in self.state.group_heap)
         waiting += sum(len(queue) for queue in self.state.entity_queue)
-        waiting += len(self.state.held_back) + sum(map(self._is_refused, self.state.group_owner))
+        waiting += len(self.state.held_back) + len(self.state.reserved)
+        waiting += sum(map(self._is_refused, self.state.group_owner))
         return len(self.state.ready) + waiting - self.state.scalars[N_STALE]
 
     def _is_refused(self, x: int) -> bool:

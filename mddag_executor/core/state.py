@@ -25,9 +25,10 @@ FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED, OUTDATED = range(8)
 # Where a vertex is expected to run; LEADS_OUT: here, and a successor is not.
 ELSEWHERE, HERE, LEADS_OUT = range(3)
 
-# Columns of ``scalars``.
+# Columns of ``scalars``.  ``REFUSES``: whether any process refuses an importance; ``CHECK_AT``:
+# when an execution in ``reserved`` may start although nothing else happens; NEVER: there is none.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- JUDGE_FROM, SKIP, N_HOLDING, URGENCY, N_SCALARS) = range(13)
+ JUDGE_FROM, SKIP, N_HOLDING, URGENCY, REFUSES, CHECK_AT, N_SCALARS) = range(15)
 
 # Which times the keys of a policy are (``URGENCY``): none, deadlines of sinks, latest starts for
 # them, or deadlines of DAGs.
@@ -56,10 +57,11 @@ class State(NamedTuple):
     """Everything that changes during a run; made by ``new_state``."""
 
     scalars: list[int]
-    # heaps: the ready queue, the executions deferred for the interpreter or a worker, and for each
-    # callback group those that wait for it
+    # heaps: the ready queue, the executions deferred for the interpreter or a worker, those that
+    # leave it to a more important job, and for each callback group those that wait for it
     ready: list[QueueEntry]
     held_back: list[QueueEntry]
+    reserved: list[QueueEntry]
     group_heap: list[list[QueueEntry]]
     group_owner: list[int]
     # under a policy that polls: a heap for each entity, and the entities with entries
@@ -78,11 +80,14 @@ class State(NamedTuple):
     # the same because of late jobs, and until when
     refused_late: list[int]
     refused_until: list[int]
+    # from when on it is reserved for the next release that is not refused
+    reserved_from: list[int]
     # by DAG
     free_slot: list[int]
     oldest: list[int]
     newest: list[int]
     n_open: list[int]
+    next_release: list[int]
     # whether some of its vertices are not expected here; by vertex: whether it is (see ``expect``)
     partial: list[int]
     expected: list[int]
@@ -201,6 +206,7 @@ def fill_state(
     s.scalars[POLLING] = polling
     s.scalars[URGENCY] = urgency
     s.scalars[JUDGE_FROM] = -NEVER
+    s.scalars[CHECK_AT] = NEVER
     for v in range(t.n_vertices + 1):
         s.start_by.append(t.latest_start[v])
         s.newest_ready.append(-1)
@@ -227,6 +233,7 @@ def fill_state(
         s.oldest.append(-1)
         s.newest.append(-1)
         s.n_open.append(0)
+        s.next_release.append(-NEVER)
         s.partial.append(0)
     for _ in range(t.n_vertices + 1):
         s.expected.append(HERE)
@@ -291,6 +298,7 @@ def add_process(s: State) -> None:
     s.overloaded.append(0)
     s.refused_late.append(0)
     s.refused_until.append(-NEVER)
+    s.reserved_from.append(-NEVER)
 
 
 def add_group(s: State) -> int:

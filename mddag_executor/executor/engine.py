@@ -43,6 +43,7 @@ from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE, TURN_NS
 from mddag_executor.core.state import (
+    CHECK_AT,
     EXPIRED,
     IDLE,
     JUDGE_FROM,
@@ -228,7 +229,7 @@ class Engine:
         """Return whether nothing is waiting, running on a worker or owning a group in the core."""
         state = self._state
         return not (
-            state.ready or state.held_back or state.unpolled
+            state.ready or state.held_back or state.reserved or state.unpolled
             or state.scalars[N_IDLE] < self.n_workers or max(state.group_owner, default=-1) >= 0)
 
     def _core(self) -> Scheduler:
@@ -402,6 +403,11 @@ class Engine:
         """Return the number of executions that wait, for a worker or for their group."""
         return len(self._lane) + self.scheduler.queue_length
 
+    @property
+    def check_at(self) -> int:
+        """Return when an execution may start although nothing else happens; NEVER: none waits."""
+        return self._state.scalars[CHECK_AT]
+
     def waits_since(self, now: int) -> int:
         """Return since when the most urgent of the ready executions has waited; now: none does."""
         ready = self._state.ready
@@ -435,7 +441,7 @@ class Engine:
                 self._core()
         if work is None:
             state = self._state
-            if not (state.ready or state.held_back or state.unpolled):
+            if not (state.ready or state.held_back or state.reserved or state.unpolled):
                 return None
             if state.worker_x[worker] >= 0:
                 if not state.scalars[N_IDLE]:

@@ -27,7 +27,15 @@ from typing import NamedTuple
 
 from mddag_executor.core import jobs, overload, rules
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import add_slot, divide, EXPIRED, fill_state, JUDGE_FROM, State
+from mddag_executor.core.state import (
+    add_slot,
+    CHECK_AT,
+    divide,
+    EXPIRED,
+    fill_state,
+    JUDGE_FROM,
+    State,
+)
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.simulate.deliveries import (
     arrive_due,
@@ -101,6 +109,7 @@ def run(
         for w in range(n_workers):
             if finish_at[w] < instant:
                 instant = finish_at[w]
+        instant = min(instant, s.scalars[CHECK_AT])
         if sends:
             instant = min(instant, next_arrival(d))
         if stops:

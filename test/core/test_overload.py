@@ -175,6 +175,33 @@ def test_the_highest_importance_is_never_refused():
     assert run(importance='low') == run(importance='high') == run()
 
 
+@pytest.mark.parametrize(('time', 'runs'), [(11, True), (20, False)])
+def test_less_important_work_leaves_room_for_the_next_important_job(time: int, runs: bool) -> None:
+    """It starts only if it ends before that job must start, or at long intervals."""
+    sinks = results([
+        single('low', 20, 20, execution_time=f'{time}us', importance='low', on_late='demote'),
+        single('high', 20, 12, execution_time='10us', on_late='demote')], [time, 10], 20_000)
+    assert counts(sinks['high']).in_time >= (0.99 if runs else 0.97) * 1000
+    assert (sinks['low']['completed'] > 600) == runs
+    assert sinks['low']['completed'] >= 9  # one in 100 deadlines
+
+
+@pytest.mark.parametrize('last', [0, 100])
+def test_room_is_left_for_one_release_after_the_last(last: int) -> None:
+    """If the source stops, less important work goes on although nothing else happens."""
+    case = Case(declaration([
+        single('low', 40, 40, execution_time='30us', importance='low', on_late='demote'),
+        single('high', 20, 12, execution_time='10us', on_late='demote')]),
+        ((30,), (10,)), 1, 'rad', False)
+    times = range(0, last + 1, 20)
+    load = case.load(1000)._replace(
+        times=[0, *(time * TICK for time in times)], dags=[0, *[1 for _ in times]],
+        jobs=[0, *range(len(times))])
+    run = simulate(case.task_set, load, Settings(workers=1, duration_ns=1000 * TICK), log=True)
+    starts = [time for time, kind, _, dag, _, _ in case.events(run) if (kind, dag) == ('start', 0)]
+    assert starts == [last + 20 + 2]  # as soon as the next job would be late
+
+
 def test_late_jobs_of_an_important_sink_refuse_others():
     # There is room for both, but the first has the earlier deadline.
     in_time = {}
