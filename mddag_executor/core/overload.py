@@ -43,6 +43,10 @@ USED_UP_PATIENCE = 1
 """The same for a sink that tolerates no further miss."""
 REFUSED_PATIENCE = 100
 """The same for a refused job."""
+RESERVED_PATIENCE = 10
+"""A refused execution leaves room for as many relative deadlines, so long ones run, too: in the
+benchmark's sets at 1.2 interpreters 98.5 % of the important results are in time with 3, 98.8 with
+10, 98.9 with 100."""
 PPM = 1_000_000
 
 
@@ -216,11 +220,12 @@ def leaves_room(t: Tables, s: State, x: int, now: int) -> bool:
     """
     Return whether an execution ends before its interpreter or worker is reserved (rule 14).
 
-    Only refused ones may have to wait, and until the release that counts for their order.
+    Only refused ones may have to wait, for ``RESERVED_PATIENCE`` of their relative deadlines.
     """
     vertex = s.x_vertex[x]
     if (s.x_started[x] >= 0 or not _is_still_refused(t, s, vertex, now)
-            or now >= s.x_key[x][0] - t.dag_deadline[t.dag_of[vertex]]
+            or now >= s.x_key[x][0] - t.dag_deadline[t.dag_of[vertex]] * (
+                REFUSED_PATIENCE + 1 - RESERVED_PATIENCE)
             or s.holder[vertex] == 0 and (s.scalars[N_IDLE] > 1 or s.scalars[PREEMPTIVE] != 0)):
         return True
     process = _process(t, s, vertex)

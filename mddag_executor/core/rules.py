@@ -88,10 +88,10 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     the least importance is refused, as many as necessary, but never the highest.  Less importance
     than that of a sink that missed a deadline is refused for ``REFUSED_PATIENCE`` of its relative
     deadlines, too.  Refused jobs (of DAGs that ``DEMOTE``) count as released that many relative
-    deadlines later.  Until then their executions leave room (``State.reserved``): without
-    preemption, one that would need the interpreter or the last idle worker beyond the latest
-    start of the next job that is not refused, expected one period after its last release, waits
-    for that job, or until it is later than that.
+    deadlines later.  Before, for ``RESERVED_PATIENCE`` of them, their executions leave room
+    (``State.reserved``): without preemption, one that would need the interpreter or the last idle
+    worker beyond the latest start of the next job that is not refused, expected one period after
+    its last release, waits for that job, or until it is later than that.
 """
 
 from __future__ import annotations

@@ -181,9 +181,9 @@ def test_less_important_work_leaves_room_for_the_next_important_job(time: int, r
     sinks = results([
         single('low', 20, 20, execution_time=f'{time}us', importance='low', on_late='demote'),
         single('high', 20, 12, execution_time='10us', on_late='demote')], [time, 10], 20_000)
-    assert counts(sinks['high']).in_time >= (0.99 if runs else 0.97) * 1000
+    assert counts(sinks['high']).in_time >= (0.99 if runs else 0.85) * 1000
     assert (sinks['low']['completed'] > 600) == runs
-    assert sinks['low']['completed'] >= 9  # one in 100 deadlines
+    assert sinks['low']['completed'] >= 80  # one in about ten deadlines
 
 
 @pytest.mark.parametrize('last', [0, 100])
