@@ -8,8 +8,8 @@ Endurance: a declared workload under one executor for as long as it takes, with 
 Theory of operation
 -------------------
 The nodes are synthetic ones, each destroyed and made again by itself.  After a warm-up there is
-one fault after the other, chosen at random, and after each of them a second to recover and a
-*clean* window:
+one fault after the other, chosen at random, and after each of them a second to recover, time to
+work off the backlog (at most ``BACKLOG_S``), and a *clean* window:
 
 * ``destroy``: a node is destroyed while its callbacks run, and made again;
 * ``raise``: a callback raises, which ends ``spin``; it is called again;
@@ -55,7 +55,7 @@ from soak_memory import in_use, kept_by_middleware, resident
 from soak_nodes import SimulatedTime, SoakFault, SoakNodes
 
 FAULTS = ('destroy', 'raise', 'stop', 'burst', 'clock')
-FAULT_S, RECOVERY_S, CLEAN_S = 1.0, 1.0, 1.5
+FAULT_S, RECOVERY_S, BACKLOG_S, CLEAN_S = 1.0, 1.0, 5.0, 1.5
 BURST = 10
 DRAIN_S = 3.0
 MEMORY_RATIO = 0.05
@@ -220,12 +220,20 @@ class Soak:
         self.counts[fault] += 1
         self._inject(fault, FAULT_S)
         time.sleep(RECOVERY_S)
+        end = time.monotonic() + BACKLOG_S
+        while self._has_backlog() and time.monotonic() < end:
+            time.sleep(0.05)
         start = time.time_ns()
         time.sleep(CLEAN_S)
         self._clean.append((start, time.time_ns(), fault))
         time.sleep(self._settle_s)  # for what was released last, before the next fault hits it
         self._say(f'{fault}: {self._sort_out()} misses in the clean window, '
                   f'{resident() / 1e6:.1f} MB')
+
+    def _has_backlog(self) -> bool:
+        """Return whether several messages wait for one callback."""
+        callbacks = self.executor.statistics()['callbacks'].values()
+        return any(counts['waiting'] > 1 for counts in callbacks)
 
     def _inject(self, fault: str, seconds: float) -> None:
         getattr(self, f'_{fault}')(seconds)
