@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
+from itertools import pairwise
 import math
 import os
 import re
@@ -211,17 +212,19 @@ class Entry:
 # --- the three kinds -----------------------------------------------------------------------------
 
 def scalar(
-    parse: Callable[[str], Any], form: Schema, missing: Any = None, plain: bool = False
+    parse: Callable[[str], Any], form: Schema, missing: Any = None, plain: bool = False,
+    what: str = 'a text',
 ) -> Kind:
     """
     Return the kind of a single value.
 
     :param parse: turns its text into the value, or raises a ``ValueProblem``.
     :param plain: it must not be in quotes.
+    :param what: what to write.
     """
     def read(value: Tree, where: str) -> Any:
         if not isinstance(value, Scalar) or value.is_null:
-            raise error_at(value, where, f'{kind_of(value)} is no single value', 'write one')
+            raise error_at(value, where, f'{kind_of(value)} is no single value', f'write {what}')
         if plain and not value.plain:
             raise error_at(value, where, f'{shown(value.text)} is in quotes', 'remove them')
         try:
@@ -290,13 +293,14 @@ def choice(*words: str, missing: str | None = None) -> Kind:
                                did_you_mean(word, words, f'use {", ".join(words)}'))
         return word
 
-    return scalar(parse, {'anyOf': [{'enum': list(words)}, _USE]}, missing)
+    return scalar(parse, {'anyOf': [{'enum': list(words)}, _USE]}, missing,
+                  what=f'one of {", ".join(words)}')
 
 
 def time(least_ns: int = MICROSECOND) -> Kind:
     """Return the kind of a time of at most a day, ns."""
     return scalar(lambda text: parse_duration(text, minimum_ns=least_ns),
-                  {'allOf': [{'$ref': '#/definitions/time'}]})
+                  {'allOf': [{'$ref': '#/definitions/time'}]}, what="a time, as '100ms'")
 
 
 def whole(least: int, most: int) -> Kind:
@@ -307,7 +311,8 @@ def whole(least: int, most: int) -> Kind:
         return int(text)
 
     return scalar(parse, {'anyOf': [
-        {'type': 'integer', 'minimum': least, 'maximum': most}, _USE]}, plain=True)
+        {'type': 'integer', 'minimum': least, 'maximum': most}, _USE]}, plain=True,
+        what=f'an integer from {least} to {most}')
 
 
 def number(**bounds: int) -> Kind:
@@ -318,7 +323,8 @@ def number(**bounds: int) -> Kind:
             raise ValueProblem(f'{shown(text)} is not a number', 'write a finite number')
         return found
 
-    return scalar(parse, {'anyOf': [{'type': 'number', **bounds}, _USE]}, plain=True)
+    return scalar(parse, {'anyOf': [{'type': 'number', **bounds}, _USE]}, plain=True,
+                  what='a finite number')
 
 
 def _truth(text: str) -> bool:
@@ -385,11 +391,13 @@ def _read_execution_time(value: Tree, where: str) -> ExecutionTime:
     count = len(quantiles_us)
     if not percent:     # evenly spaced
         percent = tuple(100.0 * i / (count - 1) for i in range(count)) if count > 1 else (50.0,)
+    falls = [pair for pair in pairwise(quantiles_us) if pair[1] < pair[0]]
     for key, wrong, problem, remedy in (
         ('quantiles_us', quantiles_us[0] < 0,
          f'the quantile {quantiles_us[0]} is negative', 'write times in us'),
-        ('quantiles_us', list(quantiles_us) != sorted(quantiles_us),
-         'the quantiles do not rise', 'write them in rising order'),
+        ('quantiles_us', falls,
+         'the quantile {1} comes after {0}'.format(*falls[0] if falls else '  '),
+         'write them in rising order'),
         ('quantiles_us', not 1 <= quantiles_us[-1] * 1000 <= DAY,
          f'the largest quantile, {quantiles_us[-1]} us, makes no sense',
          'write times from 0.001 us to a day, in us'),
@@ -420,7 +428,7 @@ def _mapping(keys: dict[str, Key]) -> Schema:
                            for word, key in keys.items()}}
 
 
-_TRUTH = scalar(_truth, {'anyOf': [{'type': 'boolean'}, _USE]}, plain=True)
+_TRUTH = scalar(_truth, {'anyOf': [{'type': 'boolean'}, _USE]}, plain=True, what='true or false')
 _WEAKLY_HARD = scalar(_weakly_hard, {
     'type': 'string', 'pattern': f'^(?:{_OF.pattern})$|{ARGUMENT_USE}', 'examples': ['1 of 100']})
 _VALUES = table(scalar(str, {'type': ['string', 'number', 'boolean', 'null']}))

@@ -139,7 +139,7 @@ def test_head(text, says):
     (f'node: /a-b {MARK}', ['not a valid node name']),
     (f'node: "/a\\nb" {MARK}', ["'/a\\nb' is not a valid"]),
     (f'node: /{"a" * 300} {MARK}', ['too long']),
-    (f'node: [/a] {MARK}', ["node 1: 'node': a list is no single value: write one"]),
+    (f'node: [/a] {MARK}', ["node 1: 'node': a list is no single value: write a text"]),
     (f'node: {MARK}', ["'node' has no value"]),
     (f'nod: /a {MARK}', ["unknown key 'nod': did you mean 'node'?"]),
 ])
