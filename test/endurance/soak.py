@@ -112,8 +112,7 @@ def unjudged_sinks(plan: ExecutionPlan) -> list[str]:
     """Return the sinks whose critical path leaves too little of their deadline for waits."""
     found = []
     for dag in plan.task_set.dags:
-        paths = path_lengths(dag, [
-            plan.execution_ns(dag.index, vertex.index) for vertex in dag.vertices])
+        paths = path_lengths(dag, [plan.execution_ns(vertex) for vertex in dag.vertices])
         sinks = [dag.vertices[sink] for sink in dag.sinks]
         found += [sink.name for sink in sinks
                   if paths[sink.index] > (1 - LEAST_SLACK) * (sink.deadline_ns or 0)]
