@@ -217,9 +217,9 @@ class Engine:
 
     def allow_bypass(self) -> None:
         """Let undeclared executions bypass the core, if the policy runs them as they come."""
-        key, undeclared = self.scheduler.policy.key, self.tables.n_vertices
-        self._may_bypass = key(self.tables, undeclared, 0, 1, 0) < key(
-            self.tables, undeclared, 0, 0, 1)
+        policy, undeclared = self.scheduler.policy, self.tables.n_vertices
+        self._may_bypass = not policy.polling and policy.key(
+            self.tables, undeclared, 0, 1, 0) < policy.key(self.tables, undeclared, 0, 0, 1)
 
     def _begin_bypass(self) -> bool:
         self._is_bypassed = self._may_bypass and self._is_core_empty()

@@ -192,7 +192,7 @@ class Twin:
         return (
             started and (started.args, started.worker), engine.queue_length, engine.has_waiting,
             engine.idle_workers, engine.may_start_more(now),
-            engine.scheduler.policy.polling or engine.waits_since(now),
+            engine.waits_since(now),
             [(len(each.waiting), each.ran, each.dropped, each.skipped, each.failed)
              for each in self.entities])
 
