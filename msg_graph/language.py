@@ -391,13 +391,12 @@ def _read_execution_time(value: Tree, where: str) -> ExecutionTime:
     count = len(quantiles_us)
     if not percent:     # evenly spaced
         percent = tuple(100.0 * i / (count - 1) for i in range(count)) if count > 1 else (50.0,)
-    falls = [pair for pair in pairwise(quantiles_us) if pair[1] < pair[0]]
+    before, after = next((pair for pair in pairwise(quantiles_us) if pair[1] < pair[0]), (0, 0))
     for key, wrong, problem, remedy in (
         ('quantiles_us', quantiles_us[0] < 0,
          f'the quantile {quantiles_us[0]} is negative', 'write times in us'),
-        ('quantiles_us', falls,
-         'the quantile {1} comes after {0}'.format(*falls[0] if falls else '  '),
-         'write them in rising order'),
+        ('quantiles_us', after < before,
+         f'the quantile {after} comes after {before}', 'write them in rising order'),
         ('quantiles_us', not 1 <= quantiles_us[-1] * 1000 <= DAY,
          f'the largest quantile, {quantiles_us[-1]} us, makes no sense',
          'write times from 0.001 us to a day, in us'),

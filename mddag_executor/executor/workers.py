@@ -583,12 +583,11 @@ class WorkerPool:
         entity = work.entity
         if entity.wall_ns <= SHORT_CALLBACK_NS:
             self._leader = me
-            if self.guard.is_set:
-                pass
-            elif not self.polling:
-                self._admit()
-            elif not (entity.habit.holds and holders) and engine.has_waiting:
-                self._guard(now - self._offset)
+            if not self.guard.is_set:
+                if not self.polling:
+                    self._admit()
+                elif not (entity.habit.holds and holders) and engine.has_waiting:
+                    self._guard(now - self._offset)
         elif not self.polling:
             self._admit()
         elif engine.may_start_more(now):
