@@ -47,8 +47,7 @@ GRAPHS = ('.yaml', '.yml')
 _MCAP = b'\x89MCAP'
 MOST_BYTES = 64 << 20
 """The largest declaration, architecture file or table of execution times."""
-_read_already: object = None  # the stream that was standard input when it was read
-_copy: Any = None  # of it
+_copy: Any = None  # of standard input
 
 
 def read_text(path: str) -> tuple[str, str]:
@@ -58,7 +57,7 @@ def read_text(path: str) -> tuple[str, str]:
         with open(path, 'rb') as file:
             data = file.read(MOST_BYTES + 1)
     else:
-        name, data = STDIN, _claim_stdin().read(MOST_BYTES + 1)
+        name, data = STDIN, _stdin().read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:
         raise InputError(name, f'it is larger than {MOST_BYTES >> 20} MiB', 'name the right file')
     try:
@@ -73,8 +72,6 @@ def load_graph(path: str) -> TaskSet:
     """Return the task set that a declaration gives, from a file or from standard input for `-`."""
     import msg_graph
     if path != '-':
-        if os.path.isfile(path) and _is_trace(path):
-            raise InputError(path, 'this is a recording, no declaration', 'name a YAML file')
         return msg_graph.load(path)
     name, text = read_text(path)
     return msg_graph.loads(text, name=name)
@@ -89,7 +86,7 @@ def input_path(given: R) -> tuple[R | str, str]:
     global _copy
     if given != '-':
         return given, str(given)  # as the user wrote it: pathlib would change ./a
-    source, _copy = _claim_stdin(), tempfile.TemporaryFile()
+    source, _copy = _stdin(), tempfile.TemporaryFile()
     shutil.copyfileobj(source, _copy, 1 << 20)
     _copy.flush()
     return f'/proc/self/fd/{_copy.fileno()}', STDIN
@@ -104,8 +101,6 @@ def recording_and_graph(args: argparse.Namespace) -> None:
     traces = args.trace
     if len(traces) > 1 and not _is_trace(traces[-1]):
         *traces, args.graph = traces
-    elif len(traces) > 1 and traces[0].endswith(GRAPHS):
-        raise UsageError(f'{traces[0]}: this is a declaration: name it after the recordings')
     args.trace = one_run(traces, args.offset)
 
 
@@ -122,8 +117,6 @@ def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | T
             raise UsageError('--offset: one trace has one clock: give the traces of all '
                              'processes, or leave the option out')
         return paths[0]
-    if len(dict(offsets)) < len(offsets):
-        raise UsageError('--offset: a process is named twice: give one offset for each')
     if '-' in paths:
         raise UsageError('-: of several traces none can be standard input: name them')
     from mddag_executor.replay import Traces
@@ -150,13 +143,9 @@ def _is_trace(path: str) -> bool:
         return False
 
 
-def _claim_stdin() -> BinaryIO:
-    global _read_already
+def _stdin() -> BinaryIO:
     if sys.stdin is None:
         raise UsageError("-: there is no standard input: name a file instead of '-'")
-    if _read_already is sys.stdin:
-        raise UsageError("-: standard input can be read only once: use '-' for one file only")
-    _read_already = sys.stdin
     return cast(BinaryIO, getattr(sys.stdin, 'buffer', sys.stdin))
 
 
@@ -180,7 +169,8 @@ def check_files(args: argparse.Namespace) -> None:
         if isinstance(each, Output) and each.checked_early:
             check_output(each, each.is_recording, getattr(args, 'overwrite', False))
         if isinstance(each, Report):
-            _check_report(each)
+            from mddag_executor.report.html import check_available
+            check_available()
 
 
 def _files(args: argparse.Namespace) -> Iterator[tuple[str, Input | Output]]:
@@ -319,13 +309,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     raise TypeError(f'{type(value).__name__} has no JSON form')
-
-
-def _check_report(path: Report) -> None:
-    if os.path.splitext(path)[1].lower() not in ('', '.html', '.htm'):
-        raise UsageError(f'--report {path}: a report is an HTML file: let its name end in .html')
-    from mddag_executor.report.html import check_available
-    check_available()
 
 
 def write_report(path: str, data: Callable[[], ReportData]) -> None:

@@ -156,8 +156,6 @@ def _summary(task_set: TaskSet, result: dict[str, Any]) -> str:
     if result['utilisation'] is not None:
         text += (f', load {result["load"]:.3f}, utilisation {result["utilisation"]:.3f} of '
                  f'{counted(result["workers"], "worker")}')
-        if task_set.workers is None:
-            text += ' (the default)'
     from msg_graph.draft import open_blanks
     left = [str(each.line) for each in open_blanks(task_set.text, task_set.file)]
     if left:

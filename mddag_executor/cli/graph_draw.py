@@ -7,14 +7,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 import shutil
-from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import one_line, run_program
 from mddag_executor.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    from mddag_executor.report.picture import Picture
 
 EXAMPLE = """\
 mddag graph draw config/autoware.yaml -o autoware.svg
@@ -34,8 +30,6 @@ Mermaid viewers limit the size: raise maxEdges and maxTextSize there for large g
 Graphs of more than 1000 vertices get straight lines, and a PNG at most 16000 dots in a row."""
 
 _BY_GRAPHVIZ = ('.svg', '.png', '.pdf')
-_MOST_CROSSINGS = 10_000
-"""Graphviz takes 10 to 20 s for these; for 60,000 it did not end in minutes."""
 _ENDINGS = (*_BY_GRAPHVIZ, '.dot', '.mmd')
 
 
@@ -57,8 +51,6 @@ def main(args: argparse.Namespace) -> int:
     task_set = common.load_graph(args.graph)
     from mddag_executor.report.picture import picture
     drawn = picture(task_set)
-    if program:
-        _check_density(drawn, args.output)
     if ending == '.mmd':
         from mddag_executor.report.mermaid import to_mermaid
         common.write_text(args.output, to_mermaid(drawn))
@@ -72,14 +64,6 @@ def main(args: argparse.Namespace) -> int:
         with common.output_file(args.output) as file:
             file.write(data)
     return 0
-
-
-def _check_density(drawn: Picture, output: str) -> None:
-    for dag in drawn.dags:
-        if dag.crossings > _MOST_CROSSINGS:
-            raise InputError(
-                output, f'{dag.title}: its arrows pass {dag.crossings} other columns, so Graphviz '
-                'would take many minutes', 'write OUT.dot or OUT.mmd')
 
 
 def _find_dot(output: str) -> str:

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 _ONLY_RESCHEDULED = (
     'workers', 'cpus', 'processes', 'policy', 'on_late', 'preemptive', 'overheads',
     'execution_times', 'seed')
-_RECORDED = -1
-"""Overheads as they were recorded."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,14 +44,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(group, '--on-late', otherwise='as recorded; of a bag: continue')
     options.add(group, '--preemptive', otherwise='as recorded, if the policy can')
     add('--overheads', type=_overheads, metavar='WHICH',
-        help='the time that noticing, dispatch and transport take: recorded (default), '
-        'none, or a time for each dispatch (50us); of a bag: none (default) or a time')
+        help='the time that noticing, dispatch and transport take: recorded (default; none of a '
+        'bag), none, or a time for each dispatch (50us)')
     options.add(group, '--execution-times', '--seed', only='of an ordinary bag: ', default=None)
 
 
-def _overheads(text: str) -> int:
+def _overheads(text: str) -> int | None:
+    """Return the overhead of each dispatch in ns, None for that of the recording."""
     if text == 'recorded':
-        return _RECORDED
+        return None
     return 0 if text == 'none' else options.duration(text)
 
 
@@ -61,11 +60,6 @@ def check(args: argparse.Namespace) -> None:
     """Check the options that depend on each other."""
     if args.processes == '0':
         raise UsageError('--processes 0: give 1 or more, or a file')
-    if args.execution_times is not None and args.seed is not None:
-        raise UsageError(
-            '--seed: nothing is drawn with --execution-times: leave one out')
-    if args.execution_times is not None and args.graph is None:
-        raise UsageError('--execution-times: they are of a declaration: give a GRAPH')
     if span_of(args.begin, args.end, args.skip) is not None and args.reschedule:
         raise UsageError('--reschedule: the scheduler runs over whole recordings: leave it out, '
                          'or --from and --to')
@@ -157,11 +151,10 @@ def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
     options.refuse(args, ('execution_times', 'seed'),
                    'a trace has its own execution times: leave the option out')
     from mddag_executor.replay import reschedule
-    recorded = args.overheads in (None, _RECORDED)
     with Progress('replaying') as line:
         return reschedule(
-            source.path, source.task_set, overheads=recorded,
-            dispatch_overhead=0 if recorded else args.overheads,
+            source.path, source.task_set, overheads=args.overheads is None,
+            dispatch_overhead=args.overheads or 0,
             progress=line.events, processes=_processes(args), **settings)
 
 
@@ -177,8 +170,6 @@ def _rescheduled_bag(
                          'option out')
     if task_set is None or not args.reschedule:
         raise source.no_graph()
-    if args.overheads == _RECORDED:
-        raise UsageError('--overheads: a bag has none: give a time for each dispatch')
     times = None
     if args.execution_times is not None:
         times_name, text = common.read_text(args.execution_times)

@@ -94,14 +94,13 @@ def _fix_hashes() -> None:
     """
     if not sys.flags.hash_randomization:
         return
-    if sys.flags.ignore_environment:
-        warn('hashes of strings are not the same in each run: leave out -E and -I of Python')
-    elif os.path.basename(sys.argv[0]) in _PROGRAMS or sys.argv[0].endswith(_MODULE):
+    is_ours = os.path.basename(sys.argv[0]) in _PROGRAMS or sys.argv[0].endswith(_MODULE)
+    if is_ours and not sys.flags.ignore_environment:
         os.execve(
             sys.executable, [sys.executable, *sys.orig_argv[1:]],
             {**os.environ, 'PYTHONHASHSEED': '0'})
-    else:
-        warn('hashes of strings are not the same in each run: set PYTHONHASHSEED=0')
+    warn('hashes of strings are not the same in each run: start Python with PYTHONHASHSEED=0, '
+         'without -E and -I')
 
 
 def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:

@@ -51,14 +51,7 @@ def junit(result: Mapping[str, Any], broken: Sinks, name: str) -> bytes:
         'failures': str(len(broken)), 'errors': '0', 'time': f'{result["duration_ns"] / 1e9:.9f}'}
     root = ElementTree.Element('testsuites', figures)
     suite = ElementTree.SubElement(root, 'testsuite', figures, skipped=str(skipped))
-    properties = ElementTree.SubElement(suite, 'properties')
-    for key in ('policy', 'workers', 'preemptive', 'rescheduled'):
-        ElementTree.SubElement(
-            properties, 'property', {'name': key, 'value': _text(str(result[key]))})
     suite.extend(cases)
-    if result['warnings']:
-        ElementTree.SubElement(suite, 'system-err').text = '\n'.join(
-            _text(warning) for warning in result['warnings'])
     ElementTree.indent(root)
     xml: bytes = ElementTree.tostring(root, encoding='utf-8', xml_declaration=True)
     return xml + b'\n'

@@ -71,16 +71,14 @@ def _run(result: Mapping[str, Any]) -> dict[str, Any]:
         'trace': result['recording']['trace'], 'policy': result['policy'],
         'workers': result['workers'], 'duration_ns': result['duration_ns'],
         'utilisation': result['utilisation'], 'imported': 'recorded_callbacks' in result,
-        'rescheduled': result['rescheduled'], 'skip_ns': result['skip_ns'],
-        **every._asdict()}
+        'rescheduled': result['rescheduled'], 'skip_ns': result['skip_ns'], **every._asdict()}
 
 
 def _side(sink: Mapping[str, Any] | None) -> dict[str, Any] | None:
     if sink is None:
         return None
     return {'relative_deadline_ns': sink['relative_deadline_ns'], **counts(sink)._asdict(),
-            'response_ns': sink['response_ns'],
-            **({'tolerate': sink['tolerate']} if 'tolerate' in sink else {})}
+            'response_ns': sink['response_ns']}
 
 
 def _sink(
@@ -149,11 +147,6 @@ def _remark(sink: Mapping[str, Any]) -> str:
         remarks.append('never due' + ('' if not any(due) else ' in B' if due[0] else ' in A'))
     if sink['a']['relative_deadline_ns'] != sink['b']['relative_deadline_ns']:
         remarks.append(f'deadline in B {format_ns(sink["b"]["relative_deadline_ns"])}')
-    for side in 'ab':
-        tolerate = sink[side].get('tolerate')
-        if tolerate is not None and tolerate['worst'] > tolerate['misses']:
-            remarks.append(f'{tolerate["worst"]} of {tolerate["of"]} missed in {side.upper()}, '
-                           f'{tolerate["misses"]} tolerated')
     return ', '.join(remarks)
 
 
@@ -181,7 +174,6 @@ def lines(difference: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
             f'policy {printable(run["policy"])}, ' + counted(run['workers'], 'worker'))
         yield (f'{mark.upper()}: {printable(run["trace"])}: '
                + verdicts_text(Counts(*(run[name] for name in Counts._fields))) + '; '
-               + ('rescheduled, ' if run['rescheduled'] else '')
                + f'{pool}, {format_ns(run["duration_ns"])}')
     if difference['a']['skip_ns']:
         yield ('left out in both: jobs released in the first '

@@ -16,28 +16,22 @@ MOST_STALLS = 10
 
 
 def causes_line(misses: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line with the causes of all misses, stops of the machine separately, if any."""
-    causes = {cause: n for cause, n in misses['causes'].items() if n}
-    if not causes:
-        return
-    stalls = [stall for stall in misses['stalls'] if stall['misses']]
-    parts = []
-    if stalls:
-        inside = sum(stall['misses'] for stall in stalls)
-        length = sum(stall['length_ns'] for stall in stalls)
-        parts.append(f'{inside} in {counted(len(stalls), "stop")} of the machine '
-                     f'({length / 1e9:.2f} s)')
-        causes['machine'] -= inside
-    parts += [f'{n} {cause}' for cause, n in sorted(causes.items(), key=lambda item: -item[1])
-              if n]
-    yield f'{counted(misses["missed"], "miss", "misses")}: {", ".join(parts)}'
+    """Yield a line with the causes of all misses, if there are any."""
+    causes = [f'{n} {cause}' for cause, n in _most_first(misses)]
+    if causes:
+        yield f'{counted(misses["missed"], "miss", "misses")}: {", ".join(causes)}'
+
+
+def _most_first(misses: Mapping[str, Any]) -> list[tuple[str, int]]:
+    return sorted(((cause, n) for cause, n in misses['causes'].items() if n),
+                  key=lambda item: -item[1])
 
 
 def causes_table(misses: Mapping[str, Any]) -> str:
     """Return a table of the causes, with remedies."""
     return table(('cause', 'misses', 'share', 'what to do'), [
         [cause, n, percent(n, misses['missed']), REMEDIES[cause]]
-        for cause, n in sorted(misses['causes'].items(), key=lambda item: -item[1]) if n])
+        for cause, n in _most_first(misses)])
 
 
 def sinks_table(mostly: Sequence[Mapping[str, Any]]) -> str:

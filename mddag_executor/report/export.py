@@ -182,19 +182,14 @@ def write_parquet(file: BinaryIO, columns: Sequence[Column]) -> None:
 
 def check_available(form: str) -> None:
     """Check that a format can be written, before long work starts."""
-    module = {'parquet': 'pyarrow', 'tables': 'pyarrow'}.get(form)
-    if module is None:
+    if form not in ('parquet', 'tables'):
         return
     try:
-        __import__(module)
-    except ModuleNotFoundError:
+        import pyarrow  # noqa: F401
+    except ImportError as error:    # also of a version that needs a newer NumPy
         raise MddagError(
-            f'-o *.{form}: {module} is not installed: '
+            f'-o *.{form}: pyarrow does not load ({" ".join(str(error).split())}): '
             "pip install 'mddag_executor[export]'") from None
-    except ImportError as error:  # for example a pyarrow that needs a newer NumPy
-        raise MddagError(
-            f'-o *.{form}: {module} does not load: {" ".join(str(error).split())}: '
-            'install versions that fit together') from None
 
 
 def write(form: str, file: BinaryIO, replay: Replay, rows: str) -> None:

@@ -1,7 +1,6 @@
 // Moves the timelines of a report to missed deadlines; times are in seconds.
 'use strict';
 (() => {
-  const NARROW = 700;                   // pixels, as in html.css
   const DARK = window.matchMedia('(prefers-color-scheme: dark)').matches;
   const element = (id) => document.getElementById(id);
   const meta = JSON.parse(element('mddag-meta').textContent);
@@ -98,24 +97,6 @@
       }));
   }
 
-  function brief(labels) {
-    return new Map([...(labels.entries ? labels.entries() : Object.entries(labels))].map(
-      ([y, text]) => {
-        const name = text.split(', every ')[0];
-        return [Number(y), name.length > 18 ? '…' + name.slice(-17) : name];
-      }));
-  }
-
-  function fit(model) {                 // leave most of a narrow screen to the pictures
-    if (window.innerWidth > NARROW) return;
-    for (const name of ['workers', 'callbacks']) {
-      const axis = model(`${name}_axis`);
-      axis.major_label_text_font_size = '9px';
-      axis.major_label_overrides = brief(axis.major_label_overrides);
-    }
-    for (const name of ['overview', 'workers', 'callbacks']) model(name).min_border_left = 110;
-  }
-
   function darken(doc) {                // the pictures, where the reader prefers dark pages
     for (const model of doc.roots()) {
       model.setv({background_fill_color: '#202022', border_fill_color: '#1b1b1d',
@@ -136,7 +117,6 @@
     const model = (name) => doc.get_model_by_name(name);
     fillTexts(model('executions'), model('marks'));
     if (DARK) darken(doc);
-    fit(model);
     const range = model('timeline_range');
     const boxes = (kind) => ['workers', 'callbacks'].map((name) => model(`${name}_${kind}`));
 

@@ -28,8 +28,7 @@ import numpy as np
 
 MOST_MISSES = 200
 MOST_LINES = 150
-"""Maximum number of lines of the timeline by callback; a single DAG may have more."""
-MOST_UNDECLARED = 200
+"""Maximum number of lines of the timeline by callback."""
 LONGEST_LABEL = 40
 UNKNOWN = '#969696'
 COLOURS = ('#d7191c', '#fd8d3c', '#fec44f', '#9ecae1', '#3182bd', UNKNOWN)
@@ -74,8 +73,8 @@ class Prepared(NamedTuple):
     A report's data, ready to be drawn.
 
     :ivar executions: the columns of the executions; ``marks``: of the missed deadlines.
-    :ivar lines: of the timelines by callback, and by worker; ``n_hidden`` is the number of DAGs
-        without line.
+    :ivar lines: of the timelines by callback, and by worker; ``n_hidden`` is the number of
+        callbacks without line.
     :ivar misses: the worst misses, in the order of their releases.
     :ivar meta: for the page's script.
     """
@@ -208,50 +207,28 @@ def label(text: str, longest: int = LONGEST_LABEL) -> str:
 
 def _lines(data: ReportData, names: list[str]) -> tuple[list[Line], Any, int]:
     """
-    Return the lines of the timeline by callback, from the top.
+    Return the lines of the timeline by callback, from the top: the worst DAGs come first.
 
-    Also return the position of each name, and the number of DAGs without line.
+    Also return the position of each name, and the number of names without a line.
     """
-    task_set = data.replay.task_set
-    chosen = _chosen_dags(data)
-    short = short_names(vertex.name for vertex in task_set.vertices)
+    dags, sinks = data.replay.task_set.dags, data.result['dags']
+    short = short_names(vertex.name for dag in dags for vertex in dag.vertices)
     texts: list[tuple[str, bool]] = []
-    rows: list[int] = []
-    for dag in task_set.dags:
-        shown = dag.index in chosen
-        if shown:
-            texts.append((f'{dag.name}, every {format_ns(dag.period_ns)}', True))
-        for vertex in dag.vertices:
-            rows.append(len(texts) if shown else -1)
-            texts += [(short[vertex.name], False)] * shown
-    others = names[len(rows):]
-    if others:
-        texts.append(('undeclared', True))
-        rows += [len(texts) + min(i, MOST_UNDECLARED) for i in range(len(others))]
-        texts += [(name, False) for name in others[:MOST_UNDECLARED]]
-        texts += [('other undeclared callbacks', False)] * (len(others) > MOST_UNDECLARED)
+    rows = np.zeros(len(names), dtype=np.int32)
+    for dag in sorted(dags, key=lambda dag: -max(
+            missed_share(counts(sink)) for sink in sinks[dag.name]['sinks'].values())):
+        first = data.replay.judged.tables.first_vertex[dag.index]
+        texts.append((f'{dag.name}, every {format_ns(dag.period_ns)}', True))
+        rows[first:first + len(dag.vertices)] = len(texts) + np.arange(len(dag.vertices))
+        texts += [(short[vertex.name], False) for vertex in dag.vertices]
+    n_declared = len(data.replay.task_set.vertices)
+    others = names[n_declared:]
+    texts += [('undeclared', True)] * bool(others)
+    rows[n_declared:] = len(texts) + np.arange(len(others))
+    texts = [*texts, *((name, False) for name in others)][:MOST_LINES]
     top = len(texts) - 1
-    ys = np.array([_HIDDEN if row < 0 else top - row for row in rows], dtype=np.int32)
-    return ([Line(label(text), top - i, heading) for i, (text, heading) in enumerate(texts)], ys,
-            len(task_set.dags) - len(chosen))
-
-
-def _chosen_dags(data: ReportData) -> set[int]:
-    """Return the DAGs with lines in the timeline by callback: those that missed most."""
-    results = data.result['dags']
-
-    def badness(dag: Dag) -> float:
-        return -max((missed_share(counts(sink))
-                     for sink in results[dag.name]['sinks'].values()), default=0.0)
-
-    chosen: set[int] = set()
-    room = MOST_LINES
-    for dag in sorted(data.replay.task_set.dags, key=badness):
-        room -= 1 + len(dag.vertices)
-        if room < 0 and chosen:
-            break
-        chosen.add(dag.index)
-    return chosen
+    return ([Line(label(text), top - i, heading) for i, (text, heading) in enumerate(texts)],
+            np.where(rows > top, _HIDDEN, top - rows), int((rows > top).sum()))
 
 
 def _worker_lines(data: ReportData, spare: int) -> list[Line]:

@@ -8,10 +8,8 @@ The page's script ``html.js`` moves the timelines to a missed deadline.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from bokeh.colors import RGB
 from bokeh.models import (
     ColumnDataSource,
     CustomJSTickFormatter,
@@ -37,8 +35,6 @@ _LINE = 16              # height of a line of a timeline, pixels
 _TOOLTIP = ('<div style="max-width:46em"><b>@a</b><br>@b<br>@c<br>@d</div>')
 _ZOOM = 'xpan,xbox_zoom,xzoom_in,xzoom_out,reset,save'
 _RED, _BLUE = '#d7191c', '#3182bd'
-_EDGES = tuple(RGB.from_hex_string(colour).darken(0.1).to_hex() for colour in COLOURS)
-
 
 THEME = Theme(json={'attrs': {
     'Plot': {'outline_line_color': '#bbbbbb', 'min_border_right': 24},  # half of the last label
@@ -126,8 +122,10 @@ def _timeline(
     # without Ctrl the wheel scrolls the page
     plot.toolbar.active_scroll = WheelZoomTool(dimensions='width', modifiers='ctrl')
     plot.add_tools(plot.toolbar.active_scroll)
+    by_class: Any = {'field': 'class', 'transform': LinearColorMapper(
+        palette=list(COLOURS), low=-0.5, high=len(COLOURS) - 0.5)}
     bars = plot.hbar(y=name, left='left', right='right', height=0.8, source=executions,
-                     fill_color=_by_class(COLOURS), line_color=_by_class(_EDGES), line_width=0.5)
+                     fill_color=by_class, line_color=by_class, line_width=0.5)
     plot.add_tools(HoverTool(renderers=[bars], tooltips=_TOOLTIP, point_policy='follow_mouse'))
     marked = plot.scatter('x', name, source=marks, marker='inverted_triangle', size=9,
                           fill_color=_RED, line_color='#ffffff')
@@ -135,16 +133,10 @@ def _timeline(
     plot.yaxis.ticker = FixedTicker(ticks=[line.y for line in lines])
     plot.yaxis.major_label_overrides = {line.y: line.label for line in lines}
     plot.yaxis.major_tick_line_color = None
-    plot.yaxis.name = f'{name}_axis'
     plot.xaxis.axis_label = 'time'
     plot.xaxis.formatter = CustomJSTickFormatter(code=_TICKS, args={'range': time})
     plot.ygrid.grid_line_color = None
     return plot
-
-
-def _by_class(palette: Sequence[str]) -> Any:
-    return {'field': 'class', 'transform': LinearColorMapper(
-        palette=list(palette), low=-0.5, high=len(palette) - 0.5)}
 
 
 def _histograms(data: ReportData) -> list[Any]:

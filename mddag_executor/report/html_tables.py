@@ -10,12 +10,7 @@ from pathlib import Path
 
 from mddag_executor.core.tally import counts, total, VERDICTS
 from mddag_executor.report.html_data import Prepared, ReportData, seconds
-from mddag_executor.report.replays import (
-    CALLBACKS_HEADER,
-    callbacks_rows,
-    RECORDED_HEADER,
-    recorded_rows,
-)
+from mddag_executor.report.replays import callbacks_table
 from mddag_executor.report.tables import (
     each_sink,
     missed_share,
@@ -62,9 +57,8 @@ def html_table(
     :param attributes: of each row, already markup.
     """
     kinds = [' class="text"' if i < texts else '' for i in range(len(header))]
-    titles = [escape(title) for title in header]
     lines = ['<table><thead><tr>', *(
-        f'<th{kind}>{title}</th>' for kind, title in zip(kinds, titles)),
+        f'<th{kind}>{escape(title)}</th>' for kind, title in zip(kinds, header)),
         '</tr></thead><tbody>\n']
     for number, row in enumerate(rows):
         lines.append(f'<tr {attributes[number]}>' if attributes else '<tr>')
@@ -72,7 +66,7 @@ def html_table(
             shown = cell if isinstance(cell, Html) else escape(
                 '-' if cell is None else printable(str(cell)))
             kind = ' class="bad"' if i in bad and cell else kinds[i]
-            lines.append(f'<td{kind} data-title="{titles[i]}">{shown}</td>')
+            lines.append(f'<td{kind}>{shown}</td>')
         lines.append('</tr>\n')
     return ''.join([*lines, '</tbody></table>'])
 
@@ -203,14 +197,10 @@ def _stack(worst: Mapping[str, int], deadline: int, longest: float) -> Html:
 
 
 def callbacks_html(data: ReportData) -> str:
-    """Return the tables of callbacks: executions, execution times, waiting times."""
+    """Return the table of callbacks: executions, execution times, waiting times."""
     usage = data.replay.usage
-    rows = list(callbacks_rows(usage.callbacks()))
-    if usage.undeclared()['executions']:
-        rows += callbacks_rows({'undeclared callbacks': usage.undeclared()})
-    tables = [html_table(CALLBACKS_HEADER, rows, 1)]
-    if 'recorded_callbacks' in data.result:
-        tables.append(html_table(
-            RECORDED_HEADER, recorded_rows(data.result['recorded_callbacks']), 1))
-    return '<h3>In the recording</h3>\n'.join(
-        f'<div class="scroll">{each}</div>\n' for each in tables)
+    callbacks = usage.callbacks() or data.result.get('recorded_callbacks', {})
+    undeclared = usage.undeclared()
+    if undeclared['executions'] and usage.callbacks():
+        callbacks = {**callbacks, 'undeclared callbacks': undeclared}
+    return f'<div class="scroll">{html_table(*callbacks_table(callbacks), 1)}</div>\n'

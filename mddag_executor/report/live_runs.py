@@ -100,10 +100,6 @@ def _measured_lines(measured: dict[str, Any]) -> Iterator[str]:
         f'utilisation {measured["utilisation"]:.3f} planned (seed {measured["seed"]}), '
         f'{measured["utilisation_taken"]:.3f} by measured times; '
         f'{measured["callbacks_per_s"]:.0f} callbacks a second, {cpu} us of CPU each')
-    attribution = measured['attribution']
-    if attribution['wrong'] or attribution['none']:
-        yield (f'{counted(attribution["wrong"], "callback")} ran as the wrong job, '
-               f'{attribution["none"]} as part of no job')
 
 
 def _numbers(callbacks: dict[str, Any], count: str) -> dict[str, int]:

@@ -10,10 +10,8 @@ Tracks are in groups:
 * *workers*: one per worker, with its executions; arrows (flows) go from the publishing execution
   to the execution that its message started (of several pieces, to and from the last);
 * *callbacks*: a group per DAG with a track per callback, with its executions by job;
-* *jobs*: one per sink, with each job from its release to its completion there, and one with an
-  instant at each deadline;
-* *missed deadlines*: an instant for each;
-* *ready callbacks*: a counter of callbacks that wait for a worker or their group.
+* *jobs by sink*: one per sink, with each job from its release to its completion there;
+* *missed deadlines*: an instant for each.
 
 Executions of one track may overlap (a reentrant group, overlapping jobs): then it has several
 tracks of one name, because Perfetto requires slices of a track to nest. An execution goes to the
@@ -41,16 +39,15 @@ import numpy as np
 
 _SEQUENCE = 1
 _CLEARED, _NEEDED = 1, 2        # SEQ_INCREMENTAL_STATE_CLEARED, SEQ_NEEDS_INCREMENTAL_STATE
-_TOP = 'workers', 'callbacks', 'jobs by sink', 'missed deadlines', 'ready callbacks'
-_WORKERS, _CALLBACKS, _JOBS, _MISSED, _READY = range(1, 6)
-_BEGIN, _END, _INSTANT, _COUNTER = range(1, 5)
+_TOP = 'workers', 'callbacks', 'jobs by sink', 'missed deadlines'
+_WORKERS, _CALLBACKS, _JOBS, _MISSED = range(1, 5)
+_BEGIN, _END, _INSTANT = range(1, 4)
 _EXPLICIT = 3
 # Fields of messages, by number.
 _PACKET = 1
 _TIMESTAMP, _SEQUENCE_ID, _TRACK_EVENT, _INTERNED, _FLAGS, _TRACK = 8, 10, 11, 12, 13, 60
-_TYPE, _UUID, _NAME_IID, _NAME, _NOTE, _FLOW, _FLOW_ENDS, _VALUE = 9, 11, 10, 23, 4, 47, 48, 30
-_NOTES = ('DAG', 'job', 'waiting_ns', 'since_release_ns', 'reference_slack_ns', 'deadline_ns',
-          'slack_ns', 'verdict', 'late_by_ns')
+_TYPE, _UUID, _NAME_IID, _NAME, _NOTE, _FLOW, _FLOW_ENDS = 9, 11, 10, 23, 4, 47, 48
+_NOTES = 'DAG', 'job', 'waiting_ns', 'since_release_ns', 'deadline_ns', 'slack_ns', 'verdict'
 _KINDS = [VERDICTS[kind] for kind in sorted(VERDICTS)]
 _BATCH = 1 << 14
 
@@ -114,7 +111,7 @@ class _Writer:
                 for field, names in ((2, interned), (3, _NOTES))
                 for i, name in enumerate(names, 1))))
         for rank, name in enumerate(_TOP, 1):
-            self._track(name, 0, rank, *[message(8)] * (rank == _READY))    # a counter
+            self._track(name, 0, rank)
         self._executions(rows)
         self._verdicts()
 
@@ -129,7 +126,6 @@ class _Writer:
             'vertex', 'first', 'release_ns', 'slack_ns', 'waiting_ns'))
         known = of['release_ns'].known
         assert known is not None
-        self._ready(table['ready'][first & (waiting > 0)], start[first & (waiting > 0)])
 
         def of_worker(row: int) -> tuple[str, int, int]:
             worker = int(table['worker'][row])
@@ -157,7 +153,7 @@ class _Writer:
                     where(declared, *self._of_job(each)),
                     where(each['first'], self._note('waiting_ns', each['waiting'])),
                     where(each['known'], self._note('since_release_ns', each['since']),
-                          self._note('reference_slack_ns', each['slack'])),
+                          self._note('slack_ns', each['slack'])),
                     *self._flows(each)),
                 self._event(each['end'], _END, each['on_worker']),
                 self._event(
@@ -180,15 +176,6 @@ class _Writer:
             sent = done & (other >= 0) & (each['completes'] == VERTEX)
             yield where(sent, fixed(_FLOW, (base + vertex) * n + other + 1))
 
-    def _ready(self, ready: Ints, started: Ints) -> None:
-        """Write the number of ready callbacks over time."""
-        when, place = np.unique(np.concatenate([ready, started]), return_inverse=True)
-        change = np.zeros(len(when), dtype=np.int64)
-        np.add.at(change, place, np.repeat([1, -1], len(ready)))
-        for each in _batches({'time': when, 'count': np.cumsum(change)}):
-            self._write(self._event(
-                each['time'], _COUNTER, _READY, number(_VALUE, each['count'])))
-
     def _verdicts(self) -> None:
         """Write jobs on the tracks of their sinks, and missed deadlines on their track."""
         verdicts = self._replay.judged.verdicts
@@ -201,15 +188,11 @@ class _Writer:
 
         tracks = np.zeros(len(sink), dtype=np.int64)
         tracks[done] = self._tracks(sink[done], release[done], completed[done], of_sink)
-        deadlines = self._tracks(
-            sink, np.zeros_like(sink), np.zeros_like(sink),
-            lambda row: (f'{self._names[sink[row]]} deadline', _JOBS, int(sink[row])))
         for each in _batches({
                 **{key: verdicts[key] for key in (
                     'kind', 'dag', 'sink', 'job', 'release', 'deadline', 'completed')},
-                'done': done, 'track': tracks, 'deadlines': deadlines}):
+                'done': done, 'track': tracks}):
             deadline, completed = each['deadline'], each['completed']
-            never = completed < 0
             note = self._note('deadline_ns', deadline)
             self._write(
                 where(each['done'], self._event(
@@ -217,12 +200,10 @@ class _Writer:
                     self._job_name(each['job'], each['kind']), note,
                     self._note('slack_ns', deadline - completed)),
                     self._event(completed, _END, each['track'])),
-                self._event(deadline, _INSTANT, each['deadlines'], self._job_name(each['job'])),
                 where(each['kind'] != SINK_IN_TIME, self._event(
-                    np.where(never, deadline, completed), _INSTANT, _MISSED,
+                    deadline, _INSTANT, _MISSED,
                     number(_NAME_IID, each['sink'] + len(self._names) + 1),
-                    *self._of_job(each), self._word('verdict', _KINDS, each['kind']), note,
-                    where(~never, self._note('late_by_ns', completed - deadline)))))
+                    *self._of_job(each), self._word('verdict', _KINDS, each['kind']))))
 
     # --- tracks ----------------------------------------------------------------------------------
 
@@ -252,12 +233,12 @@ class _Writer:
         tracks = np.array([self._track(*of(row)) for row in first.tolist()], dtype=np.int64)
         return tracks[place]
 
-    def _track(self, name: str, parent: int, rank: int, *more: Bytes) -> int:
+    def _track(self, name: str, parent: int, rank: int) -> int:
         """Describe a new track; without a parent it is at the top."""
         self._uuid += 1
         above = [number(5, parent)] if parent else []
         self._put(self._head[0], message(
-            _TRACK, number(1, self._uuid), texts(2, [printable(name)]), *above, *more,
+            _TRACK, number(1, self._uuid), texts(2, [printable(name)]), *above,
             number(11, _EXPLICIT), number(12, rank)))
         return self._uuid
 

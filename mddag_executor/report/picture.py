@@ -58,14 +58,12 @@ class DagFrame:
     A DAG: its title with name and period.
 
     :ivar depth: the number of boxes of its longest path.
-    :ivar crossings: how often arrows pass the column of another box.
     """
 
     mark: str
     title: str
     boxes: tuple[Box, ...]
     depth: int
-    crossings: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,10 +101,9 @@ def picture(task_set: TaskSet) -> Picture:
         first = tables.first_vertex[dag.index]
         boxes = tuple(_box(vertex, offset, colours[offset]) for vertex, offset in zip(
             dag.vertices, offsets[first:first + len(dag.vertices)]))
-        column = path_lengths(dag, [1] * len(boxes))
         dags.append(DagFrame(
-            f'd{dag.index}', f'{dag.name}, every {format_ns(dag.period_ns)}', boxes, max(column),
-            sum(column[end] - column[start] - 1 for start, end in dag.edges)))
+            f'd{dag.index}', f'{dag.name}, every {format_ns(dag.period_ns)}', boxes,
+            max(path_lengths(dag, [1] * len(boxes)))))
     return Picture(
         PurePath(task_set.file).name, tuple(dags),
         (*_trigger_arrows(task_set), *_queue_arrows(task_set)), _legend(colours))

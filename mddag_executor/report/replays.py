@@ -25,10 +25,9 @@ from msg_graph.binding import is_background
 _PARTS = {
     'release lag': 'release_lag_ns', 'waiting': 'waiting_ns', 'for group': 'waiting_group_ns',
     'executing': 'executing_ns', 'suspended': 'suspended_ns', 'transport': 'transport_ns'}
-CALLBACKS_HEADER = (
+_CALLBACKS = (
     'callback', 'executions', 'busy', 'mean', 'longest', 'mean wait', 'longest wait', 'CPU',
     'interpreter')
-RECORDED_HEADER = ('callback', 'executions', 'busy', 'shortest', 'mean', 'longest')
 PATHS_HEADER = ('path', 'arrived', 'case', 'count', 'min', 'median', 'p99', 'max')
 _COMPARISON_HEADER = (
     'sink', 'deadline', 'due', 'in time', 'recorded', 'p99', 'recorded', 'max', 'recorded')
@@ -50,26 +49,22 @@ def times_tables(dags: Mapping[str, Any]) -> Iterator[str]:
             for name, of in found])
 
 
-def callbacks_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[Cell]]:
-    """Yield the rows of the table of callbacks."""
+def callbacks_table(
+    callbacks: Mapping[str, Mapping[str, int]]
+) -> tuple[list[str], list[list[Cell]]]:
+    """Return titles and rows of the table of callbacks, without columns that are not known."""
     short = short_names(callbacks)
+    rows: list[list[Cell]] = []
     for key, use in callbacks.items():
         n, busy = use.get('measured', 0), use.get('measured_busy_ns', 0)
-        yield [
+        rows.append([
             short[key], use['executions'],
-            *times(with_means(use), 'busy_ns', 'mean_ns', 'longest_ns', 'mean_wait_ns',
-                   'longest_wait_ns'),
+            *times({'longest_wait_ns': None, **with_means(use)}, 'busy_ns', 'mean_ns',
+                   'longest_ns', 'mean_wait_ns', 'longest_wait_ns'),
             f'{use["cpu_ns"] / busy:.0%}' if n and busy else None,
-            f'{use["held_interpreter"] / n:.0%}' if n else None]
-
-
-def recorded_rows(callbacks: Mapping[str, Mapping[str, int]]) -> Iterator[list[Cell]]:
-    """Yield the rows of the table of an imported recording's callbacks."""
-    for label, use in callbacks.items():
-        n = use['executions']
-        mean = {**use, 'mean_ns': use['busy_ns'] // max(1, n)}
-        yield [label, n, *times(use, 'busy_ns'),
-               *times(mean if n else None, 'shortest_ns', 'mean_ns', 'longest_ns')]
+            f'{use["held_interpreter"] / n:.0%}' if n else None])
+    known = [i for i, cells in enumerate(zip(*rows)) if any(cell is not None for cell in cells)]
+    return [_CALLBACKS[i] for i in known], [[row[i] for i in known] for row in rows]
 
 
 def communications_table(communications: Iterable[Mapping[str, Any]]) -> str:
@@ -87,21 +82,19 @@ _CASES = ('all', 'best', 'worst', 'worst_with_external_latency')
 
 def recorded_tables(result: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
     """
-    Yield the tables of recorded data except jobs: paths, imported callbacks.
+    Yield the tables of recorded data except jobs: paths, callbacks, messages.
 
-    :param callbacks: also show the imported callbacks if there are DAGs.
+    :param callbacks: also show the callbacks if there are DAGs.
     """
     if result.get('paths'):
         yield 'End to end, from the first publication to the start of the last callback:'
         yield table(PATHS_HEADER, paths_rows(result['paths']))
-    if 'recorded_callbacks' in result and (callbacks or not result['dags']):
-        yield 'Callbacks in the recording:'
-        yield table(RECORDED_HEADER, recorded_rows(result['recorded_callbacks']))
-        if result['communications']:
-            yield 'Messages, from publication to the start of the callback:'
-            yield communications_table(result['communications'])
-    if callbacks:
-        yield table(CALLBACKS_HEADER, callbacks_rows(result['callbacks']))
+    if callbacks or not result['dags']:
+        yield table(*callbacks_table(
+            result['callbacks'] or result.get('recorded_callbacks', {})))
+    if not result['dags'] and result.get('communications'):
+        yield 'Messages, from publication to the start of the callback:'
+        yield communications_table(result['communications'])
 
 
 def paths_rows(paths: Mapping[str, Any]) -> Iterator[list[Cell]]:

@@ -124,7 +124,7 @@ def with_means(use: Mapping[str, int]) -> dict[str, int | None]:
     """Return the usage of a callback, with ``mean_ns`` and ``mean_wait_ns`` of its executions."""
     n = use['executions']
     return {**use, 'mean_ns': use['busy_ns'] // n if n else None,
-            'mean_wait_ns': use['waiting_ns'] // n if n else None}
+            'mean_wait_ns': use['waiting_ns'] // n if n and 'waiting_ns' in use else None}
 
 
 def percent(part: int, whole: int) -> str:

@@ -73,9 +73,6 @@ def files(tmp_path_factory):
     ('evaluate g.yaml --policies rad,rad', "--policies: 'rad' is listed twice: name each once"),
     ('diff run.mcap run.mcap --tolerance 5', "mddag diff: argument --tolerance: '5' is no share"),
     # files to read
-    ('replay g.yaml run.mcap', 'g.yaml: this is a declaration: name it after the recordings'),
-    ('run run.mcap --synthetic sleep',
-     'run.mcap: this is a recording, no declaration: name a YAML file'),
     ('graph check none.yaml', 'none.yaml: no such file or directory: check the path'),
     ('explain none.mcap', 'none.mcap: no such file or directory: check the path'),
     ('simulate g.yaml --execution-times none.json', 'none.json: no such file or directory: check'),
@@ -109,7 +106,6 @@ def files(tmp_path_factory):
     ('graph assign-deadlines g.yaml --json -',
      '-: standard output can be only one of json and output: name a file for each other one'),
     ('graph draw g.yaml -o out.jpeg', 'out.jpeg: no ending that says what to draw: use one of .s'),
-    ('replay run.mcap --report out.pdf', '--report out.pdf: a report is an HTML file: let its na'),
     ('export run.mcap -o out.xlsx', '-o out.xlsx: it is not known what to write: let the name en'),
     ('export run.mcap -o out.pftrace --rows jobs', '--rows: a .pftrace gets both, executions and'),
     ('export run.mcap -o none/out/', 'none/out/: there is no directory none: make it first'),

@@ -264,7 +264,6 @@ def test_on_the_command_line(tmp_path, call):
     for arguments, says in (
             ([path], 'no run of this executor is recorded in it, so there are no jobs: to take'),
             ([path, graph], 'no run of this executor is recorded in it'),
-            ([path, graph, '--reschedule', '--overheads', 'recorded'], 'a bag has none'),
             ([path, '--reschedule', '--execution-times', times], 'give a GRAPH')):
         status, out, err = call('replay', *arguments)
         assert (status, out) == (2, '')

@@ -19,7 +19,7 @@ messages = pytest.importorskip('perfetto.protos.perfetto.trace.perfetto_trace_pb
 
 MS = runs.MS
 DEMO = runs.CONFIG.parent / 'bags' / 'demo_short.mcap'
-BEGIN, END, INSTANT, COUNTER = range(1, 5)
+BEGIN, END, INSTANT = range(1, 4)
 
 
 class Slice(NamedTuple):
@@ -36,8 +36,8 @@ class Trace:
     """
     What the viewer shows of an exported recording.
 
-    :ivar slices: all slices and instants; ``counts``: the values of counters with their times;
-        ``flows``: names of the slices at both ends of each arrow, and their starts.
+    :ivar slices: all slices and instants.
+    :ivar flows: names of the slices at both ends of each arrow, and their starts.
     """
 
     def __init__(self, path: Path) -> None:
@@ -52,7 +52,6 @@ class Trace:
         open_slices: dict[int, tuple[str, int]] = {}
         sent: dict[int, tuple[str, int]] = {}
         self.slices: list[Slice] = []
-        self.counts: list[tuple[int, int]] = []
         self.flows: list[tuple[tuple[str, int], tuple[str, int]]] = []
         # the viewer sorts by time, and leaves what is at the same time in the order of the file
         for packet in sorted((packet for packet in trace.packet if packet.HasField('track_event')),
@@ -66,8 +65,6 @@ class Trace:
                 open_slices[event.track_uuid] = name, now
                 self.flows += ((sent[flow], (name, now)) for flow in event.terminating_flow_ids)
                 sent.update((flow, (name, now)) for flow in event.flow_ids)
-            elif event.type == COUNTER:
-                self.counts.append((now, event.counter_value))
             else:
                 name, start = (name, now) if event.type == INSTANT else open_slices.pop(
                     event.track_uuid)
@@ -81,12 +78,9 @@ def test_by_hand(tmp_path):
             for _, track, name, begin, end in trace.slices} > {
         ('worker 1', '/filter:run', 37, 40), ('spare threads', 'extra', 41, 43),
         ('/filter:run', 'job 2 (late)', 30, 40), ('/filter:run', 'job 2', 37, 40),
-        ('/filter:run deadline', 'job 2', 38, 38),
-        ('missed deadlines', '/filter:run missed', 40, 40)}
+        ('missed deadlines', '/filter:run missed', 38, 38)}
     assert Counter(each.group for each in trace.slices) == {
-        'workers': 7, '/driver, every 10 ms': 6, 'undeclared': 1, 'jobs by sink': 6, '': 1}
-    assert trace.counts == [(start + (ready + late) * MS, 1 - late)
-                            for ready in (11, 22, 36) for late in (0, 1)]
+        'workers': 7, '/driver, every 10 ms': 6, 'undeclared': 1, 'jobs by sink': 3, '': 1}
     assert [(sent[0], taken[0]) for sent, taken in trace.flows] == [
         ('/driver:tick', '/filter:run')] * 3
 
