@@ -43,8 +43,6 @@ R = TypeVar('R', bound='str | Traces')
 FORMAT = 2
 """Version of the results for machines; a change of the meaning of a key raises it."""
 STDIN = '<stdin>'
-GRAPHS = ('.yaml', '.yml')
-_MCAP = b'\x89MCAP'
 MOST_BYTES = 64 << 20
 """The largest declaration, architecture file or table of execution times."""
 _copy: Any = None  # of standard input
@@ -96,10 +94,10 @@ def recording_and_graph(args: argparse.Namespace) -> None:
     """
     Separate TRACE… from GRAPH, which `options.add_recording` leaves together.
 
-    The last one is a trace, too, if it looks like one.
+    The last one is the declaration if it is named like one, or is standard input.
     """
     traces = args.trace
-    if len(traces) > 1 and not _is_trace(traces[-1]):
+    if len(traces) > 1 and (traces[-1] == '-' or is_graph(traces[-1])):
         *traces, args.graph = traces
     args.trace = one_run(traces, args.offset)
 
@@ -133,14 +131,9 @@ def _traces_in(path: str) -> Sequence[str]:
     return [path]
 
 
-def _is_trace(path: str) -> bool:
-    if path.endswith('.mcap'):
-        return True
-    try:
-        with open(path, 'rb') as file:
-            return file.read(len(_MCAP)) == _MCAP
-    except OSError:
-        return False
+def is_graph(path: str) -> bool:
+    """Return whether a file is named like a declaration."""
+    return path.lower().endswith(('.yaml', '.yml'))
 
 
 def _stdin() -> BinaryIO:

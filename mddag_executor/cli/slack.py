@@ -60,7 +60,7 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.replay.slack import find_slack, slack_result
     from mddag_executor.report.slack import lines, page
     common.recording_and_graph(args)
-    is_graph = str(args.trace).lower().endswith(common.GRAPHS)
+    is_graph = common.is_graph(str(args.trace))
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
     callbacks = len(set(problem.callback_of))
     with Progress('searching', callbacks) as line:

@@ -26,7 +26,7 @@ from mddag_executor.report.timeline import Timeline
 from msg_graph import Dag
 import numpy as np
 
-MOST_MISSES = 200
+MOST_MISSES = 500
 MOST_LINES = 150
 """Maximum number of lines of the timeline by callback."""
 LONGEST_LABEL = 40
@@ -72,7 +72,7 @@ class Prepared(NamedTuple):
     """
     A report's data, ready to be drawn.
 
-    :ivar executions: the columns of the executions; ``marks``: of the missed deadlines.
+    :ivar executions: the columns of the executions; ``marks``: of the worst misses.
     :ivar lines: of the timelines by callback, and by worker; ``n_hidden`` is the number of
         callbacks without line.
     :ivar misses: the worst misses, in the order of their releases.
@@ -97,7 +97,9 @@ def prepare(data: ReportData) -> Prepared:
     lines, ys, n_hidden = _lines(data, names)
 
     leads_to, colour = _verdicts_of(data, table)
-    missed, marked_at, worst = _missed(verdicts)
+    worst = _worst_misses(verdicts)
+    misses = verdicts[worst]
+    marked_at = np.where(misses['completed'] < 0, misses['deadline'], misses['completed'])
     workers, n = table['worker'].astype(np.int32), data.result['workers']
     on = np.where((workers >= 0) & (workers < n), workers, n)
     spare = int((on == n).any())
@@ -111,9 +113,9 @@ def prepare(data: ReportData) -> Prepared:
          'job': table['job'].astype(np.float64),
          'release': np.where(known, seconds(data, of['release_ns'].values), np.nan),
          'verdict': leads_to.astype(np.int32), 'class': colour.astype(np.int32)},
-        {'x': seconds(data, marked_at), 'workers': np.zeros(len(missed)),
-         'callbacks': ys[verdicts['sink'][missed]], 'verdict': missed.astype(np.int32)},
-        lines, _worker_lines(data, spare), n_hidden, verdicts[worst],
+        {'x': seconds(data, marked_at), 'workers': np.zeros(len(worst)),
+         'callbacks': ys[misses['sink']], 'verdict': worst.astype(np.int32)},
+        lines, _worker_lines(data, spare), n_hidden, misses,
         _meta(data, names, worst.tolist()))
 
 
@@ -122,21 +124,14 @@ def seconds(data: ReportData, times: Any) -> Any:
     return (times - (data.replay.recording.start or 0)) / 1e9
 
 
-def _missed(verdicts: Table) -> tuple[Ints, Ints, Ints]:
-    """
-    Return the missed deadlines (rows of ``verdicts``), and the times of their marks, in order.
-
-    Also return the worst ones, in the order of their releases.
-    """
+def _worst_misses(verdicts: Table) -> Ints:
+    """Return the rows of the worst missed deadlines, in the order of their releases."""
     missed = np.flatnonzero(verdicts['kind'] != SINK_IN_TIME)
     deadline, completed = verdicts['deadline'][missed], verdicts['completed'][missed]
     done = completed >= 0
     worst = missed[np.lexsort((deadline, np.where(done, deadline - completed, 0), done))]
     worst = worst[:MOST_MISSES]
-    marked_at = np.where(done, completed, deadline)
-    order = np.argsort(marked_at, kind='stable')
-    return missed[order], marked_at[order], worst[
-        np.lexsort((verdicts['sink'][worst], verdicts['release'][worst]))]
+    return worst[np.lexsort((verdicts['sink'][worst], verdicts['release'][worst]))]
 
 
 def _verdicts_of(data: ReportData, table: Table) -> tuple[Ints, Ints]:

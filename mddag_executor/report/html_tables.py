@@ -4,13 +4,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from html import escape
 from pathlib import Path
 
 from mddag_executor.core.tally import counts, total, VERDICTS
 from mddag_executor.report.html_data import Prepared, ReportData, seconds
-from mddag_executor.report.replays import callbacks_table
+from mddag_executor.report.replays import callbacks_table, times_table
 from mddag_executor.report.tables import (
     each_sink,
     missed_share,
@@ -24,11 +24,7 @@ from mddag_executor.text import counted
 _STYLE = Path(__file__).with_name('html.css')
 MOST_ROWS = 50
 """Number of sinks in the page itself; a script adds the others."""
-_PARTS = {
-    'release_lag_ns': '#c7c7c7', 'waiting_ns': '#fd8d3c', 'executing_ns': '#3182bd',
-    'suspended_ns': '#9e9ac8', 'transport_ns': '#74c476', 'unknown_ns': '#636363'}
-"""The colours of the parts of a response time (``Breakdown``)."""
-
+RED, ORANGE, BLUE = '#d7191c', '#fd8d3c', '#3182bd'
 
 class Html(str):
     """Text that is already markup."""
@@ -127,9 +123,14 @@ def sinks_html(data: ReportData) -> str:
 
 def _reached_bar(share: float) -> Html:
     """Return a bar from 0 to the deadline, red beyond it."""
-    colour = '#d7191c' if share > 1 else '#fd8d3c' if share > 0.9 else '#3182bd'
-    return Html(f'<span class="reached"><i style="width:{100 * min(1.0, share):.1f}%;'
-                f'background:{colour}"></i></span><b>{100 * share:.0f} %</b>')
+    colour = RED if share > 1 else ORANGE if share > 0.9 else BLUE
+    return bar(share, colour, f'{100 * share:.0f} %')
+
+
+def bar(share: float, colour: str, text: str) -> Html:
+    """Return a bar with a text next to it; at most its whole width is filled."""
+    return Html(f'<span class="bar"><i style="width:{100 * min(1.0, share):.1f}%;'
+                f'background:{colour}"></i></span><b>{text}</b>')
 
 
 def misses_html(data: ReportData, prepared: Prepared) -> str:
@@ -160,40 +161,13 @@ def misses_html(data: ReportData, prepared: Prepared) -> str:
 
 
 def worst_html(data: ReportData) -> str:
-    """Return a table with a bar for each sink, the worst ones first: where the time went."""
-    task_set, deadlines = data.replay.task_set, data.replay.judged.tables.sink_deadline
-    short = short_names(vertex.name for vertex in task_set.vertices)
-    worst_of = sorted((
-        ((worst['completed_ns'] - worst['release_ns']) / deadlines[vertex], vertex, worst)
-        for vertex, each in data.replay.chains.breakdown().items() for worst in [each['worst']]),
-        key=lambda item: -item[0])[:MOST_ROWS]
-    longest = max(1.0, *(share for share, _, _ in worst_of[:1]))
-    used = [part for part in _PARTS if any(worst[part] for _, _, worst in worst_of)]
-    rows = []
-    for _, vertex, worst in worst_of:
-        one = task_set.vertices[vertex]
-        rows.append((
-            task_set.dags[one.dag].name, short[one.name],
-            _stack(worst, deadlines[vertex], longest), worst['job'],
-            format_ns(worst['completed_ns'] - worst['release_ns'], 3),
-            *(format_ns(worst[part], 3) for part in used), format_ns(deadlines[vertex])))
-    names = {part: part.removesuffix('_ns').replace('_', ' ') for part in used}
-    legend = ''.join(f'<span><i style="background:{_PARTS[part]}"></i>{name}</span>'
-                     for part, name in names.items())
-    header = ('DAG', 'sink', 'worst job', 'job', 'response', *names.values(), 'deadline')
-    return (f'<p class="legend">{legend}</p>\n<p class="note">The bars have one scale: parts of '
-            'the deadline, which is the red line.</p>\n'
-            f'<div class="wide">{html_table(header, rows, 3)}</div>')
-
-
-def _stack(worst: Mapping[str, int], deadline: int, longest: float) -> Html:
-    """Return a bar on a scale from 0 to ``longest``, in parts of the deadline."""
-    whole = max(1, deadline) * longest
-    bars = ''.join(
-        f'<i style="width:{100 * max(0, worst[part]) / whole:.3f}%;background:{colour}"></i>'
-        for part, colour in _PARTS.items())
-    return Html(f'<div class="stack">{bars}<u style="left:{100 * deadline / whole:.3f}%"></u>'
-                '</div>')
+    """Return a table of where the time of the worst job of each sink went, the worst one first."""
+    vertices, deadlines = data.replay.task_set.vertices, data.replay.judged.tables.sink_deadline
+    short = short_names(vertex.name for vertex in vertices)
+    found = sorted(data.replay.chains.breakdown().items(), key=lambda item: (
+        item[1]['worst']['release_ns'] - item[1]['worst']['completed_ns']) / deadlines[item[0]])
+    rows = [(short[vertices[sink].name], each) for sink, each in found[:MOST_ROWS]]
+    return f'<div class="wide">{html_table(*times_table(rows, "worst"), 1)}</div>'
 
 
 def callbacks_html(data: ReportData) -> str:

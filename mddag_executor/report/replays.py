@@ -35,18 +35,30 @@ _COMPARISON_HEADER = (
 
 def times_tables(dags: Mapping[str, Any]) -> Iterator[str]:
     """Yield tables of the parts of response times: mean, and of the worst job."""
-    for title, which, job in (
-            ('Where the response times went, on average:', 'mean', []),
-            ('The same of the worst job of each sink:', 'worst', ['job'])):
-        found = [(sink.shown_name, (sink.result['breakdown'] or {which: None})[which])
-                 for sink in worst_first(dags)]
-        # most programs have neither groups that wait nor coroutines
-        parts = {name: key for name, key in _PARTS.items() if name not in (
-            'for group', 'suspended') or any(of and of[key] for _, of in found)}
-        yield title
-        yield table(('sink', *job, *parts), [
-            [name, *((of or {}).get(each) for each in job), *times(of, *parts.values())]
-            for name, of in found])
+    found = [(sink.shown_name, sink.result['breakdown']) for sink in worst_first(dags)]
+    yield 'Where the response times went, on average:'
+    yield table(*times_table(found, 'mean'))
+    yield 'The same of the worst job of each sink:'
+    yield table(*times_table(found, 'worst'))
+
+
+def times_table(
+    found: Iterable[tuple[str, Mapping[str, Any] | None]], which: str
+) -> tuple[list[str], list[list[Cell]]]:
+    """
+    Return titles and rows of a table of the parts of response times.
+
+    :param found: sinks, and their ``breakdown`` in the result of a replay.
+    :param which: ``mean``, or ``worst`` for the worst job of each sink.
+    """
+    rows = [(name, each and each[which]) for name, each in found]
+    # most programs have neither groups that wait nor coroutines
+    parts = {name: key for name, key in _PARTS.items() if name not in (
+        'for group', 'suspended') or any(each and each[key] for _, each in rows)}
+    job = ['job'] if which == 'worst' else []
+    return ['sink', *job, *parts], [
+        [name, *((each or {}).get(key) for key in job), *times(each, *parts.values())]
+        for name, each in rows]
 
 
 def callbacks_table(

@@ -9,14 +9,20 @@ from html import escape
 import math
 from typing import Any
 
-from mddag_executor.report.html_tables import Html, html_table, page_head
+from mddag_executor.report.html_tables import (
+    bar,
+    BLUE,
+    Html,
+    html_table,
+    ORANGE,
+    page_head,
+    RED,
+)
 from mddag_executor.report.tables import percent, short_names, times
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 
-_BAR_PX = 240
-_COLOURS = ((1.1, '#d7191c'), (1.5, '#fd8d3c'), (2.0, '#fec44f'), (5.0, '#9ecae1'))
-_BEST = '#3182bd'
+_MARGINS = 'sink', 'deadline', 'least margin', 'of it', '99 % have', 'median'
 
 
 def lines(result: Mapping[str, Any]) -> Iterator[str]:
@@ -29,7 +35,7 @@ def lines(result: Mapping[str, Any]) -> Iterator[str]:
         [short[name], _times(one['factor']), short[one['breaks']]]
         for name, one in _tightest(result)])
     yield 'How long before their deadlines the sinks complete now:'
-    yield table(('sink', 'deadline', 'least margin', 'of it', '99 % have', 'median'), [
+    yield table(_MARGINS, [
         [short[name], *_margins(sink)] for name, sink in _least_first(result)])
     yield from _summary(result)
 
@@ -49,16 +55,11 @@ def _margins(sink: Mapping[str, Any]) -> list[Cell]:
 
 
 def _missed_lines(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines about deadlines that are missed already."""
-    if not _is_judged(result):
-        return
-    if result['left_out']:
-        yield (f'left out, because they miss every deadline already: '
-               f'{listed(result["left_out"])}')
-    some = {name: n for name, n in result['missed'].items() if name not in result['left_out']}
-    if some:
-        yield (f'{counted(sum(some.values()), "deadline")} missed already: '
-               + listed([f'{name} ({n})' for name, n in some.items()])
+    """Yield the line about deadlines that are missed already."""
+    missed = result['missed']
+    if missed and _is_judged(result):
+        yield (f'{counted(sum(missed.values()), "deadline")} missed already: '
+               + listed([f'{name} ({n})' for name, n in missed.items()])
                + '; what follows says when another one is missed')
 
 
@@ -107,13 +108,12 @@ def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
     short = _short(result)
     yield ('<h2>How many times as long each callback may take</h2>\n<p class="note">If the others '
            f'take as long as now. The bars are logarithmic, up to {result["most"]:g} times.</p>\n')
-    yield '<div class="wide">' + html_table(('callback', 'then misses', 'bar', 'may take'), [
-        (short[name], short[one['breaks']], _bar(one['factor'], result['most']),
-         _times(one['factor'])) for name, one in _tightest(result)], 3) + '</div>'
+    yield '<div class="wide">' + html_table(('callback', 'then misses', 'may take'), [
+        (short[name], short[one['breaks']], _bar(one['factor'], result['most']))
+        for name, one in _tightest(result)], 2) + '</div>'
     yield '<h2>Margins of the sinks</h2>\n'
-    yield html_table(('sink', 'least margin', 'deadline', 'least', 'of it', '99 % have', 'median'),
-                     [(short[name], _margin_bar(sink), *_margins(sink))
-                      for name, sink in _least_first(result)], 2)
+    yield html_table(_MARGINS, [(short[name], *_margins(sink))
+                                for name, sink in _least_first(result)], 1)
     yield '</body></html>\n'
 
 
@@ -141,17 +141,5 @@ def _times(factor: float) -> str:
 
 
 def _bar(factor: float, most: float) -> Html:
-    colour = next((each for limit, each in _COLOURS if factor < limit), _BEST)
-    return _drawn(math.log(factor) / math.log(most), colour)
-
-
-def _margin_bar(sink: Mapping[str, Any]) -> Html:
-    if sink['margin_ns'] is None:
-        return _drawn(0, _BEST)
-    share = sink['margin_ns']['min'] / sink['relative_deadline_ns']
-    return _drawn(max(0, share), '#d7191c' if share < 0.1 else _BEST)
-
-
-def _drawn(share: float, colour: str) -> Html:
-    return Html(f'<div class="stack" style="width:{_BAR_PX}px"><i style="width:'
-                f'{max(1, round(share * _BAR_PX))}px;background:{colour}"></i></div>')
+    colour = RED if factor < 1.1 else ORANGE if factor < 1.5 else BLUE
+    return bar(math.log(factor) / math.log(most), colour, _times(factor))

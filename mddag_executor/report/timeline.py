@@ -4,8 +4,9 @@
 Selects executions for pictures: those around missed deadlines, and samples of the rest.
 
 Executions are in blocks of ``BLOCK``, in the order in which they ended. If there are more than
-``most`` executions, the blocks with the most missed deadlines are shown, and of the others every
-second, fourth, eighth, and so on: the misses are shown, and the rest is spread over the run.
+``most`` executions, the blocks in which most jobs with missed deadlines were released or ended are
+shown, and of the others every second, fourth, eighth, and so on: the misses are shown, and the
+rest is spread over the run.
 """
 
 from __future__ import annotations
@@ -55,11 +56,9 @@ class Timeline:
 
         shown = np.arange(n_blocks)
         if n_blocks > max(2, most // block):
-            at = block_of(judged.missed['until'])
-            n_missed = np.bincount(at, minlength=n_blocks)
-            # much of a job that ended early in a block ran in the previous block
-            early = 6 * (np.searchsorted(end, judged.missed['until'], 'right') % block) < block
-            n_missed += np.bincount(at[early & (at > 0)] - 1, minlength=n_blocks)
+            n_missed = np.bincount(np.concatenate([
+                block_of(judged.missed[time]) for time in ('release', 'until')]),
+                minlength=n_blocks)
             even = np.where(shown == 0, 1 << 62, shown & -shown)
             shown = np.sort(np.lexsort((-even, -n_missed))[:max(2, most // block)])
         self.rows = rows[np.isin(np.arange(len(rows)) // block, shown)]
