@@ -85,4 +85,3 @@ def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
     yield from recorded_tables(result, args.callbacks)
     yield from summary(result)
     yield from drift_lines(result.get('drift', ()))
-    yield from verdicts.lines(result)

@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 import sys
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common
-from mddag_executor.cli.text import one_line, printable
+from mddag_executor.cli.text import one_line
 from mddag_executor.core.tally import total
 from mddag_executor.core.tolerances import not_tolerated, NOTHING_DUE
 
@@ -60,17 +60,3 @@ def unproven(place: str, what: str, remedy: str = _NEVER_DUE) -> int:
     """Say that a run proves nothing about deadlines; return the exit status."""
     print(f'error: {one_line(f"{place}: {what}: {remedy}")}', file=sys.stderr)
     return 1
-
-
-def lines(result: dict[str, Any]) -> Iterator[str]:
-    """Yield which sinks are not within what their declarations tolerate, if any tolerates some."""
-    sinks = {(name, sink): found for name, dag in result['dags'].items()
-             for sink, found in dag['sinks'].items()}
-    if not any('tolerate' in found for found in sinks.values()):
-        return
-    broken = not_tolerated(result['dags'])
-    for key, why in broken.items():
-        if 'tolerate' in sinks[key]:
-            yield f'not tolerated: {printable(key[1])}: {why}'
-    if not broken:
-        yield 'all misses, if any, are within what is tolerated'

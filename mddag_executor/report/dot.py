@@ -36,8 +36,6 @@ _SHAPES = {
     'sync': ('shape=hexagon, style="filled", margin="0,0"', 'hexagon: sync (joins topics)'),
     'service': ('shape=parallelogram, style="filled"', 'parallelogram: service'),
 }
-_CENTRED = '\\n'
-_LEFT = '\\l'
 _WIDTH, _WIDE = 22, 32
 _MOST_WRITERS = 3
 _QUEUE = 'style=dotted, color="#2244bb", penwidth=1.6, arrowhead=open'
@@ -61,9 +59,9 @@ def quoted(text: str) -> str:
     return '"' + printable(text).replace('\\', '\\\\').replace('"', '\\"') + '"'
 
 
-def _label(lines: Iterable[str], end: str = _CENTRED) -> str:
-    r"""Return lines as one label, centred (``\n`` ends each) or left-aligned (``\l``)."""
-    return '"' + ''.join(quoted(line)[1:-1] + end for line in lines) + '"'
+def _label(lines: Iterable[str]) -> str:
+    r"""Return lines as one label, centred: ``\n`` ends each."""
+    return '"' + ''.join(quoted(line)[1:-1] + '\\n' for line in lines) + '"'
 
 
 def _wrapped(name: str, width: int = _WIDTH) -> list[str]:

@@ -36,7 +36,7 @@ from mddag_executor.report.html_tables import (
     worst_line,
 )
 from mddag_executor.report.replays import PATHS_HEADER, paths_rows
-from mddag_executor.report.tables import never_due_lines, ratio, verdicts_line
+from mddag_executor.report.tables import never_due_lines, pool_text, ratio, verdicts_line
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import Timeline
 from mddag_executor.simulate import Load, SimulatedRun
@@ -86,11 +86,7 @@ def _data(
     title: str, facts: list[tuple[str, str]], result: Mapping[str, Any], replay: Replay,
     duration_ns: int,
 ) -> ReportData:
-    pool = [('policy', str(result['policy']) + (', preemptive' if result['preemptive'] else '')),
-            ('workers', str(result['workers']))]
-    if 'recorded_callbacks' in result:      # recorded by another executor
-        pool = [('imported', f'{result["workers"]} threads ran callbacks')]
-    facts = [*facts, *pool, ('duration', format_ns(result['duration_ns'])),
+    facts = [*facts, ('pool', pool_text(result)), ('duration', format_ns(result['duration_ns'])),
              ('utilisation', ratio(result['utilisation']))]
     return ReportData(title, facts, result, replay, Timeline(replay.recording, replay.judged),
                       duration_ns)

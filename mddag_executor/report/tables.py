@@ -164,19 +164,23 @@ def run_lines(result: Mapping[str, Any], more: str = '') -> Iterator[str]:
     """
     yield verdicts_line(result['dags'])
     yield from never_due_lines(result['dags'])
-    pool = f'policy {printable(result["policy"])}, ' + counted(result['workers'], 'worker')
-    if 'recorded_callbacks' in result:      # recorded by another executor
-        pool = f'imported: {counted(result["workers"], "thread")} ran callbacks'
-    if result.get('processes'):
-        pool += f' in {counted(len(result["processes"]), "process", "processes")}'
-    yield (pool + (', preemptive' if result['preemptive'] else '')
-           + f', {format_ns(result["duration_ns"])}, utilisation {ratio(result["utilisation"])}'
-           + more)
+    yield (f'{pool_text(result)}, {format_ns(result["duration_ns"])}, '
+           f'utilisation {ratio(result["utilisation"])}{more}')
     miss = result['first_miss']
     if miss is not None:
         late = 'never completed' if miss['completed_ns'] is None else \
             f'{format_ns(miss["completed_ns"] - miss["deadline_ns"], 3)} late'
         yield f'first miss: {printable(miss["vertex"])}, job {miss["job"]}, {late}'
+
+
+def pool_text(result: Mapping[str, Any]) -> str:
+    """Return what ran the callbacks of a run."""
+    if 'recorded_callbacks' in result:
+        return f'imported: {counted(result["workers"], "thread")} ran callbacks'
+    several = counted(len(result.get('processes', ())), 'process', 'processes')
+    return (f'policy {printable(result["policy"])}, {counted(result["workers"], "worker")}'
+            + (f' in {several}' if result.get('processes') else '')
+            + (', preemptive' if result['preemptive'] else ''))
 
 
 def ratio(value: float | None) -> str:

@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-import re
 from typing import Any
 
 from hypothesis import example, given, HealthCheck, settings

@@ -89,7 +89,6 @@ def test_junit_with_hostile_names():
         assert all(c.isprintable() for c in text)
     assert good.find('failure') is None and good.find('skipped') is None
     assert none.find('skipped') is not None
-    assert suite.findtext('system-err')
 
 
 @pytest.fixture
@@ -119,10 +118,8 @@ def test_the_declaration_says_what_a_sink_tolerates(
     arguments = 'replay', trace, graph, *mode, '--fail-on-miss'
     status, output, _ = call(*arguments, '--github', '--junit', out)
     assert status == (not kept)
-    assert ('all misses, if any, are within what is tolerated' in output) == kept
     why = f'{worst} of {tolerate.split()[-1]} jobs in a row missed the deadline, ' \
           f'tolerated: {tolerate}'
-    assert (f'not tolerated: /n:a: {why}' in output) != kept
     assert (f'::error file={graph},title=Deadline of /n%3Aa::{why}\n' in output) != kept
     failure = ElementTree.parse(out).getroot().find('testsuite/testcase/failure')
     assert (None if failure is None else failure.attrib['message']) == (None if kept else why)
