@@ -12,7 +12,7 @@ path costs nothing.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import json
 import os
@@ -25,7 +25,7 @@ from typing import Any, BinaryIO, cast, TYPE_CHECKING, TypeVar
 
 from mddag_executor import __version__
 from mddag_executor.cli.options import Input, NamedFile, Output, Report
-from mddag_executor.cli.text import is_quiet, Progress
+from mddag_executor.cli.text import is_quiet
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.output_rules import (
     check_distinct,
@@ -183,16 +183,11 @@ def check_output(path: str | None, recording: bool = False, overwrite: bool = Fa
     if path is None or path == '-':
         return
     target = Path(path)
-    folder = target.parent
     if target.is_dir():
         raise InputError(path, 'this is a directory', 'name a file')
-    if not folder.is_dir():
-        raise InputError(path, f'there is no directory {folder}', 'make it first')
-    if _is_special(target):
-        return
-    if not os.access(folder.resolve(), os.W_OK | os.X_OK):
-        raise InputError(path, 'the directory cannot be written to', 'name another file')
-    check_replaced(path, recording=recording, overwrite=overwrite)
+    if not _is_special(target):
+        _check_parent(path)
+        check_replaced(path, recording=recording, overwrite=overwrite)
 
 
 def _is_special(path: Path) -> bool:
@@ -244,11 +239,15 @@ def output_file(path: str) -> Iterator[BinaryIO]:
 def check_folder(path: str, names: Collection[str]) -> None:
     """Find out whether a folder of results with files of these names can be written."""
     check_results(Path(path), names)
-    target = Path(path).resolve()
-    if not target.parent.is_dir():
+    _check_parent(path)
+
+
+def _check_parent(path: str) -> None:
+    folder = Path(path).resolve().parent
+    if not folder.is_dir():
         raise InputError(path, f'there is no directory {Path(path).parent}', 'make it first')
-    if not os.access(target.parent, os.W_OK | os.X_OK):
-        raise InputError(path, 'the directory cannot be written to', 'name another folder')
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(path, 'the directory cannot be written to', 'name another one')
 
 
 @contextmanager
@@ -304,17 +303,11 @@ def _plain(value: Any) -> Any:
     raise TypeError(f'{type(value).__name__} has no JSON form')
 
 
-def write_report(path: str, data: Callable[[], ReportData]) -> None:
-    """
-    Write an HTML report as a whole.
-
-    :param data: makes what it is about, when it is needed
-    """
+def write_report(path: str, data: ReportData) -> None:
+    """Write an HTML report as a whole."""
     from mddag_executor.report.html import write
-    with Progress('making the report') as line:
-        line.update(0)
-        with output_file(path) as file:
-            write(file, data())
+    with output_file(path) as file:
+        write(file, data)
 
 
 def write_result(args: argparse.Namespace, result: Any) -> bool:

@@ -58,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
     status = verdicts.judge(args, outcome.tally, result)
     if args.report is not None:
         from mddag_executor.report.html import of_outcome
-        common.write_report(args.report, lambda: of_outcome(outcome))
+        common.write_report(args.report, of_outcome(outcome))
     common.show(args, result, _lines(args, result))
     return status
 

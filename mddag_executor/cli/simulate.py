@@ -62,7 +62,7 @@ def main(args: argparse.Namespace) -> int:
             write_trace(path, task_set, load, run)
     if args.report is not None:
         from mddag_executor.report.html import of_run
-        common.write_report(args.report, lambda: of_run(task_set, load, run))
+        common.write_report(args.report, of_run(task_set, load, run))
     result = {
         **run.result(), 'file': task_set.file, 'judge': run.settings.judge,
         'seed': args.seed if args.execution_times is None else None, 'ended_ns': run.ended_ns,
