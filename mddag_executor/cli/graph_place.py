@@ -10,6 +10,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
+from mddag_executor.cli.recorded import as_recorded, Source
 from mddag_executor.cli.text import Cell, one_line, Progress, table
 from mddag_executor.text import counted
 
@@ -65,7 +66,10 @@ def main(args: argparse.Namespace) -> int:
                        'execution times are those of --trace: leave one of them out')
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)
-    times, judged = _recorded(args.trace, task_set) if args.trace else (
+    source = None
+    if args.trace:
+        source = Source(*common.input_path(common.one_run(args.trace, ())), task_set)
+    times, judged = _recorded(source) if source else (
         execution_times(args, task_set, workers), task_set)
     placing = Placing(judged, args.processes, times, args.together, args.apart)
     cpus = args.cpus or defaults.processors()
@@ -81,7 +85,7 @@ def main(args: argparse.Namespace) -> int:
             'processes': [{'name': p.name, 'nodes': p.nodes} for p in processes],
             'loads': _loads(placing, place, processes), 'cpus': cpus, 'workers': workers,
             'policy': args.policy, 'tried': tried,
-            **{name: _predicted(args, task_set, cpus, predictor, where, times)
+            **{name: _predicted(args, source, cpus, predictor, where, times)
                for name, where in (('predicted', processes),
                                    ('one_process', (Process('all', tuple(placing.nodes)),)))}}
     common.write_text(args.output, with_processes(task_set, processes).text)
@@ -89,12 +93,11 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _recorded(traces: list[str], task_set: TaskSet) -> tuple[list[list[int]], TaskSet]:
+def _recorded(source: Source) -> tuple[list[list[int]], TaskSet]:
     """Return mean CPU times as recorded, of callbacks that wait what they took."""
-    from mddag_executor.cli import recorded
-    path = traces[0] if len(traces) == 1 else traces
-    source = recorded.Source(path, ', '.join(traces), task_set)
-    used = recorded.as_recorded(source).usage.callbacks()
+    task_set = source.task_set
+    assert task_set is not None
+    used = as_recorded(source).usage.callbacks()
     times = {}
     holds = {}
     for callback in task_set.callbacks:
@@ -114,18 +117,17 @@ def _recorded(traces: list[str], task_set: TaskSet) -> tuple[list[list[int]], Ta
 
 
 def _predicted(
-    args: argparse.Namespace, task_set: TaskSet, cpus: int, predictor: Predictor,
+    args: argparse.Namespace, source: Source | None, cpus: int, predictor: Predictor,
     processes: Sequence[Process], times: list[list[int]],
 ) -> dict[str, Any]:
     """Return the sinks of a placement; of recorded runs with what each job took, and when."""
-    if not args.trace:
+    if source is None:
         dags: dict[str, Any] = predictor.predict(processes, times).result()['dags']
         return dags
     from mddag_executor.replay import reschedule
-    path = args.trace[0] if len(args.trace) == 1 else args.trace
     outcome = reschedule(
-        path, task_set, policy=args.policy, workers=args.workers, preemptive=False, cpus=cpus,
-        name=', '.join(args.trace), processes=lambda *of: processes)
+        source.path, source.task_set, policy=args.policy, workers=args.workers, preemptive=False,
+        cpus=cpus, name=source.name, processes=lambda *of: processes)
     dags = outcome.result()['dags']
     return dags
 

@@ -153,6 +153,7 @@ def main(
     :param run: does what they say
     :returns: the exit status
     """
+    _open_streams()
     if '_ARGCOMPLETE' in os.environ:
         from mddag_executor.cli.completion import complete
         complete()
@@ -228,6 +229,21 @@ def known_errors() -> tuple[type[BaseException], ...]:
     """
     msg_graph = sys.modules.get('msg_graph')
     return (MddagError,) if msg_graph is None else (MddagError, msg_graph.GraphError)
+
+
+def _open_streams() -> None:
+    """
+    Open standard streams that are closed (`2>&-`), to write to nowhere.
+
+    Otherwise the next file that is opened would get their number, and with it what a library in C
+    prints.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
+    for name in ('stdout', 'stderr'):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))
 
 
 def _silence_stdout() -> None:

@@ -61,6 +61,8 @@ positive_int = _number(int, lambda value: value >= 1, 'an integer from 1 up')
 seed = _number(int, lambda value: 0 <= value < 2 ** 64, 'an integer from 0 to 2**64 - 1')
 number = _number(float, math.isfinite, 'a number')
 positive_float = _number(float, lambda value: 0 < value < math.inf, 'a number above zero')
+utilisation = _number(
+    float, lambda value: 0 < value <= 1000, 'a number above zero, at most 1000')
 not_negative = _number(float, lambda value: 0 <= value < math.inf, 'a number from 0 up')
 
 
@@ -200,7 +202,7 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
         'type': positive_int, 'metavar': 'N', 'help': 'how many runs to simulate at a time',
         'otherwise': 'the number of processors'},
     '--utilisation': {
-        'type': positive_float, 'metavar': 'U',
+        'type': utilisation, 'metavar': 'U',
         'help': 'scale the execution times to this normalised utilisation, sum(C/T)/workers'},
     '--skip': {
         'type': or_zero(duration), 'default': 0, 'metavar': 'TIME',

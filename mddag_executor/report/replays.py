@@ -65,12 +65,12 @@ def callbacks_table(
     callbacks: Mapping[str, Mapping[str, int]]
 ) -> tuple[list[str], list[list[Cell]]]:
     """Return titles and rows of the table of callbacks, without columns that are not known."""
-    short = short_names(callbacks)
+    short = short_names(key for key in callbacks if ':' in key)     # others are descriptions
     rows: list[list[Cell]] = []
     for key, use in callbacks.items():
         n, busy = use.get('measured', 0), use.get('measured_busy_ns', 0)
         rows.append([
-            short[key], use['executions'],
+            short.get(key, key), use['executions'],
             *times({'longest_wait_ns': None, **with_means(use)}, 'busy_ns', 'mean_ns',
                    'longest_ns', 'mean_wait_ns', 'longest_wait_ns'),
             f'{use["cpu_ns"] / busy:.0%}' if n and busy else None,

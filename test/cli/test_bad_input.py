@@ -66,6 +66,7 @@ def files(tmp_path_factory):
     ('simulate g.yaml --judge me', 'mddag simulate: argument --judge: invalid choice'),
     ('simulate g.yaml --utilisation nan',
      "mddag simulate: argument --utilisation: 'nan' is not a number above zero"),
+    ('slack g.yaml --utilisation 1e300', "mddag slack: argument --utilisation: '1e300' is not a"),
     ('simulate g.yaml --policy edf',
      "policy 'edf': there is no such policy: choose one of rad, rm, wc, fifo, gedf, dm, "),
     ('evaluate g.yaml --seed -1',

@@ -49,6 +49,7 @@ COMMANDS = {
     'diff_tolerance': 'diff run.mcap slow.mcap tolerant.yaml',
     'replay': 'replay run.mcap --callbacks --json out.json',
     'replay_imported': 'replay drive.mcap seen.yaml --json out.json',
+    'replay_undeclared': 'replay drive.mcap',
     'replay_preemptive': (
         'replay run.mcap --reschedule --policy fifo --preemptive --overheads none'),
     'replay_tolerance': 'replay run.mcap tolerant.yaml --junit out.xml --github --report out.html',

@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from importlib.metadata import distribution
 from importlib.util import find_spec
 import io
+import json
 import os
 from pathlib import Path
 import re
@@ -207,6 +208,16 @@ def test_a_full_disk_is_one_line(how):
     lines = [line for line in done.stderr.splitlines() if not line.startswith('warning: ')]
     assert (done.returncode, len(lines)) == (2, 1)
     assert lines[0].startswith(f'error: {place}: no space left on device: ')
+
+
+@pytest.mark.parametrize('closed', ['<&- >&-', '2>&-', '<&- >&- 2>&-'])
+def test_closed_streams(folder, closed):
+    """Nothing is printed, also not into files that are written."""
+    (folder / 'g.yaml').write_text(GRAPH)
+    for words in ('simulate g.yaml --trace run.mcap', 'replay run.mcap --json out.json'):
+        done = subprocess.run(f'{sys.executable} -m mddag_executor {words} {closed}', shell=True)
+        assert done.returncode == 0
+    assert json.loads((folder / 'out.json').read_text())['deadline_missed'] is False
 
 
 ONE = 'nodes: [{node: /n, callbacks: [{name: t, timer: 1s, deadline: 1s, execution_time: 1us}]}]\n'
