@@ -19,10 +19,9 @@ with topics and services with names.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 from heapq import heappop, heappush
-from operator import eq
 import re
 from typing import NamedTuple
 
@@ -133,41 +132,30 @@ def meant(callback: Callback, undeclared: Collection[Entity]) -> str | None:
     """
     Return the entity that an unbound declared callback probably means, as a question.
 
-    Candidates are an entity of another node or topic whose name has one namespace more or less, a
-    timer of its node with another period, and an entity of a node or topic with a similar name;
-    also the only entity with the same start.
+    That is the timer of its node with the nearest period, or an entity of its kind of which
+    either the node or the start has another name: a similar one, or one with other namespaces.
     """
-    pairs = [(wanted, other) for wanted in entities_of(callback) for other in undeclared
-             if other.kind == wanted.kind]
-    pairs.sort(key=lambda pair: abs((pair[1].period_ns or 0) - (pair[0].period_ns or 0)))
-    for wanted, other in pairs:
-        if not _same_below(other.node, wanted.node):
-            continue
-        if other.node != wanted.node:
-            if _starts_alike(other, wanted, _same_below):
-                return f'did you mean the node {shown(other.node)}?'
-        elif wanted.kind == 'timer':
-            return f'did you mean its timer of {format_duration(other.period_ns or 0)}?'
-        elif other.start != wanted.start and _same_below(other.start, wanted.start):
-            return f'did you mean the {_WORDS[other.kind]} {shown(other.start)}?'
     for wanted in entities_of(callback):
-        alike = [other for each, other in pairs if each == wanted]
-        nodes = sorted({other.node for other in alike if other.node != wanted.node
-                        and _starts_alike(other, wanted, eq)})
-        if found := get_close_matches(wanted.node, nodes, 1) or nodes[:len(nodes) == 1]:
-            return f'did you mean the node {shown(found[0])}?'
-        starts = {other.start for other in alike if other.node == wanted.node}
-        if wanted.start and (found := get_close_matches(wanted.start, sorted(starts), 1)):
-            return f'did you mean the {_WORDS[wanted.kind]} {shown(found[0])}?'
+        alike = [other for other in undeclared if other.kind == wanted.kind]
+        here = [other for other in alike if other.node == wanted.node]
+        if wanted.kind == 'timer' and here:
+            period = min((other.period_ns or 0 for other in here),
+                         key=lambda ns: abs(ns - (wanted.period_ns or 0)))
+            return f'did you mean its timer of {format_duration(period)}?'
+        if found := _closest(wanted.start, (other.start for other in here)):
+            return f'did you mean the {_WORDS[wanted.kind]} {shown(found)}?'
+        if found := _closest(wanted.node, (
+                other.node for other in alike if _same_below(other.start, wanted.start)
+                and is_period(other.period_ns or 0, wanted.period_ns or 0))):
+            return f'did you mean the node {shown(found)}?'
     return None
 
 
-def _starts_alike(
-    entity: Entity, declared: Entity, alike: Callable[[str, str], bool]
-) -> bool:
-    if declared.kind == 'timer':
-        return is_period(entity.period_ns or 0, declared.period_ns or 0)
-    return alike(entity.start, declared.start)
+def _closest(name: str, others: Iterable[str]) -> str | None:
+    """Return the name that differs only by namespaces, or a similar one."""
+    different = sorted({*others} - {name})
+    return next((each for each in different if _same_below(each, name)), None) or next(
+        iter(get_close_matches(name, different, 1)), None)
 
 
 def _same_below(name: str, other: str) -> bool:

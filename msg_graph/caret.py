@@ -27,13 +27,16 @@ find a value, and that it was not filled in.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, DraftPath
+from msg_graph.duration import DAY, MICROSECOND
 from msg_graph.errors import GraphError, shown, ValueProblem
-from msg_graph.language import CALLBACK, GROUP, Name, NODE, SERVICE, TOPIC
-from msg_graph.yamltext import Mapping, parse_yaml, Scalar, Sequence, Tree
+from msg_graph.language import CALLBACK, GROUP, NODE, SERVICE, TOPIC
+from msg_graph.yamltext import parse_yaml, plain
 
-_REMEDY = "give an architecture file as caret_analyze's Architecture.export writes it"
+Plain = dict[str, Any]
+"""An entry of the file; scalars are text, ``null`` is None."""
 
 
 def declaration_from_caret(
@@ -54,148 +57,115 @@ def declaration_from_caret(
 
 def read_architecture(text: str, file: str) -> Draft:
     """Return the contents of an architecture file."""
-    tree = parse_yaml(text, file)
-    if not isinstance(tree, Mapping) or 'nodes' not in tree.entries:
-        raise GraphError(file, None, 'this is no architecture file of CARET', _REMEDY)
-    reader = _Reader(file)
-    nodes = [reader.node(each) for each in reader.mappings(tree, 'nodes')]
-    paths = [reader.path(each) for each in reader.mappings(tree, 'named_paths')]
-    paths += [reader.alias(each) for each in reader.mappings(tree, 'path_name_aliases')]
+    remedy = "give an architecture file as caret_analyze's Architecture.export writes it"
+    tree: Any = plain(parse_yaml(text, file))
+    try:
+        nodes = [_node(each) for each in tree['nodes'] or ()]
+        paths = [_path(each) for each in tree.get('named_paths') or ()]
+        paths += [_alias(each) for each in tree.get('path_name_aliases') or ()]
+    except ValueProblem as wrong:
+        raise GraphError(file, None, wrong.problem, wrong.remedy) from None
+    except KeyError as missing:
+        raise GraphError(
+            file, None, f'this is no architecture file of CARET: {missing} is missing', remedy
+        ) from None
+    except (AttributeError, TypeError):
+        raise GraphError(file, None, 'this is no architecture file of CARET', remedy) from None
     return Draft(
         f'the CARET architecture file {file}', [node for node in nodes if node.callbacks], paths)
 
 
-class _Reader:
+def _node(tree: Plain) -> DraftNode:
+    node = DraftNode(NODE.check(tree['node_name']))
+    for each in tree.get('callbacks') or ():
+        node.callbacks[each['callback_name']] = _callback(each, node.name)
+    for each in tree.get('callback_groups') or ():
+        _group(node, each)
+    for each in tree.get('subscribes') or ():
+        if each['callback_name'] not in node.callbacks:
+            node.taken.append(TOPIC.check(each['topic_name']))
+    for each in tree.get('publishes') or ():
+        _publisher(node, each)
+    for each in tree.get('variable_passings') or ():
+        writer = node.callbacks.get(each['callback_name_write'])
+        reader = node.callbacks.get(each['callback_name_read'])
+        if writer is not None and reader is not None:
+            _read(reader, writer.name)
+    for each in tree.get('message_contexts') or ():
+        _context(node, each)
+    return node
 
-    def __init__(self, file: str) -> None:
-        self._file = file
 
-    def error(self, tree: Tree, problem: str) -> GraphError:
-        return GraphError(self._file, tree.line, problem, _REMEDY)
+def _callback(tree: Plain, node: str) -> DraftCallback:
+    full = tree['callback_name']
+    name = CALLBACK.check(
+        full[len(node) + 1:] if full.startswith(f'{node}/') else full.rpartition('/')[2])
+    kind = tree['type' if 'type' in tree else 'callback_type'].removesuffix('_callback')
+    if kind == 'timer':
+        period = tree['period_ns']
+        if not (period.isdecimal() and MICROSECOND <= int(period[:19]) <= DAY):
+            raise ValueProblem(f"'period_ns' of {shown(full)} is {shown(period)}",
+                               f'write ns, from {MICROSECOND} to {DAY}')
+        return DraftCallback(node, name, kind, period_ns=int(period))
+    if kind == 'subscription':
+        return DraftCallback(node, name, kind, [TOPIC.check(tree['topic_name'])])
+    if kind == 'service':
+        return DraftCallback(node, name, kind, [SERVICE.check(tree['service_name'])])
+    raise ValueProblem(f'the type {shown(kind)} of {shown(full)} is not known',
+                       'use timer_callback, subscription_callback or service_callback')
 
-    def mappings(self, tree: Mapping, key: str) -> list[Mapping]:
-        value = tree.entries.get(key)
-        if value is None or (isinstance(value, Scalar) and value.is_null):
-            return []
-        if not isinstance(value, Sequence):
-            raise self.error(value, f"'{key}' is no list")
-        for item in value.items:
-            if not isinstance(item, Mapping):
-                raise self.error(item, f"an entry of '{key}' is no mapping")
-        return [item for item in value.items if isinstance(item, Mapping)]
 
-    def text(self, tree: Mapping, key: str) -> str:
-        value = tree.entries.get(key)
-        if not isinstance(value, Scalar):
-            raise self.error(tree, f"'{key}' is missing")
-        return value.text
-
-    def texts(self, tree: Mapping, key: str) -> list[str]:
-        value = tree.entries.get(key)
-        items = value.items if isinstance(value, Sequence) else []
-        return [item.text for item in items if isinstance(item, Scalar)]
-
-    def name(self, tree: Mapping, key: str, what: Name, text: str | None = None) -> str:
-        try:
-            return what.check(self.text(tree, key) if text is None else text)
-        except ValueProblem as wrong:
-            raise GraphError(
-                self._file, tree.line, f"'{key}': {wrong.problem}", wrong.remedy) from None
-
-    def node(self, tree: Mapping) -> DraftNode:
-        node = DraftNode(self.name(tree, 'node_name', NODE))
-        for each in self.mappings(tree, 'callbacks'):
-            callback = self.callback(each, node.name)
-            full = self.text(each, 'callback_name')
-            if full in node.callbacks:
-                raise self.error(each, f'the callback {shown(full)} is listed twice')
-            node.callbacks[full] = callback
-        for each in self.mappings(tree, 'callback_groups'):
-            self._group(node, each)
-        for each in self.mappings(tree, 'subscribes'):
-            topic = self.name(each, 'topic_name', TOPIC)
-            if self.text(each, 'callback_name') not in node.callbacks:
-                node.taken.append(topic)
-        for each in self.mappings(tree, 'publishes'):
-            self._publisher(node, each)
-        for each in self.mappings(tree, 'variable_passings'):
-            writer = node.callbacks.get(self.text(each, 'callback_name_write'))
-            reader = node.callbacks.get(self.text(each, 'callback_name_read'))
-            if writer is not None and reader is not None:
-                _read(reader, writer.name)
-        for each in self.mappings(tree, 'message_contexts'):
-            self._context(node, each)
-        return node
-
-    def callback(self, tree: Mapping, node: str) -> DraftCallback:
-        full = self.text(tree, 'callback_name')
-        name = full[len(node) + 1:] if full.startswith(f'{node}/') else full.rpartition('/')[2]
-        self.name(tree, 'callback_name', CALLBACK, name)
-        key = 'type' if 'type' in tree.entries else 'callback_type'
-        kind = self.text(tree, key).removesuffix('_callback')
-        if kind == 'timer':
-            period = self.text(tree, 'period_ns')
-            if not (period.isascii() and period.isdecimal() and 0 < int(period[:19]) < 2 ** 62):
-                raise self.error(tree, f"'period_ns' is {shown(period)}")
-            return DraftCallback(node, name, kind, period_ns=int(period))
-        if kind == 'subscription':
-            return DraftCallback(node, name, kind, [self.name(tree, 'topic_name', TOPIC)])
-        if kind == 'service':
-            service = self.name(tree, 'service_name', SERVICE)
-            return DraftCallback(node, name, kind, [service])
-        raise self.error(tree, f"'{key}' {shown(kind)} is not known")
-
-    def _group(self, node: DraftNode, tree: Mapping) -> None:
-        members = [node.callbacks[name] for name in self.texts(tree, 'callback_names')
-                   if name in node.callbacks]
-        name = self.text(tree, 'callback_group_name').rpartition('/')[2]
-        if self.text(tree, 'callback_group_type') != 'mutually_exclusive' or len(members) < 2:
-            return
-        self.name(tree, 'callback_group_name', GROUP, name)
+def _group(node: DraftNode, tree: Plain) -> None:
+    members = [node.callbacks[name] for name in tree['callback_names'] or ()
+               if name in node.callbacks]
+    if tree['callback_group_type'] == 'mutually_exclusive' and len(members) > 1:
+        name = GROUP.check(tree['callback_group_name'].rpartition('/')[2])
         for callback in members:
             callback.group = name
 
-    def _publisher(self, node: DraftNode, tree: Mapping) -> None:
-        topic = self.name(tree, 'topic_name', TOPIC)
-        names = self.texts(tree, 'callback_names')
-        if 'callback_name' in tree.entries:
-            names.append(self.text(tree, 'callback_name'))
-        known = [node.callbacks[name] for name in names if name in node.callbacks]
-        if not known and len(node.callbacks) == 1:
-            known = list(node.callbacks.values())
-        for callback in known:
-            if topic not in callback.publishes:
-                callback.publishes.append(topic)
-        if not known:
-            for callback in node.callbacks.values():
-                callback.maybe.append(topic)
 
-    def _context(self, node: DraftNode, tree: Mapping) -> None:
-        kind = tree.entries.get('context_type')
-        if not isinstance(kind, Scalar) or kind.text != 'use_latest_message':
-            return
-        taken = self.text(tree, 'subscription_topic_name')
-        published = self.text(tree, 'publisher_topic_name')
+def _publisher(node: DraftNode, tree: Plain) -> None:
+    topic = TOPIC.check(tree['topic_name'])
+    names = tree.get('callback_names') or [tree.get('callback_name')]
+    known = [node.callbacks[name] for name in names if name in node.callbacks]
+    if not known and len(node.callbacks) == 1:
+        known = list(node.callbacks.values())
+    for callback in known:
+        if topic not in callback.publishes:
+            callback.publishes.append(topic)
+    if not known:
         for callback in node.callbacks.values():
-            if published not in callback.publishes or taken in callback.starts:
-                continue
-            takers = [c.name for c in node.callbacks.values()
-                      if c.kind == 'subscription' and taken in c.starts]
-            for read in takers or ([taken] if taken in node.taken else []):
-                _read(callback, read)
+            callback.maybe.append(topic)
 
-    def path(self, tree: Mapping) -> DraftPath:
-        steps = []
-        for each in self.mappings(tree, 'node_chain'):
-            steps.append((self.text(each, 'node_name'),
-                          self.text(each, 'subscribe_topic_name'),
-                          self.text(each, 'publish_topic_name')))
-        return DraftPath(self.text(tree, 'path_name'), steps)
 
-    def alias(self, tree: Mapping) -> DraftPath:
-        pairs = [text.rpartition('/') for text in self.texts(tree, 'callbacks')]
-        return DraftPath(
-            self.text(tree, 'path_name'), [], [f'{node}:{name}' for node, _, name in pairs])
+def _context(node: DraftNode, tree: Plain) -> None:
+    if tree['context_type'] != 'use_latest_message':
+        return
+    taken, published = tree['subscription_topic_name'], tree['publisher_topic_name']
+    for callback in node.callbacks.values():
+        if published not in callback.publishes or taken in callback.starts:
+            continue
+        takers = [c.name for c in node.callbacks.values()
+                  if c.kind == 'subscription' and taken in c.starts]
+        for read in takers or ([taken] if taken in node.taken else []):
+            _read(callback, read)
+
+
+def _path(tree: Plain) -> DraftPath:
+    return DraftPath(_text(tree, 'path_name'), [
+        (_text(each, 'node_name'), _text(each, 'subscribe_topic_name'),
+         _text(each, 'publish_topic_name')) for each in tree['node_chain'] or ()])
+
+
+def _alias(tree: Plain) -> DraftPath:
+    pairs = [text.rpartition('/') for text in tree['callbacks']]
+    return DraftPath(_text(tree, 'path_name'), [], [f'{node}:{name}' for node, _, name in pairs])
+
+
+def _text(tree: Plain, key: str) -> str:
+    if not isinstance(tree[key], str):
+        raise TypeError(key)
+    return str(tree[key])
 
 
 def _read(reader: DraftCallback, what: str) -> None:

@@ -42,7 +42,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 import gc
 from graphlib import CycleError, TopologicalSorter
@@ -51,14 +51,22 @@ from os import fspath, PathLike
 from typing import Any
 
 from msg_graph.declaration import parse_declaration
-from msg_graph.draft import with_blanks
-from msg_graph.errors import Collector, did_you_mean, for_each, GraphError, listed, shown
+from msg_graph.draft import open_blanks
+from msg_graph.errors import (
+    Collector,
+    did_you_mean,
+    for_each,
+    GraphError,
+    listed,
+    shown,
+    together,
+)
 from msg_graph.language import CALLBACK_KEYS, Entry
 from msg_graph.model import Callback, Dag, Path, QueueEdge, TaskSet, Vertex
 from msg_graph.yamltext import decode, MAX_BYTES
 
-MAX_VERTICES = 100_000
-MAX_EDGES = 1_000_000
+MAX_SIZE = 200_000
+"""The most vertices and edges of a declaration."""
 
 
 def load(path: str | PathLike[str]) -> TaskSet:
@@ -103,7 +111,8 @@ def loads(
                 *parse_declaration(text, name, None if path is None else fspath(path)),
                 without_deadline)
     except GraphError as error:
-        raise with_blanks(error, text, name) from None
+        blanks = open_blanks(text, name)
+        raise (together(blanks) if blanks else error) from None
 
 
 @contextmanager
@@ -256,55 +265,24 @@ class _Links:
         before: dict[Any, Iterable[Any]] = dict(self.publishers)
         before.update((place, () if _is_source(callback) else callback.topics)
                       for place, callback in enumerate(self.callbacks))
-        sorter = TopologicalSorter(before)
-        with suppress(CycleError):  # callbacks outside of a cycle are sorted nevertheless
-            sorter.prepare()
-        order: list[int] = []
-        while ready := sorter.get_ready():
-            order += [each for each in ready if isinstance(each, int)]
-            sorter.done(*ready)
-        if len(order) < len(self.callbacks):
-            for_each(self._cycles(set(range(len(self.callbacks))).difference(order)),
-                     self._refuse_cycle)
-        return order
+        try:
+            return [each for each in TopologicalSorter(before).static_order()
+                    if isinstance(each, int)]
+        except CycleError as error:
+            cycle = [each for each in error.args[1] if isinstance(each, int)]
+            raise self._cyclic(list(dict.fromkeys(cycle))) from None
 
-    def _refuse_cycle(self, cycle: list[int]) -> None:
-        # The edge to cut: one into a sync, which keeps its other topics, else one against the
-        # order of the file, which most likely leads back.
-        edges = [(cycle[i - 1], place) for i, place in enumerate(cycle)]
-        publisher, cut = max(
-            edges, key=lambda edge: (self.callbacks[edge[1]].kind == 'sync', edge[0] - edge[1]))
-        callback = self.callbacks[cut]
-        published = self.callbacks[publisher].publishes
-        topic = next(topic for topic in callback.topics if topic in published)
-        if callback.kind == 'sync':
-            how = f"take {shown(topic)} out of its 'sync:'"
-        else:
-            how = f'start it by a timer or another topic than {shown(topic)}'
-        first = cycle.index(cut)
+    def _cyclic(self, cycle: list[int]) -> GraphError:
+        """Return the error about callbacks of which each starts the next, the last the first."""
+        first = cycle.index(min(cycle))
         keys = [self.callbacks[place].key for place in cycle[first:] + cycle[:first + 1]]
         if len(keys) > 9:
             keys[8:-1] = [f'… ({len(keys) - 9} more)']
-        entry = self.entries[callback.key]
-        raise GraphError(
-            entry.file, entry.line_of(callback.kind, topic),
-            f'callbacks start each other in a cycle: {" -> ".join(keys)}',
-            f'cut it with a queue edge: in {shown(callback.key)} list {shown(topic)} under '
-            f"'reads:' and {how}")
-
-    def _cycles(self, stuck: set[int]) -> Iterator[list[int]]:
-        """Yield cycles without a common callback by walking back from publisher to publisher."""
-        while stuck:
-            place: int | None = min(stuck)
-            walk: dict[int, None] = {}
-            while place is not None and place not in walk:
-                walk[place] = None
-                place = next((publisher for topic in self.callbacks[place].topics
-                              for publisher in self.publishers[topic] if publisher in stuck), None)
-            stuck -= walk.keys()
-            if place is not None:
-                places = list(walk)
-                yield places[places.index(place):][::-1]
+        callback = self.callbacks[cycle[first]]
+        return self.entries[callback.key].error(
+            callback.kind, f'callbacks start each other in a cycle: {" -> ".join(keys)}',
+            "cut it with a queue edge: start one of them by a timer, and list the topic that "
+            "started it under its 'reads:'")
 
 
 def _is_source(callback: Callback) -> bool:
@@ -325,20 +303,18 @@ class _Vertex:
 def _vertices(links: _Links, order: list[int]) -> list[list[_Vertex]]:
     """Make the vertices of each callback, after those of its publishers (rules 4 and 5)."""
     vertices: list[list[_Vertex]] = [[] for _ in links.callbacks]
-    total = {'vertices': 0, 'edges': 0}
+    size = 0
     for place in order:
         callback = links.callbacks[place]
         publishers = set() if _is_source(callback) else {
             publisher for topic in callback.topics for publisher in links.publishers[topic]}
         count = sum(len(vertices[publisher]) for publisher in publishers)
-        total['vertices'] += count if callback.kind == 'subscription' and publishers else 1
-        total['edges'] += count
-        for what, most in (('vertices', MAX_VERTICES), ('edges', MAX_EDGES)):
-            if total[what] > most:
-                raise links.entries[callback.key].error(
-                    None, f'with it the DAGs have {total[what]} {what}, more than {most}',
-                    'a callback runs once for each publisher before it: use fewer publishers for '
-                    "one topic, or read some by a queue edge ('reads:')")
+        size += count + (count if callback.kind == 'subscription' and publishers else 1)
+        if size > MAX_SIZE:
+            raise links.entries[callback.key].error(
+                None, f'with it the DAGs have more than {MAX_SIZE} vertices and edges',
+                'a callback runs once for each publisher before it: use fewer publishers for '
+                "one topic, or read some by a queue edge ('reads:')")
         before = [vertex for publisher in sorted(publishers) for vertex in vertices[publisher]]
         if not before:
             vertices[place] = [_Vertex(place, place, [])]

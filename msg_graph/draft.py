@@ -10,8 +10,8 @@ code that makes a draft checks the names in it. ``declaration_of`` writes it as 
 fill in.
 
 Known values become entries. An unknown value becomes a comment with ``FILL IN`` and a proposal,
-which is an entry once its first ``# `` is removed. ``mddag graph check`` lists all open blanks
-(``open_blanks``) instead of the errors that follow from them:
+which is an entry once its first ``# `` is removed. While blanks are open, they are the errors of
+the declaration (``open_blanks``), since most others follow from them:
 
 1. *deadline* of a sink: the shortest period of the sources that lead to it.
 2. *period* of a service, and of a subscription whose topic no callback publishes: the measured
@@ -28,13 +28,12 @@ A named path becomes an entry if each of its nodes has exactly one matching call
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, field
 import re
 
-from msg_graph.duration import DAY, exact_duration, format_duration, MICROSECOND
-from msg_graph.errors import GraphError, printable, together
+from msg_graph.duration import exact_duration, format_duration, MICROSECOND
+from msg_graph.errors import GraphError, printable
 from msg_graph.language import PATH
 from msg_graph.model import ExecutionTime, ReleaseFrom
 from msg_graph.yamltext import plain_scalar
@@ -44,7 +43,6 @@ UNDEFINED = 'UNDEFINED'
 MARK = 'FILL IN'
 LEFT_OUT = '# Left out:'
 _OPEN = re.compile(rf'\s*#\s+(?:(\w+:).*\s#\s+)?{MARK}: (.*)')
-_ENTRY = re.compile(r'\s*- (?:name|node):|\s*-\s*\{')
 _LITTLE = 1e-4  # fraction of a period
 
 
@@ -55,14 +53,14 @@ class DraftCallback:
 
     :ivar kind: ``timer``, ``subscription``, ``sync`` or ``service``.
     :ivar starts: the topics that start it, or its service; empty for a timer.
-    :ivar period_ns: its timer's period; of another source its period, if known.
+    :ivar period_ns: its timer's period, None if the timer is only assumed; of another source its
+        period, if known.
     :ivar publishes: topics that it certainly publishes.
     :ivar maybe: topics of its node that it may publish.
     :ivar reads: topics and callbacks of its node that it reads by queue edges.
     :ivar runs: how many executions of it were recorded; None: there is no recording.
     :ivar interval_ns: measured mean time between two of its executions.
     :ivar times: its measured execution time, and the number of measured executions.
-    :ivar guessed: whether the timer is only assumed.
     :ivar also: other declared keys, with their values.
     """
 
@@ -81,7 +79,6 @@ class DraftCallback:
     runs: int | None = None
     interval_ns: int | None = None
     times: tuple[ExecutionTime, int] | None = None
-    guessed: bool = False
     also: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -134,17 +131,19 @@ class Draft:
             yield from node.callbacks.values()
 
 
-def leave_out_sources(draft: Draft, reason: Callable[[DraftCallback], str]) -> None:
+def leave_out_sources(
+    draft: Draft, which: Callable[[DraftCallback], bool], reason: str
+) -> None:
     """
     Leave out sources, and callbacks that become sources because their topics lose the publisher.
 
-    :param reason: returns why a source is left out; an empty text keeps it.
+    :param which: returns whether a source is left out.
     """
     while True:
         published = {topic for callback in draft.callbacks()
                      for topic in callback.publishes + callback.maybe}
-        found = {callback.key: why for callback in draft.callbacks()
-                 if _is_source(callback, published) and (why := reason(callback))}
+        found = {callback.key for callback in draft.callbacks()
+                 if _is_source(callback, published) and which(callback)}
         if not found:
             return
         for node in draft.nodes:
@@ -152,7 +151,7 @@ def leave_out_sources(draft: Draft, reason: Callable[[DraftCallback], str]) -> N
                 if callback.key in found:
                     del node.callbacks[callback.name]
                     what = ' '.join((callback.kind, *callback.starts))
-                    draft.left_out.append(f'{callback.key} ({what}): {found[callback.key]}')
+                    draft.left_out.append(f'{callback.key} ({what}): {reason}')
         draft.nodes = [node for node in draft.nodes if node.callbacks]
 
 
@@ -165,21 +164,8 @@ def accept(draft: Draft) -> None:
     """Replace unknown values by recorded ones, so that the periods of all sources are known."""
     for callback in draft.callbacks():
         callback.maybe.clear()
-    leave_out_sources(draft, _without_rate)
-
-
-def _without_rate(callback: DraftCallback) -> str:
-    if callback.guessed:
-        return 'nothing is recorded that starts it'
-    if callback.kind == 'timer' and not _is_timer_period(callback.period_ns or 0):
-        return f'its period is said to be {format_duration(callback.period_ns or 0)}'
-    if callback.source_period_ns is not None:
-        return ''
-    return 'it ran once, which gives no rate' if callback.runs == 1 else 'it never ran'
-
-
-def _is_timer_period(period_ns: int) -> bool:
-    return MICROSECOND <= period_ns <= DAY
+    leave_out_sources(draft, lambda callback: callback.source_period_ns is None,
+                      'its rate is unknown')
 
 
 def declaration_of(draft: Draft, accepted: bool = False) -> str:
@@ -199,18 +185,6 @@ def open_blanks(text: str, file: str) -> list[GraphError]:
         "correct the value and take the '# ' away" if match[1] else 'do so, then remove the line')
         for number, line in enumerate(text.splitlines(), 1)
         if MARK in line and (match := _OPEN.fullmatch(line)) is not None]
-
-
-def with_blanks(error: GraphError, text: str, file: str) -> GraphError:
-    """Return an error with the blanks of its file, without the errors that these cause."""
-    blanks = open_blanks(text, file)
-    if not blanks:
-        return error
-    starts = [number for number, line in enumerate(text.splitlines(), 1) if _ENTRY.match(line)]
-    unfinished = {bisect_right(starts, blank.line or 0) for blank in blanks}
-    others = [each for each in error.errors if each.file != file or each.line is None
-              or bisect_right(starts, each.line) not in unfinished]
-    return together([*blanks, *others])
 
 
 class _Writer:
@@ -379,17 +353,10 @@ def _listed(texts: Iterable[str]) -> str:
 
 
 def _timer(callback: DraftCallback) -> str:
-    period_ns = callback.period_ns or 0
-    if not callback.guessed and _is_timer_period(period_ns):
-        return f'timer: {_whole(period_ns)}'
-    if not callback.guessed:
-        return _blank('timer: 100ms', f'its period is said to be {exact_duration(period_ns)}')
-    if not (callback.publishes or callback.maybe):
-        return _blank('timer: 100ms', 'what starts it? Nothing is seen of the node but its name; '
-                      'remove it if it has no callbacks')
+    if callback.period_ns is not None:
+        return f'timer: {_whole(callback.period_ns)}'
     if callback.interval_ns is None:
-        return _blank('timer: 100ms',
-                      'what starts it? No message came while the system was probed')
+        return _blank('timer: 100ms', 'what starts it? Remove it if the node has no callbacks')
     return (f'timer: {_rounded(callback.interval_ns)}  # {MARK}: is this a timer? '
             f'Proposed: {_measured(callback)}')
 

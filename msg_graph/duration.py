@@ -23,8 +23,9 @@ UNITS = {
     's': SECOND,
     'min': 60 * SECOND,
 }
-_NUMBER = r'(?P<sign>[+-]?)(?P<number>[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})'
-_DURATION = re.compile(_NUMBER + r'[ \t]*(?P<unit>[^\W\d_]*)')
+_DURATION = re.compile(
+    r'[ \t]*(?P<number>[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})[ \t]*'
+    r'(?P<unit>[^\W\d_]*)[ \t]*')
 
 
 class DurationError(ValueProblem):
@@ -41,33 +42,24 @@ def parse_duration(
 
     :param minimum_ns: the least allowed time, ns.
     :param maximum_ns: the longest allowed time, ns.
-    :raises DurationError: (a ``ValueError``) no number, no unit or an unknown one, a negative
-        time, or one outside of the bounds.
+    :raises DurationError: (a ``ValueError``) no number, no unit or an unknown one, or a time
+        outside of the bounds.
     """
-    match = _DURATION.fullmatch(text.strip(' \t'))
-    if match is None:
-        raise DurationError(
-            f'{shown(text)} is not a time', "write a number and a unit, as '100ms'")
-    unit = match['unit']
-    if not unit:
+    match = _DURATION.fullmatch(text)
+    if match is not None and not match['unit']:
         raise DurationError(
             f'{shown(text)} has no unit',
             f"add one, as '{match['number']}ms' or '{match['number']}s' (ns, us, ms, s, min)")
-    if unit not in UNITS:
+    if match is None or match['unit'] not in UNITS:
         raise DurationError(
-            f'{shown(text)} has the unknown unit {shown(unit)}', 'use ns, us, ms, s or min')
-    if match['sign'] == '-':
-        raise DurationError(f'{shown(text)} is negative', 'write a time above zero')
-    exact = Decimal(match['number']) * UNITS[unit]
+            f'{shown(text)} is not a time',
+            "write a number and a unit (ns, us, ms, s, min), as '100ms'")
+    exact = Decimal(match['number']) * UNITS[match['unit']]
     value = int(exact.to_integral_value(ROUND_HALF_EVEN))
-    if value < minimum_ns:
+    if not minimum_ns <= value <= maximum_ns:
         raise DurationError(
-            f'{shown(text)} is too short',
-            f'write at least {format_duration(minimum_ns)} (units are ns, us, ms, s, min)')
-    if value > maximum_ns:
-        raise DurationError(
-            f'{shown(text)} is too long',
-            f'write at most {format_duration(maximum_ns)} (units are ns, us, ms, s, min)')
+            f'{shown(text)} is too {"short" if value < minimum_ns else "long"}',
+            f'write {format_duration(minimum_ns)} to {format_duration(maximum_ns)}')
     return value
 
 

@@ -31,13 +31,14 @@ import stat
 from typing import Any
 
 from msg_graph.errors import did_you_mean, GraphError, listed, shown
-from msg_graph.language import ARGUMENT, Entry, FILE, INCLUDE
+from msg_graph.language import Entry, FILE, INCLUDE
 from msg_graph.yamltext import (
     decode,
     Mapping,
     MAX_BYTES,
     MAX_SIZE,
     parse_yaml,
+    plain,
     Scalar,
     Sequence,
     Tree,
@@ -48,6 +49,7 @@ MOST_FILES = 2_000
 MOST_DEPTH = 16
 LONGEST_VALUE = 4_096
 _ARGUMENT_USE = re.compile(r'\$\(([^()]*)\)')
+_DUMPER: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 _NAMED = ('node', 'subscription', 'service', 'sync', 'publishes', 'reads')
 
 Chain = list[tuple[str, str]]
@@ -81,22 +83,9 @@ def resolve(tree: Mapping, path: str | None) -> Mapping:
 
 def as_text(tree: Tree) -> str:
     """Return a resolved tree as YAML."""
-    text: str = yaml.serialize(_yaml_node(tree), width=99, allow_unicode=True)
+    text: str = yaml.dump(plain(tree), Dumper=_DUMPER, sort_keys=False, default_flow_style=None,
+                          width=99, allow_unicode=True)
     return f'# put together from {ascii(tree.file)[1:-1]} and what it includes\n{text}'
-
-
-def _yaml_node(tree: Tree) -> yaml.Node:
-    if isinstance(tree, Scalar):
-        tag = yaml.resolver.Resolver().resolve(  # type: ignore[no-untyped-call]
-            yaml.ScalarNode, tree.text, (tree.plain, not tree.plain))
-        return yaml.ScalarNode(tag, tree.text, style=None if tree.plain else "'")
-    if isinstance(tree, Sequence):
-        return yaml.SequenceNode(
-            'tag:yaml.org,2002:seq', [_yaml_node(item) for item in tree.items],
-            flow_style=all(isinstance(item, Scalar) for item in tree.items))
-    return yaml.MappingNode('tag:yaml.org,2002:map', [
-        (_yaml_node(Scalar('', 0, key)), _yaml_node(value))
-        for key, value in tree.entries.items()], flow_style=False)
 
 
 class _Resolver:
@@ -181,27 +170,11 @@ class _Resolver:
 
 def _argument_values(tree: Mapping, given: dict[str, str]) -> dict[str, str]:
     """Return the values of a file's arguments: those that are set, or the defaults."""
-    entry = Entry(tree, 'the declaration', FILE)
-    declared = tree.entries.get('arguments', Mapping(tree.file, tree.line))
-    if not isinstance(declared, Mapping):
-        raise entry.error('arguments', "'arguments' is no mapping",
-                          'write arguments: {name: default value}')
-    values: dict[str, str] = {}
-    for name, value in declared.entries.items():
-        line = declared.key_lines[name]
-        if not ARGUMENT.fullmatch(name):
-            raise GraphError(tree.file, line, f'{shown(name)} is no name for an argument',
-                             "use letters, digits and '_', and no digit first")
-        if not isinstance(value, Scalar):
-            raise GraphError(tree.file, value.line,
-                             f'the default value of the argument {shown(name)} is no text',
-                             'write a text, a number or a time')
-        if value.is_null and name not in given:
-            raise GraphError(tree.file, line, f'the argument {shown(name)} has no value',
-                             "set it with 'set:' of the include, or give it a default here")
-        values[name] = given.get(name, value.text)
+    top = Entry(tree, 'the declaration', FILE)
+    declared: Entry = top.get('arguments')
+    values = {name: given[name] if name in given else declared.get(name) for name in declared}
     for name in given.keys() - values.keys():
-        raise entry.error(
+        raise top.error(
             'arguments', f'an include sets {shown(name)}, which is no argument of this file',
             did_you_mean(name, values, "add it to 'arguments:'"))
     return values

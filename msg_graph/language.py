@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
-from itertools import pairwise
 import math
 import os
 import re
@@ -35,8 +34,7 @@ from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
 Schema = dict[str, Any]
 
-ARGUMENT = re.compile(r'[A-Za-z_][A-Za-z0-9_]*')
-ARGUMENT_USE = rf'\$\({ARGUMENT.pattern}\)'
+ARGUMENT_USE = r'\$\([A-Za-z_][A-Za-z0-9_]*\)'
 """An argument of the file in a value; the JSON Schema allows it in all values."""
 
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
@@ -102,6 +100,7 @@ GROUP = Name('callback group')
 DAG = Name('DAG', re.compile(r'/?[A-Za-z0-9_.-]+(?:/[A-Za-z0-9_.-]+)*'))
 PATH = Name('path')
 PROCESS = Name('process')
+ARGUMENT = Name('argument', re.compile(r'[A-Za-z_][A-Za-z0-9_]*'))
 
 
 def kind_of(tree: Tree) -> str:
@@ -146,10 +145,6 @@ class Key:
     of: tuple[str, ...] = ()
 
 
-RENAMED = {'on_miss': 'on_late'}
-"""Keys of earlier versions, and their present names."""
-
-
 class Entry:
     """
     One mapping of the declaration.
@@ -169,10 +164,8 @@ class Entry:
         self._tree = tree
         for key in tree.entries:
             if key not in keys:
-                new = RENAMED.get(key)
-                raise self.error(
-                    key, f'unknown key {shown(key)}', f"write '{new}:' instead" if new in keys
-                    else did_you_mean(key, keys, f'use {", ".join(keys)}'))
+                raise self.error(key, f'unknown key {shown(key)}',
+                                 did_you_mean(key, keys, f'use {", ".join(keys)}'))
 
     def __contains__(self, key: str) -> bool:
         return key in self._tree.entries
@@ -212,21 +205,17 @@ class Entry:
 # --- the three kinds -----------------------------------------------------------------------------
 
 def scalar(
-    parse: Callable[[str], Any], form: Schema, missing: Any = None, plain: bool = False,
-    what: str = 'a text',
+    parse: Callable[[str], Any], form: Schema, missing: Any = None, what: str = 'a text',
 ) -> Kind:
     """
     Return the kind of a single value.
 
     :param parse: turns its text into the value, or raises a ``ValueProblem``.
-    :param plain: it must not be in quotes.
     :param what: what to write.
     """
     def read(value: Tree, where: str) -> Any:
         if not isinstance(value, Scalar) or value.is_null:
             raise error_at(value, where, f'{kind_of(value)} is no single value', f'write {what}')
-        if plain and not value.plain:
-            raise error_at(value, where, f'{shown(value.text)} is in quotes', 'remove them')
         try:
             return parse(value.text)
         except ValueProblem as error:
@@ -311,7 +300,7 @@ def whole(least: int, most: int) -> Kind:
         return int(text)
 
     return scalar(parse, {'anyOf': [
-        {'type': 'integer', 'minimum': least, 'maximum': most}, _USE]}, plain=True,
+        {'type': 'integer', 'minimum': least, 'maximum': most}, _USE]},
         what=f'an integer from {least} to {most}')
 
 
@@ -323,8 +312,7 @@ def number(**bounds: int) -> Kind:
             raise ValueProblem(f'{shown(text)} is not a number', 'write a finite number')
         return found
 
-    return scalar(parse, {'anyOf': [{'type': 'number', **bounds}, _USE]}, plain=True,
-                  what='a finite number')
+    return scalar(parse, {'anyOf': [{'type': 'number', **bounds}, _USE]}, what='a finite number')
 
 
 def _truth(text: str) -> bool:
@@ -335,14 +323,10 @@ def _truth(text: str) -> bool:
 
 def _weakly_hard(text: str) -> WeaklyHard:
     found = _OF.fullmatch(text)
-    if found is None:
-        raise ValueProblem(
-            f'{shown(text)} is no tolerance', "write how many of how many, as '1 of 100'")
-    misses, of = int(found[1]), int(found[2])
-    if not 0 < misses < of:
-        raise ValueProblem(
-            f'{shown(text)} makes no sense', 'tolerate at least 1 miss, and fewer than all')
-    return WeaklyHard(misses, of)
+    if found is None or not 0 < int(found[1]) < int(found[2]):
+        raise ValueProblem(f'{shown(text)} is no tolerance',
+                           "write how many of how many, as '1 of 100', but not all")
+    return WeaklyHard(int(found[1]), int(found[2]))
 
 
 FORMAT = '1'
@@ -391,25 +375,14 @@ def _read_execution_time(value: Tree, where: str) -> ExecutionTime:
     count = len(quantiles_us)
     if not percent:     # evenly spaced
         percent = tuple(100.0 * i / (count - 1) for i in range(count)) if count > 1 else (50.0,)
-    before, after = next((pair for pair in pairwise(quantiles_us) if pair[1] < pair[0]), (0, 0))
-    for key, wrong, problem, remedy in (
-        ('quantiles_us', quantiles_us[0] < 0,
-         f'the quantile {quantiles_us[0]} is negative', 'write times in us'),
-        ('quantiles_us', after < before,
-         f'the quantile {after} comes after {before}', 'write them in rising order'),
-        ('quantiles_us', not 1 <= quantiles_us[-1] * 1000 <= DAY,
-         f'the largest quantile, {quantiles_us[-1]} us, makes no sense',
-         'write times from 0.001 us to a day, in us'),
-        ('percent', len(percent) != count,
-         f'the number of shares is {len(percent)}, that of quantiles {count}',
-         'give one for each'),
-        ('percent', percent[0] < 0 or percent[-1] > 100,
-         'a share is not within 0 and 100', 'write percentages'),
-        ('percent', list(percent) != sorted(set(percent)),
-         'the shares do not rise', 'write them in rising order'),
-    ):
-        if wrong:
-            raise entry.error(key, problem, remedy)
+    if list(quantiles_us) != sorted(quantiles_us) or quantiles_us[0] < 0 or not (
+            1 <= quantiles_us[-1] * 1000 <= DAY):
+        raise entry.error('quantiles_us', 'the quantiles are not from 0 to a day and rising',
+                          'write times in us, the largest one at least 0.001')
+    if list(percent) != sorted({*percent}) or percent[0] < 0 or percent[-1] > 100 or (
+            len(percent) != count):
+        raise entry.error('percent', 'the shares are not from 0 to 100 and rising, one for each '
+                          'quantile', f'write {count} percentages')
     return ExecutionTime(tuple(round(us * 1000) for us in quantiles_us), percent)
 
 
@@ -427,10 +400,10 @@ def _mapping(keys: dict[str, Key]) -> Schema:
                            for word, key in keys.items()}}
 
 
-_TRUTH = scalar(_truth, {'anyOf': [{'type': 'boolean'}, _USE]}, plain=True, what='true or false')
+_TRUTH = scalar(_truth, {'anyOf': [{'type': 'boolean'}, _USE]}, what='true or false')
 _WEAKLY_HARD = scalar(_weakly_hard, {
     'type': 'string', 'pattern': f'^(?:{_OF.pattern})$|{ARGUMENT_USE}', 'examples': ['1 of 100']})
-_VALUES = table(scalar(str, {'type': ['string', 'number', 'boolean', 'null']}))
+_VALUES = table(scalar(str, {'type': ['string', 'number', 'boolean', 'null']}), ARGUMENT)
 _TOPICS = many(name(TOPIC), 0, different=True)
 
 QUANTILES = {
@@ -533,7 +506,7 @@ def schema() -> Schema:
             'path': _mapping(PATH_KEYS),
             'time': {
                 'type': 'string',
-                'pattern': rf'^[ \t]*\+?([0-9]+(\.[0-9]*)?|\.[0-9]+)[ \t]*({"|".join(UNITS)})'
+                'pattern': rf'^[ \t]*([0-9]+(\.[0-9]*)?|\.[0-9]+)[ \t]*({"|".join(UNITS)})'
                            rf'[ \t]*$|{ARGUMENT_USE}',
                 'examples': ['100ms', '20us', '1.5s'],
             },

@@ -39,18 +39,18 @@ _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
 
 @dataclass(eq=False, slots=True)
 class Scalar:
-    """A text; ``plain`` if it is written without quotes."""
+    """A text; ``is_plain`` if it is written without quotes."""
 
     file: str
     line: int
     text: str
-    plain: bool = True
+    is_plain: bool = True
     size: ClassVar[int] = 1
 
     @property
     def is_null(self) -> bool:
         """Return whether the value is empty."""
-        return self.plain and self.text in ('', '~', 'null')
+        return self.is_plain and self.text in ('', '~', 'null')
 
 
 @dataclass(eq=False, slots=True)
@@ -90,6 +90,15 @@ def decode(data: bytes, file: str) -> str:
         raise GraphError(
             file, line, f'byte {error.start} is not UTF-8 text',
             'give a YAML file in UTF-8') from None
+
+
+def plain(tree: Tree | None) -> Any:
+    """Return a tree as lists, dictionaries and texts; empty values are None."""
+    if isinstance(tree, Mapping):
+        return {key: plain(value) for key, value in tree.entries.items()}
+    if isinstance(tree, Sequence):
+        return [plain(item) for item in tree.items]
+    return None if tree is None or tree.is_null else tree.text
 
 
 def plain_scalar(text: str) -> str:

@@ -28,39 +28,16 @@ ROS = ('ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'launch', 
        'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'rosidl_parser', 'std_msgs')
 BLOCKER = """
 from contextlib import redirect_stderr, redirect_stdout
+from importlib.machinery import PathFinder
 import io, json, sys
-
-
-class WithoutBlocked:
-
-    def __init__(self, finder):
-        self.finder = finder
-
-    def find_spec(self, name, path=None, target=None):
-        if name.split('.')[0] in blocked:
-            return None
-        return self.finder.find_spec(name, path, target)
-
-    def __getattr__(self, name):
-        return getattr(self.finder, name)
-
-
-class Terminal(io.TextIOWrapper):
-
-    def isatty(self):
-        return True
-
-
 blocked, commands = map(json.loads, sys.argv[1:])
-sys.meta_path[:] = [WithoutBlocked(finder) for finder in sys.meta_path]
+find = PathFinder.find_spec
+PathFinder.find_spec = lambda name, *rest: None if name in blocked else find(name, *rest)
 from mddag_executor.cli.main import main
 done = []
 for command in commands:
-    sys.argv[1:] = command
-    out = (Terminal if command[0] == 'top' else io.TextIOWrapper)(io.BytesIO(), 'utf-8')
-    with redirect_stdout(out), redirect_stderr(io.StringIO()) as errors:
-        status = main(command)
-    done.append((status, errors.getvalue()))
+    with redirect_stdout(io.TextIOWrapper(io.BytesIO())), redirect_stderr(io.StringIO()) as errors:
+        done.append((main(command), errors.getvalue()))
 print(json.dumps(done))
 """
 GRAPH = """

@@ -6,15 +6,14 @@ The parts of the program know one another in one direction only.
     cli -> rerun -> report, hosting -> (executor | replay | laboratory) -> simulate
         -> trace, core -> msg_graph
 
-Imports are read from the sources, those inside functions and for type checkers included. So are
-the names of rclpy that only the modules in ``COMPAT`` may use.
+Imports are read from the sources, those inside functions and for type checkers included. Ruff
+(`SLF`) checks which modules use private names of rclpy.
 """
 
 from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -111,83 +110,3 @@ def test_imports_point_one_way():
                for path in (TOP / 'mddag_executor').glob('*/__init__.py')}
     assert folders and folders - set(LEVELS) == set()
     assert [line for module in modules() for line in violations(*module)] == []
-
-
-# --- rclpy's private names -----------------------------------------------------------------------
-
-COMPAT = ('mddag_executor.executor.compat', 'mddag_executor.executor.listeners',
-          'mddag_executor.executor.waitsets')
-# A rerun takes the middleware's place, so it replaces what is private, too.
-USES_RCLPY = ('mddag_executor.executor', 'mddag_executor.hosting')
-# In the methods of these and of what derives from them ``self`` has rclpy's attributes.
-BASES = frozenset(('BareExecutor', 'BareTask', 'Executor', 'Task', 'Future', 'Waitable'))
-
-
-def rclpys_private_names() -> frozenset[str]:
-    """Return the private names in rclpy, and those of its handles that no documented class has."""
-    spec = find_spec('rclpy')
-    private, public = {'_rclpy'}, set()
-    for path in Path(spec.origin).parent.rglob('*.py'):
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
-            if isinstance(node, (ast.Attribute, ast.FunctionDef)):
-                name = node.attr if isinstance(node, ast.Attribute) else node.name
-                if name.startswith('_') and not name.startswith('__'):
-                    private.add(name)
-                elif isinstance(node, ast.FunctionDef):
-                    public.add(name)
-    from rclpy.impl.implementation_singleton import rclpy_implementation
-    handles = {name for kind in vars(rclpy_implementation).values()
-               if hasattr(kind, 'destroy_when_not_in_use')
-               for name in vars(kind) if not name.startswith('_')}
-    # others hand a handle's pointer on to the listeners
-    return frozenset(private | handles - public - {'name', 'qos', 'pointer'})
-
-
-def private_uses(text: str, private: frozenset[str]) -> Iterator[tuple[int, str]]:
-    """Yield line and name of what a module uses of rclpy and must not."""
-    tree = ast.parse(text)
-    own = {name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)
-           for name in _attributes_of_its_own(node)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ClassDef):
-            if any(isinstance(base, ast.Name) and base.id in BASES for base in node.bases):
-                mine = _attributes_of_its_own(node)
-                yield from ((each.lineno, each.attr) for each in ast.walk(node)
-                            if isinstance(each, ast.Attribute) and each.attr in private
-                            and each.attr not in mine)
-        elif isinstance(node, ast.Attribute):
-            if node.attr in ('_getframe', '__code__') or (
-                    node.attr in private and node.attr not in own
-                    and not (isinstance(node.value, ast.Name) and node.value.id == 'self')):
-                yield node.lineno, node.attr
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            if node.value in private and node.value not in own:
-                yield node.lineno, node.value
-        elif isinstance(node, ast.ImportFrom) and (node.module or '').startswith('rclpy.impl'):
-            yield node.lineno, str(node.module)
-
-
-def _attributes_of_its_own(kind: ast.ClassDef) -> set[str]:
-    """Return the names that a class defines, in its body, its slots or by setting them."""
-    names = set()
-    for node in ast.walk(kind):
-        if isinstance(node, ast.FunctionDef):
-            names.add(node.name)
-        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
-            names.add(node.attr)
-        elif isinstance(node, (ast.AnnAssign, ast.Assign)):
-            targets = [node.target] if isinstance(node, ast.AnnAssign) else node.targets
-            names |= {target.id for target in targets if isinstance(target, ast.Name)}
-            if '__slots__' in names:
-                names |= {each.value for each in ast.walk(node) if isinstance(each, ast.Constant)}
-    return names
-
-
-def test_only_compat_uses_what_is_private_in_rclpy():
-    private = rclpys_private_names()
-    assert {'_guard', '_callback_type', 'take_message', 'call_timer', '_rclpy'} <= private
-    assert [
-        f'{module}:{line} uses {name} of rclpy: only {", ".join(COMPAT)} do'
-        for module, text, _ in modules()
-        if module.startswith(USES_RCLPY) and module not in COMPAT
-        for line, name in private_uses(text, private)] == []

@@ -232,7 +232,7 @@ def draft_of(found: Probe) -> Draft:
                          if topic in found.seen and (interval := found.seen[topic].interval_ns(
                              found.publishers[topic])) is not None]
             callbacks = [DraftCallback(
-                name, 'callback_0', 'timer', publishes=published, guessed=True,
+                name, 'callback_0', 'timer', publishes=published,
                 interval_ns=min(intervals, default=None))]
         nodes.append(DraftNode(name, {callback.name: callback for callback in callbacks}))
     return Draft('the nodes that ran', nodes)

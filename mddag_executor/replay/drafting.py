@@ -38,6 +38,7 @@ from msg_graph import Callback as Declared
 from msg_graph import ExecutionTime, NO_GRAPH, TaskSet
 from msg_graph.binding import function_of, is_background
 from msg_graph.draft import Draft, DraftCallback, DraftNode, leave_out_sources
+from msg_graph.duration import DAY
 from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
 import numpy as np
 
@@ -134,7 +135,7 @@ class System:
             unseen = [t for t, seen in topics.items()
                       if not seen and not is_background(t, name) and TOPIC.fits(t)]
             if unseen and name not in nodes and NODE.fits(name):
-                timer = DraftCallback(name, 'callback_0', 'timer', guessed=True)
+                timer = DraftCallback(name, 'callback_0', 'timer')
                 nodes[name] = DraftNode(name, {timer.name: timer})
             if unseen:
                 for callback in nodes[name].callbacks.values() if name in nodes else ():
@@ -142,8 +143,8 @@ class System:
         draft = Draft(f'the trace {self.name}', self._ordered(nodes), workers=self.workers)
         declared = {callback.key for callback in self._declared.values()}
         leave_out_sources(draft, lambda callback: (
-            'it never ran' if callback.runs == 0 and callback.kind != 'timer'
-            and callback.key not in declared else ''))
+            callback.runs == 0 and callback.kind != 'timer' and callback.key not in declared),
+            'it never ran')
         return draft
 
     def _ordered(self, nodes: dict[str, DraftNode]) -> list[DraftNode]:
@@ -167,7 +168,8 @@ class System:
         else:
             callback = DraftCallback(
                 entity.node_name, self._free_name(entity, node), entity.kind,
-                [entity.start] if entity.start else [], entity.period or None)
+                [entity.start] if entity.start else [],
+                entity.period if entity.kind == 'timer' and entity.period <= DAY else None)
             callback.group = self._group_name(entity)
         self._measure(callback, entity)
         return callback

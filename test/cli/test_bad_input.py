@@ -61,7 +61,7 @@ def files(tmp_path_factory):
     ('simulate g.yaml --workers 4097', 'mddag simulate: argument --workers: '),
     ('simulate g.yaml --duration 3',
      "mddag simulate: argument --duration: '3' has no unit: add one, as '3ms' or '3s' (ns, us, "),
-    ('simulate g.yaml --duration=-3s', "mddag simulate: argument --duration: '-3s' is negative"),
+    ('simulate g.yaml --duration=-3s', "mddag simulate: argument --duration: '-3s' is not a time"),
     ('simulate g.yaml --duration 0s', "mddag simulate: argument --duration: '0s' is too short"),
     ('simulate g.yaml --judge me', 'mddag simulate: argument --judge: invalid choice'),
     ('simulate g.yaml --utilisation nan',
@@ -91,7 +91,7 @@ def files(tmp_path_factory):
      'no_times.yaml:6: /n:t (and 2 more callbacks) declares no execution_time: add one, or gi'),
     ('graph analyse no_times.yaml',
      'no_times.yaml:6: /n:t (and 2 more callbacks) declares no execution_time: add one'),
-    ('graph from-caret times.json', 'times.json: this is no architecture file of CARET: give an'),
+    ('graph from-caret times.json', 'times.json: this is no architecture file of CARET: '),
     # execution times
     ('simulate g.yaml --execution-times no.json', 'no.json:1: not JSON ('),
     ('simulate g.yaml --execution-times list.json', 'list.json: not an object of objects: write'),

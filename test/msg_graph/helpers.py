@@ -17,20 +17,25 @@ def graph(text: str) -> TaskSet:
     return loads('mddag: 1\nnodes:\n' + textwrap.indent(textwrap.dedent(text), '  '), 'g.yaml')
 
 
-def error(text: str) -> GraphError:
-    """Return the error of a whole declaration; it must be in the line that ends with MARK."""
+def error(text: str, line: int | None = None) -> GraphError:
+    """Return the error of a declaration; it must be in that line, or in that with MARK."""
     with pytest.raises(GraphError) as caught:
         loads(text, 'g.yaml')
     found = caught.value
-    marked = [i for i, line in enumerate(text.split('\n'), 1) if line.endswith(MARK)]
+    marked = [i for i, each in enumerate(text.split('\n'), 1) if each.endswith(MARK)]
     assert len(marked) <= 1
-    assert found.line == (marked[0] if marked else None), str(found)
-    assert found.file == 'g.yaml'
+    assert found.line == (marked[0] if marked else line), str(found)
     place = f'g.yaml:{found.line}' if found.line else 'g.yaml'
-    assert str(found).startswith(f'{place}: ')
+    assert found.file == 'g.yaml' and str(found).startswith(f'{place}: ')
     assert str(found).isprintable()
     assert found.problem and found.remedy
     return found
+
+
+def refusal(text: str, right: str, wrong: str) -> GraphError:
+    """Return the error of a declaration with a replacement; it must be in the line of that."""
+    assert right in text
+    return error(text.replace(right, wrong, 1), text[:text.index(right)].count('\n') + 1)
 
 
 def nodes_error(text: str, *says: str) -> GraphError:

@@ -1,14 +1,19 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The declaration language: what entries mean, and what each is refused for."""
+"""The declaration language: what entries mean; parser and JSON Schema refuse the same."""
 
 from __future__ import annotations
 
-from msg_graph import loads, WeaklyHard
+from pathlib import Path
+
+import jsonschema
+from msg_graph import ExecutionTime, language, loads, Process, WeaklyHard
 import pytest
+import yaml
 
-from .helpers import error, graph, MARK, nodes_error
+from .helpers import graph, refusal
 
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
 EVERYTHING = """\
 mddag: 1
 workers: 7
@@ -22,16 +27,18 @@ nodes:
         dag: camera
         on_late: abort
         max_active_jobs: 3
+        keep: newest
         publishes: [/image, /info]
         execution_time: 3ms
         group: io
+        holds_interpreter: true
   - node: /detector
     callbacks:
       - name: call-1.x
         sync: [/image, /info]
         reads: [/set, settings]
         publishes: [/boxes]
-        execution_time: {quantiles_us: [1, 2.5, 1e3]}
+        execution_time: {quantiles_us: [1, 2.5, 1.0e+3]}
   - node: /detector
     callbacks:
       - name: settings
@@ -39,18 +46,21 @@ nodes:
         period: 1 s
         publishes: [/set]
         deadline: 2s
-      - {name: tick, timer: 20ms, dag: tick, deadline: 1min}
+      - {name: 7, timer: 20ms, dag: tick, deadline: 1min}
   - node: /sink
     callbacks:
       - name: show
         subscription: /boxes
         deadline: 120ms
+        importance: high
+        tolerate: 2 of 50
         execution_time: {quantiles_us: [0, 5], percent: [10, 99.9]}
 paths:
   - name: frame_to_show
     callbacks: ['/camera/driver:frame', '/detector:call-1.x', '/sink:show']
   - name: set_to_show
     callbacks: ['/detector:settings', '/detector:call-1.x', '/sink:show']
+processes: {eyes: ['/camera/driver'], rest: [/sink]}
 """
 
 
@@ -58,27 +68,28 @@ def test_every_key():
     tasks = loads(EVERYTHING, 'all.yaml')
     assert (tasks.workers, tasks.file, tasks.text) == (7, 'all.yaml', EVERYTHING)
     frame, call, settings, tick, show = tasks.callbacks
-    assert (frame.node, frame.name, frame.key) == (
-        '/camera/driver', 'frame', '/camera/driver:frame')
+    assert (frame.node, frame.name, frame.key, frame.line) == (
+        '/camera/driver', 'frame', '/camera/driver:frame', 6)
     assert (frame.kind, frame.topics, frame.period_ns, frame.timer_period_ns) == (
         'subscription', ('/camera/raw',), 50_000_000, None)
-    assert (frame.release_from, frame.dag, frame.on_late, frame.max_active_jobs) == (
-        'header_stamp', 'camera', 'abort', 3)
-    assert (frame.publishes, frame.group, frame.line) == (('/image', '/info'), 'io', 6)
-    assert (frame.execution_time.quantiles_ns, frame.execution_time.percent) == (
-        (3_000_000,), (50.0,))
+    assert (frame.release_from, frame.dag, frame.on_late, frame.max_active_jobs, frame.keep) == (
+        'header_stamp', 'camera', 'abort', 3, 'newest')
+    assert (frame.publishes, frame.group, frame.holds_interpreter, frame.execution_time) == (
+        ('/image', '/info'), 'io', True, ExecutionTime((3_000_000,), (50.0,)))
     assert (call.kind, call.topics, call.reads) == (
         'sync', ('/image', '/info'), ('/set', 'settings'))
-    assert call.execution_time.quantiles_ns == (1_000, 2_500, 1_000_000)
-    assert call.execution_time.percent == (0.0, 50.0, 100.0)
-    assert (call.period_ns, call.deadline_ns, call.group, call.dag) == (None, None, None, None)
-    assert (call.release_from, call.on_late, call.max_active_jobs) == ('arrival', None, None)
+    assert call.execution_time == ExecutionTime((1_000, 2_500, 1_000_000), (0.0, 50.0, 100.0))
+    assert (call.period_ns, call.deadline_ns, call.group, call.dag, call.holds_interpreter) == (
+        None, None, None, None, None)
+    assert (call.release_from, call.on_late, call.max_active_jobs, call.keep) == (
+        'arrival', None, None, 'all')
+    assert (call.importance, call.tolerate) == ('normal', None)
     assert (settings.kind, settings.service, settings.topics, settings.period_ns) == (
         'service', '/detector/set', (), 1_000_000_000)
     assert (tick.kind, tick.timer_period_ns, tick.period_ns, tick.deadline_ns, tick.line) == (
-        'timer', 20_000_000, 20_000_000, 60_000_000_000, 30)
-    assert show.execution_time.quantiles_ns == (0, 5_000)
-    assert show.execution_time.percent == (10.0, 99.9)
+        'timer', 20_000_000, 20_000_000, 60_000_000_000, 32)
+    assert (show.importance, show.tolerate, str(show.tolerate), show.execution_time) == (
+        'high', WeaklyHard(2, 50), '2 of 50', ExecutionTime((0, 5_000), (10.0, 99.9)))
     assert [(d.name, d.release_from, d.on_late, d.max_active_jobs) for d in tasks.dags] == [
         ('camera', 'header_stamp', 'abort', 3), ('/detector', 'arrival', None, None),
         ('tick', 'arrival', None, None)]
@@ -87,6 +98,12 @@ def test_every_key():
         ('/detector:call-1.x', None, ('/detector:settings',))]
     assert [(p.name, len(p.callbacks)) for p in tasks.paths] == [
         ('frame_to_show', 3), ('set_to_show', 3)]
+    assert tasks.processes == (
+        Process('eyes', ('/camera/driver', '/detector')), Process('rest', ('/sink',)))
+    words = EVERYTHING.replace('{', ' ').replace(',', ' ').split()
+    keys = {*language.FILE, *language.NODE_KEYS, *language.CALLBACK_KEYS,
+            *language.PATH_KEYS, *language.QUANTILES}
+    assert {f'{key}:' for key in keys} - {'arguments:', 'include:'} <= set(words)
 
 
 @pytest.mark.parametrize('count', [2, 28, 29, 30])
@@ -105,195 +122,120 @@ def test_quantiles_without_shares_are_evenly_spaced(count):
     assert (time.mean_ns, time.draw(0.99)) == (50_000, 99_000)
 
 
-HEAD = 'nodes:\n- node: /a\n  callbacks:\n  - {name: t, timer: 1ms, deadline: 1ms}\n'
+def schema_errors(text: str) -> list[str]:
+    validator = jsonschema.Draft7Validator(language.schema())
+    return [error.message for error in validator.iter_errors(yaml.safe_load(text))]
 
 
-@pytest.mark.parametrize('text, says', [
-    (HEAD + '', "'mddag' is missing: add 'mddag:'"),
-    (f'mddag: 2 {MARK}\n' + HEAD, "'2' is no known version"),
-    (f'mddag: {MARK}\n' + HEAD, "'mddag' has no value"),
-    ('mddag: 1\n', "'nodes' is missing"),
-    (f'mddag: 1\nnodes: {MARK}\n', "'nodes' has no value"),
-    (f'mddag: 1\nnodes: [] {MARK}\n', "'nodes': the list is empty"),
-    (f'mddag: 1\nnodes:\n- /a {MARK}\n',
-     "node 1: the text '/a' is no mapping: write one with the keys node, callbacks"),
-    (f'mddag: 1\nnode: [] {MARK}\n', "unknown key 'node': did you mean 'nodes'?"),
-    (f'mddag: 1\nxyz: [] {MARK}\n',
-     "unknown key 'xyz': use mddag, arguments, include, workers, nodes, processes, paths"),
-    (f'mddag: 1\nworkers: 0 {MARK}\n' + HEAD, 'from 1 to 4096'),
-    (f'mddag: 1\nworkers: 4097 {MARK}\n' + HEAD, 'from 1 to 4096'),
-    (f'mddag: 1\nworkers: seven {MARK}\n' + HEAD, "'workers': 'seven' is no integer from 1"),
-    (f'mddag: 1\nworkers: "7" {MARK}\n' + HEAD, "'7' is in quotes: remove them"),
-    (f'mddag: 1\nworkers: {"9" * 5000} {MARK}\n' + HEAD, 'is no integer'),
-])
-def test_head(text, says):
-    # Without a line of its own to blame, the mapping that lacks something starts at the top.
-    if MARK not in text:
-        text = text.replace('\n', f' {MARK}\n', 1)
-    assert says in str(error(text))
-
-
-@pytest.mark.parametrize('entry, says', [
-    (f'node: a {MARK}', ["'a' is not an absolute node name: write it in full, as '/a'"]),
-    (f'node: /a//b {MARK}', ["'/a//b' is not a valid node name"]),
-    (f'node: /a-b {MARK}', ['not a valid node name']),
-    (f'node: "/a\\nb" {MARK}', ["'/a\\nb' is not a valid"]),
-    (f'node: /{"a" * 300} {MARK}', ['too long']),
-    (f'node: [/a] {MARK}', ["node 1: 'node': a list is no single value: write a text"]),
-    (f'node: {MARK}', ["'node' has no value"]),
-    (f'nod: /a {MARK}', ["unknown key 'nod': did you mean 'node'?"]),
-])
-def test_node_names(entry, says):
-    nodes_error(
-        f'- {entry}\n  callbacks:\n  - {{name: t, timer: 1ms, deadline: 1ms}}\n', *says)
-
-
-@pytest.mark.parametrize('entries, says', [
+# What replaces what in the declaration above, and what is said of it in the line that differs.
+BOTH = [
+    # the file
+    ('mddag: 1', 'mddag: 2', "'2' is no known version of the format: write 'mddag: 1'"),
+    ('mddag: 1\n', '', "the declaration: 'mddag' is missing: add 'mddag:'"),
+    ('workers: 7', 'workers: 4097', "'workers': '4097' is no integer from 1 to 4096"),
+    ('workers: 7', 'wokers: 7', "unknown key 'wokers': did you mean 'workers'?"),
+    ('workers: 7', 'xyz: 7', "unknown key 'xyz': use mddag, arguments, include, workers"),
+    ('workers: 7', '"wor\\nkers": 7', "'wor\\nkers'"),
+    ('workers: 7', 'workers:', "'workers' has no value"),
     # names
-    ([f'timer: 1ms {MARK}'], ["callback 1 of node '/a': 'name' is missing"]),
-    ([f'name: "a b" {MARK}'], ["'a b' is not a valid callback name"]),
-    ([f'name: {"n" * 300} {MARK}'], ['too long']),
-    # unknown keys
-    (['name: t', f'subscribtion: /x {MARK}'],
-     ["callback 1 of node '/a': unknown key 'subscribtion': did you mean 'subscription'?"]),
-    (['name: t', f'deadine: 1ms {MARK}'], ["did you mean 'deadline'?"]),
-    (['name: t', f'qqq: 1ms {MARK}'], ["unknown key 'qqq': use name, timer, subscription"]),
-    (['name: t', f'"tim\\ner": 1ms {MARK}'], ["'tim\\ner': did you mean 'timer'?"]),
-    (['name: t', f'{"k" * 1000}: 1ms {MARK}'], ['unknown key']),
-    # what starts it
-    ([f'name: t {MARK}', 'deadline: 1ms'],
-     ["callback '/a:t': nothing says what starts the callback: add one of timer, subscription"]),
-    (['name: t', 'timer: 1ms', f'subscription: /x {MARK}'],
-     ["'timer', 'subscription' exclude each other"]),
-    (['name: t', f'subscription: x {MARK}'], ["'subscription': 'x' is not an absolute topic"]),
-    (['name: t', f'subscription: [/x, /y] {MARK}'], ["'subscription': a list is no single value"]),
-    (['name: t', f'subscription: {MARK}'], ["'subscription' has no value"]),
-    (['name: t', f'subscription: /{"x" * 247} {MARK}'], ['at most 247']),
-    (['name: t', f'sync: /x {MARK}'], ["'sync': the text '/x' is no list: write a list"]),
-    (['name: t', f'sync: [/x] {MARK}'],
-     ["the list is too short: give at least 2, or write 'subscription:'"]),
-    (['name: t', f'sync: [/x, /x] {MARK}'], ["'/x' is listed twice"]),
-    (['name: t', 'sync:', '- /x', f'- [/y] {MARK}'], ["'sync': a list is no single"]),
-    (['name: t', f'service: /x/ {MARK}'], ['not a valid service name']),
-    # times
-    (['name: t', f'timer: 100 {MARK}'],
-     ["callback '/a:t': 'timer': '100' has no unit: add one, as '100ms' or '100s'"]),
-    (['name: t', f'timer: often {MARK}'], ['not a time']),
-    (['name: t', f'timer: [1ms] {MARK}'], ["'timer': a list is no single value"]),
-    (['name: t', f'timer: {MARK}'], ["'timer' has no value"]),
-    (['name: t', 'timer: 1ms', f'period: 2ms {MARK}'],
-     ['period of 2ms is not that of its timer, 1ms']),
-    (['name: t', 'timer: 1ms', f'deadline: {{}} {MARK}'], ["'deadline': a mapping is no single"]),
-    # execution times
-    (['name: t', 'timer: 1ms', f'execution_time: [3ms] {MARK}'],
-     ["callback '/a:t': 'execution_time': a list is no mapping: write one with"]),
-    (['name: t', 'timer: 1ms', f'execution_time: {{}} {MARK}'], ["'quantiles_us' is missing"]),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles: [1]}} {MARK}'],
-     ["did you mean 'quantiles_us'?"]),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: []}} {MARK}'], ['is empty']),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, x]}} {MARK}'],
-     ["'x' is not a number"]),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, .nan]}} {MARK}'],
-     ["'.nan' is not a number"]),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 1e999]}} {MARK}'],
-     ["'1e999' is not a number"]),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [2, 1]}} {MARK}'],
-     ['rising order']),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [-1, 1]}} {MARK}'],
-     ['negative']),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 1e12]}} {MARK}'],
-     ['makes no sense']),
-    (['name: t', 'timer: 1ms', f'execution_time: {{quantiles_us: [1, 2], percent: [1]}} {MARK}'],
-     ['the number of shares is 1, that of quantiles 2']),
-    (['name: t', 'timer: 1ms',
-      f'execution_time: {{quantiles_us: [1, 2], percent: [5, 5]}} {MARK}'], ['do not rise']),
-    (['name: t', 'timer: 1ms',
-      f'execution_time: {{quantiles_us: [1, 2], percent: [1, 101]}} {MARK}'], ['0 and 100']),
-    (['name: t', 'timer: 1ms', 'execution_time:', '  quantiles_us: [1,', f'    x] {MARK}'],
-     ["'x' is not a number"]),
-    # lists of names
-    (['name: t', 'timer: 1ms', f'publishes: /x {MARK}'], ['write a list, as [a, b]']),
-    (['name: t', 'timer: 1ms', 'publishes:', '- /x', f'- x {MARK}'], ["'publishes': 'x' is not"]),
-    (['name: t', 'timer: 1ms', 'publishes:', '- /x', f'- /x {MARK}'], ["'/x' is listed twice"]),
-    (['name: t', 'timer: 1ms', f'reads: [a b] {MARK}'], ["'a b' is not a valid callback name"]),
-    (['name: t', 'timer: 1ms', f'reads: ["/b:c"] {MARK}'], ['names a callback with its node']),
-    (['name: t', 'timer: 1ms', f'reads: [/b c] {MARK}'], ['not a valid topic name']),
-    # words
-    (['name: t', 'timer: 1ms', f'release_from: arival {MARK}'], ["did you mean 'arrival'?"]),
-    (['name: t', 'timer: 1ms', f'release_from: 7 {MARK}'],
-     ["'7' is not known: use arrival, source_timestamp, header_stamp"]),
-    (['name: t', 'timer: 1ms', f'on_late: stop {MARK}'], ['use continue, demote, abort']),
-    (['name: t', 'timer: 1ms', f'on_miss: abort {MARK}'],
-     ["unknown key 'on_miss': write 'on_late:' instead"]),
-    (['name: t', 'timer: 1ms', f'keep: last {MARK}'], ['use all, newest']),
-    (['name: t', 'timer: 1ms', f'importance: hgh {MARK}'], ["did you mean 'high'?"]),
-    (['name: t', 'timer: 1ms', f'tolerate: 5% {MARK}'],
-     ["'tolerate': '5%' is no tolerance", "write how many of how many, as '1 of 100'"]),
-    (['name: t', 'timer: 1ms', f'tolerate: 3 of 3 {MARK}'], ['and fewer than all']),
-    (['name: t', 'timer: 1ms', f'tolerate: 0 of 3 {MARK}'], ['at least 1 miss']),
-    (['name: t', 'timer: 1ms', f'max_active_jobs: 0 {MARK}'], ['from 1 to 1000000']),
-    (['name: t', 'timer: 1ms', f'group: a/b {MARK}'], ['not a valid callback group name']),
-    (['name: t', 'timer: 1ms', f'dag: a@b {MARK}'], ['not a valid DAG name']),
-    (['name: t', 'timer: 1ms', f'dag: [a] {MARK}'], ["'dag': a list is no single"]),
-])
-def test_callback_entries(entries, says):
-    lines = '\n'.join(f'    {entry}' for entry in entries)
-    nodes_error(f'- node: /a\n  callbacks:\n  - {lines[4:]}\n', *says)
+    ('node: /sink', 'node: sink', "'sink' is not an absolute node name: write it in full, as "
+     "'/sink'"),
+    ('node: /sink', 'node: /a-b', "'/a-b' is not a valid node name"),
+    ('node: /sink', f'node: /{"a" * 300}', 'too long'),
+    ('node: /sink', 'node: [/a]', "node 4: 'node': a list is no single value: write a text"),
+    ('- node: /sink', '- /sink\n  - node: /sink',
+     "node 4: the text '/sink' is no mapping: write one with the keys node, callbacks"),
+    ('name: show', 'name: "a b"', "'a b' is not a valid callback name"),
+    ('name: show', 'nme: show', "callback 1 of node '/sink': unknown key 'nme': did you mean"),
+    ('name: show\n        ', '', "callback 1 of node '/sink': 'name' is missing"),
+    ('group: io', 'group: a/b', 'not a valid callback group name'),
+    ('dag: camera', 'dag: a@b', 'not a valid DAG name'),
+    ('{eyes:', '{"eyes/ears":', 'not a valid process name'),
+    # what starts a callback
+    ('subscription: /boxes', 'subscription: boxes', 'is not an absolute topic name'),
+    ('subscription: /boxes', f'subscription: /{"x" * 247}', 'at most 247'),
+    ('subscription: /boxes', 'subscription: [/x, /y]', 'a list is no single value'),
+    ('timer: 20ms, ', 'timer: 20ms, subscription: /x, ', "'timer', 'subscription' exclude each"),
+    ('timer: 20ms, ', '', "callback '/detector:7': nothing says what starts the callback"),
+    ('sync: [/image, /info]', 'sync: /image', "the text '/image' is no list: write a list, as"),
+    ('sync: [/image, /info]', 'sync: [/x]', "too short: give at least 2, or write 'subscr"),
+    ('sync: [/image, /info]', 'sync: []', 'the list is empty: add an entry'),
+    ('sync: [/image, /info]', 'sync: [/x, /x]', "'/x' is listed twice"),
+    ('service: /detector/set', 'service: /x/', 'not a valid service name'),
+    # values
+    ('timer: 20ms', 'timer: 20', "'timer': '20' has no unit: add one, as '20ms' or '20s'"),
+    ('timer: 20ms', 'timer: -20ms', "'-20ms' is not a time: write a number and a unit"),
+    ('deadline: 120ms', 'deadline: {}', "'deadline': a mapping is no single value"),
+    ('publishes: [/boxes]', 'publishes: [/boxes, x]', "'publishes': 'x' is not an absolute"),
+    ('reads: [/set', 'reads: ["/b:c"', 'names a callback with its node'),
+    ('on_late: abort', 'on_late: stop', "'stop' is not known: use continue, demote, abort"),
+    ('release_from: header_stamp', 'release_from: arival', "did you mean 'arrival'?"),
+    ('max_active_jobs: 3', 'max_active_jobs: many', 'from 1 to 1000000'),
+    ('holds_interpreter: true', 'holds_interpreter: maybe', 'write true or false'),
+    ('2 of 50', '5%', "'5%' is no tolerance: write how many of how many, as '1 of 100'"),
+    ('{quantiles_us: [0, 5], percent: [10, 99.9]}', '[3ms]', 'a list is no mapping'),
+    ('quantiles_us: [0, 5], ', '', "'quantiles_us' is missing"),
+    ('quantiles_us: [0, 5]', 'quantiles_us: [1, x]', "'x' is not a number"),
+    ('quantiles_us: [0, 5]', 'quantiles_us: [-1, 5]', 'not from 0 to a day and rising'),
+    ('percent: [10, 99.9]', 'percent: [1, 101]', 'not from 0 to 100 and rising'),
+    # paths
+    ("'/camera/driver:frame', '/detector:call-1.x', '/sink:show'", "'/sink:show'", 'too short'),
+    ("'/camera/driver:frame'", 'frame', "'frame' names no callback: write '/node:callback'"),
+    ('name: frame_to_show', 'nam: p', "path 1: unknown key 'nam'"),
+]
+# What the schema does not know: relations between values, and what is no JSON.
+PARSER = [
+    ('workers: 7', f'workers: {"9" * 5000}', 'is no integer'),
+    ('2 of 50', '3 of 3', 'is no tolerance'),
+    ('quantiles_us: [0, 5]', 'quantiles_us: [5, 1]', 'not from 0 to a day and rising'),
+    ('quantiles_us: [0, 5]', 'quantiles_us: [1, 1e12]', 'not from 0 to a day and rising'),
+    ('quantiles_us: [0, 5]', 'quantiles_us: [1, .nan]', "'.nan' is not a number"),
+    ('percent: [10, 99.9]', 'percent: [5]', 'one for each quantile'),
+    ('percent: [10, 99.9]', 'percent: [5, 5]', 'not from 0 to 100 and rising'),
+    ('timer: 20ms', 'timer: 20ms, period: 2ms', 'period of 2ms is not that of its timer, 20ms'),
+    ('name: set_to_show', 'name: frame_to_show', "path 'frame_to_show': this name is taken"),
+    ("'/camera/driver:frame'", "'/camera/driver:fram'", "did you mean '/camera/driver:frame'?"),
+    ("'/camera/driver:frame', ", "'/sink:show', ", "'/sink:show' is listed twice"),
+    ("'/camera/driver:frame', '/detector:call-1.x', ", "'/camera/driver:frame', ",
+     "path 'frame_to_show': no trigger or queue edge leads from '/camera/driver:frame' to"),
+    ('rest: [/sink]', 'rest: [/d]', "there is no node '/d'"),
+    ('rest: [/sink]', 'rest: [/camera/driver]', "is in process 'eyes', too"),
+    ("eyes: ['/camera/driver'], rest: [/sink]", "eyes: [/sink, /detector, '/camera/driver'], "
+     'x: []', "no node runs in process 'x'"),
+]
 
 
-def test_overload_keys():
-    tasks = loads("""
-        mddag: 1
-        nodes:
-          - node: /n
-            callbacks:
-              - {name: t, timer: 10ms, publishes: [/a], keep: newest, on_late: demote}
-              - {name: s, subscription: /a, deadline: 10ms, keep: newest, importance: high,
-                 tolerate: 2 of 50}
-    """)
-    source, sink = tasks.callbacks
-    assert (source.keep, source.importance, source.tolerate) == ('newest', 'normal', None)
-    assert (sink.keep, sink.importance, sink.tolerate) == ('newest', 'high', WeaklyHard(2, 50))
-    assert (str(sink.tolerate), tasks.dags[0].on_late) == ('2 of 50', 'demote')
+@pytest.mark.parametrize(('right', 'wrong', 'says'), BOTH + PARSER)
+def test_what_the_parser_refuses(right, wrong, says):
+    assert says in str(refusal(EVERYTHING, right, wrong))
 
 
-PATHS = """\
+@pytest.mark.parametrize(('right', 'wrong'), [each[:2] for each in BOTH])
+def test_the_schema_refuses_the_same(right, wrong):
+    assert schema_errors(EVERYTHING.replace(right, wrong, 1))
+
+
+def test_the_schema_allows_what_is_right():
+    jsonschema.Draft7Validator.check_schema(language.schema())
+    assert schema_errors(EVERYTHING) == []
+    for name in ('autoware.yaml', 'autoware_multi.yaml'):
+        assert schema_errors((CONFIG / name).read_text(encoding='utf-8')) == []
+    text = """\
 mddag: 1
+arguments: {period: 10ms, workers: }
+include:
+  - other.yaml
+  - {file: one.yaml, namespace: /front, remap: {/a: /b}, set: {period: $(period), on: 3}}
+workers: $(workers)
 nodes:
-  - node: /a
-    callbacks:
-      - {name: t, timer: 1ms, publishes: [/x]}
-      - {name: s, subscription: /x, deadline: 1ms}
-      - {name: u, timer: 1ms, dag: u, deadline: 1ms, reads: [s, /x]}
-paths:
+  - node: /$(period)
+    callbacks: [{name: $(period)_x, timer: $(period), deadline: 1ms, on_late: $(period)}]
 """
+    assert schema_errors(text) == []
+    assert schema_errors(text.replace('namespace', 'name_space')) != []
+    assert schema_errors(text.replace('remap: {/a: /b}', 'remap: {/a: b}')) != []
 
 
-@pytest.mark.parametrize('text, says', [
-    (f'- name: p\n  callbacks: ["/a:t", "/a:n"] {MARK}', "unknown callback '/a:n'"),
-    (f'- name: p\n  callbacks:\n  - /a:t\n  - /aa:s {MARK}', "did you mean '/a:s'?"),
-    (f'- name: p\n  callbacks: ["/a:s", "/a:t"] {MARK}',
-     "path 'p': no trigger or queue edge leads from '/a:s' to '/a:t'"),
-    (f'- name: p\n  callbacks:\n  - /a:t\n  - /a:s\n  - /a:u\n  - /a:t {MARK}',
-     "'/a:t' is listed twice"),
-    (f'- name: p\n  callbacks:\n  - /a:u\n  - /a:s {MARK}', "from '/a:u' to '/a:s'"),
-    (f'- name: p\n  callbacks: [t, "/a:s"] {MARK}', "'t' names no callback"),
-    (f'- name: p\n  callbacks: ["/a:t"] {MARK}', 'too short: give at least 2'),
-    (f'- name: p\n  callbacks: [] {MARK}', 'is empty'),
-    (f'- name: p {MARK}', "'callbacks' is missing"),
-    (f'- callbacks: ["/a:t", "/a:s"] {MARK}', "'name' is missing"),
-    (f'- name: p\n  callback: x {MARK}', "did you mean 'callbacks'?"),
-    (f'- name: p\n  callbacks: ["/a:t", "/a:s"]\n'
-     f'- name: p {MARK}\n  callbacks: ["/a:t", "/a:s"]', "path 'p': this name is taken"),
-    (f'- p {MARK}', "path 1: the text 'p' is no mapping"),
-])
-def test_paths(text, says):
-    assert says in str(error(PATHS + text + '\n'))
-
-
-def test_paths_run_over_trigger_and_queue_edges():
-    tasks = loads(PATHS + """
-  - {name: variable, callbacks: ['/a:t', '/a:s', '/a:u']}
-  - {name: take, callbacks: ['/a:t', '/a:u']}
-""")
-    assert [path.name for path in tasks.paths] == ['variable', 'take']
+def test_numbers_and_truth_values_may_be_quoted():
+    text = EVERYTHING.replace('7\n', '"7"\n').replace('true', "'true'").replace('2.5', '"2.5"')
+    assert loads(text).callbacks == loads(EVERYTHING).callbacks and loads(text).workers == 7

