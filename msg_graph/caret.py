@@ -116,7 +116,7 @@ def _callback(tree: Plain, node: str) -> DraftCallback:
 
 
 def _group(node: DraftNode, tree: Plain) -> None:
-    members = [node.callbacks[name] for name in tree['callback_names'] or ()
+    members = [node.callbacks[name] for name in tree.get('callback_names') or ()
                if name in node.callbacks]
     if tree['callback_group_type'] == 'mutually_exclusive' and len(members) > 1:
         name = GROUP.check(tree['callback_group_name'].rpartition('/')[2])

@@ -34,17 +34,11 @@ def test_no_declaration(text, says):
 
 
 @pytest.mark.parametrize('text', [
-    f'mddag: 1\nnodes: [1 {MARK}\n'.replace(MARK, '') + MARK,
-    f'mddag: 1\n"nodes {MARK}',
-    f'mddag: 1\nnodes:\n\t- a {MARK}',
-    f'mddag: 1\nnodes: ] {MARK}',
-    f'mddag: 1\na: b: c {MARK}',
-    f'%YAML 7.0 {MARK}\n---\nmddag: 1',
-])
+    'mddag: 1\nnodes: [1', 'mddag: 1\n"nodes', 'mddag: 1\nnodes:\n\t- a', 'mddag: 1\na: b: c',
+    '%YAML 7.0\n---\nmddag: 1'])
 def test_not_yaml(text):
-    with pytest.raises(GraphError) as caught:
+    with pytest.raises(GraphError, match='not YAML') as caught:
         loads(text, 'g.yaml')
-    assert 'not YAML' in str(caught.value)
     assert 1 <= caught.value.line <= text.count('\n') + 2
 
 
