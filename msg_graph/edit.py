@@ -152,8 +152,11 @@ def _with_entry(text: str, file: str, processes: tuple[Process, ...]) -> str:
     lines = text.splitlines(keepends=True)
     if isinstance(tree, Mapping) and 'processes' in tree.entries:
         begin = tree.key_lines['processes'] - 1
-        later = [line - 1 for line in tree.key_lines.values() if line - 1 > begin]
-        del lines[begin:min(later, default=len(lines))]
+        end = min((line - 1 for line in tree.key_lines.values() if line - 1 > begin),
+                  default=len(lines))
+        while not lines[end - 1].partition('#')[0].strip():     # comments on what follows
+            end -= 1
+        del lines[begin:end]
     if lines and not lines[-1].endswith('\n'):
         lines[-1] += '\n'
     return ''.join(lines) + processes_text(processes)

@@ -14,14 +14,12 @@ one before it has made.  What is done with a block depends on its language:
 * `text` right behind: the output of that command.  `…` in it matches anything.
 * `python`: run as a program.
 * `yaml`: a declaration, which must load.
-* `json`: must parse.
 
 Comments (HTML, invisible on the page) right before a block change that:
 
 * `<!-- file: NAME -->`: the block is that file's content (and a declaration must still load, once
   all files of the page are there).
 * `<!-- exit: N -->`: it ends with this status.
-* `<!-- until: TEXT -->`: it runs until TEXT comes out, and then gets Ctrl-C.
 * `<!-- in the test: A => B -->`: B is tried in place of A, to be quick.
 * `<!-- not run: REASON -->`: it is not run, for one of ``REASONS``; what can be checked without
   running it is: Python must compile, YAML must parse, options of `mddag` must exist.
@@ -30,11 +28,9 @@ Comments (HTML, invisible on the page) right before a block change that:
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-import json
 import os
 from pathlib import Path
 import re
-import signal
 import subprocess
 import sys
 
@@ -54,7 +50,7 @@ _BLOCK = re.compile(
     r'(?P<marks>(?:^[ ]*<!-- [^\n]* -->\n+)*)'
     r'^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$',
     re.MULTILINE | re.DOTALL)
-_MARK = re.compile(r'<!-- (file|exit|until|in the test|not run): (.*?) -->')
+_MARK = re.compile(r'<!-- (file|exit|in the test|not run): (.*?) -->')
 _TIMEOUT_S = 60.0
 
 
@@ -187,7 +183,7 @@ class Folder:
             if name is not None and 'arguments:' in block.text:
                 return  # a part, which what includes it shows
             msg_graph.load(self.write(name or 'block.yaml', block.text))
-        elif block.mark('file') is None or block.language in ('python', 'json'):
+        elif block.mark('file') is None or block.language == 'python':
             self._look_at(block)
 
     def _look_at(self, block: Block) -> None:
@@ -195,33 +191,15 @@ class Folder:
             compile(block.text, block.place, 'exec')
         elif block.language == 'yaml':
             yaml.safe_load(block.text)
-        elif block.language == 'json':
-            json.loads(block.text)
         else:
             assert block.reason is not None, (
                 f'{block.place}: {block.language!r} cannot be tried: mark it')
 
     def _run(self, block: Block, command: list[str]) -> None:
-        expected, until = int(block.mark('exit') or 0), block.mark('until')
-        with subprocess.Popen(
-                command, cwd=self.path, env=self._environment, text=True,
-                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                start_new_session=True) as process:
-            try:
-                if until is not None:
-                    found = any(until in line for line in process.stdout)
-                    process.send_signal(signal.SIGINT)  # as a user ends it
-                output, errors = process.communicate(timeout=_TIMEOUT_S)
-            finally:
-                if process.poll() is None:
-                    os.killpg(process.pid, signal.SIGKILL)
-        if until is not None:
-            assert found, f'{block.place}: {until!r} never came\n{errors}'
-            # As with rclpy's own executors, spin() ends with one of these after Ctrl-C.
-            last = errors.strip().splitlines()[-1:]
-            assert not last or re.match(
-                r'KeyboardInterrupt|.*ExternalShutdownException', last[0]), errors
-            return
-        assert process.returncode == expected, (
-            f'{block.place} ended with {process.returncode}\n{output}{errors}')
-        self.output = output if expected != 2 else errors
+        expected = int(block.mark('exit') or 0)
+        done = subprocess.run(
+            command, cwd=self.path, env=self._environment, text=True, stdin=subprocess.DEVNULL,
+            capture_output=True, timeout=_TIMEOUT_S, check=False)
+        assert done.returncode == expected, (
+            f'{block.place} ended with {done.returncode}\n{done.stdout}{done.stderr}')
+        self.output = done.stdout if expected != 2 else done.stderr

@@ -99,7 +99,7 @@ def test_nodes_that_no_process_names_run_in_the_first():
 
 
 @pytest.mark.parametrize('before', ['', 'processes: {old: [/a]}\n', 'processes:\n  old: [/b]\n'])
-@pytest.mark.parametrize('after', ['', 'workers: 3\n'])
+@pytest.mark.parametrize('after', ['', '\n# the pool\nworkers: 3\n', '# the end\n'])
 def test_processes_are_written_again(before, after):
     tasks = loads(HEAD + before + after)
     placed = with_processes(tasks, (Process('x', ('/c', '/b')), Process('1', ('/a',))))
