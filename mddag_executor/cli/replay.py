@@ -55,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
     result = outcome.result()
     if not args.reschedule:
         result['drift'] = [each.result() for each in drift]
-    status = verdicts.judge(args, outcome.tally, result)
+    status = verdicts.judge(args, result)
     if args.report is not None:
         from mddag_executor.report.html import of_outcome
         common.write_report(args.report, of_outcome(outcome))

@@ -7,27 +7,23 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from mddag_executor.cli import common
 from mddag_executor.cli.text import one_line
 from mddag_executor.core.tally import total
 from mddag_executor.core.tolerances import not_tolerated, NOTHING_DUE
 
-if TYPE_CHECKING:
-    from mddag_executor.replay.miss_tally import MissTally
-
 _NEVER_DUE = ('give a declaration whose nodes, topics and namespaces are those that ran, and a '
               'run that is longer than its deadlines')
 
 
-def judge(args: argparse.Namespace, tally: MissTally, result: dict[str, Any]) -> int:
+def judge(args: argparse.Namespace, result: dict[str, Any]) -> int:
     """
-    Add the bursts to a result, say and write what is not tolerated, and return the exit status.
+    Say and write what is not tolerated, and return the exit status.
 
     :param result: of ``replay --json``.
     """
-    tally.add_bursts(result['dags'])
     broken = not_tolerated(result['dags'])
     if args.junit is not None:
         from mddag_executor.report.ci import junit

@@ -9,10 +9,10 @@ Theory of operation
    12): of those that compute in Python the most urgent goes first, and one at a time computes.
 2. All processes share the CPUs (``simulate.machine``).
 3. The cost of the executor and the middleware is added to execution times: ``CALLBACK_NS`` for
-   each callback, ``PUBLISH_NS`` for each callback that it sends a message to.  DAGs are released
-   ``APART_NS`` after one another: timers that start together are never due at the same time.
-4. How processes notice timers and messages of other processes: see ``simulate.intakes``.
-5. A placement is better if fewer deadlines are missed, then if the largest response time, as a
+   each callback, ``PUBLISH_NS`` for each callback that it sends a message to, ``TIMER_NS`` for a
+   timer, ``RECEIVE_NS`` for each message of another process, and ``SEND_NS`` if it sends to other
+   processes.
+4. A placement is better if fewer deadlines are missed, then if the largest response time, as a
    share of its deadline, is smaller.  Placements that differ in one block of nodes or two are
    tried, those of the least load first, until none is better or ``MOST_TRIES`` were tried.
 """
@@ -21,21 +21,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import accumulate, islice
+from itertools import islice
 
 from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.tally import total
 from mddag_executor.laboratory.placement import Placing
-from mddag_executor.simulate.intakes import Costs, Intakes
-from mddag_executor.simulate.load import edge_numbers, edges_of, Load
-from mddag_executor.simulate.schedule import prepare, Settings
+from mddag_executor.simulate.schedule import prepare, schedule, Settings
 from mddag_executor.simulate.workload import periodic_load
-from msg_graph import Process, TaskSet
+from msg_graph import Process, TaskSet, Vertex
 
 CALLBACK_NS = 20_000
 PUBLISH_NS = 75_000
-APART_NS = 20_000
+TIMER_NS = 280_000
+RECEIVE_NS = 480_000
+SEND_NS = 100_000
 MOST_TRIES = 150
 _AHEAD = 40
 
@@ -70,37 +70,33 @@ class Predictor:
         """Return the verdicts about a placement, with these execution times in each job."""
         task_set = replace(self._task_set, processes=tuple(processes))
         tables = Tables.build(task_set, max_active_jobs=NEVER)
-        costs = Costs()
-        crosses = {(a, b): tables.process[a] != tables.process[b]
-                   for a, b in edge_numbers(tables)}
-        sends = {a for (a, _), leaves in crosses.items() if leaves}
-        times = [[ns + CALLBACK_NS + self._publish * len(vertex.successors)
-                  + costs.send_ns * (first + vertex.index in sends)
-                  for ns, vertex in zip(row, dag.vertices)]
-                 for row, dag, first in zip(execution_ns, task_set.dags, tables.first_vertex)]
-        bases = list(accumulate(edges_of(tables), initial=0))[:-1]
-        load = _apart(periodic_load(task_set, times, self._duration)._replace(
+        times = [[ns + self._overhead(vertex, tables.process[first:]) for ns, vertex in zip(
+            row, dag.vertices)] for row, dag, first in zip(
+                execution_ns, task_set.dags, tables.first_vertex)]
+        load = periodic_load(task_set, times, self._duration)._replace(
             holds=[0 if vertex.callback.holds_interpreter is False else process
-                   for vertex, process in zip(task_set.vertices, tables.process)],
-            delays=[costs.delay_ns * leaves for leaves in crosses.values()], delay_base=bases,
-            delay_stride=[0] * len(bases)))
+                   for vertex, process in zip(task_set.vertices, tables.process)])
         settings = Settings(
             self._policy.name, self._workers, self._duration, cpus=self._cpus,
             processes=max(1, len(processes)))
         if self._compiled is None:
             self._compiled = prepare(tables, load, settings, MOST_TRIES)
         tally = Tally(task_set, tables)
-        Intakes(task_set, tables, costs).schedule(
-            load, settings, compiled=self._compiled).count_into(tally, load, settings)
+        schedule(tables, load, settings, compiled=self._compiled).count_into(
+            tally, load, settings)
         return tally
 
+    def _overhead(self, vertex: Vertex, process: Sequence[int]) -> int:
+        """
+        Return the cost of the executor and the middleware for an execution (rule 3), ns.
 
-def _apart(load: Load) -> Load:
-    """Release each DAG a little after the one before it (rule 3)."""
-    releases = sorted((time + dag * APART_NS, dag, job) for time, dag, job in zip(
-        load.times, load.dags, load.jobs))
-    times, dags, jobs = (list(column) for column in zip(*releases))
-    return load._replace(times=times, dags=dags, jobs=jobs)
+        :param process: by local vertex its process.
+        """
+        here = process[vertex.index]
+        return (CALLBACK_NS + self._publish * len(vertex.successors)
+                + TIMER_NS * (vertex.callback.kind == 'timer')
+                + RECEIVE_NS * sum(process[other] != here for other in vertex.predecessors)
+                + SEND_NS * any(process[other] != here for other in vertex.successors))
 
 
 def cost_of(tally: Tally) -> Cost:

@@ -160,6 +160,7 @@ class _Source:
         self._last_seen = 0
         self._others: list[tuple[int, Event]] = []
         self._strange: Counter[str] = Counter()
+        self._orphans = 0
 
     def read(self, progress: Progress | None) -> Recording:
         count = 0
@@ -427,6 +428,7 @@ class _Source:
         if not known.all():
             self._strange[f'{_COMPLETE} of a vertex that is not declared'] += int((~known).sum())
             rest = rest[known]
+        self._orphans = int((~good[rest]).sum())
         more = rows(
             EXECUTIONS, len(rest), callback=complete['callback'][rest], dag=dag[rest],
             vertex=vertex[rest], job=complete['job'][rest], thread=complete['vtid'][rest],
@@ -518,16 +520,14 @@ class _Source:
         vertex, job, time, reason = zip(*drops) if drops else ((), (), (), ())
         found.drops = rows(DROPS, len(drops), vertex=vertex, job=job, time=time, reason=reason)
         found.drop_reasons = tuple(reasons)
-        judging, judging_at = self._pop(_JUDGE_FROM)
-        changes = []
-        for now, release, place in zip(*(each.tolist() for each in (
-                judging['timestamp'], judging['release'], judging_at))):
-            last = max(last, now)
-            if 0 <= release <= NEVER:
-                changes.append((now, place, release))
-            else:
-                self._strange[f'{_JUDGE_FROM} an impossible time'] += 1
-        self._changes, self._hosting = sorted(changes), sorted(hosted, key=lambda h: h[:2])
+        judging, _ = self._pop(_JUDGE_FROM)
+        last = max(last, int(judging['timestamp'].max(initial=0)))
+        possible = (judging['release'] >= 0) & (judging['release'] <= NEVER)
+        self._left_out(_JUDGE_FROM, 'an impossible time', ~possible)
+        judging = judging[possible]
+        for place in sort_by(judging['timestamp'])[-1:]:
+            found.judge_from = int(judging['release'][place])
+        self._hosting = sorted(hosted, key=lambda h: h[:2])
         last = min(last, NEVER - 1)     # a run without end cannot be rescheduled
         found.end = found.judged_until = last
         self._shutdown_at: tuple[int, int] | None = None
@@ -558,7 +558,7 @@ class _Source:
     ) -> None:
         """Assign positions in the order to the core's events (rule 7)."""
         done = np.flatnonzero(complete_at >= 0)
-        single = [(time, place) for time, place, *_ in (*self._changes, *self._hosting)]
+        single = [(time, place) for time, place, *_ in self._hosting]
         if self._shutdown_at is not None:
             single.append(self._shutdown_at)
         times = np.concatenate([
@@ -577,7 +577,6 @@ class _Source:
             table['order'] = rank[at:at + len(table)]
             at += len(table)
         ranks = iter(rank[at:].tolist())
-        found.judge_from = [(next(ranks), release) for *_, release in self._changes]
         found.hosted = [(next(ranks), dag, vertices) for *_, dag, vertices in self._hosting]
         if self._shutdown_at is not None:
             found.judged_order = next(ranks)
@@ -591,6 +590,9 @@ class _Source:
             lines.append(
                 f'{name}: left out: {counted(sum(self._strange.values()), "event")} that make no '
                 f'sense, most often ({n}) {what}')
+        if self._orphans:
+            lines.append(f'{name}: {counted(self._orphans, "execution")} completed in it that did '
+                         'not run in it')
         return lines
 
 

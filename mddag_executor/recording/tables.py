@@ -165,7 +165,7 @@ class Recording:
     :ivar end: the end of the run, ns.
     :ivar judged_until: when the run was judged, ns: what was open then and past its deadline
         missed it.
-    :ivar judge_from: changes of the first judged release, by position in the order.
+    :ivar judge_from: the first judged release, ns; -NEVER: all are judged.
     :ivar judged_releases: range of judged releases, ns; None: all.
     :ivar hosted: changes of the vertices of a DAG that the process runs, by position in the order.
     :ivar drop_reasons: names of the values of ``drops['reason']``.
@@ -205,7 +205,7 @@ class Recording:
     judged: bool = True
     judged_until: int = 0
     judged_order: int = 2 ** 62 - 1
-    judge_from: Sequence[tuple[int, int]] = ()
+    judge_from: int = -NEVER
     judged_releases: tuple[int, int] | None = None
     hosted: Sequence[tuple[int, int, frozenset[int]]] = ()
     drop_reasons: Sequence[str] = ()

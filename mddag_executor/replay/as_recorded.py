@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from mddag_executor.memory import give_back
+from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.tables import Recording
 from mddag_executor.replay.chains import Chains
 from mddag_executor.replay.communications import communications, recorded_callbacks
@@ -148,6 +149,10 @@ def replay(
 
     :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
     :param span: begin and end of the part to replay, ns after the start; see ``Recording.cut``.
+    :raises mddag_executor.replay.ReplayError: also for an ordinary bag.
     """
     recording = open_recording(path, task_set, name, progress)
+    if recording.messages is not None:
+        raise ReplayError(recording.name, 'it is an ordinary bag, in which no callback ran',
+                          'reschedule it')
     return Replay(recording if span is None else recording.cut(*span), skip)

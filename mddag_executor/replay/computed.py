@@ -156,7 +156,7 @@ class _Player:
             demotions=self._demotions(),
             end=schedule.end, judged=schedule.judged, judged_until=schedule.end,
             workers_each=workers,
-            judge_from=() if schedule.judge_from == -NEVER else [(-1, schedule.judge_from)])
+            judge_from=schedule.judge_from)
         found.start = tables.earliest(found.releases['release'], found.executions['ready'])
         return found
 
@@ -231,10 +231,6 @@ class _Player:
 
     def _change(self, entry: LogEntry) -> None:
         now, kind, worker, dag, v, job = entry
-        if v < 0:       # its timer or message was noticed (see ``simulate.intakes``)
-            what = (dag, ~v, job)
-            self._ready[what] = max(now, self._ready.get(what, now))
-            return
         what = (dag, v, job)
         if kind == START:
             before = self._begun.pop(what, None)

@@ -14,8 +14,7 @@ at once; ``test/replay/test_deadlines.py`` compares both implementations.
 3. A sink that completed by its absolute deadline is in time, later it is late.  If the job ended
    before, the sink gets the verdict of that end.  If the run ended after the deadline, the sink is
    overdue.
-4. Jobs released before ``judge_from`` (its value at the time of the verdict) or outside
-   ``judged_releases`` are not judged.
+4. Jobs released before ``judge_from`` or outside ``judged_releases`` are not judged.
 5. A change of the vertices that a process expects (``hosted``) applies to jobs released after it.
 
 The executor's recorded misses must equal the computed ones.  If they differ, the recording is
@@ -24,13 +23,12 @@ incomplete or this program is wrong; ``Judged.differences`` reports it.
 
 from __future__ import annotations
 
-from array import array
 from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, cast, NamedTuple
 
-from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core import NEVER, Scheduler, Tables, Tally
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
@@ -61,7 +59,6 @@ from mddag_executor.recording.tables import (
     sort_by,
     Table,
 )
-from mddag_executor.replay.miss_tally import MissTally
 from mddag_executor.text import counted
 import numpy as np
 
@@ -115,8 +112,9 @@ class Judged:
         self._recording, self.task_set, self.skip = recording, task_set, skip
         self.tables = Tables.build(task_set, legs=True, groups=False)
         self.contradictions = 0
-        self._outcomes: list[tuple[int, Ints, Ints, Mask]] = []
-        self._judging = _Judging(recording, skip)
+        self._outcomes: list[tuple[int, Ints, Mask]] = []
+        #: The first release that is judged.
+        self.judge_from = _judge_from(recording, skip)
         ends, releases = ([table[mine] for mine in rows_by(table['dag'], len(task_set.dags))]
                           for table in (recording.job_ends, recording.releases))
         executions = recording.executions
@@ -134,11 +132,6 @@ class Judged:
         table = np.concatenate(found) if found else np.empty(0, dtype=VERDICTS)
         self.verdicts = table[np.argsort(table['order'], kind='stable')]
         self.tally = self._tally()
-
-    @property
-    def judge_from(self) -> int:
-        """Return the first release that is judged."""
-        return self._judging.last
 
     @cached_property
     def missed(self) -> Table:
@@ -193,6 +186,7 @@ class Judged:
             reason != recorded.WITHDRAWN)[:, None]
         self.contradictions += int((duplicates[0] < ended[duplicates[1]]).sum())
         self._late_ends(jobs, ends, ended)
+        judged = self._is_judged(jobs.release)
         places: Any = np.indices(done.shape)
         row, sink = places
         verdicts = []
@@ -211,7 +205,7 @@ class Judged:
                  np.full(done.shape, min(judged_order, NEVER)),
                  np.full(done.shape, judged_until)))
         for which, verdict, at, until in choices:
-            which = which & self._judging.is_judged(at, jobs.release[:, None])
+            which = which & judged[:, None]
             if not which.any():
                 continue
             table = np.zeros(int(which.sum()), dtype=VERDICTS)
@@ -230,9 +224,7 @@ class Judged:
         for of, (end, _) in _ENDS.items():
             outcome[(jobs.ended <= closed) & (reason == of)] = end
         over = (ended < NEVER) & ~((jobs.ended <= closed) & (reason == recorded.WITHDRAWN))
-        self._outcomes.append((
-            dag, outcome, jobs.released,
-            over & self._judging.is_judged(ended, jobs.release)))
+        self._outcomes.append((dag, outcome, over & judged))
         return jobs, verdicts
 
     def _dropped(self, jobs: Jobs, sinks: list[int]) -> tuple[Mask, Ints]:
@@ -362,19 +354,24 @@ class Judged:
         jobs.done.reshape(-1)[cells[whole]] = completing[last]
         jobs.done_order.reshape(-1)[cells[whole]] = order[last]
 
+    def _is_judged(self, release: Ints) -> Mask:
+        """Return which releases are judged (rule 4)."""
+        begin, end = self._recording.judged_releases or (-NEVER, NEVER)
+        judged: Mask = (release >= max(begin, self.judge_from)) & (release < end)
+        return judged
+
     # --- results ---------------------------------------------------------------------------------
 
-    def _tally(self) -> MissTally:
-        tally = MissTally(self.task_set, self.tables)
-        judging = self._judging
+    def _tally(self) -> Tally:
+        tally = Tally(self.task_set, self.tables)
         demotions = self._recording.demotions
         if self.skip:
             numbers = JobNumbers(self._recording.releases)
             kept = numbers.marked(self._recording.releases['release'] >= self.judge_from)
             demotions = demotions[kept[numbers.of(demotions)]]
         demoted = Counter(demotions['vertex'].tolist())
-        for dag, outcome, released, over in self._outcomes:
-            tally.jobs[dag] = int(judging.is_judged(released, self.jobs[dag].release).sum())
+        for dag, outcome, over in self._outcomes:
+            tally.jobs[dag] = int(self._is_judged(self.jobs[dag].release).sum())
             for end, n in Counter(outcome[over].tolist()).items():
                 tally.ends[dag][end] += n
         for v, mine in zip(self.tables.sinks, self.by_sink()):
@@ -390,10 +387,8 @@ class Judged:
             if len(responses):
                 sink.shortest, sink.longest = int(responses[0]), int(responses[-1])
             sink.responses = cast(Any, memoryview(responses))
-            missed = mine[mine['kind'] != SINK_IN_TIME]
-            tally.missed_jobs[v] = array('q', missed['job'].tobytes())
             if v in tally.windows:
-                for job in np.sort(missed['job']).tolist():
+                for job in np.sort(mine['job'][mine['kind'] != SINK_IN_TIME]).tolist():
                     tally.windows[v].add(job)
         for first in self.missed[:1]:
             tally.first_miss = {
@@ -434,35 +429,14 @@ class Judged:
                 f'{more.total()} that were not recorded: the first is job {example[2]} at {name}')
 
 
-class _Judging:
-    """The first judged release, as it changes during the run (rule 4)."""
-
-    def __init__(self, recording: Recording, skip: int) -> None:
-        changes = [(-1, -NEVER)]
-        events = [(order, release + skip) for order, release in recording.judge_from]
-        releases = recording.releases
-        if skip > 0 and len(releases):
-            first = int(releases['order'].argmin())
-            order = int(releases['order'][first])
-            if all(at > order for at, _ in events):
-                changes.append((order, int(releases['release'][first]) + skip))
-        changes += events
-        self._orders = np.array([order for order, _ in changes], dtype=np.int64)
-        self._releases = np.array([release for _, release in changes], dtype=np.int64)
-        self.last = changes[-1][1]
-        self._begin, self._end = recording.judged_releases or (-NEVER, NEVER)
-
-    def is_judged(self, order: Any, release: Any) -> Mask:
-        """Return whether jobs are judged, by release and position in the order of events."""
-        in_range = (release >= self._begin) & (release < self._end)
-        if len(self._orders) == 1:
-            judged: Mask = np.broadcast_to(
-                in_range & (release >= self._releases[0]),
-                np.broadcast_shapes(order.shape, release.shape))
-            return judged
-        at = np.searchsorted(self._orders, order, 'right') - 1
-        judged = in_range & (release >= self._releases[at])
-        return judged
+def _judge_from(recording: Recording, skip: int) -> int:
+    """Return the first release that is judged after a warm-up."""
+    begin, releases = recording.judge_from, recording.releases
+    if begin > -NEVER:
+        return begin + skip
+    if skip > 0 and len(releases):
+        return int(releases['release'][releases['order'].argmin()]) + skip
+    return begin
 
 
 def judge(recording: Recording, skip: int = 0) -> Judged:

@@ -391,7 +391,7 @@ class Joined:
         """Find when judging begins and ends (rules 4 and 5)."""
         judges_from = max(self._judging(), default=0)
         if judges_from:
-            found.judge_from = [(0, judges_from)]
+            found.judge_from = judges_from
         ends = [part.end + part.shift for part in self._parts if part.end is not None]
         end = max(int(part.seen_at.max(initial=0)) for part in self._parts)
         found.end = found.judged_until = min(end, NEVER - 1)

@@ -18,15 +18,15 @@ Theory of operation
 * A sync vertex has the execution time of the leg that completed it.  Earlier legs, which only
   store their message, load the workers like undeclared callbacks: each piece is a job of the
   undeclared DAG, ready when it was in the recording.  Their callback groups are ignored.
-* If CPU times are recorded, execution times are isolated execution times (``isolation``), and the
-  load has the CPU time and whether the GIL was held (as recorded or declared).  With one worker,
-  an execution that holds the GIL takes its CPU time: no other thread competes for the GIL.
+* If CPU times are recorded, the load has the CPU time and whether the GIL was held (as recorded or
+  declared).  An execution that computes without the GIL takes its CPU time: for the rest of the
+  time it waited for a CPU.  One that holds the GIL takes its duration without the time in which
+  another callback held the GIL, too; with one worker, or in fewer processes than recorded, it
+  takes its CPU time.  (The difference: other threads of its process computed.)
 * *Transport* is the time from the end of the publishing execution until the successor is ready;
   negative if it published early.
 * *Dispatch* is the time from when an execution could have started until it started (see
   ``dispatches``).  It occupies the worker, so it is added to the execution time.
-* If processes differ from the recorded ones, intakes (``simulate.intakes``) notice timers and
-  messages at the recorded costs (see ``noticed``).  Jobs of late timers are not skipped then.
 * A time that is missing in a job is replaced by the median of the edge, or of all executions.
 * Missing publications are kept: if an execution completed without publishing on a topic that its
   callback used in other jobs, and no execution followed in that job, the edge is not satisfied.
@@ -45,16 +45,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
-from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded_tables
 from mddag_executor.recording.tables import Ints, look_up, Recording, sort_by
 from mddag_executor.replay.dispatches import dispatch_times
-from mddag_executor.replay.isolation import isolated_times, Recorded
-from mddag_executor.replay.noticed import Noticed
+from mddag_executor.replay.spans import crowded, Spans
 from mddag_executor.replay.usage import ran
 from mddag_executor.simulate import Load
 from mddag_executor.simulate.deliveries import DELAY_NS
-from mddag_executor.simulate.intakes import Costs
 from mddag_executor.simulate.load import edge_numbers, edges_of, FAILS, RUNS, SKIPPED
 from msg_graph import Dag
 from msg_graph.model import topological_order
@@ -84,7 +81,6 @@ class RecordedLoad(NamedTuple):
     dispatch_ns: int | None = None
     transport_ns: int | None = None
     dispatches: Any = ()
-    intakes: Costs | None = None
 
 
 _JOB, _VERTEX, _EDGE = range(3)
@@ -125,21 +121,20 @@ class LoadBuilder:
     Makes a load from a recording.
 
     :param n_workers: number of workers of each recorded process.
-    :param cpus: number of CPUs; 0: unknown.
     :param processes: by vertex the recorded process, from 1; None: one process.
     :param times: by DAG the execution times of its jobs and vertices, for a recording without
         executions; None: missing ones are estimated.
     """
 
     def __init__(
-        self, recording: Recording, tables: Tables, n_workers: int, cpus: int = 0,
+        self, recording: Recording, tables: Tables, n_workers: int,
         processes: Sequence[int] | None = None, times: Sequence[Any] | None = None,
     ) -> None:
         task_set = recording.task_set
         self._task_set, self._recording, self._tables = task_set, recording, tables
         self._first = tables.first_vertex
         self._process = [*(processes or [1] * tables.n_vertices), 1]
-        self._cpus, self._times = cpus, times
+        self._times = times
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
         # by global vertex and leg: the edge (number in its DAG) that its message satisfies
         numbers = edge_numbers(tables)
@@ -331,23 +326,18 @@ class LoadBuilder:
 
     def build(
         self, overheads: bool = True, process: Sequence[int] | None = None, workers: int = NEVER,
-        notices: bool = False,
     ) -> RecordedLoad:
         """
         Return the load.
 
         :param process: by vertex the process to run it in; None: as recorded.
         :param workers: workers of each process, if fewer than in the recording.
-        :param notices: whether intakes notice timers and messages, instead of the recorded times;
-            this needs CPU times, which say how long others computed.
         """
         process = process or self._process
-        notices = notices and bool((self._whole['cpu'] >= 0).any())
-        every, usual, late, intakes = self._isolate(workers, notices)
-        if notices:
-            self._skipped.clear()
+        every, usual, late = self._dispatches()
+        self._take_cpu_times(workers == 1 or max(process) < max(self._process))
         unsent = self._unsent()
-        delays, transport = self._transports(overheads, process, intakes)
+        delays, transport = self._transports(overheads, process)
         if unsent:
             delays[np.concatenate([each.ravel() for each in unsent])] = NEVER
         self._drop('start', 'end', 'arrived', 'sent')
@@ -356,9 +346,6 @@ class LoadBuilder:
         demand, executions = int(took.sum()), len(took)
         if overheads:
             took += late
-        if intakes is not None:     # dispatching needs CPU time, too
-            cpu[cpu >= 0] += late[cpu >= 0]
-            took += intakes.send_ns * self._by_execution(self._sends(process))
         others = self._others[sort_by(*self._others.T)]
         more = np.zeros(len(others), dtype=np.int64)
         number = others[:, 2]
@@ -372,12 +359,12 @@ class LoadBuilder:
                 'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
                 'delays': delays, 'delay_stride': self._widths[_EDGE].tolist(),
                 'delay_base': self._begins[_EDGE, :-1].tolist()}
-        load = self._load(costs, bases, others[:, 0], overheads and not notices, workers == 1)
+        load = self._load(costs, bases, others[:, 0], overheads, workers == 1)
         load = load._replace(
             fates=self._fates(len(costs)), **columns)
         return RecordedLoad(
             load, [jobs.numbers.tolist() for jobs in self._jobs], demand, executions, estimated,
-            unknown, usual, transport, late if overheads else late[:0], intakes)
+            unknown, usual, transport, late if overheads else late[:0])
 
     def _drop(self, *columns: str) -> None:
         """Free columns, which are large for long runs."""
@@ -452,91 +439,36 @@ class LoadBuilder:
             fates[int(self._places(_VERTEX, row, self._tables.source[dag]))] = SKIPPED
         return fates
 
-    def _by_execution(self, by_vertex: Sequence[int]) -> Any:
-        numbers = np.array(by_vertex, dtype=np.int32)   # there may be millions
-        return np.concatenate([
-            np.tile(numbers[first:first + jobs.size], len(jobs.numbers))
-            for first, jobs in zip(self._first, self._jobs)])
-
-    def _isolate(
-        self, workers: int, notices: bool
-    ) -> tuple[Any, int | None, Any, Costs | None]:
-        """
-        Convert times to isolated execution times (see ``isolation``).
-
-        ``took`` becomes the isolated times of callbacks.
-
-        :return: dispatch time by number of an execution, with the usual one last; the usual one;
-            the executor's own cost per execution; and the costs of intakes, if ``notices``.
-        """
-        intakes = None
-        number, took, start, cpu, held = (
-            self._whole[name] for name in ('dispatch', 'took', 'start', 'cpu', 'held'))
-        locks = (held > 0) & (cpu >= 0)
+    def _dispatches(self) -> tuple[Any, int | None, Any]:
+        """Return dispatch times by number (the last: the median), the median, and by execution."""
+        number = self._whole['dispatch']
         known = number[number >= 0]
         usual = quantile(memoryview(np.sort(self._late[known])), 0.5) if len(known) else None
         every = np.append(self._late, usual or 0)     # number -1
         late = every[number]
-        del self._late, number, known
+        del self._late, number
         self._drop('dispatch')
-        ran: Any = (took >= 0) & (start >= 0)
-        if ran.all():
-            ran = slice(None)   # a slice copies nothing: there may be millions
-        if (cpu[ran] >= 0).any():
-            recorded = Recorded(
-                start[ran] - late[ran], took[ran] + late[ran], cpu[ran], locks[ran],
-                self._by_execution(self._process)[ran])
-            give_back()
-            beyond = recorded
-            if notices:
-                noticed = self._noticed()
-                intakes = noticed.costs(recorded)
-                beyond = recorded.followed_by(noticed.executions(intakes))
-            cost = isolated_times(beyond, self._cpus)[:len(recorded.took)]
-            del beyond
-            if workers == 1:    # no other thread of the process competes for the GIL
-                alone = recorded.locks
-                cost[alone] = np.minimum(cost, recorded.cpu + late[ran])[alone]
-            # the reduction: it began late, or was paused later
-            began = recorded.took - cost
-            del recorded
-            began = np.minimum(began, np.maximum(0, late[ran] - (usual or 0)))
-            took[ran] = np.maximum(0, cost - late[ran] + began)
-            late[ran] = cost - took[ran]
-        return every, usual, late, intakes
+        return every, usual, late
 
-    def _noticed(self) -> Noticed:
-        """Return what the intakes noticed in the recording."""
-        columns = []
-        for dag, jobs in enumerate(self._jobs):
-            if self._timer[dag]:
-                ready, of = np.unique(jobs.noticed, return_inverse=True)
-                due = np.full(len(ready), NEVER)
-                np.minimum.at(due, of, jobs.release)
-                columns.append(np.stack((
-                    due, ready, np.full(len(due), self._process[self._tables.source[dag]]),
-                    np.ones_like(due))))
-        to = [[self._process[b] for a, b in edge_numbers(self._tables)
-               if self._tables.dag_of[a] == dag.index] for dag in self._task_set.dags]
-        for jobs, crosses, places in zip(self._jobs, self._crossings(self._process), to):
-            end, arrived = map(jobs.rows, ('end', 'arrived'))
-            for edge, (crossed, _) in enumerate(crosses):
-                sent = np.minimum(end[:, jobs.publishers[edge]], arrived[:, edge])
-                known = sent >= 0
-                if crossed:
-                    columns.append(np.stack((
-                        sent[known], arrived[known, edge], np.full(known.sum(), places[edge]),
-                        np.zeros(known.sum(), dtype=np.int64))))
-        came = np.concatenate(columns, axis=1)
-        return Noticed(came[0], came[1], came[2], came[3] > 0)
+    def _take_cpu_times(self, alone: bool) -> None:
+        """
+        Subtract from durations the time in which others computed, down to the CPU time.
 
-    def _sends(self, process: Sequence[int]) -> list[int]:
-        """Return by vertex whether it sends to other processes, minus whether it did."""
-        found = [0] * self._tables.n_vertices
-        for how, sign in ((process, 1), (self._process, -1)):
-            for before in {a for a, b in edge_numbers(self._tables) if how[a] != how[b]}:
-                found[before] += sign
-        return found
+        :param alone: whether executions that hold the GIL take their CPU time.
+        """
+        took, cpu, held, start, end = (
+            self._whole[name] for name in ('took', 'cpu', 'held', 'start', 'end'))
+        known = cpu >= 0
+        computes = known & np.where(held > 0, alone, 2 * cpu >= took)
+        np.minimum(took, cpu, out=took, where=computes)
+        holds = np.flatnonzero(known & (held > 0))
+        process = np.concatenate([np.empty(0, dtype=np.int64), *(
+            np.tile(self._process[first:first + jobs.size], len(jobs.numbers))
+            for first, jobs in zip(self._first, self._jobs))])[holds]
+        for number in np.unique(process).tolist():
+            mine = holds[process == number]
+            shared = Spans(*crowded(start[mine], end[mine], 2)).within(start[mine], end[mine])
+            took[mine] = np.maximum(np.minimum(took[mine], cpu[mine]), took[mine] - shared)
 
     def _load(
         self, costs: Any, bases: list[int], others: Ints, overheads: bool, one_worker: bool
@@ -556,7 +488,7 @@ class LoadBuilder:
             ready, dags, rows, costs, bases, [*(jobs.size for jobs in self._jobs), 1], release)
 
     def _transports(
-        self, overheads: bool, process: Sequence[int], intakes: Costs | None
+        self, overheads: bool, process: Sequence[int]
     ) -> tuple[Any, int | None]:
         """
         Return the transports by job, and the median of all measured ones.
@@ -575,9 +507,7 @@ class LoadBuilder:
                 column = found[known[:, edge], edge]
                 found[~known[:, edge], edge] = np.median(column) if len(column) else 0
                 measured[before].append(column)
-                if intakes is not None and after:
-                    found[:, edge] = intakes.delay_ns
-                elif before != after:
+                if before != after:
                     changed.append((found[:, edge], after))
             delays.append(found)
         usual = {after: np.concatenate(each) for after, each in measured.items()}

@@ -15,7 +15,7 @@ from dataclasses import asdict, replace
 from functools import cached_property, partial
 from typing import Any
 
-from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, POLICIES, processes_of, Tables
+from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, POLICIES, processes_of, Tables, Tally
 from mddag_executor.core import policy as find_policy
 from mddag_executor.core.tables import DEMOTE, ON_LATE
 from mddag_executor.errors import UsageError
@@ -25,11 +25,9 @@ from mddag_executor.recording.tables import Recording
 from mddag_executor.replay.as_recorded import recording_result, Replay
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
-from mddag_executor.replay.miss_tally import MissTally
 from mddag_executor.replay.run import Given, open_recording, Progress, undeclared
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import LogEntry, schedule, Settings
-from mddag_executor.simulate.intakes import Intakes
 from mddag_executor.simulate.load import edge_numbers, SKIPPED
 from mddag_executor.simulate.workload import with_execution_times
 from mddag_executor.text import counted, listed
@@ -62,17 +60,15 @@ class Reschedule:
         self.warnings = warnings
         self._skip, self._overheads, self._about = skip, overheads, recording_result(run)
         self._start = run.begin
-        self.tally = MissTally(task_set, tables)
-        self._run = partial(schedule, tables) if work.intakes is None else Intakes(
-            task_set, tables, work.intakes).schedule
-        result = self._run(work.load, settings)
+        self.tally = Tally(task_set, tables)
+        result = schedule(tables, work.load, settings)
         self.decisions, self.busy = result.decisions, result.busy
         result.count_into(self.tally, work.load, settings)
 
     @cached_property
     def log(self) -> Sequence[LogEntry]:
         """Return starts, ends and preemptions, on the recording's clock; runs the load again."""
-        return self._run(self.work.load, self.settings, log=True).log
+        return schedule(self.tables, self.work.load, self.settings, log=True).log
 
     @property
     def worker_names(self) -> list[str]:
@@ -203,7 +199,7 @@ def reschedule(
     recorded = Replay(run, skip) if run.messages is None else None
     with no_garbage():
         builder = LoadBuilder(
-            run, tables, each, max(0, head.cpus), _processes(run, ran), times)
+            run, tables, each, _processes(run, ran), times)
     give_back()
     placed = _placed(run, ran, builder) if processes is None else processes(
         run.task_set, builder.times())
@@ -214,10 +210,7 @@ def reschedule(
     tables = tables._replace(process=[*_processes(run, placed), 1])
     find_policy(policy).mode(preemptive, len(placed))
     with no_garbage():
-        work = builder.build(
-            overheads, tables.process, workers if workers < each else NEVER,
-            overheads and not preemptive and not find_policy(policy).polling
-            and tables.process[:-1] != _processes(run, ran))
+        work = builder.build(overheads, tables.process, workers if workers < each else NEVER)
     if work.unknown:
         raise ReplayError(
             run.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '

@@ -46,14 +46,16 @@ def open_recording(
     name: str | None = None, progress: Progress | None = None,
 ) -> Recording:
     """
-    Read a trace of this executor, an imported trace, or the traces of one run.
+    Read a trace of this executor, an imported trace, the traces of one run, or an ordinary bag.
+
+    A bag only has releases: the messages that start the declared DAGs.
 
     :param task_set: the declaration to judge by, or its path; None: the one in the trace, if any.
     :param name: the recording's name in messages, if not its path.
     :param progress: called regularly with the number of events read.
     :raises mddag_executor.trace.TraceError: if a file is not a trace.
     :raises mddag_executor.replay.ReplayError: if the recording has nothing to replay or none of
-        the declaration's callbacks.
+        the declaration's callbacks, or if it is a bag, and there is no declaration.
     """
     if isinstance(task_set, (str, os.PathLike)):
         task_set = load(task_set)
@@ -64,6 +66,10 @@ def open_recording(
         return judged_by(joined.recording(progress), task_set)
     reader = path if isinstance(path, TraceReader) else None
     path = os.fspath(path) if not isinstance(path, TraceReader) else path.path
+    if reader is None:
+        from mddag_executor.replay.bags import is_ordinary
+        if is_ordinary(path):
+            return _bag(path, task_set, name)
     with named_errors(path, name or path):
         reader = reader or TraceReader(path)
         head = read_head(reader)
@@ -74,6 +80,16 @@ def open_recording(
             return UndeclaredRun(reader, name or path, task_set, head, progress).read()
         from mddag_executor.replay.imported_run import ImportedRun
         return ImportedRun(reader, name or path, task_set, progress=progress).read()
+
+
+def _bag(path: str, task_set: TaskSet | None, name: str | None) -> Recording:
+    """Return the recording of an ordinary bag."""
+    if task_set is None:
+        raise ReplayError(
+            name or path, 'it is an ordinary bag: nothing in it says which callbacks its messages '
+            'start', 'give the GRAPH')
+    from mddag_executor.replay.bags_reschedule import read_bag
+    return read_bag(path, task_set, name)
 
 
 def check_declared(path: Given, name: str) -> None:

@@ -60,7 +60,7 @@ def junit(result: Mapping[str, Any], broken: Sinks, name: str) -> bytes:
 def _facts(sink: Mapping[str, Any]) -> str:
     verdicts, response = counts(sink), sink['response_ns']
     text = (f'deadline {format_ns(sink["relative_deadline_ns"])}: {verdicts.in_time} of '
-            f'{verdicts.due} in time, longest burst of misses {sink["longest_burst"]}')
+            f'{verdicts.due} in time')
     if response:
         text += ', response time ' + ', '.join(
             f'{key} {format_ns(response[key], 3)}' for key in ('median', 'p99', 'max'))

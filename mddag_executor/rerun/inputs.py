@@ -152,7 +152,7 @@ def _fixed(task_set: TaskSet, times: list[list[int]]) -> Durations:
 def _recorded(run: Recording, task_set: TaskSet) -> Durations:
     """Return the times of each job of a recorded run."""
     tables = Tables.build(task_set, max_active_jobs=NEVER)
-    builder = LoadBuilder(run, tables, run.head.workers, max(0, run.head.cpus))
+    builder = LoadBuilder(run, tables, run.head.workers)
     return Durations(tables, builder.build().load, recorded=True)
 
 

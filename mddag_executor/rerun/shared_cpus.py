@@ -46,7 +46,7 @@ class SharedCpus:
 
     def waits(self, work: Work) -> None:
         """Note that an execution has a worker and, for now, needs nothing."""
-        begins(self._state, self._machine, work.x, 0, -1, False)
+        begins(self._state, self._machine, work.x, 0, -1)
 
     def begin(
         self, execution: Any, takes: int, leaving: list[tuple[int, Callable[[], None]]],
@@ -60,7 +60,7 @@ class SharedCpus:
         state, work, x = self._state, execution.work, execution.work.x
         state.x_left[x] += takes - state.x_cost[x]  # else the core cannot say how far it is
         state.x_cost[x] = takes
-        begins(state, self._machine, x, takes, work.cpu_ns, False)
+        begins(state, self._machine, x, takes, work.cpu_ns)
         self._running[work.worker] = execution
         if leaving:
             self._places[x] = sorted(leaving, key=lambda each: each[0], reverse=True)

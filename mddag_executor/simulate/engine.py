@@ -68,7 +68,6 @@ class Orders(NamedTuple):
 
     workers: int
     processes: int
-    intakes: int
     preemptive: int
     polling: int
     urgency: int
@@ -157,18 +156,16 @@ def run(
 def _fill(t: Tables, s: State, d: Deliveries, m: Machine, load: Load, o: Orders) -> None:
     """Fill the columns of an empty state, and of deliveries and machine if the load needs them."""
     sends = len(load.delay_base) > 0
-    workers = [o.workers] * o.processes + [1] * (o.processes * o.intakes)
     fill_state(
-        t, s, sum(workers), o.preemptive, 2 if sends else 1, o.dispatch_overhead,
+        t, s, o.workers * o.processes, o.preemptive, 2 if sends else 1, o.dispatch_overhead,
         o.switch_overhead, o.polling, o.urgency)
-    if len(workers) > 1:
-        divide(s, workers)
+    if o.processes > 1:
+        divide(s, [o.workers] * o.processes)
     s.scalars[JUDGE_FROM] = o.judge_from
     if sends:
         d.sent.append(0)
     if len(load.holds) > 0 or o.cpus < NEVER:
-        fill_machine(
-            t, s, m, o.cpus, int(needs_python(load)), o.processes if o.intakes != 0 else NEVER)
+        fill_machine(t, s, m, o.cpus, int(needs_python(load)))
     if len(load.holds) > 0:
         for v in range(t.n_vertices):
             place = load.cost_base[t.dag_of[v]] + t.region_offset[v]  # of its first job, if any

@@ -26,7 +26,6 @@ class Load(NamedTuple):
     * ``holds``: the interpreter that an execution holds (from 1; 0: none);
     * ``computed``: its CPU time; -1: it only waits, as far as is known.  Empty: it computes all
       the time;
-    * ``locks``: whether it computes with the GIL, as executions that hold the interpreter do;
     * ``fates``: its fate (``RUNS``, …; ``SKIPPED`` only at a source).
 
     ``delays[delay_base[d] + k * delay_stride[d] + e]`` is how long after a vertex's completion its
@@ -43,7 +42,6 @@ class Load(NamedTuple):
     releases: list[int] = []
     holds: list[int] = []
     computed: list[int] = []
-    locks: list[int] = []
     fates: list[int] = []
     delays: list[int] = []
     delay_base: list[int] = []

@@ -60,9 +60,8 @@ _LOCK, _CPU, _NOTHING = range(3)
 # Columns of ``Machine.scalars``: number of CPUs; whether executions that do not hold the
 # interpreter need the GIL at their end; the time up to which the machine is up to date; when the
 # slices end, if nothing happens before; when an execution needs something else; how often the CPUs
-# were assigned; when overtaking pays that does not pay now; number of interpreters, which the
-# additional pools (``intakes``) use, too.
-CPUS, PYTHON, COUNTED_UNTIL, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT, INTERPRETERS = range(8)
+# were assigned; when overtaking pays that does not pay now.
+CPUS, PYTHON, COUNTED_UNTIL, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT = range(7)
 
 
 class Machine(NamedTuple):
@@ -99,15 +98,13 @@ def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = Fal
     :param python: whether executions that do not hold the interpreter need the GIL at their end.
     """
     machine = empty(Machine)
-    fill_machine(t, s, machine, cpus or NEVER, int(python), NEVER)
+    fill_machine(t, s, machine, cpus or NEVER, int(python))
     return machine
 
 
-def fill_machine(
-    t: Tables, s: State, m: Machine, cpus: int, python: int, interpreters: int
-) -> None:
+def fill_machine(t: Tables, s: State, m: Machine, cpus: int, python: int) -> None:
     """Fill the columns of an empty machine; see ``new_machine``."""
-    for value in (cpus, python, 0, NEVER, NEVER, 1, NEVER, interpreters):
+    for value in (cpus, python, 0, NEVER, NEVER, 1, NEVER):
         m.scalars.append(value)
     for vertex in range(len(t.process)):
         while len(s.overtaking) <= t.process[vertex]:
@@ -159,15 +156,10 @@ def decide(t: Tables, s: State, m: Machine, now: int) -> None:
 def starts(s: State, load: Load, m: Machine, x: int, now: int) -> None:
     """Note that an execution has been dispatched."""
     cost = s.x_cost[x]
-    cpu, locks = cost, False
-    if len(load.computed) > 0:
-        cpu = load.computed[place_of(s, load, x)]
-    if len(load.locks) > 0:
-        locks = load.locks[place_of(s, load, x)] != 0
-    begins(s, m, x, cost, cpu, locks)
+    begins(s, m, x, cost, load.computed[place_of(s, load, x)] if len(load.computed) > 0 else cost)
 
 
-def begins(s: State, m: Machine, x: int, cost: int, cpu: int, locks: bool) -> None:
+def begins(s: State, m: Machine, x: int, cost: int, cpu: int) -> None:
     """Note the cost of a dispatched execution, and its computing parts."""
     while len(m.at) <= x:
         for column in (m.locked_until, m.computes_until, m.waits_until, m.publishes_at, m.at,
@@ -175,7 +167,7 @@ def begins(s: State, m: Machine, x: int, cost: int, cpu: int, locks: bool) -> No
             column.append(0)
     m.publishes_at[x] = NEVER
     cpu = min(cpu, cost)
-    if locks or s.x_holds[x] != 0:
+    if s.x_holds[x] != 0:
         if (cost - cpu) * HARDLY <= cpu:
             _set_parts(m, x, cost, cost, cost)
         else:
@@ -247,8 +239,6 @@ def _find_need(t: Tables, s: State, m: Machine, x: int, at: int) -> None:
         interpreter = s.x_holds[x]
         if interpreter == 0:
             interpreter = t.process[s.x_vertex[x]]
-            if interpreter > m.scalars[INTERPRETERS]:
-                interpreter -= m.scalars[INTERPRETERS]
         if x not in m.lock_queue[interpreter]:
             _ask(t, s, m, x, interpreter)
     elif need == _CPU and x not in m.computing:

@@ -37,8 +37,7 @@ class Settings:
         each preemption.
     :ivar cpus: shared by the executions that compute; None: enough for all.
     :ivar judge_from: jobs released before are not judged.
-    :ivar processes: number of processes, each with its own interpreter; ``intakes``: whether each
-        has an additional pool of one worker, after those of all processes (see ``intakes``).
+    :ivar processes: number of processes, each with its own interpreter.
     :ivar on_late: handling of late jobs of a DAG that does not declare it.
     """
 
@@ -53,7 +52,6 @@ class Settings:
     cpus: int | None = None
     judge_from: int = -NEVER
     processes: int = 1
-    intakes: bool = False
     on_late: str = 'continue'
 
     @property
@@ -65,7 +63,7 @@ class Settings:
     def orders(self) -> Orders:
         """Return the settings as integers for the engine; raise like ``preempts``."""
         return Orders(
-            self.workers, self.processes, int(self.intakes), int(self.preempts),
+            self.workers, self.processes, int(self.preempts),
             int(find_policy(self.policy).polling), find_policy(self.policy).urgency,
             self.dispatch_overhead_ns,
             self.switch_overhead_ns, self.judge_from, self.cpus or NEVER, self.duration_ns,

@@ -15,9 +15,10 @@ from mddag_executor.laboratory.prediction import (
     improve,
     Predictor,
     PUBLISH_NS,
+    RECEIVE_NS,
+    SEND_NS,
+    TIMER_NS,
 )
-from mddag_executor.simulate.intakes import Costs
-from mddag_executor.simulate.machine import SWITCH_NS
 from msg_graph import loads, Process, TaskSet
 import pytest
 
@@ -109,33 +110,8 @@ def test_what_leaves_its_process_takes_longer():
             processes, [[2 * MS, 3 * MS]])
         return tally.result()['dags']['/a']['sinks']['/b:t']['response_ns']['max']
 
-    costs = Costs()
-    assert response(ALL) == 5 * MS + 2 * CALLBACK_NS + PUBLISH_NS + costs.timer_ns
-    assert response(EACH) == response(ALL) + costs.send_ns + costs.message_ns
-
-
-def test_a_timer_is_noticed_a_switch_interval_later_where_a_callback_computes():
-    urgent = """
-mddag: 1
-nodes:
-  - {node: /a, callbacks: [{name: t, timer: 100ms, deadline: 100ms}]}
-  - {node: /b, callbacks: [{name: t, timer: 10ms, deadline: 10ms, holds_interpreter: false}]}
-"""
-
-    def responses(processes):
-        dags = Predictor(loads(urgent), 7, 3, 'rad', 1000 * MS).predict(
-            processes, [[50 * MS], [MS]]).result()['dags']
-        long, short = (dags[name]['sinks'][f'{name}:t']['response_ns']['max']
-                       for name in ('/a', '/b'))
-        return long, short
-
-    alone, together = responses(EACH), responses(ALL)
-    costs = Costs()
-    assert alone == (50 * MS + CALLBACK_NS + costs.timer_ns,
-                     MS + CALLBACK_NS + costs.timer_ready_ns)
-    assert together[1] == alone[1] + SWITCH_NS
-    # it is stopped while others are noticed
-    assert together[0] >= alone[0] + 4 * costs.timer_ns
+    assert response(ALL) == 5 * MS + 2 * CALLBACK_NS + PUBLISH_NS + TIMER_NS
+    assert response(EACH) == response(ALL) + SEND_NS + RECEIVE_NS
 
 
 def several(*times: int) -> tuple[TaskSet, list[list[int]]]:

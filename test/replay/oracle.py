@@ -4,17 +4,16 @@
 
 from __future__ import annotations
 
-from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core import NEVER, Scheduler, Tables, Tally
 from mddag_executor.core import state as core
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.rules import complete
 from mddag_executor.core.state import Decision, IDLE, JOB_END, OPEN, SKIP
 from mddag_executor.core.tables import CONTINUE
 from mddag_executor.recording.tables import ABORTED, ALL_LEGS, EXPIRED, FAILED, Recording
-from mddag_executor.replay.miss_tally import MissTally
 
 ENDS = {EXPIRED: core.EXPIRED, ABORTED: core.ABORTED, FAILED: core.FAILED}
-_KINDS = ('released', 'completed', 'ended', 'judge_from', 'hosted', 'finished')
+_KINDS = ('released', 'completed', 'ended', 'hosted', 'finished')
 
 
 class Oracle:
@@ -26,10 +25,12 @@ class Oracle:
         n = tables.n_dags + 1
         self.tables = tables._replace(
             max_active_jobs=[NEVER] * n, expire_after=[NEVER] * n, on_late=[CONTINUE] * n)
-        self.tally = MissTally(task_set, self.tables)
+        self.tally = Tally(task_set, self.tables)
         self.decisions: list[Decision] = []
         self.scheduler = Scheduler(self.tables, 1, propagate=False)
         self.scheduler.state.scalars[SKIP] = skip
+        if recording.judge_from > -NEVER:
+            judge_from(self.scheduler.state, recording.judge_from)
         self.slots: dict[tuple[int, int], int] = {}
         events = [(order, 0, (dag, job, release, noticed)) for _, dag, job, release, noticed, order
                   in recording.releases.tolist()]
@@ -39,10 +40,9 @@ class Oracle:
         events += [(order, 1, row) for order, *row in done[list(columns)].tolist()]
         events += [(order, 2, (dag, job, time, reason)) for _, dag, _, job, time, reason, order
                    in recording.job_ends.tolist()]
-        events += [(order, 3, (release,)) for order, release in recording.judge_from]
-        events += [(order, 4, (dag, here)) for order, dag, here in recording.hosted]
+        events += [(order, 3, (dag, here)) for order, dag, here in recording.hosted]
         if recording.judged:
-            events.append((recording.judged_order, 5, (recording.judged_until,)))
+            events.append((recording.judged_order, 4, (recording.judged_until,)))
         for _, kind, what in sorted(events, key=lambda event: event[0]):
             getattr(self, _KINDS[kind])(*what)
             decided = self.scheduler.decisions()
@@ -81,9 +81,6 @@ class Oracle:
             self.scheduler.give_up(slot, core.EXPIRED, time)
             del decisions[before:]  # its end is not known
             del self.slots[dag, job]
-
-    def judge_from(self, release: int) -> None:
-        judge_from(self.scheduler.state, release)
 
     def hosted(self, dag: int, here: frozenset[int]) -> None:
         first, last = self.tables.first_vertex[dag:dag + 2]

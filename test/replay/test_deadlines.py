@@ -12,9 +12,11 @@ from typing import Any
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from mddag_executor.core import NEVER
 from mddag_executor.core.state import DROP, JOB_END
 from mddag_executor.recording.tables import ABORTED, EXPIRED, FAILED, Recording, Table, WITHDRAWN
-from mddag_executor.replay import open_recording, Replay, ReplayError
+from mddag_executor.replay import open_recording, Replay, replay, ReplayError, reschedule
+from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.replay.deadlines import Judged
 from msg_graph import loads
 import numpy as np
@@ -22,6 +24,7 @@ import pytest
 
 from .helpers import Chances, declarations, MS, PATHS, SMALL, VirtualRun
 from .oracle import Oracle
+from .test_ordinary_bags import GRAPH, write_bag
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 
@@ -32,8 +35,6 @@ def check(recording: Recording, skip: int = 0) -> None:
     expected = [each for each in oracle.decisions if each[0] not in (JOB_END, DROP)]
     columns = ('kind', 'dag', 'sink', 'job', 'deadline', 'completed')
     assert judged.verdicts[list(columns)].tolist() == expected
-    assert {v: list(jobs) for v, jobs in judged.tally.missed_jobs.items()} == {
-        v: list(jobs) for v, jobs in oracle.tally.missed_jobs.items()}
 
 
 @given(declarations(), st.integers(0, 2**32), st.integers(1, 4), st.integers(1, 25),
@@ -92,8 +93,7 @@ def test_verdicts_of_any_tables(seed, data):
         recording,
         releases=releases, executions=tables[1], job_ends=tables[2], hosted=hosted,
         judged_order=int(generator.integers(0, len(orders) + 1)) * 2 - 1,
-        judge_from=[(int(generator.integers(0, len(orders))) * 2 + 1, start + 50 * MS)]
-        if data.draw(st.booleans()) else [])
+        judge_from=start + 50 * MS if data.draw(st.booleans()) else -NEVER)
     check(changed)
 
 
@@ -197,3 +197,14 @@ def test_a_recording_in_a_program(tmp_path):
         r'<Recording .*demo_short\.mcap: 1\.4\d\d s, \d+ jobs, \d+ executions>', repr(recording))
     with pytest.raises(KeyError, match="no table 'nope': the tables are releases, executions, "):
         recording.to_pandas('nope')
+
+
+def test_an_ordinary_bag_has_releases(tmp_path):
+    path, graph = write_bag(tmp_path / 'bag'), loads(GRAPH, 'g.yaml')
+    run = open_recording(path, graph)
+    assert np.bincount(run.releases['dag']).tolist() == [10, 31]
+    assert (reschedule(run).decisions == reschedule_bag(path, graph).decisions)
+    for wrong, says in ((lambda: open_recording(path), 'give the GRAPH'),
+                        (lambda: replay(path, graph), 'in which no callback ran: reschedule it')):
+        with pytest.raises(ReplayError, match=says):
+            wrong()

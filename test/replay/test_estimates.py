@@ -1,84 +1,24 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What is estimated from a recording: isolated execution times, latencies, use of the pool."""
+"""What is estimated from a recording: dispatch times, waiting for groups, use of the pool."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import EXECUTIONS, Recording, rows
-from mddag_executor.replay import isolation as module
 from mddag_executor.replay import replay
 from mddag_executor.replay.dispatches import dispatch_times
-from mddag_executor.replay.isolation import isolated_times, Recorded
 from mddag_executor.replay.usage import group_waits, PoolUse
 from mddag_executor.trace import TraceFile
 import numpy as np
 import pytest
-from pytest import approx, MonkeyPatch
 
 from .helpers import add_execution, MS, small, START_TIME
-
-Ran = tuple[float, float, float, int]
-"""When it could start, what it took, its CPU time (-1: not known); whose lock it has, 0: none."""
-
-
-def of(
-    *ran: Ran, cpus: int = 0, here: Sequence[int] | None = None,
-) -> list[float]:
-    """Return what executions would have taken alone; all in ms."""
-    could, took, cpu, held = (np.array(column) for column in zip(*ran))
-    times = [np.rint(each * 1e6).astype(np.int64) for each in (could, took)]
-    cpu = np.where(cpu < 0, -1, np.rint(cpu * 1e6)).astype(np.int64)
-    interpreter = np.array(here) if here is not None else np.maximum(held, 1)
-    found = isolated_times(Recorded(*times, cpu, held > 0, interpreter), cpus)
-    return [float(each) for each in np.round(found / 1e6, 1)]
-
-
-def test_two_that_held_it_at_the_same_time():
-    # they took turns, the first one had the first
-    assert of((0, 19, 10, 1), (0, 20, 10, 1)) == [10, 10]
-    # one was overtaken by another
-    assert of((0, 13, 10, 1), (2, 6, 3, 1)) == approx([10, 3], abs=0.1)
-    # in processes of their own they had nothing to share
-    assert of((0, 13, 10, 1), (2, 6, 3, 2)) == [13, 6]
-
-
-def test_what_the_machine_does_not_explain_is_its_own():
-    assert of((0, 20, 10, 1), (30, 20, 20, 1)) == [20, 20]
-    assert of((0, 20, -1, 0), (0, 20, 10, 0)) == [20, 20]
-
-
-def test_one_that_waits_got_the_lock_late():
-    # it needs the lock for 0.3 ms when it goes on
-    waits = (0, 6, 0.4, 0)
-    assert of(waits, (4, 20, 19.7, 1)) == [5, 19.7]
-    assert of(waits, (7, 20, 20, 1)) == [6, 20]
-    assert of(waits, (4, 20, 20, 1), here=[1, 2]) == [6, 20]
-
-
-def test_cpus_that_were_busy():
-    assert of((0, 17, 10, 0), (0, 20, 10, 0), cpus=1) == approx([10, 10], abs=1.2)
-    assert of((0, 20, 10, 0), (0, 20, 10, 0), cpus=3) == [20, 20]
-    assert of((0, 20, 10, 0), (0, 20, 10, 0)) == [20, 20]
-
-
-@settings(deadline=None)
-@given(st.lists(st.tuples(
-    st.integers(0, 10), st.integers(0, 10), st.integers(-1, 10), st.integers(0, 2)),
-    min_size=1, max_size=20), st.integers(0, 3), st.integers(1, 30))
-def test_never_longer_and_alone_never_less_than_it_computed(ran, cpus, window):
-    """Also where the windows part what runs."""
-    with MonkeyPatch.context() as patch:
-        patch.setattr(module, 'WINDOW', window)
-        found = of(*ran, cpus=cpus)
-    for (_, took, cpu, _), alone_ in zip(ran, found):
-        assert min(cpu, took) <= alone_ <= took
-
 
 Execution = tuple[int, 'int | None', int, int, int]
 """Worker, group, when it was ready, its start and its end."""

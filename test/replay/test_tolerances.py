@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-from itertools import groupby
 import json
 from typing import Any
 from xml.etree import ElementTree
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.core import Tables
+from mddag_executor.core import Tables, Tally
 from mddag_executor.core.state import (
     Decision,
     SINK_ABORTED,
@@ -23,7 +22,6 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tally import counts
 from mddag_executor.core.tolerances import not_tolerated
-from mddag_executor.replay.miss_tally import MissTally
 from mddag_executor.report.ci import annotation_lines, junit
 from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
@@ -43,7 +41,7 @@ nodes:
 def sink_of(missed: list[bool]) -> dict[str, Any]:
     """Return the result of a sink whose jobs missed or not, in a tally that is told of them."""
     task_set = loads(GRAPH, 'g.yaml')
-    tally = MissTally(task_set, Tables.build(task_set))
+    tally = Tally(task_set, Tables.build(task_set))
     decisions: list[Decision] = []
     for job, miss in enumerate(missed):
         deadline = job * 10 * MS + 8 * MS
@@ -53,16 +51,12 @@ def sink_of(missed: list[bool]) -> dict[str, Any]:
         time = deadline + miss if kind in SINK_COMPLETED else -1
         decisions.append((kind, 0, 0, job, deadline, time))
     tally.add(reversed(decisions))      # jobs may complete out of order
-    result = tally.result()
-    tally.add_bursts(result['dags'])
-    return result['dags']['/n']['sinks']['/n:a']
+    return tally.result()['dags']['/n']['sinks']['/n:a']
 
 
 @given(st.lists(st.booleans(), max_size=30))
 def test_without_a_tolerance_each_miss_counts(missed):
     sink = sink_of(missed)
-    runs = [len(list(run)) for miss, run in groupby(missed) if miss]
-    assert sink['longest_burst'] == max(runs, default=0)
     assert (counts(sink).due, counts(sink).missed) == (len(missed), sum(missed))
     found = not_tolerated({'/n': {'sinks': {'/n:a': sink}}})
     assert bool(found) == (any(missed) or not missed)

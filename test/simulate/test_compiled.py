@@ -110,7 +110,6 @@ def with_everything(load_: Load, tables: Tables, chances: random.Random) -> Load
             tables.process[v] * each for v, each in zip(vertices, some([0, 1], [1, 1]))])
     if stops and computes:
         load_ = load_._replace(
-            locks=some([0, 1], [3, 1]),
             computed=[chances.choice([cost, cost // 2, cost // 9, -1]) for cost in costs])
     if sends:
         delays = [chances.choice([0, 0, 1, 7, -1, -3, -8]) * TICK * SLOW

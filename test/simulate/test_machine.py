@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from mddag_executor.core import queues, Tables
 from mddag_executor.errors import UsageError
 from mddag_executor.simulate import (
+    draw_execution_times,
     END,
     engine,
     Load,
@@ -23,9 +24,7 @@ from mddag_executor.simulate import (
     simulate,
     START,
 )
-from mddag_executor.simulate.intakes import Costs, Intakes
-from mddag_executor.simulate.load import FAILS, RUNS, SKIPPED
-from msg_graph import loads, TaskSet
+from msg_graph import loads
 import pytest
 
 from ..core.task_sets import declaration, examples
@@ -121,7 +120,6 @@ def test_declared_holders_in_the_simulator():
     worst = []
     for holds, cpus in (('false', None), ('true', None), ('false', 1)):
         task_set = loads(HOLDERS.replace('H', holds), 'g.yaml')
-        from mddag_executor.simulate import draw_execution_times, periodic_load
         load = periodic_load(task_set, draw_execution_times(task_set, 0), 40 * MS)
         result = simulate(task_set, load, Settings(workers=2, duration_ns=40 * MS, cpus=cpus)
                           ).result()
@@ -287,76 +285,3 @@ def test_as_the_model_that_goes_by_ticks(jobs, workers, cpus, python, divided):
             patch.setattr(queues, name, ticks)
         found: Any = times(jobs, workers, cpus, python, divided=divided)
     assert found == Ticks(jobs, workers, cpus, python, divided).times()
-
-
-COSTS = Costs(timer_ns=300_000, timer_ready_ns=100_000, message_ns=200_000,
-              message_ready_ns=500_000, send_ns=0)
-CHAIN = """
-mddag: 1
-nodes:
-  - {node: /a, callbacks: [{name: t, timer: 100ms, publishes: [/x]}]}
-  - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 100ms}]}
-processes: {p1: [/a], p2: [/b]}
-"""
-BOTH = """
-mddag: 1
-nodes:
-  - {node: /a, callbacks: [{name: t, timer: 100ms, deadline: 100ms}]}
-  - {node: /b, callbacks: [{name: t, timer: 50ms, deadline: 20ms}]}
-"""
-
-
-def responses_of(
-    task_set: TaskSet, times: list[list[int]], compiled: bool = False, costs: Costs = COSTS,
-    **columns: Any,
-) -> Any:
-    """Run 100 ms in which all callbacks compute with Python's lock."""
-    tables = Tables.build(task_set)
-    load: Load = periodic_load(task_set, times, 100 * MS)
-    n = sum(map(len, times))
-    edges = [len(dag.edges) for dag in task_set.dags]
-    columns = {
-        'holds': tables.process[:n], 'delays': [costs.delay_ns] * sum(edges),
-        'delay_base': [sum(edges[:i]) for i in range(len(edges))],
-        'delay_stride': [0] * len(edges), **columns}
-    return Intakes(task_set, tables, costs).schedule(
-        load._replace(**columns),
-        Settings('rad', 2, 100 * MS, processes=max(1, len(task_set.processes))),
-        log=True, compiled=compiled)
-
-
-@pytest.mark.parametrize('compiled', [False, True])
-def test_what_comes_is_noticed_by_a_thread_that_takes_no_worker(compiled):
-    if compiled:
-        pytest.importorskip('numba')
-    ran = responses_of(loads(CHAIN), [[2 * MS, MS]], compiled)
-    ready = 100_000
-    ended = 300_000 + 2 * MS    # the intake still has the lock when the callback is ready
-    arrived = ended + 500_000
-    assert [tuple(map(int, entry)) for entry in ran.log] == [
-        (ready, START, 0, 0, 0, 0),
-        (300_000, END, 4, 0, ~0, 0),
-        (ended, END, 0, 0, 0, 0),
-        (arrived, END, 5, 0, ~1, 0),
-        (arrived, START, 2, 0, 1, 0),
-        (arrived + MS, END, 2, 0, 1, 0)]
-    assert ran.busy == [ended - ready, 0, MS, 0]
-    assert [(d[2], d[5]) for d in ran.decisions if d[2] >= 0] == [(1, arrived + MS)]
-
-
-def test_a_computing_callback_is_stopped_while_a_timer_is_noticed():
-    ran = responses_of(loads(BOTH), [[80 * MS], [MS]])
-    ends = {(int(e[4]), int(e[5])): int(e[0]) for e in ran.log if e[1] == END}
-    # a switch interval until the intake gets the lock; then the urgent one waits for it as long
-    assert ends[~1, 1] == 50 * MS + MS + 300_000
-    assert ends[1, 1] == ends[~1, 1] + MS + MS
-    assert ends[0, 0] == 300_001 + MS + 80 * MS + 300_000 + MS
-
-
-def test_a_skipped_job_is_skipped_and_a_failed_one_fails():
-    task_set = loads(CHAIN)
-    for fate, decided in ((SKIPPED, 0), (FAILS, 1)):
-        ran = responses_of(task_set, [[2 * MS, MS]], fates=[fate, RUNS])
-        started = [e for e in ran.log if e[1] == START]
-        assert len(started) == decided
-        assert not any(e[4] == 1 for e in ran.log)
