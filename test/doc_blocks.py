@@ -51,7 +51,7 @@ _BLOCK = re.compile(
     r'^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$',
     re.MULTILINE | re.DOTALL)
 _MARK = re.compile(r'<!-- (file|exit|in the test|not run): (.*?) -->')
-_TIMEOUT_S = 60.0
+_TIMEOUT_S = 150.0  # of a command that takes 10 s on an idle machine
 
 
 @dataclass

@@ -49,6 +49,7 @@ EXTRAS = {
 }
 
 
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize('page', [page for page in PAGES if blocks(page)])
 def test_what_a_page_shows_works(page, tmp_path):
     for name in EXTRAS.get(page, ()):
