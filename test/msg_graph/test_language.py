@@ -170,6 +170,8 @@ BOTH = [
     ('reads: [/set', 'reads: ["/b:c"', 'names a callback with its node'),
     ('on_late: abort', 'on_late: stop', "'stop' is not known: use continue, demote, abort"),
     ('release_from: header_stamp', 'release_from: arival', "did you mean 'arrival'?"),
+    ('keep: newest', 'keep: last', 'use all, newest'),
+    ('importance: high', 'importance: vital', 'use high, normal, low'),
     ('max_active_jobs: 3', 'max_active_jobs: many', 'from 1 to 1000000'),
     ('holds_interpreter: true', 'holds_interpreter: maybe', 'write true or false'),
     ('2 of 50', '5%', "'5%' is no tolerance: write how many of how many, as '1 of 100'"),
