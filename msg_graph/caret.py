@@ -67,10 +67,10 @@ def read_architecture(text: str, file: str) -> Draft:
         raise GraphError(file, None, wrong.problem, wrong.remedy) from None
     except KeyError as missing:
         raise GraphError(
-            file, None, f'this is no architecture file of CARET: {missing} is missing', remedy
+            file, None, f'this is not an architecture file of CARET: {missing} is missing', remedy
         ) from None
     except (AttributeError, TypeError):
-        raise GraphError(file, None, 'this is no architecture file of CARET', remedy) from None
+        raise GraphError(file, None, 'this is not an architecture file of CARET', remedy) from None
     return Draft(
         f'the CARET architecture file {file}', [node for node in nodes if node.callbacks], paths)
 

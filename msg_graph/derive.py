@@ -22,7 +22,7 @@ Rules 1, 2, 3 and 6 concern callbacks (``_Links``), the others make vertices.
 4. *OR*: a subscription callback runs once for each message. So it, and each callback after it, has
    one vertex for each vertex of each publisher of its topic. *AND*: a sync callback is one vertex,
    after all vertices of all publishers of all its topics.
-5. Hence a vertex that is no sync has one predecessor and lies in the same DAG. A sync joins
+5. Hence a vertex that is not a sync has one predecessor and lies in the same DAG. A sync joins
    only vertices of one DAG: two sources joined by a sync are an error. So every vertex leads back
    to exactly one source, and each weakly connected component is the vertices of one source.
 6. A *sink* is a callback that starts no other callback. By rule 4, either all vertices of a

@@ -53,7 +53,7 @@ class GraphError(Exception):
 
 class ValueProblem(ValueError):
     """
-    A text that is no valid value; ``str()`` is one line.
+    A text that is not a valid value; ``str()`` is one line.
 
     :ivar problem: what is wrong with it.
     :ivar remedy: what to write instead.

@@ -157,7 +157,7 @@ class _Resolver:
         if path not in self._trees:
             try:
                 if not stat.S_ISREG(os.stat(path).st_mode):
-                    raise OSError(0, 'it is no regular file')
+                    raise OSError(0, 'it is not a regular file')
                 with open(path, 'rb') as stream:
                     data = stream.read(MAX_BYTES + 1)
             except (OSError, ValueError) as error:
@@ -175,7 +175,7 @@ def _argument_values(tree: Mapping, given: dict[str, str]) -> dict[str, str]:
     values = {name: given[name] if name in given else declared.get(name) for name in declared}
     for name in given.keys() - values.keys():
         raise top.error(
-            'arguments', f'an include sets {shown(name)}, which is no argument of this file',
+            'arguments', f'an include sets {shown(name)}, which is not an argument of this file',
             did_you_mean(name, values, "add it to 'arguments:'"))
     return values
 
@@ -185,7 +185,7 @@ def _substituted(old: Scalar, values: dict[str, str]) -> str:
     def value(found: re.Match[str]) -> str:
         if found[1] not in values:
             raise GraphError(
-                old.file, old.line, f'{shown(found[0])} is no argument of this file',
+                old.file, old.line, f'{shown(found[0])} is not an argument of this file',
                 did_you_mean(found[1], values, f"add it to 'arguments:' ({listed(values)})"
                              if values else "add it to 'arguments:'"))
         return values[found[1]]

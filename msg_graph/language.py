@@ -159,7 +159,7 @@ class Entry:
         self.name = name
         self._keys = keys
         if not isinstance(tree, Mapping):
-            raise error_at(tree, name, f'{kind_of(tree)} is no mapping',
+            raise error_at(tree, name, f'{kind_of(tree)} is not a mapping',
                            f'write one with the keys {", ".join(keys)}')
         self._tree = tree
         for key in tree.entries:
@@ -215,7 +215,8 @@ def scalar(
     """
     def read(value: Tree, where: str) -> Any:
         if not isinstance(value, Scalar) or value.is_null:
-            raise error_at(value, where, f'{kind_of(value)} is no single value', f'write {what}')
+            raise error_at(
+                value, where, f'{kind_of(value)} is not a single value', f'write {what}')
         try:
             return parse(value.text)
         except ValueProblem as error:
@@ -233,7 +234,7 @@ def many(item: Kind, least: int = 1, different: bool = False, too_few: str = '')
     """
     def read(value: Tree, where: str) -> tuple[Any, ...]:
         if not isinstance(value, Sequence):
-            raise error_at(value, where, f'{kind_of(value)} is no list',
+            raise error_at(value, where, f'{kind_of(value)} is not a list',
                            'write a list, as [a, b] or as - a')
         if len(value.items) < least:
             raise error_at(value, where, f'the list is {"too short" if value.items else "empty"}',
@@ -296,7 +297,8 @@ def whole(least: int, most: int) -> Kind:
     """Return the kind of an integer within bounds."""
     def parse(text: str) -> int:
         if not (_INTEGER.fullmatch(text) and least <= int(text) <= most):
-            raise ValueProblem(f'{shown(text)} is no integer from {least} to {most}', 'write one')
+            raise ValueProblem(
+                f'{shown(text)} is not an integer from {least} to {most}', 'write one')
         return int(text)
 
     return scalar(parse, {'anyOf': [
@@ -317,14 +319,14 @@ def number(**bounds: int) -> Kind:
 
 def _truth(text: str) -> bool:
     if text not in ('true', 'false'):
-        raise ValueProblem(f'{shown(text)} is no truth value', 'write true or false')
+        raise ValueProblem(f'{shown(text)} is neither true nor false', 'write one of them')
     return text == 'true'
 
 
 def _weakly_hard(text: str) -> WeaklyHard:
     found = _OF.fullmatch(text)
     if found is None or not 0 < int(found[1]) < int(found[2]):
-        raise ValueProblem(f'{shown(text)} is no tolerance',
+        raise ValueProblem(f'{shown(text)} is not a tolerance',
                            "write how many of how many, as '1 of 100', but not all")
     return WeaklyHard(int(found[1]), int(found[2]))
 
@@ -335,13 +337,13 @@ FORMAT = '1'
 def _format(given: str) -> str:
     if given != FORMAT:
         raise ValueProblem(
-            f'{shown(given)} is no known version of the format', f"write 'mddag: {FORMAT}'")
+            f'{shown(given)} is not a known version of the format', f"write 'mddag: {FORMAT}'")
     return given
 
 
 def _file(path: str) -> str:
     if os.path.isabs(path) or path.startswith('~') or '\0' in path or not path:
-        raise ValueProblem(f'{shown(path)} is no relative path',
+        raise ValueProblem(f'{shown(path)} is not a relative path',
                            'write it as seen from the file that includes it')
     return path
 
@@ -359,7 +361,7 @@ def _key(text: str) -> str:
     """Check the key of a callback, ``/node:callback``."""
     node, colon, name = text.rpartition(':')
     if not colon:
-        raise ValueProblem(f'{shown(text)} names no callback', "write '/node:callback'")
+        raise ValueProblem(f'{shown(text)} does not name a callback', "write '/node:callback'")
     NODE.check(node)
     CALLBACK.check(name)
     return text
@@ -451,7 +453,7 @@ TRIGGERS = {
 CALLBACK_KEYS = {
     'name': Key(name(CALLBACK), 'Name of the callback, unique in its node.', needed=True),
     **TRIGGERS,
-    'period': Key(time(), 'Time between two releases of a source that is no timer.'),
+    'period': Key(time(), 'Time between two releases of a source that is not a timer.'),
     'publishes': Key(_TOPICS, 'The topics that it publishes.'),
     'reads': Key(many(scalar(_read, {'anyOf': [TOPIC.schema, CALLBACK.schema]}), 0,
                       different=True),

@@ -91,7 +91,7 @@ def files(tmp_path_factory):
      'no_times.yaml:6: /n:t (and 2 more callbacks) declares no execution_time: add one, or gi'),
     ('graph analyse no_times.yaml',
      'no_times.yaml:6: /n:t (and 2 more callbacks) declares no execution_time: add one'),
-    ('graph from-caret times.json', 'times.json: this is no architecture file of CARET: '),
+    ('graph from-caret times.json', 'times.json: this is not an architecture file of CARET: '),
     # execution times
     ('simulate g.yaml --execution-times no.json', 'no.json:1: not JSON ('),
     ('simulate g.yaml --execution-times list.json', 'list.json: not an object of objects: write'),

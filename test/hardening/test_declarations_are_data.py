@@ -62,11 +62,11 @@ def test_endless_files(mddag, tmp_path, arguments):
     refused(mddag(*arguments, cwd=tmp_path, timeout=30), tmp_path)
 
 
-OUTSIDE, IRREGULAR = 'lies outside of the folder of the first file', 'it is no regular file'
+OUTSIDE, IRREGULAR = 'lies outside of the folder of the first file', 'it is not a regular file'
 
 
 @pytest.mark.parametrize(('name', 'says'), [
-    ('/etc/passwd', "'/etc/passwd' is no relative path"), ('../secret.yaml', OUTSIDE),
+    ('/etc/passwd', "'/etc/passwd' is not a relative path"), ('../secret.yaml', OUTSIDE),
     ('link', OUTSIDE), ('folder/link', OUTSIDE), ('folder', IRREGULAR), ('fifo', IRREGULAR),
     *((name, '') for name in (
         'sub/../../secret.yaml', '~/secret.yaml', '.', '"a\\0b"', '$(HOME)/x', "''"))])

@@ -123,7 +123,7 @@ def test_a_file_of_its_own():
             Process('x', ('/a', '/b', '/c')),)
     for text, says in (('', "there is no 'processes:'"), ('mddag: 1', "there is no 'processes:'"),
                        ('processes: {x: [/d]}', "p.yaml:1: the file: 'processes': there is no"),
-                       ('[1]', 'p.yaml:1: the file: a list is no mapping')):
+                       ('[1]', 'p.yaml:1: the file: a list is not a mapping')):
         with pytest.raises(GraphError) as caught:
             load_processes(text, 'p.yaml', tasks)
         assert says in str(caught.value)

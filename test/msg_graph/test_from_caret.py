@@ -160,12 +160,12 @@ def test_a_file_of_2021():
 
 
 @pytest.mark.parametrize(('text', 'problem'), [
-    ('', 'this is no architecture file'),
-    ('[1]', 'this is no architecture file'),
-    ('mddag: 1\nworkers: 2\n', "this is no architecture file of CARET: 'nodes' is missing"),
-    ('nodes: 3\n', 'this is no architecture file'),
+    ('', 'this is not an architecture file'),
+    ('[1]', 'this is not an architecture file'),
+    ('mddag: 1\nworkers: 2\n', "this is not an architecture file of CARET: 'nodes' is missing"),
+    ('nodes: 3\n', 'this is not an architecture file'),
     ('nodes: [{}]\n', "'node_name' is missing"),
-    ('nodes: []\nnamed_paths: [{path_name: [a], node_chain: []}]', 'no architecture file'),
+    ('nodes: []\nnamed_paths: [{path_name: [a], node_chain: []}]', 'not an architecture file'),
     (HEAD + node('no/slash', 'timer 1'), 'is not an absolute node name'),
     (HEAD + node('/a', 'timer soon'), "'period_ns' of '/a/callback_0' is 'soon'"),
     (HEAD + node('/a', 'timer 5000').replace('timer_callback', 'magic'), "'magic' of '/a/callbac"),

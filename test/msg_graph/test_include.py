@@ -139,12 +139,12 @@ def test_includes_within_includes(tmp_path):
 
 @pytest.mark.parametrize(('wrong', 'right', 'place', 'problem'), [
     ('timer: $(period)', 'timer: $(perod)', 'parts/sensor.yaml:9',
-     "'$(perod)' is no argument of this file: did you mean 'period'?"),
+     "'$(perod)' is not an argument of this file: did you mean 'period'?"),
     ('subscription: /raw', 'subscription: /rawe', 'parts/sensor.yaml:13',
      "no callback publishes '/front/left/rawe': did you mean '/front/left/raw'?"),
     ('set: {late: 80ms}', 'set: {}', 'parts/sensor.yaml:5', "'late' has no value"),
     ('set: {late: 80ms}', 'set: {lat: 80ms, late: 1s}', 'parts/sensor.yaml:3',
-     "sets 'lat', which is no argument of this file: did you mean 'late'?"),
+     "sets 'lat', which is not an argument of this file: did you mean 'late'?"),
     ('/shared: /twist}\n    set: {late: 80', '/share: /twist}\n    set: {late: 80', 'top.yaml:6',
      "'remap': the included file does not name '/share': did you mean '/shared'?"),
     ('remap: {/cropped: /left,', 'remap: {/cropped: left,', 'top.yaml:6', 'not an absolute topic'),
@@ -155,7 +155,7 @@ def test_includes_within_includes(tmp_path):
      'this name is taken in line 9'),
     ('  period: 100ms', '  1period: 100ms', 'parts/sensor.yaml:4', 'not a valid argument name'),
     ('    remap: {/cropped: /behind, /shared: /twist}', '    remap: [1]', 'top.yaml:10',
-     "'remap': a list is no mapping: write one with"),
+     "'remap': a list is not a mapping: write one with"),
 ])
 def test_errors_name_their_file(tmp_path, wrong, right, place, problem):
     assert wrong in TOP + SENSOR

@@ -163,9 +163,10 @@ def found(text: str) -> GraphError:
 
 
 @pytest.mark.parametrize(('text', 'expected'), [
-    (ENTRIES, [(2, "'none' is no integer"), (6, "'10' has no unit"), (7, "unknown key 'deadine'"),
+    (ENTRIES, [(2, "'none' is not an integer"), (6, "'10' has no unit"),
+               (7, "unknown key 'deadine'"),
                (9, 'taken in line 8'), (10, 'not an absolute node name'),
-               (13, 'the list is too short'), (14, "'y' names no callback")]),
+               (13, 'the list is too short'), (14, "'y' does not name a callback")]),
     (LINKS, [(6, "no callback publishes '/c'"), (7, "no callback publishes '/d'"),
              (9, "'dag:' is for a source"), (8, "unknown callback 'w'"),
              (8, "it reads '/e', which no callback")]),
