@@ -164,7 +164,7 @@ def drive_live(tables: Tables, policy: str, load: Load) -> int:
     :param tables: with legs.
     :return: the number of vertex jobs that completed.
     """
-    core = Scheduler(tables, 1, policy, propagate=False)
+    core = Scheduler(tables, 1, policy)
     completed = 0
     first, successors = tables.first_successor, tables.successors
     state = core.state

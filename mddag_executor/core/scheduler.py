@@ -1,12 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The core for drivers in plain Python: tables, state and policy in one object."""
+"""The core for drivers that run callbacks: tables, state and policy in one object."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from heapq import heapify
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import policy
@@ -15,10 +14,11 @@ from mddag_executor.core.state import (
     add_slot,
     as_object,
     Decision,
-    N_IDLE,
+    empty,
+    fill_state,
     N_STALE,
-    new_state,
     OPEN,
+    State,
     SUSPENDED,
 )
 from mddag_executor.core.tables import Tables
@@ -26,7 +26,7 @@ from mddag_executor.core.tables import Tables
 
 class Scheduler:
     """
-    The scheduling rules bound to one run.
+    The scheduling rules bound to one run, in which messages make the edges true.
 
     A driver reports events in order of time; the object is not thread-safe.  Executions ``x``,
     slots, DAGs and vertices are the integers of ``core.state`` and ``core.tables``.
@@ -34,14 +34,11 @@ class Scheduler:
     :param tables: the task set's tables.
     :param n_workers: size of the bounded pool.
     :param policy_name: a row of ``core.policies``; PolicyError when there is none.
-    :param preemptive: see ``core.state.new_state``, also for the remaining parameters.
     :ivar ready: ``ready(x, now)`` makes an execution ready.
     :ivar ready_undeclared: ``ready_undeclared(job, group, holds, now)`` makes an undeclared
         callback ready, and returns its execution.
     :ivar take: ``take(worker, now)`` dispatches the next execution on an idle worker and returns
         it; -1: there is none to run.
-    :ivar schedule: ``schedule(now)`` dispatches one execution if the rules want it and returns
-        it; -1: there is none to dispatch.
     :ivar complete: ``complete(x, now)`` ends a running execution; it returns False for a leg that
         did not complete its vertex.
     :ivar fail: ``fail(x, now)`` ends a failed execution; see ``complete``.
@@ -50,23 +47,13 @@ class Scheduler:
     ``core.rules`` and ``core.jobs``.
     """
 
-    def __init__(
-        self,
-        tables: Tables,
-        n_workers: int,
-        policy_name: str = 'rad',
-        *,
-        preemptive: bool = False,
-        propagate: bool = True,
-        dispatch_overhead: int = 0,
-        switch_overhead: int = 0,
-    ) -> None:
+    def __init__(self, tables: Tables, n_workers: int, policy_name: str = 'rad') -> None:
         self.tables = as_object(tables)
         self.policy = policy(policy_name)
-        self.state = as_object(new_state(
-            tables, n_workers, preemptive=self.policy.mode(preemptive), propagate=propagate,
-            dispatch_overhead=dispatch_overhead, switch_overhead=switch_overhead,
-            polling=self.policy.polling, urgency=self.policy.urgency))
+        state = empty(State)
+        fill_state(tables, state, n_workers, 0, 0, 0, 0, int(self.policy.polling),
+                   self.policy.urgency)
+        self.state = as_object(state)
         self._free_groups: list[int] = []
         # bound here: a method would be one more call for each execution
         rule = self.tables, self.state
@@ -75,7 +62,6 @@ class Scheduler:
         self.ready_undeclared: Callable[[int, int, int, int], int] = partial(
             rules.ready_undeclared, *rule, self.policy.key)
         self.take: Callable[[int, int], int] = partial(rules.take, *rule)
-        self.schedule: Callable[[int], int] = partial(rules.schedule, *rule, self.policy.key)
         self.complete: Callable[[int, int], bool] = partial(
             rules.complete, *rule, self.policy.key)
         self.fail: Callable[[int, int], bool] = partial(rules.fail, *rule, self.policy.key)
@@ -106,13 +92,6 @@ class Scheduler:
         """Return the execution of the source of the job in a slot."""
         return self.execution(slot, self.tables.source[self.state.job_dag[slot]])
 
-    def start(self, x: int, worker: int, now: int) -> None:
-        """Start an execution reported late: it began on an idle worker before all that waits."""
-        self.ready(x, now)
-        self.state.ready.remove(self.state.x_key[x])
-        heapify(self.state.ready)
-        rules.start_on(self.state, x, worker, now)
-
     def give_up(self, slot: int, end: int, now: int) -> None:
         """End the job in a slot early unless it has ended already; see ``core.jobs.give_up``."""
         if self.state.job_state[slot] == OPEN:
@@ -141,11 +120,6 @@ class Scheduler:
         taken = self.state.decisions[:]
         self.state.decisions.clear()
         return taken
-
-    @property
-    def idle_workers(self) -> int:
-        """Return the number of workers that run nothing."""
-        return self.state.scalars[N_IDLE]
 
     @property
     def queue_length(self) -> int:

@@ -54,7 +54,7 @@ Kind = TypeVar('Kind')
 
 
 class State(NamedTuple):
-    """Everything that changes during a run; made by ``new_state``."""
+    """Everything that changes during a run; see ``fill_state``."""
 
     scalars: list[int]
     # heaps: the ready queue, the executions deferred for the interpreter or a worker, those that
@@ -160,42 +160,22 @@ def empty(kind: type[Kind]) -> Kind:
     return kind(*([] for _ in kind._fields))    # type: ignore[attr-defined]
 
 
-def new_state(
-    tables: Tables,
-    n_workers: int,
-    *,
-    preemptive: bool = False,
-    propagate: int = 1,
-    dispatch_overhead: int = 0,
-    switch_overhead: int = 0,
-    polling: bool = False,
-    urgency: int = OTHER_KEYS,
-) -> State:
+def fill_state(
+    t: Tables, s: State, n_workers: int, preemptive: int, propagate: int, dispatch_overhead: int,
+    switch_overhead: int, polling: int, urgency: int,
+) -> None:
     """
-    Make an empty state.
+    Fill the columns of an empty state.
 
-    :param n_workers: size of the bounded pool.
-    :param preemptive: a smaller key takes the worker of a larger one.
+    :param preemptive: 1: a smaller key takes the worker of a larger one.
     :param propagate: 1: completions make the graph's edges true at once (simulation); 0: messages
         do, leg by leg, and the driver makes each leg ready (live); 2: messages do, and the driver
         reports each with ``rules.edge`` (rescheduling, with message latency).
     :param dispatch_overhead: added to an execution each time it is dispatched, ns.
     :param switch_overhead: added to an execution each time it is preempted, ns.
-    :param polling: ready executions wait for a poll (see ``queues``); never with preemption.
+    :param polling: 1: ready executions wait for a poll (see ``queues``); never with preemption.
     :param urgency: the kind of the policy's keys, ``DEADLINE_KEYS``, …
     """
-    state = empty(State)
-    fill_state(
-        tables, state, n_workers, int(preemptive), int(propagate), dispatch_overhead,
-        switch_overhead, int(polling), urgency)
-    return state
-
-
-def fill_state(
-    t: Tables, s: State, n_workers: int, preemptive: int, propagate: int, dispatch_overhead: int,
-    switch_overhead: int, polling: int, urgency: int,
-) -> None:
-    """Fill the columns of an empty state; see ``new_state``."""
     for _ in range(N_SCALARS):
         s.scalars.append(0)
     s.scalars[N_IDLE] = n_workers

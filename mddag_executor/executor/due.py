@@ -130,6 +130,11 @@ class DueTimes:
 
     # --- the GIL ---------------------------------------------------------------------------------
 
+    @property
+    def is_checking(self) -> bool:
+        """Return whether a check is due at some time."""
+        return self._gil_check.at > 0
+
     def check_holder(self, now: int, is_late: bool = False) -> None:
         """
         Check whether the execution that holds the GIL computes, as another one waits for it.
@@ -162,7 +167,7 @@ class DueTimes:
         thread = None if holder is None else self._pool.thread_of(holder)
         if holder is None or thread is None:
             self._gil_check.end()
-        elif self._gil_check.waits(thread.ident, thread.vtid, now):
+        elif self._gil_check.waits(holder, thread.ident, thread.vtid, now):
             self._gil_check.end()
             self._engine.stop_holding(holder)
 

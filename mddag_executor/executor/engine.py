@@ -89,7 +89,7 @@ class Engine:
         self.tables = Tables.build(
             task_set, legs=True, groups=False, default_deadline=default_deadline,
             max_active_jobs=max_active_jobs, expire_after=expire_after, on_late=on_late)
-        self.scheduler = Scheduler(self.tables, n_workers, policy, propagate=False)
+        self.scheduler = Scheduler(self.tables, n_workers, policy)
         self.deadlines = Deadlines(self.tables, self.scheduler.state)
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.jobs = Jobs(task_set)
@@ -101,8 +101,7 @@ class Engine:
         self.record = record
         self.on_late = on_late
         self.undeclared = 0
-        # how often a callback group refused an execution, and the entities to ask about again
-        self.refusals = 0
+        # entities whose executions a callback group has refused
         self.to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
         # see 4. above: the execution that runs meanwhile, since when, and those that wait, whose
@@ -228,9 +227,8 @@ class Engine:
     def _is_core_empty(self) -> bool:
         """Return whether nothing is waiting, running on a worker or owning a group in the core."""
         state = self._state
-        return not (
-            state.ready or state.held_back or state.reserved or state.unpolled
-            or state.scalars[N_IDLE] < self.n_workers or max(state.group_owner, default=-1) >= 0)
+        return not (self._core_has_waiting() or state.scalars[N_IDLE] < self.n_workers
+                    or max(state.group_owner, default=-1) >= 0)
 
     def _core(self) -> Scheduler:
         """Return the core, after the end of the bypass: everything is reported to it."""
@@ -394,9 +392,12 @@ class Engine:
 
     @property
     def has_waiting(self) -> bool:
-        """Return whether an execution waits that a worker may be able to run."""
+        """Return whether any execution waits, except for its callback group."""
+        return bool(self._lane) or self._core_has_waiting()
+
+    def _core_has_waiting(self) -> bool:
         state = self._state
-        return bool(self._lane or state.ready or state.held_back or state.unpolled)
+        return bool(state.ready or state.held_back or state.reserved or state.unpolled)
 
     @property
     def queue_length(self) -> int:
@@ -441,7 +442,7 @@ class Engine:
                 self._core()
         if work is None:
             state = self._state
-            if not (state.ready or state.held_back or state.reserved or state.unpolled):
+            if not self._core_has_waiting():
                 return None
             if state.worker_x[worker] >= 0:
                 if not state.scalars[N_IDLE]:
@@ -490,9 +491,9 @@ class Engine:
                 return bool(self._lane)
             self._core()
         state = self._state
-        ready, held_back = state.ready, state.held_back
-        if not state.scalars[N_IDLE] or not (ready or held_back or state.unpolled):
+        if not state.scalars[N_IDLE] or not self._core_has_waiting():
             return False
+        ready, held_back = state.ready, state.held_back
         is_held = bool(self.holders)
         if state.unpolled or len(ready) > MOST or held_back and not is_held:
             return True
@@ -659,7 +660,6 @@ class Engine:
         self._work[x] = work
         entity.waiting = {x: None, **entity.waiting}
         self.to_ask_again.append(entity)
-        self.refusals += 1
         if 0 < entity.depth < len(entity.waiting) and entity.kind != TIMER:
             self._drop(entity, x, 'qos_depth', now)  # a newer one has arrived meanwhile
 

@@ -276,13 +276,15 @@ class GilCheck:
         self._subject = None
         self.at = 0
 
-    def waits(self, ident: int, tid: int, now: int) -> bool:
+    def waits(self, subject: object, ident: int, tid: int, now: int) -> bool:
         """
-        Return whether the thread has waited for anything but the GIL since the last check.
+        Return whether an execution has waited for anything but the GIL since its last check.
 
-        :param ident: the thread's id in Python; ``tid``: its native id.
+        :param ident: the id of its thread in Python; ``tid``: the native id.
         :param now: monotonic ns.
         """
+        if subject is not self._subject:
+            self._subject, self._last, self._unclear = subject, None, 0
         last = self._last
         new = self._last = _Reading(now, cpu_ns(ident), process_time_ns(), schedule_of(tid))
         self._step = CHECK_NS if last is None else min(2 * self._step, LAST_CHECK_NS)

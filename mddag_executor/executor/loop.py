@@ -6,8 +6,8 @@ The one place in which idle workers wait: an epoll over all events.
 Theory of operation
 -------------------
 1.  *Channels.*  The middleware announces arrivals by writing to an eventfd (``listeners``).  A
-    channel is an eventfd with the sources that share it.  Most sources have their own; if there
-    are more than ``fd_budget`` sources, several share one.
+    channel is an eventfd with the sources that share it.  Most sources have their own; seldom used
+    ones of a node (timers, built-in services) share one, as do all after ``_budget`` channels.
 2.  *Waiting.*  All descriptors are registered edge-triggered in one epoll.  However many workers
     wait, the kernel wakes exactly one for each event.  ``wake`` wakes one more.
 3.  *Time.*  One timerfd is set to the earliest time at which anything has to be done.
@@ -70,11 +70,6 @@ class ChannelSource:
         raise NotImplementedError
 
 
-def fd_budget() -> int:
-    """Return the most eventfds to use: a quarter of the descriptors that the process may open."""
-    return max(16, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4)
-
-
 def urgency_of(relative_deadline_ns: int) -> int:
     """Return the nested epoll for sources with this relative deadline, or ALWAYS."""
     found = ALWAYS
@@ -102,11 +97,11 @@ class EventLoop:
         for nested in self._nested:
             self._epoll.register(nested.fileno(), _EDGE)
         self._channels: dict[int, tuple[ChannelSource, ...]] = {}
-        self._shared: dict[str, list[int]] = {}
-        self._shared_fds: set[int] = set()
+        self._shared: dict[str, int] = {}
         self._free: list[int] = []
         self._muted = len(urgencies_ns)
-        self._budget = fd_budget()
+        # a quarter of the descriptors that the process may open
+        self._budget = resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4
 
     @property
     def fd(self) -> int:
@@ -121,23 +116,17 @@ class EventLoop:
 
         :param share: sources with the same name share one descriptor, as they are seldom used.
         """
-        most = 0
-        if share:
-            most = 1
-        elif len(self._channels) >= self._budget:
-            most = self._budget
-        fds = self._shared.setdefault(share, []) if most else []
+        if not share and len(self._channels) >= self._budget:
+            share = 'the rest'
         source.urgency = ALWAYS
-        source.is_counted = not most
-        if most and len(fds) >= most:
-            source.fd = fds.pop(0)
-            fds.append(source.fd)
+        source.is_counted = not share
+        if share in self._shared:
+            source.fd = self._shared[share]
             self._channels[source.fd] += (source,)
             return
         source.fd = self._free.pop() if self._free else new_eventfd()
-        if most:
-            fds.append(source.fd)
-            self._shared_fds.add(source.fd)
+        if share:
+            self._shared[share] = source.fd
         self._channels[source.fd] = (source,)
         self._epoll.register(source.fd, _EDGE)
 
@@ -155,10 +144,7 @@ class EventLoop:
             return
         del self._channels[fd]
         self._home(source.urgency).unregister(fd)
-        self._shared_fds.discard(fd)
-        for fds in self._shared.values():
-            if fd in fds:
-                fds.remove(fd)
+        self._shared = {name: each for name, each in self._shared.items() if each != fd}
         self._free.append(fd)
 
     def has(self, source: ChannelSource) -> bool:
@@ -167,7 +153,7 @@ class EventLoop:
 
     def move(self, source: ChannelSource, urgency: int) -> None:
         """Mute a source with this urgency from now on; ALWAYS: never mute it."""
-        if source.fd < 0 or source.urgency == urgency or source.fd in self._shared_fds:
+        if source.fd < 0 or source.urgency == urgency:
             return
         self._home(source.urgency).unregister(source.fd)
         self._home(urgency).register(source.fd, _EDGE)  # reports earlier arrivals

@@ -573,20 +573,21 @@ class WorkerPool:
             return False
         me.work = work
         me.worker = work.worker
-        holders = engine.holders
-        if holders:
-            if holders[0].entity.habit.mean_ns >= TURN_NS or self.muting.until:
+        entity = work.entity
+        is_short = entity.wall_ns <= SHORT_CALLBACK_NS
+        holds = bool(engine.holders) and engine.holders[-1] is work
+        if holds:
+            if entity.habit.mean_ns >= TURN_NS or self.muting.until and not is_short:
                 self.muting.update(now)
                 due.arm(now - self._offset)  # timers that are muted no more may be due sooner
-            if engine.has_waiting:
+            if engine.has_waiting and not (is_short and due.is_checking):
                 due.check_holder(now - self._offset)
-        entity = work.entity
-        if entity.wall_ns <= SHORT_CALLBACK_NS:
+        if is_short:
             self._leader = me
             if not self.guard.is_set:
                 if not self.polling:
                     self._admit()
-                elif not (entity.habit.holds and holders) and engine.has_waiting:
+                elif not holds and engine.has_waiting:
                     self._guard(now - self._offset)
         elif not self.polling:
             self._admit()

@@ -275,7 +275,7 @@ class Judged:
         if not changes:
             return None
         first, last = self.tables.first_vertex[dag:dag + 2]
-        scheduler = Scheduler(self.tables, 1, propagate=False)
+        scheduler = Scheduler(self.tables, 1)
         expected = np.full(jobs.done.shape, HERE)
         for order, vertices in changes:
             scheduler.expect(dag, [int(v in vertices) for v in range(first, last)])

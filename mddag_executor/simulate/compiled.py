@@ -50,7 +50,7 @@ _MODULES = (
     tables, state, queues, jobs, overload, policies, rules, load, machine, deliveries, engine)
 _NOT_COMPILED = frozenset({
     # for plain lists
-    'empty', 'as_object', 'new_state', 'add_queue', 'rad_offsets', 'reached_sinks', 'mean_time',
+    'empty', 'as_object', 'add_queue', 'rad_offsets', 'reached_sinks', 'mean_time',
     'policy', 'new_machine', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
 ENTRY_POINTS = ('run_once', 'free_run')
 _REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')

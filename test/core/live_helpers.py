@@ -26,7 +26,7 @@ def live(task_set: TaskSet | None = JOIN, workers: int = 2, **more: Any) -> Sche
     options = {name: more.pop(name) for name in ('max_active_jobs', 'expire_after', 'on_late')
                if name in more}
     tables = Tables.build(task_set, legs=True, groups=False, **options)
-    return Scheduler(tables, workers, propagate=False, **more)
+    return Scheduler(tables, workers, **more)
 
 
 def run_one(scheduler: Scheduler, x: int, now: int) -> bool:

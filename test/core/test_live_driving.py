@@ -89,7 +89,7 @@ class LiveDriver(RuleBasedStateMachine):
         self.tables = Tables.build(
             task_set, legs=True, groups=False, max_active_jobs=MAX_ACTIVE,
             expire_after=EXPIRE_AFTER, default_deadline=10 * TICK)
-        self.scheduler = Scheduler(self.tables, workers, policy, propagate=False)
+        self.scheduler = Scheduler(self.tables, workers, policy)
         self.state = self.scheduler.state
         self.workers = workers
         self.groups = [-1, self.scheduler.new_group(), self.scheduler.new_group()]
@@ -163,16 +163,13 @@ class LiveDriver(RuleBasedStateMachine):
         self.by_x[run.x] = run
         self.runs.append(run)
 
-    @rule(worker=st.integers(0, 2), schedule=st.booleans())
-    def dispatch(self, worker, schedule):
+    @rule(worker=st.integers(0, 2))
+    def dispatch(self, worker):
         idle = [w for w in range(self.workers) if self.state.worker_x[w] == -1]
-        if not idle and not schedule:
+        if not idle:
             return
         waiting = [run for run in self.alive() if run.fate == WAITING]
-        if schedule:
-            x = self.scheduler.schedule(self.now)
-        else:
-            x = self.scheduler.take(idle[worker % len(idle)], self.now)
+        x = self.scheduler.take(idle[worker % len(idle)], self.now)
         self.settle()
         able = [run for run in waiting if run.fate == WAITING and not self.blocked(run)]
         if x < 0:
@@ -185,7 +182,7 @@ class LiveDriver(RuleBasedStateMachine):
             assert keys[run.x] == min(keys[other.x] for other in able), 'a smaller key waits'
         run.fate, run.began, run.owns = RUNNING, True, True
         worker = self.state.x_worker[x]
-        assert worker == min(idle) if schedule else worker in idle
+        assert worker in idle
         assert self.state.worker_x[worker] == x
 
     @precondition(methodcaller('with_fate', RUNNING))
@@ -361,7 +358,7 @@ class LiveDriver(RuleBasedStateMachine):
         waiting = self.with_fate(WAITING) + self.with_fate(REFUSED)
         assert self.scheduler.queue_length == len(waiting)
         placed = [run for run in self.with_fate(RUNNING) if not run.lent]
-        assert self.scheduler.idle_workers == self.workers - len(placed)
+        assert self.state.worker_x.count(-1) == self.workers - len(placed)
         assert sorted(x for x in self.state.worker_x if x >= 0) == sorted(r.x for r in placed)
 
     @invariant()
@@ -409,7 +406,7 @@ class LiveDriver(RuleBasedStateMachine):
                 run.fate = WAITING
             for run in self.with_fate(RUNNING):
                 self.complete_one(run)
-            self.dispatch(0, True)
+            self.dispatch(0)
             if not self.alive():
                 break
         assert self.alive() == []

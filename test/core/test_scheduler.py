@@ -187,7 +187,7 @@ def scheduler(workers: int = 1) -> Scheduler:
         {'node': '/n', 'name': 'join', 'sync': ['/a', '/b'], 'deadline': '10us'},
         {'node': '/n', 'name': 'tick', 'timer': '10us', 'deadline': '10us', 'dag': 't'}]),
         legs=True)
-    return Scheduler(tables, workers, 'ros2', propagate=False)
+    return Scheduler(tables, workers, 'ros2')
 
 
 def test_dropped_ones_leave_the_queues():
@@ -209,11 +209,9 @@ def test_dropped_ones_leave_the_queues():
 
 def test_no_preemption():
     task_set = declaration([single('a', 10)])
-    with pytest.raises(PolicyError, match="policy 'ros2': .* preempts no callback: run it"):
-        Scheduler(Tables.build(task_set), 1, 'ros2', preemptive=True)
     of = ros2([single('a', 10)], {'a': 1})
     settings = Settings(policy='ros2', workers=1, preemptive=True, duration_ns=10)
-    with pytest.raises(PolicyError, match='preempts no callback'):
+    with pytest.raises(PolicyError, match="policy 'ros2': .* preempts no callback: run it"):
         simulate(task_set, of.load(10), settings)
     assert not simulate(
         task_set, of.load(10), Settings(policy='ros2', preemptive=None)).settings.preempts
@@ -228,8 +226,13 @@ DEADLINES = (10, 20, 30)
 def computing(workers: int, policy: str = 'rad') -> Scheduler:
     """Return one with a DAG of one callback for each urgency."""
     dags = [single(f'd{deadline}', 1000, deadline) for deadline in DEADLINES]
-    return Scheduler(Tables.build(declaration(dags), groups=False), workers, policy,
-                     propagate=False)
+    return Scheduler(Tables.build(declaration(dags), groups=False), workers, policy)
+
+
+def start_next(core: Scheduler, now: int) -> int:
+    """Start one execution on an idle worker and return it; -1: there is none."""
+    workers = core.state.worker_x
+    return core.take(workers.index(-1), now) if -1 in workers else -1
 
 
 @dataclass
@@ -255,7 +258,7 @@ class Driver:
     def go(self) -> list[int]:
         """Return what starts now."""
         started = []
-        while (x := self.core.schedule(self.now)) >= 0:
+        while (x := start_next(self.core, self.now)) >= 0:
             started.append(x)
         return started
 
@@ -272,7 +275,7 @@ def test_one_that_turns_out_to_wait_gives_the_interpreter_back():
     assert drive.go() == [held_back]
     drive.complete(holder)
     drive.complete(held_back)
-    assert drive.core.idle_workers == 7
+    assert drive.core.state.worker_x.count(-1) == 7
 
 
 def may_start(core: Scheduler, x: int) -> bool:
@@ -323,8 +326,8 @@ def test_whatever_happens_the_most_urgent_that_may_start_starts(seed, workers, g
             core.resume(draw.choice(suspended))
         while True:
             could = [x for x in alive if state.x_state[x] == WAITING and may_start(core, x)]
-            idle = core.idle_workers
-            x = core.schedule(drive.now)
+            idle = core.state.worker_x.count(-1)
+            x = start_next(core, drive.now)
             if x < 0:
                 assert not could or not idle
                 break

@@ -198,7 +198,7 @@ class VirtualRun:
         self.tables = Tables.build(
             self.task_set, legs=True, groups=False, max_active_jobs=self.max_active_jobs,
             expire_after=self.expire_after)
-        self.scheduler = Scheduler(self.tables, self.workers, self.policy, propagate=False)
+        self.scheduler = Scheduler(self.tables, self.workers, self.policy)
         self.tally = Tally(self.task_set, self.tables)
         self.executions: dict[str, int] = {}
         self.busy: dict[str, int] = {}

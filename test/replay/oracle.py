@@ -27,7 +27,7 @@ class Oracle:
             max_active_jobs=[NEVER] * n, expire_after=[NEVER] * n, on_late=[CONTINUE] * n)
         self.tally = Tally(task_set, self.tables)
         self.decisions: list[Decision] = []
-        self.scheduler = Scheduler(self.tables, 1, propagate=False)
+        self.scheduler = Scheduler(self.tables, 1)
         self.scheduler.state.scalars[SKIP] = skip
         if recording.judge_from > -NEVER:
             judge_from(self.scheduler.state, recording.judge_from)
