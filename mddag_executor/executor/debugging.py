@@ -31,7 +31,6 @@ class InvariantError(MddagError):
     def __init__(self, broken: list[str]) -> None:
         super().__init__(
             f'engine: {"; ".join(broken)}: this is a defect of mddag_executor, please report it')
-        self.broken = broken
 
 
 class CheckedLock:

@@ -167,7 +167,9 @@ class DueTimes:
         thread = None if holder is None else self._pool.thread_of(holder)
         if holder is None or thread is None:
             self._gil_check.end()
-        elif self._gil_check.waits(holder, thread.ident, thread.vtid, now):
+        elif holder is not self._gil_check.subject:  # one of several short callbacks in a row
+            self._watch_holder(now)
+        elif self._gil_check.waits(thread.ident, thread.vtid, now):
             self._gil_check.end()
             self._engine.stop_holding(holder)
 

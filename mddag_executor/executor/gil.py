@@ -246,13 +246,14 @@ class GilCheck:
     Finds out whether an execution that holds the GIL computes.
 
     :ivar at: when to check next, monotonic ns; 0: never.
+    :ivar subject: the execution to check.
     """
 
-    __slots__ = ('at', '_subject', '_step', '_last', '_unclear')
+    __slots__ = ('at', 'subject', '_step', '_last', '_unclear')
 
     def __init__(self) -> None:
         self.at = 0
-        self._subject: object = None
+        self.subject: object = None
         self._step = 0
         self._last: _Reading | None = None
         self._unclear = 0
@@ -263,8 +264,8 @@ class GilCheck:
 
         :param after: time until the first check, ns.
         """
-        if self._subject is not subject or after < self._step:
-            self._subject = subject
+        if self.subject is not subject or after < self._step:
+            self.subject = subject
             self._step = after
             self._last = None
             self._unclear = 0
@@ -273,18 +274,16 @@ class GilCheck:
 
     def end(self) -> None:
         """Stop checking."""
-        self._subject = None
+        self.subject = None
         self.at = 0
 
-    def waits(self, subject: object, ident: int, tid: int, now: int) -> bool:
+    def waits(self, ident: int, tid: int, now: int) -> bool:
         """
-        Return whether an execution has waited for anything but the GIL since its last check.
+        Return whether the thread has waited for anything but the GIL since the last check.
 
-        :param ident: the id of its thread in Python; ``tid``: the native id.
+        :param ident: the thread's id in Python; ``tid``: its native id.
         :param now: monotonic ns.
         """
-        if subject is not self._subject:
-            self._subject, self._last, self._unclear = subject, None, 0
         last = self._last
         new = self._last = _Reading(now, cpu_ns(ident), process_time_ns(), schedule_of(tid))
         self._step = CHECK_NS if last is None else min(2 * self._step, LAST_CHECK_NS)
