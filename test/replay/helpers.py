@@ -330,12 +330,14 @@ class VirtualRun:
         return action
 
     def _dispatch(self, now: int) -> None:
-        while True:
-            x = self.scheduler.schedule(now)
+        workers = self.scheduler.state.worker_x
+        while -1 in workers:
+            worker = workers.index(-1)
+            x = self.scheduler.take(worker, now)
             self.decided(now)
             if x < 0:
                 return
-            self._start(self._waiting.pop(x), self.scheduler.state.x_worker[x], now)
+            self._start(self._waiting.pop(x), worker, now)
 
     def _start(self, work: _Execution, worker: int, now: int) -> None:
         start = now + self.random.randrange(50_000)
