@@ -51,7 +51,8 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     time.  An execution with sinks of both kinds has as RAD the earliest deadline of those that can
     be in time.  Executions of one vertex keep their order: one that comes first while older ones
     are demoted has to wait for these.  If it can be in time, the oldest inherits its priority, so
-    a backlog is worked off; if not, it is demoted behind the oldest.  In a lasting overload
+    a backlog is worked off; if not, it is demoted behind the oldest.  If one is dropped (rule 13,
+    or live a full queue), the next one counts as released as early.  In a lasting overload
     (``State.overloaded``) the mean execution times of the older ones count, too.  Running
     executions keep their keys.  Only policies whose keys are times demote.
 8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
@@ -90,8 +91,9 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     deadlines, too.  Refused jobs (of DAGs that ``DEMOTE``) count as released that many relative
     deadlines later.  Before, for ``RESERVED_PATIENCE`` of them, their executions leave room
     (``State.reserved``): without preemption, one that would need the interpreter or the last idle
-    worker beyond the latest start of the next job that is not refused, expected one period after
-    its last release, waits for that job, or until it is later than that.
+    worker beyond the latest time from which the next jobs that are not refused can be in time,
+    sharing the interpreter, waits for these, or until it is later than that.  Such a job is
+    expected one period after the last release of its DAG.
 """
 
 from __future__ import annotations
@@ -234,6 +236,8 @@ def drop(s: State, x: int, now: int) -> None:
     in_queue = s.x_state[x] == WAITING  # a refused execution is in no queue
     s.x_state[x] = DROPPED
     slot = s.x_slot[x]
+    if s.job_demoted[slot] >= 0:
+        s.passed_on[s.x_vertex[x]] = s.job_demoted[slot]
     dag = s.job_dag[slot]
     s.decisions.append((DROP, dag, s.x_vertex[x], s.job_index[slot], x, now))
     group = s.x_group[x]

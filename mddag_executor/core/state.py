@@ -88,17 +88,21 @@ class State(NamedTuple):
     newest: list[int]
     n_open: list[int]
     next_release: list[int]
+    # how long a job needs the interpreter, without refused vertices
+    interpreter_time: list[int]
     # whether some of its vertices are not expected here; by vertex: whether it is (see ``expect``)
     partial: list[int]
     expected: list[int]
     # by vertex: from when on its executions are checked (see ``overload``); with ``keep: newest``,
     # the execution that became ready last; a heap of the demoted executions that wait, by order;
-    # the order of the one that a newer one made urgent last, or -1; the known mean execution time,
-    # and whether it holds the interpreter
+    # the order of the one that a newer one made urgent last, or -1; ``job_demoted`` of the one
+    # dropped last, for the next one; the known mean execution time, and whether it holds the
+    # interpreter
     start_by: list[int]
     newest_ready: list[int]
     demoted: list[list[QueueEntry]]
     urged: list[int]
+    passed_on: list[int]
     mean: list[int]
     holder: list[int]
     # of a sink that tolerates misses: its last ones, from ``Tables.first_miss`` on, as a ring, and
@@ -192,6 +196,7 @@ def fill_state(
         s.newest_ready.append(-1)
         add_queue(s.demoted)
         s.urged.append(-1)
+        s.passed_on.append(-1)
         s.mean.append(t.mean_time[v])
         s.holder.append(0)
         s.next_miss.append(0)
@@ -214,6 +219,7 @@ def fill_state(
         s.newest.append(-1)
         s.n_open.append(0)
         s.next_release.append(-NEVER)
+        s.interpreter_time.append(0)
         s.partial.append(0)
     for _ in range(t.n_vertices + 1):
         s.expected.append(HERE)

@@ -175,15 +175,31 @@ def test_the_highest_importance_is_never_refused():
     assert run(importance='low') == run(importance='high') == run()
 
 
+@pytest.mark.parametrize('keep', ['all', 'newest'])
 @pytest.mark.parametrize(('time', 'runs'), [(11, True), (20, False)])
-def test_less_important_work_leaves_room_for_the_next_important_job(time: int, runs: bool) -> None:
+def test_less_important_work_leaves_room_for_the_next_important_job(time, runs, keep):
     """It starts only if it ends before that job must start, or at long intervals."""
     sinks = results([
-        single('low', 20, 20, execution_time=f'{time}us', importance='low', on_late='demote'),
+        single('low', 20, 20, execution_time=f'{time}us', importance='low', on_late='demote',
+               keep=keep),
         single('high', 20, 12, execution_time='10us', on_late='demote')], [time, 10], 20_000)
     assert counts(sinks['high']).in_time >= (0.99 if runs else 0.85) * 1000
     assert (sinks['low']['completed'] > 600) == runs
     assert sinks['low']['completed'] >= 80  # one in about ten deadlines
+
+
+def test_less_important_work_leaves_room_for_all_important_jobs():
+    """Those released together need the interpreter one after the other."""
+    task_set = declaration([
+        single('low', 50, 50, execution_time='26us', importance='low', on_late='demote'),
+        *(single(name, 50, deadline, execution_time='14us', on_late='demote')
+          for name, deadline in (('first', 20), ('second', 30)))])
+    case = Case(task_set, ((26,), (14,), (14,)), 7, 'rad', False)
+    load = case.load(20_000)._replace(holds=[1, 1, 1])
+    run = simulate(task_set, load, Settings(workers=7, duration_ns=20_000 * TICK))
+    for name in ('first', 'second'):
+        sink = run.result()['dags'][name]['sinks'][f'/n:{name}']
+        assert counts(sink).in_time >= 0.85 * 400
 
 
 @pytest.mark.parametrize('last', [0, 100])
