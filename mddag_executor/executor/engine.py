@@ -120,6 +120,7 @@ class Engine:
         self.holders: list[Work] = []
         self._holds_since = 0
         self._keys_are_deadlines = policy in ('rad', 'gedf')
+        self._default_deadline = default_deadline
 
     # --- ready work --- --------------------------------------------------------------------------
 
@@ -208,9 +209,14 @@ class Engine:
         entity.ready += 1
 
     def _enqueue(self, work: Work) -> None:
-        entity = work.entity
+        entity, since = work.entity, work.ready_ns
+        if entity.callback is not None and self._keys_are_deadlines:
+            # It belongs to no job, but comes after the messages that wait already.
+            for x in entity.waiting:
+                if x >= 0:
+                    since = max(since, self._state.x_key[x][0] + 1 - self._default_deadline)
         x = work.x = self.scheduler.ready_undeclared(
-            entity.ready, entity.group, entity.habit.holds, work.ready_ns)
+            entity.ready, entity.group, entity.habit.holds, since)
         entity.waiting[x] = None
         self._work[x] = work
 

@@ -88,6 +88,31 @@ class Driver:
                 Work(after, print), Origin(slot, dag, job, vertex), -1, -1, now)
 
 
+@pytest.mark.parametrize('policy', ['rad', 'gedf', 'fifo'])
+def test_a_second_message_of_a_publication_comes_after_the_first(policy):
+    """It belongs to no job, and would have the earlier deadline."""
+    task_set = loads("""\
+mddag: 1
+nodes:
+  - node: /sensor
+    callbacks: [{name: tick, timer: 500ms, publishes: [/data], dag: data}]
+  - node: /user
+    callbacks: [{name: use, subscription: /data, deadline: 300ms}]
+""", 'graph.yaml')
+    engine = Engine(task_set, 1, policy, default_deadline=100_000_000, max_active_jobs=NEVER,
+                    expire_after=NEVER)
+    source, user = (entity_of(engine, task_set, 0, index) for index in (0, 1))
+    engine.timer_due(Work(source, print), 0, 0)
+    running = engine.dispatch(0, 0)
+    messages = [Work(user, print) for _ in range(3)]
+    for time, message in enumerate(messages):
+        engine.arrived(message, running.origin, -1, -1, time)
+    for time, message in enumerate(messages, 3):
+        engine.finished(running, 0, time, time, 0, 0)
+        running = engine.dispatch(0, time)
+        assert running is message
+
+
 @examples(150)
 @given(cases(policies=PLAIN, groups=False, bounds=False))
 def test_the_same_events_give_the_same_answers_as_the_simulator(case):
