@@ -39,5 +39,4 @@ def test_a_short_soak_loses_nothing_and_keeps_nothing():
     assert result['ran'] > 10_000 and result['jobs'] > 2_000
     # one that was made ready by the last tick of the simulated time may still wait
     assert 0 <= result['executions'] - result['ran'] - result['dropped'] <= 2
-    assert -20_000 < result['middleware_keeps'] < 50_000, 'bytes for each node made again'
     assert -0.5 < result['memory_growth'] <= MEMORY_RATIO
