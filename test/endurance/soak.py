@@ -15,7 +15,7 @@ work off the backlog (at most ``BACKLOG_S``), and a *clean* window:
 * ``raise``: a callback raises, which ends ``spin``; it is called again;
 * ``stop``: a source stops for a second;
 * ``burst``: a source releases ten times as often for a second;
-* ``clock``: the simulated time, which an additional node follows, jumps to and fro.
+* ``clock``: the simulated time, which an additional node follows, jumps back and forth.
 
 At the end these have to hold: memory in use within 5 % of what it was after the warm-up; as many
 threads and file handles; every execution that became ready ran, was dropped, or is one of those
@@ -62,7 +62,7 @@ BURST = 10
 DRAIN_S = 3.0
 MEMORY_RATIO = 0.05
 MATCH_S = 30.0
-MOST_TOLD = 50
+MOST_LISTED = 50
 STALL_S = 0.01
 LEAST_SLACK = 0.1
 
@@ -91,7 +91,7 @@ class StallWatch:
             self.stalls.append(int(line))
 
     def within(self, start: int, end: int) -> bool:
-        """Tell whether there was one between two times."""
+        """Return whether one was noted between two times."""
         return any(start <= stall < end for stall in self.stalls)
 
     def stop(self) -> None:
@@ -131,7 +131,7 @@ class Soak:
     """
     One endurance run.
 
-    :param say: told what happens, one line each.
+    :param say: receives what happens, one line each.
     """
 
     def __init__(
@@ -188,7 +188,7 @@ class Soak:
                     return
 
     def run(self) -> dict[str, Any]:
-        """Run, and return what came of it; ``failed`` has what should not be, one line each."""
+        """Run, and return the result; its ``failed`` has what should not be, one line each."""
         for node in (*self.nodes.nodes.values(), self._simulated.node):
             self.executor.add_node(node)
         self._thread.start()
@@ -210,9 +210,9 @@ class Soak:
 
     def _misuse_once(self) -> None:
         """
-        Have each fault once before the first measurement: what it needs stays there.
+        Inject each fault once before the first measurement: the memory that it needs is kept.
 
-        Bursts of all sources at once: each DAG keeps the places of as many jobs as were ever open.
+        Bursts of all sources at once: each DAG keeps room for as many jobs as were ever open.
         """
         for fault in FAULTS:
             if fault != 'burst':
@@ -232,7 +232,7 @@ class Soak:
         start = time.time_ns()
         time.sleep(CLEAN_S)
         self._clean.append((start, time.time_ns(), fault))
-        time.sleep(self._settle_s)  # for what was released last, before the next fault hits it
+        time.sleep(self._settle_s)  # the last jobs end before the next fault
         self._say(f'{fault}: {self._sort_out()} misses in the clean window')
 
     def _has_backlog(self) -> bool:
@@ -313,7 +313,7 @@ class Soak:
             'stalls': len(self._stalls.stalls), 'clean_misses': len(clean_misses),
             'clean_missed_sinks': sorted({miss.vertex for _, miss in clean_misses}),
             'clean_missed': [
-                {'after': fault, **asdict(miss)} for fault, miss in clean_misses[:MOST_TOLD]],
+                {'after': fault, **asdict(miss)} for fault, miss in clean_misses[:MOST_LISTED]],
             'unjudged_sinks': self._unjudged, 'simulated_ticks': ticks}
         result['failed'] = [*self._failures(result, statistics, n_open)]
         if not simulated_goes_on:
