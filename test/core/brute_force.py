@@ -26,7 +26,7 @@ Its reading of the documents:
   the workers, it is late if the mean time of each execution that was demoted there leaves it no
   deadline within reach.
 * ``keep: newest`` at a source or sink: one of an earlier job that waits there and has never run
-  vanishes when the next one is ready.
+  vanishes when the next one is ready. If it was late, the next late one goes as early.
 * ``ros2`` goes by rounds. When a worker is free and the round has nothing left that it could take,
   the next round is, of all that waits, the first of each callback. The worker goes through it by
   kind (timers, subscriptions and syncs, services), then by the callback's place in the file, and
@@ -110,6 +110,7 @@ class BruteForce:
         self.waiting: list[Execution] = []
         # by DAG and vertex: the demoted executions by arrival, and the arrival of the urged one
         self.demoted: dict[tuple[int, int], list[tuple[int, Execution]]] = {}
+        self.passed_on: dict[tuple[int, int], int] = {}
         self.urged: dict[tuple[int, int], int] = {}
         self.round: list[Execution] = []
         self.jobs: list[Job] = []
@@ -221,7 +222,8 @@ class BruteForce:
         if not within:
             if job.demoted is None:
                 deadline = max(job.dag.vertices[s].deadline_ns or 0 for s in job.dag.sinks)
-                job.demoted = self.now * self.tick + 10 * deadline
+                job.demoted = self.passed_on.pop(
+                    (job.dag.index, vertex.index), self.now * self.tick + 10 * deadline)
             lowest += (job.demoted - job.release * self.tick) // unit
         return lowest
 
@@ -308,6 +310,8 @@ class BruteForce:
                 continue
             self.waiting.remove(old)
             job, sink = old.job, old.vertex.index
+            if job.demoted is not None:
+                self.passed_on[job.dag.index, sink] = job.demoted
             if job.outcome is not None:
                 continue
             if old.vertex.predecessors:
