@@ -64,8 +64,8 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
+    from mddag_executor.report.diff import compare_sinks, sinks_table
     from mddag_executor.report.replays import (
-        comparison_table,
         recorded_tables,
         summary,
         times_tables,
@@ -77,8 +77,8 @@ def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
         yield ('transport, dispatch and other load are not in a bag: they are left out '
                '(--overheads)')
     elif result['rescheduled']:
-        yield 'Rescheduled, compared with the recording:'
-        yield comparison_table(result['dags'], result['recorded']['dags'])
+        yield 'The recording (A) and the same rescheduled (B):'
+        yield sinks_table(compare_sinks(result['recorded']['dags'], result['dags']))
     elif result['dags'] or 'recorded_callbacks' not in result:
         yield sink_table(result['dags'])
         yield from times_tables(result['dags'])

@@ -7,10 +7,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from mddag_executor.core.tally import counts
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.tables import (
-    percent,
     ratio,
     run_lines,
     short_names,
@@ -29,8 +27,6 @@ _CALLBACKS = (
     'callback', 'executions', 'busy', 'mean', 'longest', 'mean wait', 'longest wait', 'CPU',
     'interpreter')
 PATHS_HEADER = ('path', 'arrived', 'case', 'count', 'min', 'median', 'p99', 'max')
-_COMPARISON_HEADER = (
-    'sink', 'deadline', 'due', 'in time', 'recorded', 'p99', 'recorded', 'max', 'recorded')
 
 
 def times_tables(dags: Mapping[str, Any]) -> Iterator[str]:
@@ -120,21 +116,6 @@ def paths_rows(paths: Mapping[str, Any]) -> Iterator[list[Cell]]:
             yield [shown, arrived, case, None if of is None else of['count'],
                    *times(of, 'min', 'median', 'p99', 'max')]
             shown = arrived = ''
-
-
-def comparison_table(dags: Mapping[str, Any], recorded: Mapping[str, Any]) -> str:
-    """Return a table of rescheduled sinks, each number next to the recorded one."""
-    rows: list[list[Cell]] = []
-    for sink in worst_first(dags):
-        sides = (sink.result, recorded[sink.dag]['sinks'][sink.name])
-        row: list[Cell] = [
-            sink.shown_name, format_ns(sink.result['relative_deadline_ns']),
-            counts(sides[0]).due]
-        row += [percent(counts(side).in_time, counts(side).due) for side in sides]
-        for key in ('p99', 'max'):
-            row += [cell for side in sides for cell in times(side['response_ns'], key)]
-        rows.append(row)
-    return table(_COMPARISON_HEADER, rows)
 
 
 def summary(result: Mapping[str, Any]) -> Iterator[str]:

@@ -157,10 +157,10 @@ def test_what_only_one_run_has(result, tmp_path):
     graph = runs.GRAPH.replace('deadline: 8ms', 'deadline: 5ms').replace('name: whole', 'name: w')
     other = replay(runs.by_hand(tmp_path / 'other.mcap'), msg_graph.loads(graph)).result()
     difference = compare(result, other)
-    assert 'worse, deadline in B 5 ms' in sinks_table(difference)
+    assert 'worse, deadline in B 5 ms' in sinks_table(difference['dags'])
     lacking = {**result, 'dags': {}}
-    assert 'only in A' in sinks_table(compare(result, lacking))
+    assert 'only in A' in sinks_table(compare(result, lacking)['dags'])
     difference = compare(lacking, result)
-    assert 'only in B' in sinks_table(difference) and not difference['worse']
+    assert 'only in B' in sinks_table(difference['dags']) and not difference['worse']
     assert difference['dags']['/driver']['sinks']['/filter:run']['a'] is None
     assert 'driver:tick' in callbacks_table(compare({**result, 'callbacks': {}}, result))
