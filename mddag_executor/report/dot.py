@@ -148,7 +148,7 @@ def _box(box: Box) -> str:
     sink = ', peripheries=2' if box.sink else ''
     label = _label((*_wrapped(box.node), *box.lines))
     return (f'{quoted(box.mark)} [label={label}, {_SHAPES[box.kind][0]}, '
-            f'fillcolor={quoted(box.colour)}{sink}, tooltip={quoted(box.note)}]')
+            f'fillcolor={quoted(box.colour)}{sink}]')
 
 
 def _legend(picture: Picture) -> str:

@@ -40,7 +40,6 @@ class Box:
     :ivar node: the name of its node.
     :ivar lines: callback, trigger if that is not a topic, a sink's deadline.
     :ivar kind: ``timer``, ``subscription``, ``sync`` or ``service``.
-    :ivar note: all properties, for a tool tip.
     """
 
     mark: str
@@ -49,7 +48,6 @@ class Box:
     kind: str
     colour: str
     sink: bool
-    note: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +97,7 @@ def picture(task_set: TaskSet) -> Picture:
     dags = []
     for dag in task_set.dags:
         first = tables.first_vertex[dag.index]
-        boxes = tuple(_box(vertex, offset, colours[offset]) for vertex, offset in zip(
+        boxes = tuple(_box(vertex, colours[offset]) for vertex, offset in zip(
             dag.vertices, offsets[first:first + len(dag.vertices)]))
         dags.append(DagFrame(
             f'd{dag.index}', f'{dag.name}, every {format_ns(dag.period_ns)}', boxes,
@@ -113,7 +111,7 @@ def _mark(vertex: Vertex) -> str:
     return f'd{vertex.dag}v{vertex.index}'
 
 
-def _box(vertex: Vertex, offset: int, colour: str) -> Box:
+def _box(vertex: Vertex, colour: str) -> Box:
     callback = vertex.callback
     _, several, number = vertex.name[len(callback.key):].partition('#')
     lines = [callback.name + several + number]
@@ -125,15 +123,8 @@ def _box(vertex: Vertex, offset: int, colour: str) -> Box:
         lines.append(f'service {callback.service}')
     if vertex.deadline_ns is not None:
         lines.append(f'deadline {format_ns(vertex.deadline_ns)}')
-    note = [vertex.name, f'RAD offset {format_ns(offset)}']
-    if callback.execution_time is not None:
-        note.append(f'mean execution time {format_ns(callback.execution_time.mean_ns)}')
-    if callback.topics:
-        note.append('started by ' + ', '.join(callback.topics))
-    if callback.group is not None:
-        note.append(f'group {callback.group}')
     return Box(_mark(vertex), callback.node, tuple(lines), callback.kind, colour,
-               vertex.deadline_ns is not None, ', '.join(note))
+               vertex.deadline_ns is not None)
 
 
 def _colours(offsets: list[int]) -> dict[int, str]:

@@ -80,7 +80,7 @@ def test_labels_hold_any_text(text):
 def test_graphviz_reads_hostile_names_as_they_are():
     result = drawn()
     first = result.dags[0]
-    boxes = tuple(replace(first.boxes[0], mark=f'd0v{place}', node=name, lines=(name,), note=name)
+    boxes = tuple(replace(first.boxes[0], mark=f'd0v{place}', node=name, lines=(name,))
                   for place, name in enumerate(HOSTILE))
     hostile = replace(result, title='\\N"<b>&', arrows=(),
                       dags=(replace(first, title='"<\\', boxes=boxes),))
