@@ -19,13 +19,13 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 from hypothesis import given, strategies
-from mddag_executor import __version__, defaults
+from mddag_executor import __version__
 from mddag_executor.cli import main as program
 from mddag_executor.cli.text import format_ns, one_line, printable, Progress
 from mddag_executor.errors import InputError, MddagError, UsageError
 from mddag_executor.simulate import Settings
 from mddag_executor.simulate.run import check
-from msg_graph import errors, GraphError, loads
+from msg_graph import errors, GraphError
 import pytest
 
 
@@ -221,13 +221,6 @@ def test_closed_streams(folder, closed):
 
 
 ONE = 'nodes: [{node: /n, callbacks: [{name: t, timer: 1s, deadline: 1s, execution_time: 1us}]}]\n'
-
-
-def test_the_number_of_workers():
-    text = 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, timer: 1s, deadline: 1s}]}]\n'
-    assert defaults.workers(None, loads(text)) == 7
-    assert defaults.workers(None, loads(text + 'workers: 3\n')) == 3
-    assert defaults.workers(2, loads(text + 'workers: 3\n')) == 2
 
 
 def test_the_limit_of_workers_is_the_same_everywhere(tmp_path):
