@@ -13,7 +13,7 @@ from typing import TextIO
 
 from mddag_executor.text import listed as listed_plainly
 
-Cell = str | int | float | None
+Cell = str | int | None
 
 WIDTH, NARROW = 120, 100
 """A table is at most 120 columns wide, or 100 with few rows, if its names can be shortened."""
@@ -92,7 +92,7 @@ def table(
     with few rows ``NARROW``.
 
     :param header: the titles of the columns
-    :param rows: their cells; None is printed as `-`, a float with two decimals
+    :param rows: their cells; None is printed as `-`
     :param marked: rows that are red if colours are available
     :param most: maximum width instead of these
     :param grouped: number of columns on the left that are empty if the first one is as above
@@ -135,8 +135,4 @@ def _fitting(widths: list[int], names: Sequence[int], most: int) -> list[int]:
 
 
 def _cell(cell: Cell) -> str:
-    if cell is None:
-        return '-'
-    if isinstance(cell, float):
-        return f'{cell:.2f}'
-    return printable(str(cell))
+    return '-' if cell is None else printable(str(cell))
