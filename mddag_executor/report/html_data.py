@@ -92,8 +92,8 @@ def prepare(data: ReportData) -> Prepared:
     """Prepare a report's data for drawing."""
     replay, verdicts = data.replay, data.timeline.verdicts
     columns, rows = executions(replay, data.timeline.rows)
-    of, table = {column.name: column for column in columns}, replay.recording.executions[rows]
-    names = [printable(name) for name in of['vertex'].names]
+    column, table = {each.name: each for each in columns}, replay.recording.executions[rows]
+    names = [printable(name) for name in column['vertex'].names]
     lines, ys, n_hidden = _lines(data, names)
 
     leads_to, colour = _verdicts_of(data, table)
@@ -103,15 +103,15 @@ def prepare(data: ReportData) -> Prepared:
     workers, n = table['worker'].astype(np.int32), data.result['workers']
     on = np.where((workers >= 0) & (workers < n), workers, n)
     spare = int((on == n).any())
-    declared, known = (np.asarray(of[name].known) for name in ('dag', 'release_ns'))
+    declared, known = (np.asarray(column[name].known) for name in ('dag', 'release_ns'))
     return Prepared(
         {'left': seconds(data, table['start']), 'right': seconds(data, table['end']),
          'waited': (table['start'] - table['ready']) / 1e9, 'worker': workers,
-         'workers': (n + spare - on).astype(np.int32), 'callbacks': ys[of['vertex'].values],
-         'name': of['vertex'].values.astype(np.int32),
-         'dag': np.where(declared, of['dag'].values, -1).astype(np.int32),
+         'workers': (n + spare - on).astype(np.int32), 'callbacks': ys[column['vertex'].values],
+         'name': column['vertex'].values.astype(np.int32),
+         'dag': np.where(declared, column['dag'].values, -1).astype(np.int32),
          'job': table['job'].astype(np.float64),
-         'release': np.where(known, seconds(data, of['release_ns'].values), np.nan),
+         'release': np.where(known, seconds(data, column['release_ns'].values), np.nan),
          'verdict': leads_to.astype(np.int32), 'class': colour.astype(np.int32)},
         {'x': seconds(data, marked_at), 'workers': np.zeros(len(worst)),
          'callbacks': ys[misses['sink']], 'verdict': worst.astype(np.int32)},
@@ -147,7 +147,7 @@ def _verdicts_of(data: ReportData, table: Table) -> tuple[Ints, Ints]:
     found, least = np.full(len(table), -1), np.full(len(table), np.inf)
     for dag, first in zip(data.replay.task_set.dags, first_vertex):
         for sink in dag.sinks:
-            mine = np.flatnonzero(np.isin(table['vertex'] - first, _before(dag, sink)))
+            mine = np.flatnonzero(np.isin(table['vertex'] - first, _ancestors(dag, sink)))
             judged = np.flatnonzero(verdicts['sink'] == first + sink)
             at = look_up(verdicts['job'][judged], table['job'][mine])
             mine, judged = mine[at >= 0], judged[at[at >= 0]]
@@ -157,8 +157,8 @@ def _verdicts_of(data: ReportData, table: Table) -> tuple[Ints, Ints]:
         found < 0, len(COLOURS) - 1, np.searchsorted(_SHARES, least, 'right'))
 
 
-def _before(dag: Dag, sink: int) -> list[int]:
-    """Return the vertices that lead to a sink, and the sink."""
+def _ancestors(dag: Dag, sink: int) -> list[int]:
+    """Return the sink and the vertices that lead to it."""
     found = [sink]
     seen = {sink}
     for vertex in found:
