@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from contextlib import ExitStack, redirect_stdout
-from dataclasses import replace
 import os
 import sys
 from typing import Any, BinaryIO, TYPE_CHECKING
@@ -108,10 +107,6 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
     from mddag_executor.rerun.inputs import open_input
     from mddag_executor.rerun.run import Rerun, Settings
     task_set = common.load_graph(args.graph)
-    if task_set.processes:
-        warn(f'{task_set.file}: processes: all nodes run in one here, with its workers and its '
-             'interpreter, and messages between them take no longer')
-        task_set = replace(task_set, processes=())
     settings = Settings(
         defaults.workers(args.workers, task_set), args.cpus, args.policy, args.seed,
         args.all_clocks, ros_args=tuple(args.ros_args))

@@ -45,3 +45,9 @@ def goal_states(server: Any) -> Iterator[tuple[Any, int]]:
         handle = goal._goal_handle
         if handle is not None:  # not by its property: that takes a lock that may be locked here
             yield goal._goal_info, handle.get_status()
+
+
+def has_result(server: Any, info: Any) -> bool:
+    """Return whether an action server keeps the result of a goal (``GoalInfo``)."""
+    future = server._result_futures.get(bytes(info.goal_id.uuid))
+    return future is not None and future.done()

@@ -10,6 +10,7 @@ messages that they need. These are in a temporary file, which is in memory while
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from operator import itemgetter
 import os
@@ -117,6 +118,7 @@ def open_input(
     :raises mddag_executor.errors.MddagError: if anything of it cannot be used.
     """
     name = name or path
+    processes, task_set = task_set.processes, replace(task_set, processes=())
     is_bag = is_ordinary(path)
     if times is None:
         times = DECLARED if is_bag else RECORDED
@@ -135,6 +137,10 @@ def open_input(
         with open(times, encoding='utf-8') as file:
             taken = _fixed(task_set, read_execution_times(task_set, file.read(), times))
     messages = MessageBag(path, name)
+    if processes:
+        messages.warnings.append(
+            f'{task_set.file}: processes: all nodes run in one here, with its workers and its '
+            'interpreter, and messages between them take no longer')
     if not messages.topics:
         if run is None:
             raise UsageError(

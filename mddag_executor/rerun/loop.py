@@ -13,8 +13,7 @@ same instant is done before time goes on.
 
 A callback runs, for real and at once, when the core dispatches it. In virtual time it takes as
 long as ``times`` says, or as long as it has waited, if that is more. What it sends is kept until
-its virtual end, or until it begins to wait, because others may have to answer it. A message whose
-recorded transport time is negative left before the end, and does so here, too.
+its virtual end, or until it begins to wait, because others may have to answer it.
 
 A message that another thread sends has no virtual time: it gets the time at which it arrives, and
 a warning says so.
@@ -70,16 +69,12 @@ class Sent:
     """
     Something that an execution has sent.
 
-    :ivar leave: sends it, given the execution's job and release, and when that ends (or begins to
-        wait).
+    :ivar leave: sends it, given the execution's job and release.
     :ivar record: records it, as sent by a thread of the trace.
-    :ivar early: returns how long before the end of its execution it leaves, ns, as a negative
-        number, given its job and release.
     """
 
-    leave: Callable[[Origin | None, int, int], None]
+    leave: Callable[[Origin | None, int], None]
     record: Callable[[int], None] = lambda thread: None
-    early: Callable[[Origin, int], int] = lambda origin, release: 0
 
 
 @dataclass(eq=False, slots=True)
@@ -262,13 +257,9 @@ class Loop:
             work.entity.habit.took(takes, takes)
         waited = self.now > execution.start
         if self.computing is not None and execution.worker >= 0 and not waited:
-            self.computing.begin(execution, takes, [
-                (max(0, takes + early), partial(self._leave, sent, execution, early))
-                for early, sent in self._take_early(execution, takes)])
+            self.computing.begin(execution, takes)
             return
         end = max(self.now, execution.start + takes)
-        for early, sent in self._take_early(execution, takes):
-            self.at(max(self.now, end + early), ARRIVED, self._leave, sent, execution, early)
         order = (work.worker << _WORKER_BITS) + next(self._order)
         heappush(self._events, (end, ENDED, order, self.ended, (execution, end)))
 
@@ -295,20 +286,6 @@ class Loop:
             self._current = None
         return True
 
-    def _take_early(self, execution: Execution, takes: int) -> list[tuple[int, Sent]]:
-        """Take from what an execution has sent what left before its end in the recording."""
-        origin = execution.origin
-        if origin is None or not takes:
-            return []
-        all_sent = [(sent.early(origin, execution.release), sent) for sent in execution.sent]
-        execution.sent = [sent for early, sent in all_sent if early >= 0]
-        return [each for each in all_sent if each[0] < 0]
-
-    def _leave(self, sent: Sent, execution: Execution, early: int) -> None:
-        """Let something leave before its execution ends."""
-        sent.record(execution.thread)
-        sent.leave(execution.origin, execution.release, self.now - early)
-
     def _execution_time(self, work: Work, origin: Origin | None, release: int) -> int:
         """Return how long a callback takes: its first piece all of it, a sync its last leg."""
         if origin is None or work.coroutine is not None:
@@ -333,7 +310,7 @@ class Loop:
             engine.suspended(work, start, now, execution.thread, worker)
             self._resume_when_done(work, waits_for)
         for each in execution.sent:
-            each.leave(execution.origin, execution.release, now)
+            each.leave(execution.origin, execution.release)
         if engine.to_ask_again:
             engine.ask_again()
 
@@ -350,7 +327,7 @@ class Loop:
         if execution is not None:
             execution.sent.append(sent)
         else:
-            self.call_in_run(partial(sent.leave, None, 0, self.now))
+            self.call_in_run(partial(sent.leave, None, 0))
 
     def call_at_end(self, function: Callable[[], None]) -> None:
         """Do something when the callback that runs ends, or else at once."""
@@ -386,7 +363,7 @@ class Loop:
             sent, execution.sent = execution.sent, []
             for each in sent:
                 each.record(execution.thread)
-                each.leave(execution.origin, execution.release, self.now)
+                each.leave(execution.origin, execution.release)
             if lends and execution.worker >= 0 and execution.work.x >= 0:
                 self.engine.lend(execution.work)
                 execution.worker = -1

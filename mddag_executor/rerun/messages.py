@@ -20,9 +20,9 @@ Which job does a message belong to?  That of the execution that has sent it. A r
 a job if its subscription is its DAG's source. Otherwise it enters the job
 that its header's stamp names, or one of its own (see ``executor.other_processes``).
 
-Nodes that ask for the ROS graph find the nodes of the run, and what is recorded, at once, not
-after some time as in the middleware. Questions that are not answered here go to the middleware,
-and a warning says that the answer is not the same in each run.
+Nodes that count the publishers or subscribers of a topic find those of the run, and the recording,
+at once. Other questions about the ROS graph go to the middleware, which knows no recording, and a
+warning says that the answer is not the same in each run.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ from rosgraph_msgs.msg import Clock
 CLOCK = '/clock'
 CLOCK_EVERY_NS = 10_000_000
 """How often ``/clock`` gives the time."""
-_OTHERS = (
+_ASK_MIDDLEWARE = (
+    'get_topic_names_and_types', 'get_node_names', 'get_node_names_and_namespaces',
     'get_publisher_names_and_types_by_node', 'get_subscriber_names_and_types_by_node',
     'get_service_names_and_types_by_node', 'get_client_names_and_types_by_node',
     'get_service_names_and_types', 'get_publishers_info_by_topic',
@@ -120,7 +121,6 @@ class Messages:
         task_set: TaskSet,
     ) -> None:
         self._loop = loop
-        self._nodes: Sequence[Node] = ()
         self._inlets: dict[str, list[Inlet]] = {}
         self.offered: dict[str, list[Outlet]] = {}
         self._engine = loop.engine
@@ -138,15 +138,16 @@ class Messages:
         """Have publishers and subscriptions use this."""
         replace = replacements.replace
         replace(Publisher, 'publish', instead(self._publish))
-        replace(Publisher, 'get_subscription_count', instead(self._subscription_count))
+        replace(Publisher, 'get_subscription_count',
+                instead(lambda publisher: self._count_subscribers(publisher.topic_name)))
         replace(Publisher, 'wait_for_all_acked', instead(lambda *args, **more: True))
-        replace(Subscription, 'get_publisher_count', instead(self._publisher_count))
-        replace(Node, 'get_topic_names_and_types', instead(self._topics))
-        replace(Node, 'count_publishers', instead(self._count_publishers))
-        replace(Node, 'count_subscribers', instead(self._count_subscribers))
-        replace(Node, 'get_node_names', instead(self._node_names))
-        replace(Node, 'get_node_names_and_namespaces', instead(self._node_names_and_namespaces))
-        for name in _OTHERS:
+        replace(Subscription, 'get_publisher_count',
+                instead(lambda subscription: self._count_publishers(subscription.topic_name)))
+        replace(Node, 'count_publishers', instead(
+            lambda node, topic_name: self._count_publishers(node.resolve_topic_name(topic_name))))
+        replace(Node, 'count_subscribers', instead(
+            lambda node, topic_name: self._count_subscribers(node.resolve_topic_name(topic_name))))
+        for name in _ASK_MIDDLEWARE:
             if name in vars(Node):
                 replace(Node, name, self._asking)
 
@@ -154,7 +155,6 @@ class Messages:
 
     def refresh(self, nodes: Sequence[Node], subscriptions: Iterable[Entity]) -> None:
         """Update which subscriptions and publishers there are."""
-        self._nodes = nodes
         known = {inlet.entity: inlet for inlets in self._inlets.values() for inlet in inlets}
         new = []
         self._inlets = {}
@@ -216,40 +216,15 @@ class Messages:
 
         return ask
 
-    def _topics(self, node: Node, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
+    def _count_publishers(self, topic: str) -> int:
+        """Count those of nodes of the run, or else the recording."""
         self._loop.refresh_now()
-        kinds = {topic: {kind} for topic, kind in self._recording.kinds.items()}
-        for found in (self._inlets, self.offered):
-            for topic, (first, *_) in found.items():
-                kinds.setdefault(topic, set()).add(type_name(first.kind))
-        return [(topic, sorted(names)) for topic, names in sorted(kinds.items())]
-
-    def _count_publishers(self, node: Node, topic_name: str) -> int:
-        self._loop.refresh_now()
-        topic = node.resolve_topic_name(topic_name)
         return len(self.offered.get(topic, ())) or int(topic in self._recording.topics)
 
-    def _count_subscribers(self, node: Node, topic_name: str) -> int:
+    def _count_subscribers(self, topic: str) -> int:
+        """Count those of nodes of the run, and the rerun itself, which keeps all messages."""
         self._loop.refresh_now()
-        return len(self._inlets.get(node.resolve_topic_name(topic_name), ()))
-
-    def _node_names(self, node: Node) -> list[str]:
-        return [name for name, _ in self._node_names_and_namespaces(node)]
-
-    def _node_names_and_namespaces(self, node: Node) -> list[tuple[str, str]]:
-        self._loop.refresh_now()
-        return [(each.get_name(), each.get_namespace()) for each in self._nodes]
-
-    def _subscription_count(self, publisher: Publisher) -> int:
-        """Return how many subscribe to a publisher's topic: nodes, and the rerun itself."""
-        self._loop.refresh_now()
-        return 1 + len(self._inlets_of(self._outlet(publisher)))
-
-    def _publisher_count(self, subscription: Any) -> int:
-        """Return how many publish to a subscription: nodes of the run, or the recording."""
-        self._loop.refresh_now()
-        topic = subscription.topic_name
-        return len(self.offered.get(topic, ())) or int(topic in self._last)
+        return 1 + len(self._inlets.get(topic, ()))
 
     # --- what nodes publish ----------------------------------------------------------------------
 
@@ -270,9 +245,7 @@ class Messages:
         current = self._loop.current
         if current is not None:
             current.work.entity.publishes.add(outlet.topic)
-        self._loop.send(Sent(
-            partial(self._leave, outlet, data), partial(self._record, outlet),
-            partial(self._earliest, outlet)))
+        self._loop.send(Sent(partial(self._leave, outlet, data), partial(self._record, outlet)))
 
     def _record(self, outlet: Outlet, thread: int) -> None:
         """Record a publication."""
@@ -281,22 +254,13 @@ class Messages:
             self._engine.record(
                 PUBLICATION, self._loop.now, thread, id(outlet.publisher), self._sequence)
 
-    def _earliest(self, outlet: Outlet, origin: Origin, release: int) -> int:
-        """Return when the first subscription gets a message, after its execution's end."""
-        if not self._times.recorded:
-            return 0
-        return min((self._delay(inlet, origin, release) for inlet in self._inlets_of(outlet)),
-                   default=0)
-
     def _delay(self, inlet: Inlet, origin: Origin | None, release: int) -> int:
         target = None if origin is None else inlet.entity.targets.get(origin.vertex)
         if origin is None or target is None:
             return 0
         return self._times.transport(origin.dag, origin.vertex, target[0], release)
 
-    def _leave(
-        self, outlet: Outlet, data: bytes, origin: Origin | None, release: int, end: int
-    ) -> None:
+    def _leave(self, outlet: Outlet, data: bytes, origin: Origin | None, release: int) -> None:
         """Send a message to the outputs and to the subscriptions."""
         now = self._loop.now
         self._outputs.add(now, outlet.topic, outlet.kind, data, outlet.publisher)
@@ -304,12 +268,12 @@ class Messages:
         if outlet.kept.maxlen:
             outlet.kept.append((now, data))
         for inlet in self._inlets_of(outlet):
-            time = end + self._delay(inlet, origin, release)
             arrive = partial(self._arrive, inlet, data, now, origin, outlet.count)
-            if time <= now:
-                arrive()
+            delay = self._delay(inlet, origin, release)
+            if delay:
+                self._loop.at(now + delay, ARRIVED, arrive)
             else:
-                self._loop.at(time, ARRIVED, arrive)
+                arrive()
 
     # --- what is recorded ------------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ and a warning says so.
 
 rclpy's action clients and servers do all by themselves but for sending (methods of their handles)
 and taking: they get what they would have taken. Goals are known by the middleware's own
-bookkeeping, which stays in use; results do not expire.
+bookkeeping, which stays in use; results expire in virtual time.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import copy
 from functools import partial
+from inspect import signature
 import itertools
 from typing import Any
 
@@ -36,10 +37,11 @@ from mddag_executor.rerun.compat import (
     CLIENT_HANDLE,
     feedback_callback,
     goal_states,
+    has_result,
     new_request,
     SERVER_HANDLE,
 )
-from mddag_executor.rerun.loop import Loop
+from mddag_executor.rerun.loop import Loop, TIMER
 from rclpy.client import Client
 from rclpy.service import Service
 from rclpy.task import Future
@@ -63,6 +65,7 @@ class Requests:
         self._services: dict[str, Entity] = {}
         # clients and servers of actions with their names, by the id of their handles
         self._actions: dict[int, tuple[str, Any]] = {}
+        self._result_timeout_ns: dict[int, int] = {}  # by the id of a server's handle
 
     def refresh(self, entities: dict[int, Entity]) -> None:
         """Update which entities there are, by the id of those of rclpy."""
@@ -86,6 +89,7 @@ class Requests:
                 instead(lambda handle: bool(self._peers(handle))))
         replace(SERVER_HANDLE, 'publish_feedback', instead(self._feedback))
         replace(SERVER_HANDLE, 'publish_status', instead(self._status))
+        replace(SERVER_HANDLE, 'notify_goal_done', instead(self._goal_done))
         for kind in ('goal', 'cancel', 'result'):
             replace(CLIENT_HANDLE, f'send_{kind}_request',
                     instead(partial(self._ask_action, kind)))
@@ -164,13 +168,18 @@ class Requests:
 
     def _made(self, original: Callable[..., None]) -> Callable[..., None]:
         """Return a constructor that keeps by which name an action is known."""
+        timeout = signature(original).parameters.get('result_timeout')  # of servers only
+
         def construct(
             waitable: Any, node: Any, action_type: Any, action_name: str, *args: Any, **more: Any
         ) -> None:
             original(waitable, node, action_type, action_name, *args, **more)
             name = node.resolve_service_name(f'{action_name}/_action/send_goal')
-            self._actions[id(action_handle(waitable))] = (
-                name.removesuffix('/_action/send_goal'), waitable)
+            handle = id(action_handle(waitable))
+            self._actions[handle] = name.removesuffix('/_action/send_goal'), waitable
+            if timeout is not None:
+                self._result_timeout_ns[handle] = round(
+                    more.get('result_timeout', timeout.default) * 1e9)
 
         return construct
 
@@ -231,6 +240,22 @@ class Requests:
                 self._take(client, {'status': message})
 
         self._loop.call_at_end(deliver)
+
+    def _goal_done(self, handle: Any) -> None:
+        """Have the results of goals that have ended expire after the server's timeout."""
+        from action_msgs.msg import GoalStatus
+        _, server = self._actions[id(handle)]
+        timeout_ns = self._result_timeout_ns[id(handle)]
+        at = self._loop.now + timeout_ns
+        if timeout_ns >= 0 and at < self._loop.end:
+            ended = [info for info, status in goal_states(server)
+                     if status > GoalStatus.STATUS_CANCELING]
+            self._loop.at(at, TIMER, self._expire, server, ended)
+
+    def _expire(self, server: Any, ended: list[Any]) -> None:
+        expired = [info for info in ended if has_result(server, info)]
+        if expired:
+            self._take(server, {'expired': expired})
 
     def _take(self, waitable: Any, data: dict[str, Any]) -> None:
         attach_futures(waitable, self._executor)

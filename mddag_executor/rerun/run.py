@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import gc
 import os
 import sys
@@ -93,8 +93,7 @@ class Result:
     :ivar digest: that of all outputs, see ``outputs``.
     :ivar outputs: what was published, in order.
     :ivar counts: how many messages were published, by topic.
-    :ivar started_s: how long it took, really, until all programs had started; ``elapsed_s``: with
-        that, until the end.
+    :ivar elapsed_s: how long it really took.
     :ivar start_ns: the virtual time at which it began.
     :ivar recorded_topics: those that are in the recording, too; ``recorded``: how these differ.
     :ivar warnings: what is not the same in each run, or doubtful, one line each.
@@ -104,7 +103,6 @@ class Result:
     outputs: list[Output]
     counts: dict[str, int]
     callbacks: int
-    started_s: float
     start_ns: int
     virtual_ns: int
     elapsed_s: float
@@ -118,7 +116,7 @@ class Result:
         return {
             'digest': self.digest, 'messages': sum(self.counts.values()),
             'callbacks': self.callbacks, 'virtual_s': self.virtual_ns / 1e9,
-            'elapsed_s': self.elapsed_s, 'started_s': self.started_s,
+            'elapsed_s': self.elapsed_s,
             'topics': dict(sorted(self.counts.items())), **self.verdicts,
             'recorded_topics': self.recorded_topics,
             'recorded': [each._asdict() for each in self.recorded],
@@ -140,13 +138,12 @@ class Rerun:
     ) -> None:
         self._recording = recording
         self._times = times
-        self._task_set = task_set
+        self._task_set = replace(task_set, processes=())  # all nodes run in one
         self._settings = settings
         self._trace = trace
         self._outputs = Outputs(output, None if keep else recording.topics)
         self._failed: list[Guest] = []
         self._hosted: set[str] = set()
-        self._started_s = 0.0
 
     # --- parts -----------------------------------------------------------------------------------
 
@@ -239,7 +236,7 @@ class Rerun:
         :param tick: gets now and then how far the run is, ns.
         :raises RerunError: on whatever keeps it from going on.
         """
-        self._begun = time.monotonic()
+        begun = time.monotonic()
         self._programs = programs
         arguments = sys.argv  # each program has its own
         with _context(self._settings.ros_args) as context:
@@ -268,7 +265,7 @@ class Rerun:
         if not self._hosted:
             loop.warn(self._none_hosted())
         self._outputs.finish()
-        return self._result(time.monotonic() - self._begun)
+        return self._result(time.monotonic() - begun)
 
     def _passed_ns(self) -> int:
         return self._loop.now - self._loop.start
@@ -282,7 +279,6 @@ class Rerun:
 
     def _started(self) -> None:
         """Begin to deliver, when each program waits for something."""
-        self._started_s = time.monotonic() - self._begun
         gc.freeze()  # else each full collection visits all objects of the nodes
         if all(guest.is_complete for guest in self._host.guests) and not self._hosted:
             raise RerunError(self._none_hosted())
@@ -335,8 +331,8 @@ class Rerun:
             'preemptive': False, 'duration_ns': self._passed_ns(),
             **self._engine.verdicts.tally.result()}
         return Result(
-            outputs.digest, outputs.messages, outputs.counts, loop.callbacks, self._started_s,
-            loop.start, self._passed_ns(), elapsed_s, verdicts, sorted(both), recorded,
+            outputs.digest, outputs.messages, outputs.counts, loop.callbacks, loop.start,
+            self._passed_ns(), elapsed_s, verdicts, sorted(both), recorded,
             [*recording.warnings, *loop.warnings])
 
 

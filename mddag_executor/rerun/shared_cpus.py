@@ -3,9 +3,7 @@
 """
 When executions end that share CPUs and the interpreter.
 
-The machine is the simulator's (``simulate.machine``): it decides which execution pauses. A message
-that an execution sent before its end leaves when the execution is as far as it was in the
-recording.
+The machine is the simulator's (``simulate.machine``): it decides which execution pauses.
 """
 
 from __future__ import annotations
@@ -14,7 +12,6 @@ from collections.abc import Callable
 from typing import Any
 
 from mddag_executor.core import NEVER
-from mddag_executor.core.rules import progress
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.work import Work
 from mddag_executor.simulate.machine import begins, new_machine, NEXT_TIME, settle, share
@@ -41,35 +38,22 @@ class SharedCpus:
         self._ended = ended
         self._finish_at = [NEVER] * engine.n_workers
         self._running: list[Any] = [None] * engine.n_workers
-        # by execution: how far it is when something leaves, and that; the next one last
-        self._places: dict[int, list[tuple[int, Callable[[], None]]]] = {}
 
     def waits(self, work: Work) -> None:
         """Note that an execution has a worker and, for now, needs nothing."""
         begins(self._state, self._machine, work.x, 0, -1)
 
-    def begin(
-        self, execution: Any, takes: int, leaving: list[tuple[int, Callable[[], None]]],
-    ) -> None:
+    def begin(self, execution: Any, takes: int) -> None:
         """
         Have an execution run on its worker.
 
         :param takes: how long, if nothing keeps it; of that it computes ``work.cpu_ns``.
-        :param leaving: what is to be done before its end, and how far it is then.
         """
         state, work, x = self._state, execution.work, execution.work.x
         state.x_left[x] += takes - state.x_cost[x]  # else the core cannot say how far it is
         state.x_cost[x] = takes
         begins(state, self._machine, x, takes, work.cpu_ns)
         self._running[work.worker] = execution
-        if leaving:
-            self._places[x] = sorted(leaving, key=lambda each: each[0], reverse=True)
-            self._leaves_next(x)
-
-    def _leaves_next(self, x: int) -> None:
-        """Give the machine how far an execution is when something of it leaves next."""
-        places = self._places[x]
-        self._machine.publishes_at[x] = places[-1][0] if places else NEVER
 
     def next_time(self) -> int:
         """Return when the next execution ends, or needs another resource."""
@@ -88,17 +72,10 @@ class SharedCpus:
 
     def go_on(self, now: int) -> bool:
         """Do what is due; False: there is nothing."""
-        for x, places in self._places.items():
-            if places and progress(self._state, x, now) >= places[-1][0]:
-                leaves = places.pop()[1]
-                self._leaves_next(x)
-                leaves()
-                return True
         for worker, time in enumerate(self._finish_at):
             if time <= now:
                 self._finish_at[worker] = NEVER
                 execution, self._running[worker] = self._running[worker], None
-                self._places.pop(execution.work.x, None)
                 self._ended(execution, now)
                 return True
         return False

@@ -68,7 +68,6 @@ class Timers:
         replace(Timer, 'cancel', then(self._cancelled))
         replace(Timer, 'time_until_next_call', instead(self._until_next))
         replace(Timer, 'time_since_last_call', instead(self._since_last))
-        replace(Timer, 'is_ready', instead(lambda timer: self._until_next(timer) == 0))
 
     def refresh(self, entities: Iterable[Entity]) -> None:
         """Update which timers there are."""

@@ -88,6 +88,18 @@ def test_the_same_again_and_with_other_workers(bag, graph):
     assert rerun(bag, graph, [Filter, Sink], workers=7).digest == first.digest
 
 
+def test_processes_share_one_interpreter(bag, graph):
+    """A node that computes in Python waits for others, also if declared for another process."""
+    text = GRAPH.replace('execution_time: 10ms', 'execution_time: 90ms, holds_interpreter: true')
+    text = text.replace('execution_time: 5ms', 'execution_time: 60ms, holds_interpreter: true')
+    graph.write_text(text)
+    expected = rerun(bag, graph, [Filter, Sink])
+    graph.write_text(f'{text}\nprocesses:\n  one: [/driver, /filter]\n  two: [/sink]\n')
+    found = rerun(bag, graph, [Filter, Sink])
+    assert found.digest == expected.digest
+    assert [warning.split(': ')[1] for warning in found.warnings] == ['processes']
+
+
 def test_what_cannot_be_in_time_is_demoted(bag, graph):
     graph.write_text(GRAPH.replace('deadline: 50ms', 'deadline: 14ms').replace(
         'dag: main', 'dag: main, on_late: demote'))
@@ -129,25 +141,19 @@ def test_recorded_times_come_from_a_trace(bag, graph, tmp_path):
         100.0 * i + 10 for i in range(20)]
 
 
-class Early(Durations):
-    """Each callback takes 10 ms and publishes 4 ms before its end."""
-
-    def execution(self, dag: int, vertex: int, release: int) -> int:
-        return 10 * MS
-
-    def transport(self, dag: int, before: int, after: int, release: int) -> int:
-        return -4 * MS
-
-
+@pytest.mark.parametrize(('delay_ms', 'out_ms'), [(4, 24), (-4, 20)])
 @pytest.mark.parametrize('cpus', [None, 2])
-def test_what_was_published_early_leaves_early(bag, graph, cpus):
+def test_messages_leave_at_the_end_and_take_their_recorded_time(
+        bag, graph, cpus, delay_ms, out_ms):
+    """Each callback takes 10 ms; what was recorded before a callback's end arrives at the end."""
     task_set = load(str(graph))
-    times = Early(Tables.build(task_set), Load([], [], [], [], [0], [0]), recorded=True)
+    recorded = Load([0], [0], [0], [0, 10 * MS, 10 * MS], [0], [0],
+                    delays=[0, delay_ms * MS], delay_base=[0], delay_stride=[0])
+    times = Durations(Tables.build(task_set), recorded, recorded=True)
     result = Rerun(MessageBag(bag), times, task_set, Settings(workers=2, cpus=cpus)).run(
         lambda: programs([Filter, Sink]))
-    assert [time for time, _ in published(result, '/filtered')][:2] == [6, 106]
-    # Nobody takes it in this DAG: it leaves at the end.
-    assert [time for time, _ in published(result, '/out')][:2] == [16, 116]
+    assert [time for time, _ in published(result, '/filtered')][:2] == [10, 110]
+    assert [time for time, _ in published(result, '/out')][:2] == [out_ms, 100 + out_ms]
 
 
 # --- timers, seeds, what is kept -----------------------------------------------------------------

@@ -143,7 +143,7 @@ def test_threads_of_nodes_are_in_virtual_time_too(bag, graph):
 
 # --- actions -------------------------------------------------------------------------------------
 
-def fibonacci() -> Node:
+def fibonacci(**more: Any) -> Node:
     """Return a node with an action that feeds back each 10 ms, and may be cancelled."""
     node = rclpy.create_node('fibonacci')
 
@@ -161,7 +161,7 @@ def fibonacci() -> Node:
 
     node.server = ActionServer(
         node, Fibonacci, 'fibonacci', execute, callback_group=ReentrantCallbackGroup(),
-        cancel_callback=lambda goal: CancelResponse.ACCEPT)
+        cancel_callback=lambda goal: CancelResponse.ACCEPT, **more)
     return node
 
 
@@ -185,6 +185,21 @@ def test_an_action(bag, graph):
             (310.0, True), (320.0, [0, 1, 1]), (330.0, [0, 1, 1, 2]), (340.0, [0, 1, 1, 2, 3]),
             (340.0, (GoalStatus.STATUS_SUCCEEDED, [0, 1, 1, 2, 3]))]
         assert not result.warnings
+
+
+def test_results_of_actions_expire(bag, graph):
+    async def take(node, number):
+        if number == 3:
+            node.goal = await node.client.send_goal_async(Fibonacci.Goal(order=3))
+        if number in (3, 9, 11):
+            node.note((await node.goal.get_result_async()).status)
+
+    def fill(node):
+        node.client = ActionClient(node, Fibonacci, 'fibonacci')
+
+    seen, _ = run_filter(bag, graph, take, lambda: fibonacci(result_timeout=0.7), fill=fill)
+    assert seen == [(340.0, GoalStatus.STATUS_SUCCEEDED), (910.0, GoalStatus.STATUS_SUCCEEDED),
+                    (1110.0, GoalStatus.STATUS_UNKNOWN)]
 
 
 # --- programs ------------------------------------------------------------------------------------
@@ -274,18 +289,18 @@ def test_who_is_there_is_known_at_once(bag, graph):
 
     def take(node, number):
         if number == 1:
-            node.note(dict(node.get_topic_names_and_types())['/names'])
-            node.note((node.count_publishers('names'), node.count_subscribers('/names'),
-                       node.get_node_names()))
+            node.note((node.count_publishers('names'), node.count_subscribers('/names')))
+            node.get_node_names()
 
     def other():
         node = rclpy.create_node('other')
         node.create_subscription(String, '/names', lambda message: None, 10)
         return node
 
-    seen, _ = run_filter(bag, graph, take, other, fill=fill)
-    assert seen == [(0.0, 1), (100.0, ['std_msgs/msg/String']),
-                    (100.0, (1, 1, ['filter', 'other']))]
+    seen, result = run_filter(bag, graph, take, other, fill=fill)
+    assert seen == [(0.0, 1), (100.0, (1, 2))]  # the rerun subscribes, too
+    warning, = result.warnings
+    assert warning.startswith('/filter: get_node_names asks the middleware')
 
 
 # --- what blocks ---------------------------------------------------------------------------------
