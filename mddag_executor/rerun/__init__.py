@@ -14,8 +14,8 @@ In a test::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, ExitStack, suppress
 import os
 from typing import Any
 
@@ -63,7 +63,8 @@ def rerun(
     :param graph: the declaration: a file, or a task set.
     :param nodes: as for ``mddag run --node``; or classes of nodes, or functions that return nodes.
     :param times: ``recorded``, ``declared``, or a file (see ``inputs.open_input``).
-    :param output: a file that gets the outputs as a bag; ``trace``: one that gets the run.
+    :param output: a file that gets the outputs as a bag; ``trace``: one that gets the run. A run
+        that fails leaves no file.
     :param overwrite: whether ``output`` and ``trace`` may replace files that are there.
     :param patience_s: a callback or thread that waits for this long, and not in virtual time, ends
         the run.
@@ -84,11 +85,24 @@ def rerun(
     messages, taken = open_input(
         os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)
     with ExitStack() as files:
+        parts = {name: files.enter_context(_made_whole(path)) for name, path in written}
         run = Rerun(
             messages, taken, task_set, settings,
-            None if output is None else files.enter_context(open(output, 'wb')),
-            None if trace is None else os.fspath(trace))
+            None if output is None else files.enter_context(open(parts['output'], 'wb')),
+            parts.get('trace'))
         return run.run(lambda: programs(nodes, ros_args))
+
+
+@contextmanager
+def _made_whole(path: str) -> Iterator[str]:
+    """Give a file name that becomes `path` if the block ends well; otherwise the file vanishes."""
+    part = f'{path}.{os.getpid()}.part'
+    try:
+        yield part
+        os.replace(part, path)
+    finally:
+        with suppress(FileNotFoundError):
+            os.remove(part)
 
 
 def programs(nodes: Sequence[NodeSpec], ros_args: Sequence[str] = ()) -> list[Program]:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from mddag_executor.executor.compat import BareExecutor
+from mddag_executor.executor.compat import alive, BareExecutor
 from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.tasks import make_task, Unclaimed
 from mddag_executor.executor.work import QuickCallback, Work
@@ -36,7 +36,8 @@ class NodeHolder(BareExecutor):
 
     def ordered_nodes(self) -> list[Node]:
         """Return the nodes, by name: their order must not depend on the machine."""
-        return sorted(self.get_nodes(), key=lambda node: node.get_fully_qualified_name())
+        nodes = filter(alive, self.get_nodes())  # a callback may have destroyed its node
+        return sorted(nodes, key=lambda node: node.get_fully_qualified_name())
 
     def wake(self) -> None:
         """Take note that entities have come or gone."""

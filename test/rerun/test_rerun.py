@@ -14,6 +14,7 @@ from mddag_executor.core import Tables
 from mddag_executor.replay import replay
 from mddag_executor.rerun import (
     assert_same,
+    CallbackFailed,
     compare,
     programs,
     rerun,
@@ -279,6 +280,24 @@ def test_a_changed_constant_is_found(bag, graph, tmp_path, monkeypatch):
 
 
 # --- what goes wrong -----------------------------------------------------------------------------
+
+def test_a_failed_run_leaves_the_files_of_before(bag, graph, tmp_path):
+    files = {name: tmp_path / f'{name}.mcap' for name in ('output', 'trace')}
+    run_filter(bag, graph, **files)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(CallbackFailed, match='it raised ZeroDivisionError: .* at 0.000000 s'):
+        run_filter(bag, graph, lambda node, number: 1 / number, overwrite=True, **files)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_callback_destroys_its_node(bag, graph):
+    def take(node, number):
+        node.note(number)
+        if number == 3:
+            node.destroy_node()
+
+    seen, _ = run_filter(bag, graph, take)
+    assert [number for _, number in seen] == [0, 1, 2, 3]
 
 
 def test_a_circle_that_takes_no_time(bag, graph):
