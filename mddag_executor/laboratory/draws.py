@@ -26,7 +26,7 @@ import zlib
 from mddag_executor.core import rad_offsets
 from mddag_executor.errors import InputError
 from mddag_executor.simulate.workload import check_execution_times
-from msg_graph import Dag, TaskSet
+from msg_graph import Dag, ExecutionTime, TaskSet
 from msg_graph.duration import DAY
 from msg_graph.model import topological_order
 import numpy as np
@@ -40,6 +40,7 @@ Bools = npt.NDArray[np.bool_]
 Samples = Mapping[str, Times]
 
 _REMEDY = "write one array of measured ns for each 'node:callback' with numpy.savez"
+_DAMAGED = (TypeError, ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error)
 
 
 def read_samples(task_set: TaskSet, path: Path, name: str) -> dict[str, Times]:
@@ -51,36 +52,26 @@ def read_samples(task_set: TaskSet, path: Path, name: str) -> dict[str, Times]:
     """
     try:
         archive = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, zipfile.BadZipFile):
-        raise InputError(name, 'this is no .npz file', _REMEDY) from None
+    except _DAMAGED:
+        archive = None
     if not isinstance(archive, np.lib.npyio.NpzFile):
-        raise InputError(name, 'this is a single array, not an .npz file', _REMEDY)
-    samples: dict[str, Times] = {}
+        raise InputError(name, 'this is no .npz file', _REMEDY)
     with archive:
-        for vertex in task_set.vertices:
-            key = vertex.callback.key
-            if key not in samples:
-                samples[key] = _whole_us(_array(archive, key, name), key, name)
-    return samples
+        return {key: _read_values(archive, key, name)
+                for key in {vertex.callback.key: None for vertex in task_set.vertices}}
 
 
-def _array(archive: Any, key: str, name: str) -> npt.NDArray[Any]:
+def _read_values(archive: Any, key: str, name: str) -> Times:
     if key not in archive.files:
         raise InputError(name, f'no values for {key}', 'add an array of that name')
     try:
-        values: npt.NDArray[Any] = archive[key]
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error):
-        raise InputError(name, f'the values of {key} are damaged or no numbers', _REMEDY) from None
-    return values
-
-
-def _whole_us(values: npt.NDArray[Any], key: str, name: str) -> Times:
-    if values.ndim != 1 or values.size == 0 or values.dtype.kind not in 'iuf':
-        raise InputError(name, f'the values of {key} are no list of numbers', _REMEDY)
-    if not bool(np.all((values >= 0) & (values < DAY))):  # false for what is no number
+        values = archive[key].astype(np.float64)
+    except _DAMAGED:
+        values = np.empty(0)
+    # false for what is no number
+    if values.ndim != 1 or not values.size or not np.all((values >= 0) & (values < DAY)):
         raise InputError(
-            name, f'a value of {key} is negative or no number of ns below one day',
-            'take it out of the array')
+            name, f'the values of {key} are damaged, or no list of ns below one day', _REMEDY)
     return np.maximum(np.ceil(values / 1000).astype(np.int64), 1) * 1000
 
 
@@ -97,8 +88,8 @@ class Draws:
         if samples is None:
             check_execution_times(task_set, ', or give --samples FILE.npz')
         self._pickers: list[Callable[[Floats], Times]] = [
-            partial(_from_table, vertex.callback.execution_time) if samples is None
-            else partial(_from_measured, samples[vertex.callback.key])
+            partial(_from_table, vertex.callback.execution_time)  # type: ignore[arg-type]
+            if samples is None else partial(_from_measured, samples[vertex.callback.key])
             for vertex in task_set.vertices]
 
     def times(self, first: int, count: int) -> Times:
@@ -118,18 +109,8 @@ def _from_measured(values: Times, uniform: Floats) -> Times:
     return values[(uniform * len(values)).astype(np.int64)]
 
 
-def _from_table(table: Any, uniform: Floats) -> Times:
-    """Do what ``ExecutionTime.draw`` does for many numbers, with the same results to the bit."""
-    percent = np.array(table.percent, dtype=np.float64)
-    quantiles = np.array(table.quantiles_ns, dtype=np.int64)
-    if len(percent) == 1:
-        return np.full(uniform.shape, max(1, int(quantiles[0])), dtype=np.int64)
-    at = np.clip(uniform * 100.0, percent[0], percent[-1])
-    above = np.clip(np.searchsorted(percent, at, side='right'), 1, len(percent) - 1)
-    low, high = percent[above - 1], percent[above]
-    first, second = quantiles[above - 1], quantiles[above]
-    drawn = np.rint(first + (second - first) * (at - low) / (high - low)).astype(np.int64)
-    return np.maximum(drawn, 1)
+def _from_table(table: ExecutionTime, uniform: Floats) -> Times:
+    return np.array([max(1, table.draw(share)) for share in uniform.tolist()], dtype=np.int64)
 
 
 def _by_dag(task_set: TaskSet, times: Times) -> Iterator[tuple[Dag, Times]]:

@@ -134,7 +134,7 @@ def open_input(
     elif os.path.isdir(times) or _begins_as_mcap(times):
         taken = _recorded(open_recording(times, task_set, times), task_set)
     else:
-        with open(times, encoding='utf-8') as file:
+        with open(times, 'rb') as file:
             taken = _fixed(task_set, read_execution_times(task_set, file.read(), times))
     messages = MessageBag(path, name)
     if processes:

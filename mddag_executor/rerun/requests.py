@@ -66,6 +66,7 @@ class Requests:
         # clients and servers of actions with their names, by the id of their handles
         self._actions: dict[int, tuple[str, Any]] = {}
         self._result_timeout_ns: dict[int, int] = {}  # by the id of a server's handle
+        self._ended_goals: set[bytes] = set()
 
     def refresh(self, entities: dict[int, Entity]) -> None:
         """Update which entities there are, by the id of those of rclpy."""
@@ -248,9 +249,12 @@ class Requests:
         timeout_ns = self._result_timeout_ns[id(handle)]
         at = self._loop.now + timeout_ns
         if timeout_ns >= 0 and at < self._loop.end:
-            ended = [info for info, status in goal_states(server)
-                     if status > GoalStatus.STATUS_CANCELING]
-            self._loop.at(at, TIMER, self._expire, server, ended)
+            ended = {
+                bytes(info.goal_id.uuid): info for info, status in goal_states(server)
+                if status > GoalStatus.STATUS_CANCELING}
+            new = [info for goal, info in ended.items() if goal not in self._ended_goals]
+            self._ended_goals |= ended.keys()
+            self._loop.at(at, TIMER, self._expire, server, new)
 
     def _expire(self, server: Any, ended: list[Any]) -> None:
         expired = [info for info in ended if has_result(server, info)]

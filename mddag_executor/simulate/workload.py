@@ -68,7 +68,9 @@ def draw_execution_times(
     return [[draw(vertex) for vertex in dag.vertices] for dag in task_set.dags]
 
 
-def read_execution_times(task_set: TaskSet, text: str, name: str) -> list[list[int]]:
+def read_execution_times(
+    task_set: TaskSet, text: str | bytes, name: str
+) -> list[list[int]]:
     """
     Read fixed execution times: JSON ``{"DAG": {"/node:callback": microseconds, …}, …}``.
 
@@ -77,10 +79,9 @@ def read_execution_times(task_set: TaskSet, text: str, name: str) -> list[list[i
     """
     try:
         data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(name, f'not JSON ({error.msg})', _FORMAT, error.lineno) from None
-    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
-        raise InputError(name, f'not usable JSON ({error})', _FORMAT) from None
+    except (ValueError, RecursionError) as error:  # also what is no text
+        raise InputError(
+            name, f'not usable JSON ({error})', _FORMAT, getattr(error, 'lineno', None)) from None
     if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
         raise InputError(name, 'not an object of objects', _FORMAT)
     known = {dag.name for dag in task_set.dags}

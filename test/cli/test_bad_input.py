@@ -93,7 +93,7 @@ def files(tmp_path_factory):
      'no_times.yaml:6: /n:t (and 2 more callbacks) declares no execution_time: add one'),
     ('graph from-caret times.json', 'times.json: this is not an architecture file of CARET: '),
     # execution times
-    ('simulate g.yaml --execution-times no.json', 'no.json:1: not JSON ('),
+    ('simulate g.yaml --execution-times no.json', 'no.json:1: not usable JSON ('),
     ('simulate g.yaml --execution-times list.json', 'list.json: not an object of objects: write'),
     ('simulate g.yaml --execution-times typo.json', "typo.json: DAG 'oen' is not in g.yaml: its"),
     ('simulate g.yaml --execution-times few.json', 'few.json: no execution time for /n:x of DAG '),

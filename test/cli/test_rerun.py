@@ -25,6 +25,7 @@ def drive(tmp_path_factory):
     folder = tmp_path_factory.mktemp('rerun')
     for name in ('graph.yaml', 'robot.py'):
         shutil.copy(EXAMPLE / name, folder)
+    (folder / 'binary').write_bytes(b'\xff')
     mddag(folder, 'simulate', 'graph.yaml', '--duration', '5s', '--trace', 'releases.mcap')
     mddag(folder, 'rerun', 'releases.mcap', 'graph.yaml', '--node', 'robot:Lidar', '-o',
           'drive.mcap')
@@ -178,6 +179,7 @@ def test_where_hashes_cannot_be_fixed_that_is_said(hashes, options):
     (('drive.mcap', 'graph.yaml', *NODES, '--times', 'recorded'),
      '--times recorded: drive.mcap is a bag'),
     (('drive.mcap', 'graph.yaml', *NODES, '--times', 'none.json'), 'none.json: '),
+    (('drive.mcap', 'graph.yaml', *NODES, '--times', 'binary'), 'binary: not usable JSON'),
     (('drive.mcap', 'graph.yaml', *NODES, '--expect', 'none.mcap'), 'none.mcap: '),
     (('drive.mcap', 'graph.yaml', *NODES, '-o', '/nowhere/out.mcap'), 'there is no directory'),
     (('drive.mcap', 'graph.yaml', *NODES, '--policy', 'edf'), "policy 'edf': there is no such"),

@@ -12,11 +12,9 @@ from mddag_executor.errors import InputError
 from mddag_executor.laboratory.acceptance import Acceptance, BINS, bins_of, wilson
 from mddag_executor.laboratory.draws import Draws, feasible, read_samples, utilisations
 from mddag_executor.laboratory.shares import Dice, dirichlet_rescale
-from msg_graph import ExecutionTime, loads, TaskSet
+from msg_graph import loads
 import numpy as np
 import pytest
-
-from ..core.task_sets import examples
 
 GRAPH = """\
 mddag: 1
@@ -38,29 +36,15 @@ def task_set():
     return loads(GRAPH, 'graph.yaml')
 
 
-def table(values: list[int], percent: list[float]) -> TaskSet:
-    text = GRAPH.replace('{quantiles_us: [5, 9]}', str({
-        'quantiles_us': [value / 1000 for value in values], 'percent': percent}))
-    return loads(text, 'graph.yaml')
-
-
-@examples(100)
-@given(st.lists(st.integers(1, 10 ** 9), min_size=1, max_size=6),
-       st.lists(st.floats(0, 100), min_size=6, max_size=6, unique=True),
-       st.integers(0, 2 ** 64 - 1))
-def test_tables_are_drawn_as_one_by_one(values, percent, seed):
-    """The columns hold to the bit what ExecutionTime.draw gives for the same numbers."""
-    quantiles = sorted(values)
-    task_set = table(quantiles, sorted(percent)[:len(quantiles)])
-    drawn = Draws(task_set, seed).times(5, 4)
+def test_a_run_is_drawn_by_its_number(task_set):
+    """Run 5 + r of a seed has the numbers of Philox with the key (seed, 5 + r)."""
+    drawn = Draws(task_set, 2 ** 64 - 1).times(5, 4)
     for row in range(4):
-        generator = np.random.Generator(
-            np.random.Philox(key=np.array([seed, 5 + row], dtype=np.uint64)))
-        for vertex, u in zip(task_set.vertices, generator.random(4)):
-            times = vertex.callback.execution_time
-            assert isinstance(times, ExecutionTime)
-            column = task_set.vertices.index(vertex)
-            assert drawn[row, column] == max(1, times.draw(float(u)))
+        key = np.array([2 ** 64 - 1, 5 + row], dtype=np.uint64)
+        uniform = np.random.Generator(np.random.Philox(key=key)).random(4)
+        times = [vertex.callback.execution_time for vertex in task_set.vertices]
+        assert drawn[row].tolist() == [
+            time.draw(float(u)) for time, u in zip(times, uniform, strict=True)]
 
 
 def npz(**arrays: object) -> bytes:
@@ -76,21 +60,15 @@ def npy(array: object) -> bytes:
 
 
 GOOD = {'/n:a': [1], '/n:b': [1], '/n:c': [1]}
+UNFIT = ([], [[1]], ['x'], np.array([{}]), [1, -1], [1, float('nan')], [10 ** 18])
 
 
 @pytest.mark.parametrize(('content', 'problem'), [
-    (b'', 'this is no .npz file'),
-    (b'mddag: 1', 'this is no .npz file'),
-    (npz(**GOOD)[:-30], 'this is no .npz file'),
-    (npy([1, 2]), 'this is a single array, not an .npz file'),
+    *((content, 'this is no .npz file')
+      for content in (b'', b'mddag: 1', npz(**GOOD)[:-30], npy([1, 2]))),
     (npz(**{'/n:a': [1], '/n:b': [1]}), 'no values for /n:c: add an array of that name'),
-    (npz(**{**GOOD, '/n:b': []}), 'the values of /n:b are no list of numbers'),
-    (npz(**{**GOOD, '/n:b': [[1]]}), 'the values of /n:b are no list of numbers'),
-    (npz(**{**GOOD, '/n:b': ['x']}), 'the values of /n:b are no list of numbers'),
-    (npz(**{**GOOD, '/n:b': np.array([{}])}), 'the values of /n:b are damaged or no numbers'),
-    (npz(**{**GOOD, '/n:b': [1, -1]}), 'a value of /n:b is negative or no number of ns'),
-    (npz(**{**GOOD, '/n:b': [1, float('nan')]}), 'a value of /n:b is negative or no number'),
-    (npz(**{**GOOD, '/n:b': [10 ** 18]}), 'a value of /n:b is negative or no number of ns'),
+    *((npz(**{**GOOD, '/n:b': values}), 'the values of /n:b are damaged, or no list of ns')
+      for values in UNFIT),
 ])
 def test_bad_samples(task_set, tmp_path, content, problem):
     path = tmp_path / 'samples.npz'
