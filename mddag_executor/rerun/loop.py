@@ -44,6 +44,7 @@ from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.jobs import Origin
 from mddag_executor.executor.work import Destroyed, QuickCallback, Refused, Work
+from mddag_executor.hosting.loading import describe
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.run_threads import RunThreads
@@ -276,12 +277,13 @@ class Loop:
         except Refused:
             self.engine.refused(work, self.now)
             return False
-        except SystemExit as error:
-            if error.code not in (None, 0):
+        except (Exception, SystemExit) as error:
+            if isinstance(error, SystemExit) and error.code in (None, 0):
+                self.stop()
+            elif self.run_threads.over:
+                self.warn(f'{entity.name}: after the end of the run it raised {describe(error)}')
+            else:
                 raise CallbackFailed(entity.name, error, self.now - self.start) from error
-            self.stop()
-        except Exception as error:
-            raise CallbackFailed(entity.name, error, self.now - self.start) from error
         finally:
             self._current = None
         return True
