@@ -104,7 +104,7 @@ class Loop:
         that still wait.
     :ivar now: the virtual time.
     :ivar callbacks: how many callbacks have run.
-    :ivar computing: shares CPUs and the interpreter, if they are limited.
+    :ivar shared_cpus: shares CPUs and the interpreter, if they are limited.
     :ivar changed: whether there may be new entities, or some are gone.
     :ivar warnings: what is not the same in each run, or doubtful, one line each.
     :ivar on_ended: called with rclpy's entity when its callback has ended.
@@ -122,7 +122,7 @@ class Loop:
         self.callbacks = 0
         self.changed = True
         self.warnings: list[str] = []
-        self.computing: SharedCpus | None = None
+        self.shared_cpus: SharedCpus | None = None
         self.on_ended: Callable[[Any], object] = lambda entity: None
         self.run_threads = RunThreads(self._step, over)
         self._times = times
@@ -185,7 +185,7 @@ class Loop:
         self.refresh_now()
         if self._stopped:
             return False
-        if self.computing is not None and self.computing.go_on(self.now):
+        if self.shared_cpus is not None and self.shared_cpus.go_on(self.now):
             return True
         events, now = self._events, self.now
         if events and events[0][0] <= now:
@@ -201,9 +201,9 @@ class Loop:
         if work is not None:
             self._execute(work)
             return True
-        if self.computing is not None:
-            self.computing.share(now)
-            if self.computing.go_on(now):
+        if self.shared_cpus is not None:
+            self.shared_cpus.share(now)
+            if self.shared_cpus.go_on(now):
                 return True
         if engine.has_waiting and engine.interpreter_holder() and now >= self._ask_at:
             self._ask_at = now + POLL_NS
@@ -222,16 +222,19 @@ class Loop:
         if deadline is not None and deadline <= self.end and (
                 next_at is None or deadline < next_at):
             next_at = deadline
-        if self.computing is not None:
-            ends = max(self.now + 1, self.computing.next_time())
+        if self.shared_cpus is not None:
+            ends = max(self.now + 1, self.shared_cpus.next_time())
             if ends < NEVER and (next_at is None or ends < next_at):
                 next_at = ends
+        check_at = max(self.now + 1, self.engine.check_at)
+        if check_at < NEVER and (next_at is None or check_at < next_at):
+            next_at = check_at
         if next_at is None or next_at > self.end + DRAIN_NS:
             return False
         self.now = next_at
         self._at_once = 0
-        if self.computing is not None:
-            self.computing.settle(next_at)
+        if self.shared_cpus is not None:
+            self.shared_cpus.settle(next_at)
         return True
 
     # --- callbacks -------------------------------------------------------------------------------
@@ -248,8 +251,8 @@ class Loop:
         release = 0 if origin is None else self.engine.release_of(work)
         execution = Execution(work, self.now, work.worker, work.worker + 1, origin, release)
         takes = self._execution_time(work, origin, release)
-        if self.computing is not None:
-            self.computing.waits(work)
+        if self.shared_cpus is not None:
+            self.shared_cpus.waits(work)
         if not self._call(execution):
             return
         self.callbacks += 1
@@ -257,8 +260,8 @@ class Loop:
             work.cpu_ns = max(0, self._times.computed(origin.dag, origin.vertex, release))
             work.entity.habit.took(takes, takes)
         waited = self.now > execution.start
-        if self.computing is not None and execution.worker >= 0 and not waited:
-            self.computing.begin(execution, takes)
+        if self.shared_cpus is not None and execution.worker >= 0 and not waited:
+            self.shared_cpus.begin(execution, takes)
             return
         end = max(self.now, execution.start + takes)
         order = (work.worker << _WORKER_BITS) + next(self._order)

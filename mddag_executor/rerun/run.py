@@ -173,7 +173,7 @@ class Rerun:
             if (self._times.holds(place) if vertex.callback.holds_interpreter is None
                 else vertex.callback.holds_interpreter)}
         if settings.cpus is not None or self._holders:
-            loop.computing = SharedCpus(
+            loop.shared_cpus = SharedCpus(
                 engine, settings.cpus, self._times.python, loop.start, loop.ended)
         self._registry = Registry(task_set, engine, engine.leave_group)
         self._messages = Messages(loop, recording, self._times, self._outputs, task_set)

@@ -109,6 +109,37 @@ def test_what_cannot_be_in_time_is_demoted(bag, graph):
     assert sink['demoted'] == sink['late'] == 20
 
 
+RESERVED = """\
+mddag: 1
+workers: 1
+nodes:
+  - node: /filter
+    callbacks:
+      - {name: important, subscription: /points, period: 100ms, dag: important, importance: high,
+         execution_time: 60ms, deadline: 70ms, on_late: demote}
+      - {name: refused, subscription: /others, period: 140ms, dag: refused, importance: low,
+         execution_time: 70ms, deadline: 140ms, on_late: demote}
+"""
+
+
+def test_refused_work_runs_when_what_it_waits_for_does_not_come(tmp_path, graph):
+    """The worker is reserved for a job that must start by 610 ms; its message is lost."""
+    graph.write_text(RESERVED)
+    bag = write_bag(tmp_path / 'in.mcap', sorted([
+        *((i * 100 * MS, '/points', Header()) for i in range(6)),
+        *((time * MS, '/others', String()) for time in (565, 2000))], key=lambda each: each[0]))
+
+    def node():
+        made = rclpy.create_node('filter')
+        made.create_subscription(Header, '/points', lambda message: None, 10)
+        publisher = made.create_publisher(String, '/done', 10)
+        made.create_subscription(String, '/others', publisher.publish, 10)
+        return made
+
+    done = published(rerun(bag, graph, [node]), '/done')
+    assert [round(time) for time, _ in done] == [680, 2070]
+
+
 def test_outputs_are_a_bag_that_others_read(bag, graph, tmp_path):
     from rosbags.highlevel import AnyReader
     out = tmp_path / 'out.mcap'
