@@ -99,20 +99,12 @@ def test_shapes(count, part, edges, ors, seed):
 
 @pytest.mark.parametrize(('change', 'problem'), [
     ({'sinks': (9, 9), 'vertices': (9, 9)}, '--sinks 9: a DAG of 9 vertices has at most 8: '),
-    ({'sinks': (2, 2), 'vertices': (1, 9)}, '--sinks 2: a DAG of 1 vertex has at most 1: '),
     ({'dags': (0, 3)}, '--dags 0: it is out of range: give 1 to 1000'),
     ({'dags': (5, 3)}, '--dags 5:3: the first is larger: write the smaller one first'),
-    ({'vertices': (1, 10 ** 9)}, '--vertices 1e+09: it is out of range: '),
     ({'tightness': (0.0, 1.0)}, '--tightness 0: it is out of range: give above 0 to 1000'),
-    ({'tightness': (1.0, float('nan'))}, '--tightness nan: it is out of range: '),
-    ({'edge_probability': 1.5}, '--edge-probability 1.5: it is out of range: give 0 to 1'),
-    ({'or_share': -0.1}, '--or-share -0.1: it is out of range: '),
-    ({'utilisation': 0.0}, '--utilisation 0: it is out of range: give above 0 to 100'),
     ({'utilisation': 0.9, 'dags': (3, 3)},
      '--utilisation 0.9: a load of 3.6 does not fit into 3 DAGs of at most 1: '),
     ({'utilisation': 1e-6}, '--utilisation 1e-06: it leaves a callback less than 1 us: give more'),
-    ({'periods_ns': (5,)}, '--periods 5: it is out of range: '),
-    ({'workers': 0}, '--workers 0: it is out of range: '),
 ])
 def test_impossible(change, problem):
     with pytest.raises(UsageError) as caught:

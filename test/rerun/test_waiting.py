@@ -312,11 +312,6 @@ def test_who_is_there_is_known_at_once(bag, graph):
 # --- what blocks ---------------------------------------------------------------------------------
 
 
-def sleep_for_ever() -> None:
-    while True:
-        time.sleep(0.01)  # the line that is named
-
-
 def read_for_ever() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         device.bind(('127.0.0.1', 0))
@@ -339,8 +334,7 @@ def compute_for_ever() -> None:
 
 
 @pytest.mark.parametrize(('function', 'what'), [
-    (sleep_for_ever, 'blocking'), (read_for_ever, 'blocking'), (pass_on_for_ever, 'blocking'),
-    (compute_for_ever, 'computing')])
+    (read_for_ever, 'blocking'), (pass_on_for_ever, 'blocking'), (compute_for_ever, 'computing')])
 def test_a_thread_that_keeps_virtual_time_from_passing_is_named(
         tmp_path, bag, graph, function, what):
     """In a process of its own: the thread never ends."""
