@@ -226,8 +226,8 @@ class Loop:
             ends = max(self.now + 1, self.shared_cpus.next_time())
             if ends < NEVER and (next_at is None or ends < next_at):
                 next_at = ends
-        check_at = max(self.now + 1, self.engine.check_at)
-        if check_at < NEVER and (next_at is None or check_at < next_at):
+        check_at = self.engine.check_at
+        if self.now < check_at < NEVER and (next_at is None or check_at < next_at):
             next_at = check_at
         if next_at is None or next_at > self.end + DRAIN_NS:
             return False
