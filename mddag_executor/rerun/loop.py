@@ -38,7 +38,6 @@ import itertools
 import math
 from typing import Any
 
-from mddag_executor.core import NEVER
 from mddag_executor.core.state import DONE
 from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.engine import Engine
@@ -104,14 +103,13 @@ class Loop:
         that still wait.
     :ivar now: the virtual time.
     :ivar callbacks: how many callbacks have run.
-    :ivar shared_cpus: shares CPUs and the interpreter, if they are limited.
     :ivar changed: whether there may be new entities, or some are gone.
     :ivar warnings: what is not the same in each run, or doubtful, one line each.
     :ivar on_ended: called with rclpy's entity when its callback has ended.
     """
 
     def __init__(
-        self, engine: Engine, times: Durations, start: int, end: int,
+        self, engine: Engine, times: Durations, cpus: SharedCpus, start: int, end: int,
         pauses: Sequence[tuple[int, int]], refresh: Callable[[], None],
         begin: Callable[[], None], over: Callable[[], None],
     ) -> None:
@@ -122,7 +120,8 @@ class Loop:
         self.callbacks = 0
         self.changed = True
         self.warnings: list[str] = []
-        self.shared_cpus: SharedCpus | None = None
+        self._cpus = cpus
+        cpus.settle(start)
         self.on_ended: Callable[[Any], object] = lambda entity: None
         self.run_threads = RunThreads(self._step, over)
         self._times = times
@@ -185,9 +184,9 @@ class Loop:
         self.refresh_now()
         if self._stopped:
             return False
-        if self.shared_cpus is not None and self.shared_cpus.go_on(self.now):
-            return True
         events, now = self._events, self.now
+        if self._end_finished():
+            return True
         if events and events[0][0] <= now:
             _, _, _, function, args = heappop(events)
             function(*args)
@@ -201,14 +200,19 @@ class Loop:
         if work is not None:
             self._execute(work)
             return True
-        if self.shared_cpus is not None:
-            self.shared_cpus.share(now)
-            if self.shared_cpus.go_on(now):
-                return True
+        self._cpus.share(now)
+        if self._end_finished():
+            return True
         if engine.has_waiting and engine.interpreter_holder() and now >= self._ask_at:
             self._ask_at = now + POLL_NS
             self.at(self._ask_at, TIMER, lambda: None)  # it may overtake by then
         return self._advance(deadline)
+
+    def _end_finished(self) -> bool:
+        execution = self._cpus.take_finished(self.now)
+        if execution is not None:
+            self._end(execution, self.now)
+        return execution is not None
 
     def refresh_now(self) -> None:
         """Bring up to date which entities there are, if any may have come or gone."""
@@ -218,23 +222,18 @@ class Loop:
 
     def _advance(self, deadline: int | None) -> bool:
         """Let time go on to what comes next."""
-        next_at = self._events[0][0] if self._events else None
-        if deadline is not None and deadline <= self.end and (
-                next_at is None or deadline < next_at):
-            next_at = deadline
-        if self.shared_cpus is not None:
-            ends = max(self.now + 1, self.shared_cpus.next_time())
-            if ends < NEVER and (next_at is None or ends < next_at):
-                next_at = ends
-        check_at = self.engine.check_at
-        if self.now < check_at < NEVER and (next_at is None or check_at < next_at):
-            next_at = check_at
-        if next_at is None or next_at > self.end + DRAIN_NS:
+        next_at = max(self.now + 1, self._cpus.next_time())
+        if self._events:
+            next_at = min(next_at, self._events[0][0])
+        if deadline is not None and deadline <= self.end:
+            next_at = min(next_at, deadline)
+        if self.engine.check_at > self.now:  # else a worker is needed first
+            next_at = min(next_at, self.engine.check_at)
+        if next_at > self.end + DRAIN_NS:
             return False
         self.now = next_at
         self._at_once = 0
-        if self.shared_cpus is not None:
-            self.shared_cpus.settle(next_at)
+        self._cpus.settle(next_at)
         return True
 
     # --- callbacks -------------------------------------------------------------------------------
@@ -251,21 +250,19 @@ class Loop:
         release = 0 if origin is None else self.engine.release_of(work)
         execution = Execution(work, self.now, work.worker, work.worker + 1, origin, release)
         takes = self._execution_time(work, origin, release)
-        if self.shared_cpus is not None:
-            self.shared_cpus.waits(work)
+        self._cpus.waits(work)
         if not self._call(execution):
             return
         self.callbacks += 1
         if origin is not None and takes:
             work.cpu_ns = max(0, self._times.computed(origin.dag, origin.vertex, release))
             work.entity.habit.took(takes, takes)
-        waited = self.now > execution.start
-        if self.shared_cpus is not None and execution.worker >= 0 and not waited:
-            self.shared_cpus.begin(execution, takes)
+        if execution.worker >= 0 and self.now == execution.start:  # it has not waited
+            self._cpus.begin(execution, takes)
             return
         end = max(self.now, execution.start + takes)
         order = (work.worker << _WORKER_BITS) + next(self._order)
-        heappush(self._events, (end, ENDED, order, self.ended, (execution, end)))
+        heappush(self._events, (end, ENDED, order, self._end, (execution, end)))
 
     def _call(self, execution: Execution) -> bool:
         """Run an execution's callback; return whether it ran."""
@@ -302,7 +299,7 @@ class Loop:
             return 0
         return self._times.execution(origin.dag, origin.vertex, release)
 
-    def ended(self, execution: Execution, now: int) -> None:
+    def _end(self, execution: Execution, now: int) -> None:
         """End an execution in virtual time, or suspend it."""
         work, engine, worker = execution.work, self.engine, execution.worker
         start, waits_for = execution.start, execution.waits_for

@@ -156,9 +156,15 @@ class Rerun:
             record=None if writer is None else writer.record)
         engine.other_processes = self._other_processes = OtherProcesses(
             task_set, engine.tables, engine.scheduler, engine.jobs, task_set.dags)
+        # the callbacks that hold the interpreter, declared or else recorded
+        self._holders = {
+            vertex.callback.key for place, vertex in enumerate(task_set.vertices)
+            if (self._times.holds(place) if vertex.callback.holds_interpreter is None
+                else vertex.callback.holds_interpreter)}
+        cpus = SharedCpus(engine, settings.cpus, bool(self._holders) and self._times.python)
         self._loop = loop = Loop(
-            engine, self._times, recording.start, recording.end, recording.pauses, self._refresh,
-            self._begin, self._over)
+            engine, self._times, cpus, recording.start, recording.end, recording.pauses,
+            self._refresh, self._begin, self._over)
         self._holder = NodeHolder(context, loop)
         self._recorder = None
         if writer is not None:
@@ -167,14 +173,6 @@ class Rerun:
                 MAX_ACTIVE_JOBS, _TraceTime(loop), writer, settings.cpus or 0,
                 on_late=engine.on_late)
             self._recorder.entities((), [self._holder.task_entity])
-        # the callbacks that hold the interpreter, declared or else recorded
-        self._holders = {
-            vertex.callback.key for place, vertex in enumerate(task_set.vertices)
-            if (self._times.holds(place) if vertex.callback.holds_interpreter is None
-                else vertex.callback.holds_interpreter)}
-        if settings.cpus is not None or self._holders:
-            loop.shared_cpus = SharedCpus(
-                engine, settings.cpus, self._times.python, loop.start, loop.ended)
         self._registry = Registry(task_set, engine, engine.leave_group)
         self._messages = Messages(loop, recording, self._times, self._outputs, task_set)
         self._requests = Requests(loop, self._holder)

@@ -8,7 +8,6 @@ The machine is the simulator's (``simulate.machine``): it decides which executio
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from mddag_executor.core import NEVER
@@ -23,19 +22,12 @@ class SharedCpus:
 
     :param cpus: how many there are; None: as many as are needed.
     :param python: whether all need the interpreter at their end: see ``Machine``.
-    :param start: when the run begins.
-    :param ended: called with what was given to ``begin`` when it ends, and the time.
     """
 
-    def __init__(
-        self, engine: Engine, cpus: int | None, python: bool, start: int,
-        ended: Callable[[Any, int], None],
-    ) -> None:
+    def __init__(self, engine: Engine, cpus: int | None, python: bool) -> None:
         self._engine = engine
         self._state = engine.scheduler.state
         self._machine = new_machine(engine.tables, self._state, cpus, python)
-        settle(self._state, self._machine, start)
-        self._ended = ended
         self._finish_at = [NEVER] * engine.n_workers
         self._running: list[Any] = [None] * engine.n_workers
 
@@ -70,12 +62,11 @@ class SharedCpus:
             if execution is None:
                 self._finish_at[worker] = NEVER
 
-    def go_on(self, now: int) -> bool:
-        """Do what is due; False: there is nothing."""
+    def take_finished(self, now: int) -> Any:
+        """Return an execution that has finished, of the first such worker; None: none has."""
         for worker, time in enumerate(self._finish_at):
             if time <= now:
                 self._finish_at[worker] = NEVER
                 execution, self._running[worker] = self._running[worker], None
-                self._ended(execution, now)
-                return True
-        return False
+                return execution
+        return None
