@@ -5,12 +5,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 import random
 import threading
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from mddag_executor import open_recording
 from mddag_executor.core import Tables
+from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.replay import replay
 from mddag_executor.rerun import (
     assert_same,
@@ -22,18 +25,22 @@ from mddag_executor.rerun import (
     Result,
 )
 from mddag_executor.rerun.durations import Durations
-from mddag_executor.rerun.inputs import MessageBag
+from mddag_executor.rerun.inputs import MessageBag, open_input
 from mddag_executor.rerun.run import Rerun, Settings
-from mddag_executor.simulate import Load
-from msg_graph import load
+from mddag_executor.simulate import draw_execution_times, Load, periodic_load, simulate
+from mddag_executor.simulate import Settings as SimulatorSettings
+from msg_graph import load, loads
+from msg_graph.duration import parse_duration
 import numpy
 import pytest
 import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Float64, Header, String
+import yaml
 
 from .helpers import GRAPH, MS, run_filter, START, write_bag
 
@@ -174,18 +181,60 @@ def test_recorded_times_come_from_a_trace(bag, graph, tmp_path):
 
 
 @pytest.mark.parametrize(('delay_ms', 'out_ms'), [(4, 24), (-4, 20)])
-@pytest.mark.parametrize('cpus', [None, 2])
-def test_messages_leave_at_the_end_and_take_their_recorded_time(
-        bag, graph, cpus, delay_ms, out_ms):
+def test_messages_leave_at_the_end_and_take_their_recorded_time(bag, graph, delay_ms, out_ms):
     """Each callback takes 10 ms; what was recorded before a callback's end arrives at the end."""
     task_set = load(str(graph))
     recorded = Load([0], [0], [0], [0, 10 * MS, 10 * MS], [0], [0],
                     delays=[0, delay_ms * MS], delay_base=[0], delay_stride=[0])
     times = Durations(Tables.build(task_set), recorded, recorded=True)
-    result = Rerun(MessageBag(bag), times, task_set, Settings(workers=2, cpus=cpus)).run(
+    result = Rerun(MessageBag(bag), times, task_set, Settings(workers=2)).run(
         lambda: programs([Filter, Sink]))
     assert [time for time, _ in published(result, '/filtered')][:2] == [10, 110]
     assert [time for time, _ in published(result, '/out')][:2] == [out_ms, 100 + out_ms]
+
+
+def make_node(declared: dict[str, Any]) -> Node:
+    """Return a node whose callbacks only publish what they declare."""
+    node = rclpy.create_node(declared['node'][1:])
+    for callback in declared['callbacks']:
+        publishers = [node.create_publisher(Header, topic, 100)
+                      for topic in callback.get('publishes', ())]
+
+        def publish(message=None, publishers=publishers):
+            for publisher in publishers:
+                publisher.publish(Header())
+
+        group = ReentrantCallbackGroup()
+        if 'timer' in callback:
+            node.create_timer(parse_duration(callback['timer']) / 1e9, publish, group)
+        else:
+            node.create_subscription(
+                Header, callback['subscription'], publish, 100, callback_group=group)
+    return node
+
+
+@pytest.mark.parametrize('seed', range(9))
+def test_callbacks_start_and_end_as_in_the_simulator(tmp_path, monkeypatch, seed):
+    cpus, workers = (None, 1, 2)[seed % 3], 1 + seed % 2
+    declared = yaml.safe_load(generate(Options(
+        dags=(2, 4), vertices=(1, 5), or_share=1.0, utilisation=0.5, workers=workers, seed=seed)))
+    for place, node in enumerate(declared['nodes']):
+        for callback in node['callbacks']:
+            callback['holds_interpreter'] = (place + seed) % 2 == 0
+    task_set = loads(yaml.safe_dump(declared, sort_keys=False))
+    simulated = simulate(
+        task_set, periodic_load(task_set, draw_execution_times(task_set, 0), 1000 * MS),
+        SimulatorSettings('rad', workers, 1000 * MS, cpus=cpus, on_late='demote'),
+        log=True).log
+    bag = write_bag(tmp_path / 'in.mcap', [(t * MS, '/unused', String()) for t in (0, 1000)])
+    monkeypatch.setattr(Durations, 'first_release', lambda times, dag: START)
+    trace = str(tmp_path / 'run.mcap')
+    Rerun(*open_input(bag, task_set), task_set, Settings(workers, cpus), trace=trace).run(
+        lambda: programs([partial(make_node, node) for node in declared['nodes']]))
+    found = [(int(row[name]) - START, int(row['vertex']), int(row['job']))
+             for row in open_recording(trace).executions for name in ('start', 'end')]
+    assert sorted(each for each in found if each[0] < 1000 * MS) == sorted(
+        (time, vertex, job) for time, _, _, _, vertex, job in simulated if time < 1000 * MS)
 
 
 # --- timers, seeds, what is kept -----------------------------------------------------------------
