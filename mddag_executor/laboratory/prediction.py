@@ -100,7 +100,7 @@ class Predictor:
 
 
 def cost_of(tally: Tally) -> Cost:
-    """Return what is compared of two placements (rule 5)."""
+    """Return what is compared of two placements (rule 4)."""
     dags = tally.result()['dags']
     worst = max((sink['response_ns']['max'] / sink['relative_deadline_ns']
                  for dag in dags.values() for sink in dag['sinks'].values()
