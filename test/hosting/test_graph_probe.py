@@ -66,6 +66,7 @@ def test_a_real_system(system, make_node, ros_context):
     draft = draft_of(found)
     draft.nodes = [node for node in draft.nodes if node.name in ('/camera', '/deep/worker')]
     text = declaration_of(draft)
+    assert f'{MARK}: is this a timer? Proposed: ' in text
     accepted = re.sub(rf'^( +)# (\w+: .*# {MARK})', r'\1\2', text, flags=re.MULTILINE)
     task_set = loads(accepted)
     assert task_set.callback('/camera:callback_0').publishes == ('/image',)

@@ -84,6 +84,12 @@ def test_the_rate_of_messages(got, said):
         assert found[0].text == f'/b:m got {got} messages, and by the declaration 50 were due'
 
 
+def test_few_messages_prove_nothing():
+    seen = observed(jobs=9)
+    seen.got['/b:m'] = 3
+    assert drift(TASKS, seen) == []
+
+
 def test_what_an_overload_skips_and_drops_is_no_difference():
     seen = observed()
     seen.ran['/a:t'] = seen.got['/b:m'] = 20     # of 50 releases

@@ -50,6 +50,9 @@ named_paths:
   - callback_group_type: reentrant
     callback_group_name: /b/callback_group_1
     callback_names: [/b/callback_1, /b/callback_2]
+  - callback_group_type: mutually_exclusive
+    callback_group_name: /b/callback_group_2
+    callback_names: [/b/callback_2]
   variable_passings:
   - callback_name_write: /b/callback_1
     callback_name_read: /b/callback_0
@@ -104,6 +107,7 @@ def test_message_contexts_become_queue_edges():
   subscribes:
   - {topic_name: /x, callback_name: /b/callback_0}
   - {topic_name: /y, callback_name: UNDEFINED}
+  - {topic_name: /chained, callback_name: UNDEFINED}
   message_contexts:
   - context_type: use_latest_message
     subscription_topic_name: /x
@@ -112,7 +116,7 @@ def test_message_contexts_become_queue_edges():
     subscription_topic_name: /y
     publisher_topic_name: /z
   - context_type: callback_chain
-    subscription_topic_name: /x
+    subscription_topic_name: /chained
     publisher_topic_name: /z
 """
     text = declaration_from_caret(
