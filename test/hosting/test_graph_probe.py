@@ -55,7 +55,11 @@ def test_a_real_system(system, make_node, ros_context):
     with Spinning(MultiDeadlineExecutor(diagnostics_period='100ms', context=ros_context)):
         assert wait_for(lambda: [
             name for name in watcher.get_node_names() if 'mddag_diagnostics' in name])
-        found = probe(2.5, ticks.append)
+        for seconds in (2.5, 10.0, 30.0):   # a busy machine discovers late
+            ticks.clear()
+            found = probe(seconds, ticks.append)
+            if '/deep/worker' in found.nodes and found.seen.get('/image', Seen()).interval_ns():
+                break
     assert set(found.nodes) >= {'/camera', '/deep/worker'}
     assert not [name for name in found.nodes if 'mddag' in name]
     assert not [warning for warning in found.warnings if 'rate' in warning]
