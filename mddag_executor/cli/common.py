@@ -261,8 +261,10 @@ def output_folder(path: str, names: Collection[str]) -> Iterator[Path]:
         yield part
         remove_results(target, names)
         part.rename(target)
-    except BaseException:
+    except BaseException as error:
         remove_results(part, names)
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = path  # a full disk
         raise
 
 

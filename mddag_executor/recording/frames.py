@@ -131,6 +131,6 @@ def write_tables(recording: Recording, folder: Path) -> list[str]:
     """Write each table as a Parquet file into an existing folder; return the file names."""
     import pyarrow.parquet
     for name in TABLES:
-        pyarrow.parquet.write_table(
-            arrow_table(recording, name), folder / f'{name}.parquet', compression='zstd')
+        with (folder / f'{name}.parquet').open('wb') as file:
+            pyarrow.parquet.write_table(arrow_table(recording, name), file, compression='zstd')
     return list(TABLES)

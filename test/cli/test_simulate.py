@@ -102,3 +102,20 @@ def test_a_disk_that_gets_full_leaves_nothing_and_promises_nothing(graph):
         f'error: out.mcap: writing failed ({os.strerror(errno.EFBIG)}): free space, then try '
         'again\n')
     assert not [path for path in graph.parent.iterdir() if path != graph]
+
+
+@pytest.mark.parametrize('command', [
+    'export run.mcap -o tables/', 'export run.mcap -o out.csv', 'generate --sets 3 -o sets'])
+def test_a_disk_that_gets_full_is_one_line(graph, call, command):
+    if 'tables' in command:
+        pytest.importorskip('pyarrow', reason='pyarrow is not installed')
+    assert call('simulate', graph, '--duration', '2s', '--trace', 'run.mcap').returncode == 0
+    before = sorted(graph.parent.iterdir())
+    done = subprocess.run(
+        [sys.executable, '-m', 'mddag_executor', *command.split()], cwd=graph.parent, text=True,
+        capture_output=True, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, 1_000)))
+    assert done.returncode == 2
+    assert done.stderr.startswith(f'error: {command.split()[-1]}: ')
+    assert done.stderr.count('\n') == 1 and 'ile too large' in done.stderr
+    assert sorted(graph.parent.iterdir()) == before
