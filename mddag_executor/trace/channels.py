@@ -34,6 +34,7 @@ import numpy as np
 
 Decoder = tuple[Event, Callable[[bytes], Event]]
 
+UNDEFINED = 'the channel is not defined'
 _TOPIC = re.compile(r'/trace/([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)')
 _NO_SCHEMA = Schema(0, b'', '', '')
 _T = TypeVar('_T', Channel, Schema)
@@ -52,11 +53,10 @@ class Topic(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """An event's full name, and the names and types of its fields without the preamble."""
+    """An event's full name, and the names of its fields without the preamble."""
 
     name: str
     fields: tuple[str, ...]
-    types: tuple[FieldType, ...] = ()
 
 
 class Channels:
@@ -125,7 +125,7 @@ class Channels:
 
         :raises ValueError: if the channel cannot be decoded
         """
-        decoder = self._decoders.get(number, 'the channel is not defined')
+        decoder = self._decoders.get(number, UNDEFINED)
         if isinstance(decoder, str):
             raise ValueError(decoder)
         return decoder
@@ -143,8 +143,7 @@ class Channels:
         _check(fields, table)
         preamble = [field for field, _ in PREAMBLE]
         wanted = table if self._as_table and table else fields
-        kept = tuple(field for field in wanted if field not in preamble)
-        layout = Layout(name, kept, tuple(fields[field] for field in kept if field in fields))
+        layout = Layout(name, tuple(field for field in wanted if field not in preamble))
         self.fields.setdefault(name, layout.fields)
 
         head = (name if self._as_table else layout,)

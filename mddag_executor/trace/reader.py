@@ -12,12 +12,13 @@ from array import array
 from collections.abc import Callable, Collection, Iterable, Iterator
 import os
 import stat
+import struct
 from typing import Any, BinaryIO, TypeVar
 import warnings
 import weakref
 
 from mddag_executor.text import counted
-from mddag_executor.trace.blocks import Block, Damage, open_data, read_summary, scan
+from mddag_executor.trace.blocks import open_data, read_summary, Summary
 from mddag_executor.trace.channels import Channels, Topic
 from mddag_executor.trace.errors import TraceError, TraceWarning
 from mddag_executor.trace.events import Batch, Event
@@ -27,7 +28,7 @@ from mddag_executor.trace.schema import PROCESS
 
 _REMEDY = 'check its name, that you may read it, and the disk it is on'
 _T = TypeVar('_T')
-_Way = Callable[[Reading, BinaryIO], Iterator[_T]]
+_Way = Callable[[Reading], Iterator[_T]]
 
 
 def _opened(path: str) -> BinaryIO:
@@ -52,22 +53,18 @@ def _unreadable(path: str, error: OSError) -> TraceError:
 
 def no_trace(folder: str) -> TraceError:
     """
-    Return the error for a folder that was given instead of a trace; it lists the contents.
+    Return the error for a folder that was given instead of a trace.
 
     :raises OSError: if the folder cannot be read
     """
-    names = sorted(os.listdir(folder))
-    traces = [name for name in names if name.endswith('.mcap')]
-    if not names:
-        return TraceError(folder, 'is an empty folder', 'give a trace, an .mcap file')
     if any('metadata' in files for _, _, files in os.walk(folder)):
         return TraceError(folder, 'is a folder that LTTng recorded to',
                           "make a trace of it with 'mddag import ctf'")
-    if traces:
-        more = f' or one of {len(traces) - 1} more in it' if len(traces) > 1 else ''
-        return TraceError(
-            folder, 'is a folder', f'give the trace {os.path.join(folder, traces[0])}{more}')
-    return TraceError(folder, 'is a folder without a trace', 'give a trace, an .mcap file')
+    traces = sorted(name for name in os.listdir(folder) if name.endswith('.mcap'))
+    if not traces:
+        return TraceError(folder, 'is a folder without a trace', 'give a trace, an .mcap file')
+    return TraceError(folder, 'is a folder', f'give the trace {os.path.join(folder, traces[0])}'
+                      + ' or another one in it' * (len(traces) > 1))
 
 
 class TraceReader:
@@ -86,7 +83,6 @@ class TraceReader:
         self.fields: dict[str, tuple[str, ...]] = {}
         self.topics: dict[int, Topic] = {}
         self.times = array('Q')
-        self._scanned: tuple[list[Block], Damage | None] | None = None
         stream = self._stream = _opened(self.path)
         self._closing = weakref.finalize(self, stream.close)
         try:
@@ -94,7 +90,13 @@ class TraceReader:
             self._start, library = open_data(stream, self.path)
             #: Whether this program wrote the file.
             self.written_here = library == LIBRARY
-            self._finished, self._summary = read_summary(stream, size)
+            #: Whether the summary at the end is there and sound; or a finished file has none.
+            self._finished = True
+            self._summary: Summary | None = None
+            try:
+                self._summary = read_summary(stream, size)
+            except (ValueError, struct.error):
+                self._finished = False
         except OSError as error:
             raise _unreadable(self.path, error) from None
 
@@ -156,16 +158,14 @@ class TraceReader:
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the undecoded messages of some topics, in the order of the file."""
-        return self._read(Channels(set(), True), lambda reading, stream: reading.messages_of(
-            stream, topics, self.times))
+        return self._read(
+            Channels(set(), True), lambda reading: reading.messages_of(topics, self.times))
 
     def _read(self, channels: Channels, way: _Way[_T]) -> Iterator[_T]:
         self.fields, self.topics = channels.fields, channels.topics
         try:
-            if self._scanned is None:
-                self._scanned = scan(self._stream, self._start, self._size)
-            reading = Reading(self.path, channels, *self._scanned)
-            yield from way(reading, self._stream)
+            reading = Reading(self.path, channels, self._stream, self._start, self._size)
+            yield from way(reading)
         except OSError as error:
             raise _unreadable(self.path, error) from None
         for text in (self._missing(reading), reading.undecoded(), reading.impossible_times()):
@@ -179,18 +179,15 @@ class TraceReader:
         stated = (f'the file says that it holds {_contents(summary.chunks, summary.messages)}'
                   if summary else 'what there should be is not known')
         if damage:
-            used = f'used all of it, {found}' if damage.offset >= self._size else (
-                f'used {found} before it, not the {self._size - damage.offset} bytes from there '
-                'on')
-            at = '' if damage.offset >= self._size else f' (at byte {damage.offset})'
-            return f'{self.path}: {damage.what}{at}: {used}; {stated}'
+            lost = self._size - damage.offset
+            more = f', not the {lost} bytes from there on' if lost else ''
+            return (f'{self.path}: {damage.what} (at byte {damage.offset}): used {found} before '
+                    f'it{more}; {stated}')
         if not self._finished:
             return (f'{self.path}: the summary at the end is damaged or missing: used all of the '
                     f'data, {found}')
         if summary and (summary.chunks, summary.messages) != (reading.chunks, reading.messages):
-            what = 'are missing' if summary.messages >= reading.messages else \
-                'were put in or doubled after it was finished'
-            return f'{self.path}: events {what}: found and used {found}; {stated}'
+            return f'{self.path}: events are missing or doubled: used {found}; {stated}'
         return None
 
 

@@ -6,15 +6,14 @@ Reads a trace file once, in the order of the file or of time.
 Theory of operation
 -------------------
 1. The file is read block by block (``blocks``), some megabytes at a time.  Message indexes locate
-   the messages of each channel.  They are used if they match the data: every message has its
-   channel, and messages and definitions together fill the data.  Otherwise the records are read
-   one after the other.
+   the messages.  They are used if messages are there that do not overlap.  The records between
+   these, or all records, are read one after the other.
 2. In the order of the file the events of one thread are ordered.  Those of different threads are
    not: a thread appends an event after it has read its clock.
 3. In the order of time all events are in memory.  Events of equal time are in the order of the
    file.
-4. A block is used only if everything before it in the file is valid.  So the beginning of a
-   damaged recording is used.  ``damage`` has the damage; it is not raised.
+4. A block is used only if all blocks before it are valid.  So the beginning of a damaged
+   recording is used.  ``damage`` has the damage; it is not raised.
 5. An undecodable message in a valid block is skipped and counted.  In the order of time, events
    before 1970 or after 2116 are skipped, too: a simulation of them would never end.
 """
@@ -22,7 +21,6 @@ Theory of operation
 from __future__ import annotations
 
 from array import array
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from operator import itemgetter
@@ -32,22 +30,23 @@ from typing import Any, BinaryIO, NamedTuple
 from mcap.opcode import Opcode
 from mddag_executor.text import counted
 from mddag_executor.trace import records
-from mddag_executor.trace.blocks import Block, Damage, load
+from mddag_executor.trace.blocks import blocks, Damage
 from mddag_executor.trace.cdr import ENCAPSULATION
-from mddag_executor.trace.channels import Channels, Topic
+from mddag_executor.trace.channels import Channels, Topic, UNDEFINED
 from mddag_executor.trace.events import Batch, Column, Event, FIELDS, Ints, rows_at
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
 _BATCH_BYTES = 1 << 21
 _HEAD = np.dtype({
-    'names': ['opcode', 'length', 'channel', 'log_time', 'publish_time', 'encapsulation'],
-    'formats': ['u1', '<u8', '<u2', '<u8', '<u8', '<u2'], 'offsets': [0, 1, 9, 15, 23, 31],
-    'itemsize': 33})
+    'names': ['opcode', 'length', 'channel', 'log_time', 'publish_time'],
+    'formats': ['u1', '<u8', '<u2', '<u8', '<u8'], 'offsets': [0, 1, 9, 15, 23],
+    'itemsize': 31})
 """The begin of a message's record."""
 _CONTENT = records.RECORD.size
-_LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as read by _HEAD
-_INDEX_HEAD = struct.Struct('<BQHI')     # opcode, length, channel, bytes of entries
+_ENCAPSULATION = np.dtype('<u2')
+_LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as read by _ENCAPSULATION
+_INDEX_HEAD = 6         # bytes: channel, size of the entries
 _INDEX_ENTRY = np.dtype([('time', '<u8'), ('offset', '<u8')])
 
 
@@ -62,33 +61,15 @@ class Message(NamedTuple):
 
 class _Loaded(NamedTuple):
     """
-    The data of some blocks, the begin of each block, and the end.
+    The data of some blocks.
 
-    The buffer is larger than the data and is reused for the next blocks.
+    :ivar data: their records.
+    :ivar at: positions of the messages in the data, ascending; ``heads``: their heads.
     """
 
-    blocks: list[Block]
-    data: bytearray
-    begins: list[int]
-    indexes: list[bytes]
-
-    @property
-    def end(self) -> int:
-        """Return the end of the data."""
-        return self.begins[-1]
-
-    def block_at(self, position: int) -> Block:
-        """Return the block of a position in the data."""
-        return self.blocks[bisect_right(self.begins, position) - 1]
-
-    def until(self, offset: int) -> _Loaded:
-        """Return the same without the blocks from a position in the file on."""
-        count = sum(block.offset < offset for block in self.blocks)
-        return _Loaded(self.blocks[:count], self.data, self.begins[:count + 1], self.indexes)
-
-
-_Places = dict[int, tuple[Ints, Any]]
-"""By channel the positions of its message records in the data, ascending, and their heads."""
+    data: bytes
+    at: Ints
+    heads: Any
 
 
 class Reading:
@@ -96,218 +77,129 @@ class Reading:
     One pass over a file: its data, and the unusable parts.
 
     :param channels: decides which messages are decoded.
-    :param damage: the damage that ends the blocks.
+    :param start: start of the data section; ``size``: size of the file.
+    :ivar damage: the damage that ends the data, if any.
     """
 
     def __init__(
-        self, path: str, channels: Channels, blocks: Sequence[Block], damage: Damage | None
+        self, path: str, channels: Channels, stream: BinaryIO, start: int, size: int
     ) -> None:
         self.chunks = 0             # used
         self.messages = 0           # in used chunks, of all channels
-        self.damage = damage
-        self._path, self._channels, self._blocks = path, channels, blocks
+        self.damage: Damage | None = None
+        self._path, self._channels = path, channels
+        self._blocks = blocks(stream, start, size)
         self._undecoded: Counter[str] = Counter()       # by topic and reason
         self._left_out: list[int] = []      # impossible times
         self._place = 0             # of the next batch in the order of the file
-        self._used = 0              # blocks
-        self._buffer = bytearray()
 
-    def by_file(self, stream: BinaryIO) -> Iterator[Batch]:
+    def by_file(self) -> Iterator[Batch]:
         """Yield the events in the order of the file."""
-        for loaded, heads in self._messages(stream):
-            yield self._decoded(loaded, heads)
+        for loaded in self._messages():
+            yield self._decoded(loaded)
 
-    def by_time(self, stream: BinaryIO) -> Iterator[Event]:
+    def by_time(self) -> Iterator[Event]:
         """Yield the events in the order of time."""
-        found = [event for batch in self.by_file(stream) for event in batch]
+        found = [event for batch in self.by_file() for event in batch]
         possible = [event for event in found if 0 <= event[1] < NEVER]
         if len(possible) < len(found):
             self._left_out = [event[1] for event in found if not 0 <= event[1] < NEVER]
         yield from sorted(possible, key=itemgetter(1))
 
-    def messages_of(
-        self, stream: BinaryIO, topics: Collection[str], times: array[int]
-    ) -> Iterator[Message]:
+    def messages_of(self, topics: Collection[str], times: array[int]) -> Iterator[Message]:
         """Yield the messages of some topics; add the times of all messages to ``times``."""
         known = self._channels.topics
-        for loaded, by_channel in self._messages(stream):
-            at, heads = _in_order(loaded, by_channel)
-            unknown = at[~np.isin(heads['channel'], list(known))]
-            if len(unknown):
-                self._end(Damage('a message is of no channel',
-                                 loaded.block_at(int(unknown[0])).offset))
-                at, heads = at[at < unknown[0]], heads[at < unknown[0]]
+        for data, at, heads in self._messages():
             times.frombytes(heads['log_time'].tobytes())
+            undefined = heads['channel'][~np.isin(heads['channel'], list(known))]
+            self._undecoded.update(
+                f'channel {channel}: {UNDEFINED}' for channel in undefined.tolist())
             wanted = np.isin(heads['channel'], [n for n in known if known[n].name in topics])
-            for start, (_, length, channel, log_time, publish_time, _) in zip(
+            for start, (_, length, channel, log_time, publish_time) in zip(
                     at[wanted].tolist(), heads[wanted].tolist()):
                 yield Message(known[channel], log_time, publish_time,
-                              bytes(loaded.data[start + FIELDS - 4:start + _CONTENT + length]))
+                              data[start + FIELDS - 4:start + _CONTENT + length])
 
     # --- positions of messages -------------------------------------------------------------------
 
-    def _messages(self, stream: BinaryIO) -> Iterator[tuple[_Loaded, _Places]]:
-        """Yield the data of some blocks, and by channel the positions of its messages."""
-        while self._used < len(self._blocks):
-            loaded = self._load(stream)
-            while loaded.blocks:
-                try:
-                    found = self._located(loaded)
-                    break
-                except Damage as damage:
-                    self._end(damage)
-                    loaded = loaded.until(damage.offset)
-            else:
-                return
-            self._used += len(loaded.blocks)
-            self.chunks += sum(block.chunk for block in loaded.blocks)
-            self.messages += sum(len(at) for at, _ in found.values())
-            yield loaded, found
-            self._place += loaded.end
-
-    def _end(self, damage: Damage) -> None:
-        """Ignore all data from the damage on."""
-        # the traceback would keep the data in memory
-        self.damage, damage.__context__ = damage.with_traceback(None), None
-        self._blocks = [block for block in self._blocks if block.offset < damage.offset]
-
-    def _load(self, stream: BinaryIO) -> _Loaded:
-        """Return the data of the next blocks."""
-        blocks, begins = list[Block](), [0]
-        for block in self._blocks[self._used:]:
-            if blocks and begins[-1] + block.size > _BATCH_BYTES:
-                break
-            blocks.append(block)
-            begins.append(begins[-1] + block.size)
-        # a head can be read at any record, even a short one
-        room = begins[-1] + _HEAD.itemsize
-        if len(self._buffer) < room:
-            self._buffer.clear()    # frees its memory: batches that refer to it are over
-            try:
-                self._buffer = bytearray(room)
-            except MemoryError:
-                self._end(Damage('a chunk does not fit into the memory', blocks[0].offset))
-                return _Loaded([], self._buffer, [0], [])
-        loaded = _Loaded(blocks, self._buffer, begins, [])
-        view = memoryview(self._buffer)
-        for block, begin, end in zip(blocks, begins, begins[1:]):
-            try:
-                loaded.indexes.append(load(stream, block, view[begin:end]))
-            except Damage as damage:
-                self._end(damage)
-                return loaded.until(damage.offset)
-        return loaded
-
-    def _located(self, loaded: _Loaded) -> _Places:
-        """
-        Return by channel the positions of its messages.
-
-        :raises Damage: if the records are invalid.
-        """
-        found = self._by_index(loaded)
-        if found is not None:
-            return found
-        walked: dict[int, list[int]] = {}
-        for begin, end in zip(loaded.begins, loaded.begins[1:]):
-            for channel, at in self._walk(loaded, begin, end):
-                walked.setdefault(channel, []).append(at)
-        places = {channel: np.array(at, dtype=np.int64) for channel, at in walked.items()}
-        return {channel: (at, rows_at(loaded.data, _HEAD, at)) for channel, at in places.items()}
-
-    def _by_index(self, loaded: _Loaded) -> _Places | None:
-        """Return positions from the message indexes; None if these do not fit (rule 1)."""
-        entries: dict[int, list[tuple[int, bytes]]] = {}
-        for begin, index in zip(loaded.begins, loaded.indexes):
-            end = 0
-            while end < len(index):
-                _, length, channel, size = _INDEX_HEAD.unpack_from(index, end)
-                first = end + _INDEX_HEAD.size
-                end += _CONTENT + length
-                if size % _INDEX_ENTRY.itemsize or first + size != end:
-                    return None
-                entries.setdefault(channel, []).append((begin, index[first:end]))
-        found: _Places = {}
-        total = 0
-        for channel, parts in entries.items():
-            at = np.frombuffer(b''.join(part for _, part in parts), _INDEX_ENTRY)['offset']
-            at = at.astype(np.int64) + np.repeat(
-                [begin for begin, _ in parts],
-                [len(part) // _INDEX_ENTRY.itemsize for _, part in parts])
-            if not len(at):
-                continue
-            if (at[1:] <= at[:-1]).any() or at[0] < 0 or at[-1] >= loaded.end:
-                return None
-            heads = rows_at(loaded.data, _HEAD, at)
-            lengths = heads['length']
-            if (heads['opcode'] != Opcode.MESSAGE).any() or (heads['channel'] != channel).any() \
-                    or (lengths < records.MESSAGE_HEAD.size).any() or (
-                        lengths > loaded.end).any():
-                return None
-            found[channel] = at, heads
-            total += int(lengths.sum()) + _CONTENT * len(at)
-        if total == loaded.end:
-            return found
-        return found if total < loaded.end and self._define_between(loaded, found) else None
-
-    def _define_between(self, loaded: _Loaded, found: _Places) -> bool:
-        """Read definitions between messages; return whether only these are there and all fits."""
-        starts, heads = _in_order(loaded, found)
-        lengths = heads['length'].astype(np.int64)
-        ends, begins = np.append(0, starts + _CONTENT + lengths), np.append(starts, loaded.end)
-        if (ends > begins).any():
-            return False
-        gaps = np.flatnonzero(ends < begins)
-        return not any(
-            True for begin, end in zip(ends[gaps].tolist(), begins[gaps].tolist())
-            for _ in self._walk(loaded, begin, end))
-
-    def _walk(self, loaded: _Loaded, position: int, end: int) -> Iterator[tuple[int, int]]:
-        """Yield channels and positions of messages between two records; read definitions."""
-        unpack, data = records.RECORD.unpack_from, loaded.data
-        while position < end:
-            opcode, length = unpack(data, position)
-            after = position + _CONTENT + length
-            if after > end:
-                raise Damage('the records of a chunk do not fit into it',
-                             loaded.block_at(position).offset)
-            if opcode == Opcode.MESSAGE:
-                if length < records.MESSAGE_HEAD.size:
-                    raise Damage('a message is shorter than its head',
-                                 loaded.block_at(position).offset)
-                yield int.from_bytes(data[position + 9:position + 11], 'little'), position
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define(opcode, bytes(data[position + _CONTENT:after]),
-                             loaded.block_at(position))
-            position = after
-
-    def _define(self, opcode: int, content: bytes, block: Block) -> None:
+    def _messages(self) -> Iterator[_Loaded]:
+        """Yield the messages of all blocks, some blocks at a time."""
+        parts: list[bytes | bytearray] = []
+        places: list[Ints] = []
+        size = 0
         try:
-            if opcode == Opcode.SCHEMA:
-                self._channels.add_schema(content)
-            else:
-                self._channels.add_channel(content)
-        except ValueError as error:
-            raise Damage(str(error), block.offset) from None
+            for block in self._blocks:
+                try:
+                    at = self._located(block.data, block.indexes)
+                except ValueError as error:
+                    raise Damage(str(error), block.offset) from None
+                self.chunks += block.is_chunk
+                self.messages += len(at)
+                parts.append(block.data)
+                places.append(at + size)
+                size += len(block.data)
+                if size >= _BATCH_BYTES:
+                    yield _joined(parts, places)
+                    self._place += size
+                    parts, places, size = [], [], 0
+        except Damage as damage:
+            self.damage = Damage(damage.what, damage.offset)    # no traceback: it keeps the data
+        if parts:
+            yield _joined(parts, places)
+
+    def _located(self, data: bytes | bytearray, indexes: Sequence[bytes]) -> Ints:
+        """
+        Return the positions of the messages in a block, and read its definitions.
+
+        :raises ValueError: if the records are invalid.
+        """
+        at, lengths = _indexed(data, indexes)
+        # definitions are between the messages; without usable indexes all messages are, too
+        ends, begins = np.append(0, at + _CONTENT + lengths), np.append(at, len(data))
+        gaps = np.flatnonzero(ends < begins)
+        found = [position for begin, until in zip(ends[gaps].tolist(), begins[gaps].tolist())
+                 for position in self._walk(data, begin, until)]
+        return np.sort(np.append(at, found)).astype(np.int64) if found else at
+
+    def _walk(self, data: bytes | bytearray, position: int, end: int) -> Iterator[int]:
+        """Yield the positions of messages between two positions; read definitions."""
+        while position < end:
+            opcode, length = data[position], data[position + 1:position + _CONTENT]
+            after = position + _CONTENT + int.from_bytes(length, 'little')
+            if after > end:
+                raise ValueError('the records of a chunk do not fit into it')
+            if opcode == Opcode.MESSAGE:
+                if after - position < _HEAD.itemsize:
+                    raise ValueError('a message is shorter than its head')
+                yield position
+            elif opcode == Opcode.SCHEMA:
+                self._channels.add_schema(bytes(data[position + _CONTENT:after]))
+            elif opcode == Opcode.CHANNEL:
+                self._channels.add_channel(bytes(data[position + _CONTENT:after]))
+            position = after
 
     # --- contents of messages --------------------------------------------------------------------
 
-    def _decoded(self, loaded: _Loaded, found: _Places) -> Batch:
+    def _decoded(self, loaded: _Loaded) -> Batch:
         """Return the events of some blocks; count undecodable ones."""
         columns, others = [], list[tuple[int, Event]]()
-        for channel, (at, heads) in found.items():
+        order = np.argsort(loaded.heads['channel'], kind='stable')
+        every, begins = np.unique(loaded.heads['channel'][order], return_index=True)
+        for channel, mine in zip(every.tolist(), np.split(order, begins[1:])):
             if channel in self._channels.passed_over:
                 continue
+            at, heads = loaded.at[mine], loaded.heads[mine]
             fixed = self._channels.fixed.get(channel)
             lengths = heads['length'].astype(np.int64) + _CONTENT
             if fixed is not None:
-                plain = (heads['encapsulation'] == _LITTLE_ENDIAN) & (
-                    lengths >= FIELDS + fixed.kind.itemsize)
-                mine = at if plain.all() else at[plain]
+                plain = lengths >= FIELDS + fixed.kind.itemsize
+                plain[plain] = rows_at(
+                    loaded.data, _ENCAPSULATION, at[plain] + FIELDS - 4) == _LITTLE_ENDIAN
                 size = int(lengths[0]) if (lengths == lengths[0]).all() else 0
-                columns.append(Column(fixed, mine, size))
+                columns.append(Column(fixed, at[plain], size))
                 at, lengths = at[~plain], lengths[~plain]
             for start, length in zip(at.tolist(), lengths.tolist()):
-                event = self._any(channel, bytes(loaded.data[start:start + length]))
+                event = self._any(channel, loaded.data[start:start + length])
                 if event is not None:
                     others.append((start, event))
         others.sort(key=itemgetter(0))
@@ -343,7 +235,23 @@ class Reading:
                 f'most of them ({count}) of {reason}')
 
 
-def _in_order(loaded: _Loaded, found: _Places) -> tuple[Ints, Any]:
-    """Return the positions of all messages, in the order of the file, and their heads."""
-    at = np.sort(np.concatenate([*(at for at, _ in found.values()), np.empty(0, dtype=np.int64)]))
-    return at, rows_at(loaded.data, _HEAD, at)
+def _indexed(data: bytes | bytearray, indexes: Sequence[bytes]) -> tuple[Ints, Ints]:
+    """Return positions and lengths of messages by the message indexes; none if these are wrong."""
+    none = np.empty(0, dtype=np.int64)
+    try:
+        entries = [np.frombuffer(index, _INDEX_ENTRY, offset=_INDEX_HEAD) for index in indexes]
+    except ValueError:      # not a number of whole entries
+        return none, none
+    at = np.sort(np.concatenate([none, *(each['offset'].astype(np.int64) for each in entries)]))
+    if not len(at) or at[0] < 0 or at[-1] > len(data) - _HEAD.itemsize:
+        return none, none
+    heads = rows_at(data, _HEAD, at)
+    lengths = heads['length'].astype(np.int64)
+    fits = (heads['opcode'] == Opcode.MESSAGE) & (lengths >= records.MESSAGE_HEAD.size) & (
+        lengths <= len(data)) & (at + _CONTENT + lengths <= np.append(at[1:], len(data)))
+    return (at, lengths) if fits.all() else (none, none)
+
+
+def _joined(parts: Sequence[bytes | bytearray], places: Sequence[Ints]) -> _Loaded:
+    data, at = b''.join(parts), np.concatenate(places)
+    return _Loaded(data, at, rows_at(data, _HEAD, at))

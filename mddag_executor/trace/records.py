@@ -22,7 +22,6 @@ LIBRARY = 'mddag_executor'
 
 RECORD = struct.Struct('<BQ')               # opcode, length of the content
 MESSAGE_HEAD = struct.Struct('<HIQQ')       # channel, sequence, log_time, publish_time
-CHUNK_HEAD = struct.Struct('<QQQI')         # start, end, size, CRC; compression and records follow
 FOOTER_CONTENT = struct.Struct('<QQI')      # summary start, summary offset start, summary CRC
 UINT32 = struct.Struct('<I')
 

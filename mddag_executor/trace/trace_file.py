@@ -119,18 +119,6 @@ def _completed(event: EventType, pack: Callable[..., bytes]) -> Callable[..., by
     return encode
 
 
-def _channels(events: Iterable[EventType]) -> dict[str, _Channel]:
-    """Return the channels by full and by short event name; of equal short names the first wins."""
-    channels: dict[str, _Channel] = {}
-    taken: set[str] = set()
-    for number, event in enumerate(events, 1):
-        channel = _Channel(event, number, _schema_name(event, taken))
-        taken.add(channel.schema_name)
-        channels[event.key] = channel
-        channels.setdefault(event.name, channel)
-    return channels
-
-
 def _schema_name(event: EventType, taken: Collection[str], number: int = 1) -> str:
     """Return a name for an event's message; used names get the provider, then numbers."""
     name = camel_case(event.name)
@@ -151,13 +139,10 @@ class TraceFile:
     `finish()`; a `with` block finishes it, or abandons it after an exception.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *,
-                 extra_events: Iterable[EventType] = (), overwrite: bool = False) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """
         Open the file.
 
-        :param extra_events: events that are not in the table, or with other fields than in the
-            table
         :param overwrite: whether an existing file may be replaced
         :raises TraceError: if the file cannot be written, or must not be replaced
         """
@@ -169,12 +154,13 @@ class TraceFile:
         #: Number of events that could not be encoded, and the reason of the first.
         self.rejected = 0
         self.rejection: str | None = None
-        events = {**EVENTS, **{event.key: event for event in extra_events}}
-        self._channels = _channels(events.values())
-        self._in_order = list(dict.fromkeys(self._channels.values()))
-        self._groups = {  # unless a caller gave one of their events other fields
-            name: Group(name, self._channels) for name, keys in GROUPS.items()
-            if all(self._channels[key].event == EVENTS[key] for key in keys)}
+        self._in_order = [_Channel(event, number, _schema_name(event, ()))
+                          for number, event in enumerate(EVENTS.values(), 1)]
+        #: By the event's full name, and by its short name.
+        self._channels = {
+            name: channel for channel in self._in_order
+            for name in (channel.event.key, channel.event.name)}
+        self._groups = {name: Group(name, self._channels) for name in GROUPS}
         self._zstd = zstandard.ZstdCompressor(level=_COMPRESSION_LEVEL)
         self._records: list[bytes] = []     # of the open chunk
         self._size = 0                      # their total size
@@ -194,7 +180,7 @@ class TraceFile:
 
     def define(self, event: EventType) -> str:
         """
-        Define a kind of event while the file is being written.
+        Define a kind of event that is not in the table, or with other fields than there.
 
         If its name is already used with other fields, its events go to another channel of the same
         topic.
@@ -217,7 +203,7 @@ class TraceFile:
         """
         Write one event.
 
-        :param event: its full name (`ros2:callback_start`), or its short one if that is unique
+        :param event: its full name (`ros2:callback_start`), or its short one if it is in the table
         :param timestamp: ns on the trace's clock
         :param vpid: process id
         :param vtid: native thread id

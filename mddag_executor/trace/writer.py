@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import atexit
 from collections import deque
-from collections.abc import Iterable
 import logging
 import os
 import threading
@@ -31,7 +30,6 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.groups import events_of
-from mddag_executor.trace.schema import EventType
 from mddag_executor.trace.trace_file import TraceFile
 
 if TYPE_CHECKING:
@@ -51,7 +49,7 @@ class TraceWriter:
 
     def __init__(self, path: str | os.PathLike[str], *, clock_offset: int | None = None,
                  flush_interval_s: float = 0.25, capacity: int = 1 << 17,
-                 extra_events: Iterable[EventType] = (), overwrite: bool = False) -> None:
+                 overwrite: bool = False) -> None:
         """
         Open the file and start the writer thread.
 
@@ -59,7 +57,6 @@ class TraceWriter:
             trace's clock counts from the epoch
         :param flush_interval_s: interval at which events are written to the operating system
         :param capacity: maximum number of events that wait for the writer thread
-        :param extra_events: events that are not in the table
         :param overwrite: whether an existing file may be replaced
         """
         if clock_offset is None:
@@ -68,7 +65,7 @@ class TraceWriter:
         self.clock_offset = clock_offset
         #: Why recording ended early; None: no error.
         self.error: TraceError | None = None
-        self._file = TraceFile(path, extra_events=extra_events, overwrite=overwrite)
+        self._file = TraceFile(path, overwrite=overwrite)
         self._interval_s = flush_interval_s
         self._pending: deque[tuple[Any, ...]] = deque()
         self._capacity = capacity       # 0: recording has ended

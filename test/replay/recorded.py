@@ -68,17 +68,18 @@ class Recorded:
 
     def write(self, but: Sequence[int] = (), stop: int | None = None) -> Path:
         """Write the file, without the events at these places in the order of time."""
-        extra = []
-        for name, fields in _MORE.items():
-            provider, _, short = name.partition(':')
-            extra.append(EventType(provider, short, tuple(
-                (field, 'int64' if field.endswith('stamp') else 'uint64') for field in fields)))
-        with TraceFile(self.path, extra_events=extra, overwrite=True) as file:
+        with TraceFile(self.path, overwrite=True) as file:
             file.define(_JAZZY)
+            keys = {}
+            for name, fields in _MORE.items():
+                provider, _, short = name.partition(':')
+                keys[name] = file.define(EventType(provider, short, tuple(
+                    (field, 'int64' if field.endswith('stamp') else 'uint64')
+                    for field in fields)))
             ordered = sorted(self._events, key=lambda event: event[0])
             for place, (time, pid, tid, name, fields) in enumerate(ordered[:stop]):
                 if place not in but:
-                    file.add(name, time, pid, tid, *fields)
+                    file.add(keys.get(name, name), time, pid, tid, *fields)
         return self.path
 
     def names(self) -> list[str]:

@@ -32,6 +32,7 @@ from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.bags import Bag
 from mddag_executor.trace import records
 from mddag_executor.trace.blocks import Content
+from mddag_executor.trace.trace_file import written
 from msg_graph import GraphError
 import pytest
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
@@ -132,19 +133,16 @@ def inside(data: bytearray, rng: random.Random) -> None:
     chunks = [span for span in spans(bytes(data)) if span[0] == Opcode.CHUNK]
     _, start, end = rng.choice(chunks)
     chunk = Chunk.read(Content(bytes(data[start + records.RECORD.size:end])))
-    begin, last, size = (
-        chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size)
-    content = bytearray(zstandard.decompress(chunk.data, size))
+    content = bytearray(zstandard.decompress(chunk.data, chunk.uncompressed_size))
     for _ in range(rng.choice((1, 1, 4))):
         where = rng.randrange(len(content))
         if rng.random() < 0.5:
             content[where] = rng.randrange(256)
         elif where + 8 <= len(content):
             struct.pack_into('<Q', content, where, rng.choice(INTERESTING))
-    packed = zstandard.compress(bytes(content))
-    data[start:end] = records.record(
-        Opcode.CHUNK, records.CHUNK_HEAD.pack(begin, last, len(content), zlib.crc32(content))
-        + records.UINT32.pack(4) + b'zstd' + struct.pack('<Q', len(packed)) + packed)
+    chunk.data, chunk.uncompressed_size = zstandard.compress(bytes(content)), len(content)
+    chunk.uncompressed_crc = zlib.crc32(content)
+    data[start:end] = written(chunk)
 
 
 def counts(result: dict[str, Any]) -> dict[str, int]:

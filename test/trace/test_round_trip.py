@@ -150,11 +150,12 @@ def test_events_beyond_the_table(tmp_path):
         # other fields for one of the table
         EventType('ros2', 'rcl_publish', (('message', 'uint64'), ('node', 'string'))),
     ]
-    with TraceFile(path, extra_events=extra, overwrite=True) as file:
-        file.add('rcl_node_init', 1, VPID, 2, 3, 4, 'name', '/')        # the table's goes first
-        file.add('ros2_caret:rcl_node_init', 2, VPID, 2, 3, -4)
-        file.add('rmw_publisher_init', 3, VPID, 2, range(16), ['a', 'b'])
-        file.add('rcl_publish', 4, VPID, 2, 7, 'n')
+    with TraceFile(path) as file:
+        keys = [file.define(event) for event in extra]
+        file.add('rcl_node_init', 1, VPID, 2, 3, 4, 'name', '/')
+        file.add(keys[0], 2, VPID, 2, 3, -4)
+        file.add(keys[1], 3, VPID, 2, range(16), ['a', 'b'])
+        file.add(keys[2], 4, VPID, 2, 7, 'n')
     reader = TraceReader(path)
     assert list(reader.events()) == [
         ('ros2:rcl_node_init', 1, VPID, 2, 3, 4, 'name', '/'),
@@ -170,7 +171,7 @@ def test_events_beyond_the_table(tmp_path):
     with AnyReader([path]) as rosbags_reader:           # two schemas of one name would fail here
         assert {connection.msgtype for connection in rosbags_reader.connections} == {
             'mddag_trace/msg/RclNodeInit', 'mddag_trace/msg/Ros2CaretRclNodeInit',
-            'mddag_trace/msg/RmwPublisherInit', 'mddag_trace/msg/RclPublish'}
+            'mddag_trace/msg/RmwPublisherInit', 'mddag_trace/msg/Ros2RclPublish'}
 
 
 def test_add_refuses_what_it_cannot_write(tmp_path):
@@ -216,11 +217,12 @@ def test_optional_fields_of_older_files(tmp_path):
     now = EVENTS['mddag:complete']
     before = EventType(now.provider, now.name, now.fields[:7])
     cases: list[tuple[Any, ...]] = [
-        ((before,), (), -1, False), ((), (), -1, False), ((), (700, True), 700, True)]
-    for events, fields, cpu_time, held in cases:
-        with TraceFile(path, extra_events=events, overwrite=True) as file:
+        (before, (), -1, False), (now, (), -1, False), (now, (700, True), 700, True)]
+    for event, fields, cpu_time, held in cases:
+        with TraceFile(path, overwrite=True) as file:
+            key = file.define(event)
             for job in range(3):
-                file.add('complete', 1000 + job, 1, 2, 5, 0, 1, job, True, 900, 0, *fields)
+                file.add(key, 1000 + job, 1, 2, 5, 0, 1, job, True, 900, 0, *fields)
         read = list(TraceReader(path).events())
         assert [event[7:] for event in read] == [
             (job, True, 900, 0, cpu_time, held) for job in range(3)]

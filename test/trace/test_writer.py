@@ -193,7 +193,7 @@ def test_a_disk_that_gets_full(tmp_path):
     assert 0 < len(there) == recorded - dropped
     assert reported == 0
     assert path.stat().st_size < 20_000         # cut back to whole chunks
-    assert len(warnings) == 1 and 'record: used all of it, ' in warnings[0]
+    assert len(warnings) == 1 and 'the file ends without a finish record' in warnings[0]
 
 
 FORGOTTEN = """
