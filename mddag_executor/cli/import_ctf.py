@@ -38,8 +38,4 @@ def main(args: argparse.Namespace) -> int:
     warn(*imported.warnings)
     say(f'{counted(imported.events, "event")} of {counted(imported.kinds, "kind")} from '
           f'{counted(len(imported.processes), "process", "processes")}: {printable(args.output)}')
-    if imported.unread:
-        named = ', '.join(f'{printable(provider)} ({count})'
-                          for provider, count in imported.unread.most_common())
-        say(f'replay does not use the events of these providers: {named}')
     return 0

@@ -9,10 +9,10 @@ Theory of operation:
    because the bindings usually belong to the system's Python and abort on some damage. Python
    interpreters are tried one after the other, the running one first, until one has the bindings.
 2. All traces of a session (processes, kernel, rotated chunks) are read as one stream in the order
-   of time.  The metadata of each trace names its session.  A folder with several sessions is
-   refused, because they may be of different runs.  Sessions of one run on several computers are
-   given one by one.  CARET's cache `caret_converted` in the session's folder is a Python pickle of
-   the same events. It is not read, because unpickling can run any code.
+   of time.  A folder with several sessions is refused, because they may be of different runs.
+   Sessions of one run on several computers are given one by one, and written one after the other;
+   readers sort events by time.  CARET's cache `caret_converted` in the session's folder is a
+   Python pickle of the same events. It is not read, because unpickling can run any code.
 3. Every event becomes one event of the trace, with all fields of its payload. An event of the
    table (`schema.EVENTS`) has the table's types for the table's fields: integer flags become bool,
    unsigned times become int64 of the same bits. Other events and fields keep their types. A name
@@ -28,8 +28,7 @@ Theory of operation:
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 import json
 import os
@@ -45,16 +44,17 @@ from typing import Any, IO, NamedTuple
 from mddag_executor.output_rules import holds_data
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.cdr import FieldType
-from mddag_executor.trace.ctf_helper import PATIENCE_S, SESSION
+from mddag_executor.trace.ctf_helper import PATIENCE_S
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.numbers import Numbers
-from mddag_executor.trace.schema import EVENTS, EventType, PREAMBLE, PROVIDERS
+from mddag_executor.trace.schema import EVENTS, EventType, PREAMBLE
 from mddag_executor.trace.trace_file import TraceFile
 
 INSTALL = 'apt install python3-bt2'
 _HELPER = Path(__file__).with_name('ctf_helper.py')
 _CACHE = 'caret_converted'
 _RECORD = 'check the recording, or record it again'
+_UNREADABLE = 'check the recording (CTF 2 needs babeltrace2 2.1), or record it again'
 
 Row = list[Any]
 
@@ -68,9 +68,7 @@ class Imported:
     processes: set[int] = field(default_factory=set)
     #: Number of events that the tracer discarded, as far as it counted them.
     discarded: int = 0
-    #: Number of events by provider that replay does not know.
-    unread: Counter[str] = field(default_factory=Counter)
-    #: Missing or changed data, one line each.
+    #: Missing data, one line each.
     warnings: list[str] = field(default_factory=list)
 
 
@@ -91,22 +89,21 @@ def import_ctf(
     """
     paths = [os.fspath(path) for path in (
         [session] if isinstance(session, (str, os.PathLike)) else session)]
-    found = [_metadata_of(path) for path in paths]
-    real = [os.path.realpath(metadata) for each in found for metadata in each]
+    found = [os.path.realpath(metadata) for path in paths for metadata in _metadata_of(path)]
     name = ', '.join(paths)
-    if len(set(real)) < len(real):
+    if len(set(found)) < len(found):
         raise TraceError(name, 'a session is named twice', 'name each once')
-    sessions = [_check_sessions(path, each) for path, each in zip(paths, found)]
-    places = {each: place for place, (_, several) in enumerate(sessions) for each in several}
     file = TraceFile(output, overwrite=overwrite)
     try:
         with file:
-            importer = _Importer(name, file, places)
-            for row in _rows(name, paths, any(is_ctf_2 for is_ctf_2, _ in sessions)):
-                importer.take(row)
-                events = importer.result.events
-                if progress is not None and row[0] == 'event' and events % 5000 == 0:
-                    progress(events)
+            importer = _Importer(name, file)
+            for path in paths:
+                importer.begin()
+                for row in _rows(path):
+                    importer.take(row)
+                    events = importer.result.events
+                    if progress is not None and row[0] == 'event' and events % 5000 == 0:
+                        progress(events)
             if importer.result.events == 0:
                 raise TraceError(name, 'no event is recorded in it', _RECORD)
             importer.finish()
@@ -119,69 +116,42 @@ def import_ctf(
 
 def _metadata_of(path: str) -> list[str]:
     """
-    Return the metadata files of the traces below a folder.
+    Return the metadata files of the traces of a session.
 
-    :raises TraceError: if there is none; babeltrace2's own message would be unclear
+    :param path: its folder.
+    :raises TraceError: if there is none, or of several sessions; babeltrace2's own message would
+        be unclear, and it hangs on cut metadata
     """
     remedy = 'name the folder that LTTng recorded to, such as ~/.ros/tracing/SESSION'
     if '\0' in path or not os.path.exists(path):
         raise TraceError(path, 'there is no such folder', remedy)
     if not os.path.isdir(path):
         raise TraceError(path, 'is no folder', remedy)
-    found = [os.path.join(folder, 'metadata') for folder, _, names in os.walk(path)
-             if 'metadata' in names]
-    if not found:
+    folders = sorted(folder for folder, _, names in os.walk(path) if 'metadata' in names)
+    if not folders:
         what = 'holds no CTF recording (no file called metadata is in it or below)'
         if os.path.exists(os.path.join(path, _CACHE)):
             what = f'holds only what CARET converted ({_CACHE}), not the recording itself'
         raise TraceError(path, what, remedy)
-    return sorted(found)
-
-
-def _check_sessions(path: str, found: Sequence[str]) -> tuple[bool, set[tuple[str, ...]]]:
-    """
-    Return whether a trace of the session is CTF 2, and the identities of its sessions.
-
-    :param found: the metadata files below the folder.
-    :raises TraceError: if the folder holds several sessions, or metadata is damaged
-    """
-    # Metadata of the traces in a session's folder may differ: the first one counts.
-    sessions: dict[str, tuple[str, ...]] = {}
-    every: set[tuple[str, ...]] = set()
-    is_ctf_2 = False
-    for metadata in found:
-        text = _metadata_text(metadata)
-        is_ctf_2 = is_ctf_2 or text.startswith(_CTF_2)
-        known = dict(_ENVIRONMENT.findall(text))
-        if 'trace_name' in known:
-            said = tuple(known.get(name, '') for name in SESSION)
-            sessions.setdefault(_session_folder(os.path.relpath(metadata, path)), said)
-            every.add(said)
-    folders = {identity: folder for folder, identity in sessions.items()}
-    if len(folders) > 1:
+    sessions = set()
+    for folder in folders:
+        parts = os.path.relpath(folder, path).split(os.sep)
+        below = [place for place, part in enumerate(parts) if part in _PARTS]
+        if below:
+            sessions.add(os.sep.join(parts[:below[0]]))
+    if len(sessions) > 1:
         raise TraceError(
-            path, f'it holds {len(folders)} sessions: {listed(sorted(folders.values()))}',
+            path, f'it holds {len(sessions)} sessions: {listed(sorted(sessions))}',
             'name the folder of one, or, if they are of one run on several computers, each of '
             'their folders')
-    return is_ctf_2, every
+    found = [os.path.join(folder, 'metadata') for folder in folders]
+    for metadata in found:
+        _check_metadata(metadata)
+    return found
 
 
-def _session_folder(metadata: str) -> str:
-    """Return the session folder of a trace: LTTng's subfolders are below it."""
-    folder = os.path.dirname(metadata)
-    parts = folder.split(os.sep)
-    below = next((place for place, part in enumerate(parts) if part in _PARTS), len(parts))
-    return os.sep.join(parts[:below])
-
-
-# LTTng's entries in the metadata's environment, in CTF 1.8 and CTF 2, and the names of subfolders
-# of a session.
-_ENVIRONMENT = re.compile(
-    r'"?\b(trace_name|trace_creation_datetime|hostname)\b"?\s*[=:]\s*"((?:[^"\\]|\\.)*)"')
+# The folders that LTTng makes in a session's folder.
 _PARTS = {'ust', 'kernel', 'archives'}
-# CTF 2 metadata, a sequence of JSON texts (RFC 7464), begins with this character.
-_CTF_2 = '\x1e'
-_READS_CTF_2 = (2, 1)
 
 # The head of a metadata packet: magic, UUID, checksum, sizes of content and packet in bits, and
 # compression, encryption, checksum scheme, major, minor (CTF 1.8.3, 7.1).
@@ -189,35 +159,25 @@ _PACKET = '16sIII5B'
 _MAGIC = 0x75D11D57
 
 
-def _metadata_text(path: str) -> str:
-    """
-    Return the text of metadata, which is stored in packets or as plain text.
-
-    :raises TraceError: if a packet is truncated: babeltrace2 2.0 hangs on it
-    """
+def _check_metadata(path: str) -> None:
+    """Check that the packets of metadata are whole; metadata may also be plain text."""
     try:
-        with open(path, 'rb') as stream:
-            data = stream.read()
+        data = Path(path).read_bytes()
     except OSError as error:
         raise TraceError(path, f'cannot be read ({error.strerror})', _RECORD) from None
     if not data:
         raise TraceError(path, 'the metadata is empty', _RECORD)
     order = next((order for order in '<>' if data[:4] == struct.pack(f'{order}I', _MAGIC)), None)
-    if order is None:
-        return data.decode(errors='replace')
-    head = struct.Struct(f'{order}I{_PACKET}')
-    position, text = 0, b''
+    position = 0 if order else len(data)
     while position < len(data):
-        if position + head.size > len(data):
-            raise TraceError(path, f'the metadata is cut at byte {len(data)}', _RECORD)
-        magic, _, _, content, size, *_ = head.unpack_from(data, position)
-        if magic != _MAGIC or not head.size * 8 <= content <= size or size % 8:
-            raise TraceError(path, f'the metadata is damaged at byte {position}', _RECORD)
-        text += data[position + head.size:position + content // 8]
+        head = struct.Struct(f'{order}I{_PACKET}')
+        packet = data[position:position + head.size].ljust(head.size, b'\0')
+        magic, _, _, content, size, *_ = head.unpack(packet)
+        if magic != _MAGIC or not head.size * 8 <= content <= size or (
+                position + size // 8 > len(data)):
+            raise TraceError(
+                path, f'the metadata is cut or damaged at byte {position}', _RECORD)
         position += size // 8
-        if position > len(data):
-            raise TraceError(path, f'the metadata is cut at byte {len(data)}', _RECORD)
-    return text.decode(errors='replace')
 
 
 # --- the helper process --------------------------------------------------------------------------
@@ -231,40 +191,27 @@ def interpreters() -> list[str]:
     return list(dict.fromkeys(name for name in found if name and os.access(name, os.X_OK)))
 
 
-def _rows(name: str, paths: Sequence[str], is_ctf_2: bool) -> Iterator[Row]:
-    """Yield the rows from the first Python interpreter with bindings that read the format."""
-    too_old = None
+def _rows(path: str) -> Iterator[Row]:
+    """Yield the rows from the first Python interpreter with bindings."""
     for interpreter in interpreters():
-        rows = _rows_of(interpreter, name, paths)
+        rows = _rows_of(interpreter, path)
         first = next(rows, None)
         if first is not None and first[0] == 'ready':
-            if not is_ctf_2 or _version(first[1]) >= _READS_CTF_2:
-                yield from rows
-                return
-            too_old = first[1]
+            yield from rows
+            return
         rows.close()
-    if too_old is not None:
-        raise TraceError(
-            name, f'it is CTF 2, which babeltrace2 {too_old} does not read',
-            'install babeltrace2 2.1 or newer, or record with lttng create --trace-format=ctf-1.8')
     raise TraceError(
-        name, "babeltrace2's Python bindings, which read it, are not installed", INSTALL)
+        path, "babeltrace2's Python bindings, which read it, are not installed", INSTALL)
 
 
-def _version(text: str) -> tuple[int, ...]:
-    return tuple(map(int, re.findall(r'\d+', text)[:2]))
-
-
-def _rows_of(
-    interpreter: str, name: str, paths: Sequence[str]
-) -> Generator[Row, None, None]:
+def _rows_of(interpreter: str, path: str) -> Generator[Row, None, None]:
     """Yield the rows of a helper process."""
     # PYTHONHOME of one interpreter breaks another. Without bytecode nothing is written.
     environment = {name: value for name, value in os.environ.items() if name != 'PYTHONHOME'}
     environment['PYTHONDONTWRITEBYTECODE'] = '1'
     try:
         process = subprocess.Popen(
-            [interpreter, str(_HELPER), *map(os.path.abspath, paths)], env=environment,
+            [interpreter, str(_HELPER), os.path.abspath(path)], env=environment,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     except OSError:
         return      # try the next interpreter
@@ -273,13 +220,13 @@ def _rows_of(
     try:
         for row in _read(process.stdout):
             if row[0] == 'error':
-                raise TraceError(name, f'cannot be read ({row[1]})', _RECORD)
+                raise TraceError(path, f'cannot be read ({row[1]})', _UNREADABLE)
             if row[0] == 'end':
                 return
             ready = ready or row[0] == 'ready'
             yield row
         if ready:
-            raise TraceError(name, f'babeltrace2 gave up ({_end_of(process)})', _RECORD)
+            raise TraceError(path, f'babeltrace2 gave up ({_end_of(process)})', _UNREADABLE)
     finally:
         process.kill()
         process.stdout.close()
@@ -317,42 +264,32 @@ def _end_of(process: subprocess.Popen[bytes]) -> str:
 
 
 class _Kind(NamedTuple):
-    """
-    How the events of a class are written.
-
-    :ivar unread: a provider that replay does not know.
-    :ivar place: number of their session.
-    """
+    """How the events of a class are written."""
 
     key: str
     converts: Sequence[Callable[[Any], Any] | None]
-    unread: str | None
-    place: int
 
 
 class _Importer:
-    """
-    Writes the rows of the sessions of a run as events.
+    """Writes the rows of the sessions of a run as events."""
 
-    :param places: by identity the number of a session.
-    """
-
-    def __init__(
-        self, path: str, file: TraceFile, places: Mapping[tuple[str, ...], int]
-    ) -> None:
+    def __init__(self, path: str, file: TraceFile) -> None:
         self.result = Imported()
         self._path = path
         self._file = file
-        self._places = places
+        self._place = 0             # number of the session
         self._processes, self._threads = Numbers(), Numbers()
         self._kinds: dict[int, _Kind] = {}
-        # full name in the session, by full name in the trace
-        self._originals: dict[str, str] = {}
-        self._changed: dict[str, str] = {}
+        self._names: set[str] = set()       # of events
         self._procnames: dict[tuple[int, int], str] = {}
         self._nameless = 0                          # events without process or thread
         self._uncounted = 0                         # gaps of an unknown number of events
         self._time = 0
+
+    def begin(self) -> None:
+        """Begin with the next session."""
+        self._place += 1
+        self._kinds, self._time = {}, 0
 
     def take(self, row: Row) -> None:
         """Write a row."""
@@ -369,8 +306,8 @@ class _Importer:
             self._nameless += 1
             vpid, vtid = vpid or 0, vtid or 0
         kind = self._kinds[number]
-        vpid = self._processes.of(kind.place, vpid)
-        vtid = self._threads.of(kind.place, vtid)
+        vpid = self._processes.of(self._place, vpid)
+        vtid = self._threads.of(self._place, vtid)
         if procname and self._procnames.get((vpid, vtid)) != procname:
             self._procnames[vpid, vtid] = procname
             self._file.extend((('mddag:process', time, vtid, procname),), vpid)
@@ -379,8 +316,6 @@ class _Importer:
                       for convert, value in zip(kind.converts, values)]
         self._file.extend(((kind.key, time, vtid, *values),), vpid)
         self.result.events += 1
-        if kind.unread is not None:
-            self.result.unread[kind.unread] += 1
         self.result.processes.add(vpid)
         self._time = time
 
@@ -390,35 +325,19 @@ class _Importer:
         self.result.discarded += max(count, 1)
         self._file.extend((('mddag:lost', max(time, self._time), 0, max(count, 1)),), 0)
 
-    def _class(
-        self, number: int, original: str, fields: list[tuple[str, str]],
-        session: Sequence[str] = (),
-    ) -> None:
-        event, converts = event_type(self._name(original), fields)
-        for (given, _), (name, _) in zip(fields, event.fields):
-            if given != name and given not in dict(PREAMBLE):
-                self._changed[f'{original}.{given}'] = name
-        unread = None if event.provider in PROVIDERS else event.provider
-        self._kinds[number] = _Kind(
-            self._file.define(event), converts if any(converts) else (), unread,
-            self._places.get(tuple(session), 0))
-
-    def _name(self, original: str) -> str:
-        """Return the full name of an event; different events keep different names."""
+    def _class(self, number: int, original: str, fields: list[tuple[str, str]]) -> None:
         provider, colon, name = original.partition(':')
         if not colon:
             provider, name = 'ctf', original
         key = f'{_legal(provider)}:{_legal(name)}'
-        while self._originals.setdefault(key, original) != original:
-            key += '_'
-        if key != original:
-            self._changed[original] = key
-        return key
+        self._names.add(key)
+        event, converts = event_type(key, fields)
+        self._kinds[number] = _Kind(self._file.define(event), converts if any(converts) else ())
 
     def finish(self) -> None:
         """Note what is missing or was changed."""
         result, path = self.result, self._path
-        result.kinds = len(self._originals)
+        result.kinds = len(self._names)
         if result.discarded:
             about = ' at least' if self._uncounted else ''
             result.warnings.append(
@@ -432,11 +351,6 @@ class _Importer:
             result.warnings.append(
                 f'{path}: left out {counted(self._file.rejected, "event")}, the first because of: '
                 f'{self._file.rejection}')
-        if self._changed:
-            given, name = next(iter(self._changed.items()))
-            result.warnings.append(
-                f'{path}: changed {counted(len(self._changed), "name")} that ROS cannot have, '
-                f'such as {given!r} to {name!r}')
 
 
 def _legal(name: str) -> str:

@@ -9,7 +9,7 @@ Theory of operation:
    project and needs Python 3.9 or later. If babeltrace2 aborts on damaged input, only this process
    ends.
 2. Standard output has one JSON row a line:
-   `["missing", reason]` (no bt2 here; the only row), `["ready", version]` (the first row),
+   `["missing", reason]` (no bt2 here; the only row), `["ready"]` (the first row),
    `["class", number, name, [[field, type], ...]]` (before its first event),
    `["event", number, timestamp, vpid, vtid, procname, [value, ...]]`,
    `["discarded", timestamp, count]` (-1: unknown count),
@@ -172,11 +172,11 @@ class Session:
         # By address of the event's class, which is kept so that its address is not reused.
         self._known: dict[int, _Class] = {}
 
-    def read(self, paths: list[str]) -> None:
-        """Write a row for each event below the folders, in the order of time."""
+    def read(self, path: str) -> None:
+        """Write a row for each event below a folder, in the order of time."""
         bt2 = self._bt2
         discarded = (bt2._DiscardedEventsMessageConst, bt2._DiscardedPacketsMessageConst)
-        for message in bt2.TraceCollectionMessageIterator(paths):
+        for message in bt2.TraceCollectionMessageIterator(path):
             if type(message) is bt2._EventMessageConst:
                 self._event(message)
             elif isinstance(message, discarded):
@@ -196,8 +196,6 @@ class Session:
 
     def _define(self, event: Any) -> _Class:
         cls = event.cls         # belongs to one trace
-        environment = event.stream.trace.environment
-        session = [str(environment[name]) if name in environment else '' for name in SESSION]
         fields = members(self._native, cls.payload_field_class)
         context = {name: get for name, _, get in members(
             self._native, cls.stream_class.event_common_context_field_class)}
@@ -205,7 +203,7 @@ class Session:
             len(self._known), cls, [get for _, _, get in fields],
             [next((context[name] for name in names if name in context), None)
              for names in _IDENTITY])
-        self._add('class', known.number, cls.name or '', [field[:2] for field in fields], session)
+        self._add('class', known.number, cls.name or '', [field[:2] for field in fields])
         return known
 
     def _discarded(self, message: Any) -> None:
@@ -219,9 +217,6 @@ class Session:
         self._add('discarded', time, -1 if count is None else count)
 
 
-# Identity of a session in the environment of its traces.
-SESSION = ('hostname', 'trace_name', 'trace_creation_datetime')
-
 # Process, thread and name: of user space first, then of the kernel.
 _IDENTITY = (('vpid', 'pid'), ('vtid', 'tid'), ('procname',))
 
@@ -233,8 +228,8 @@ def reason(error: BaseException) -> str:
     return ' '.join(str(text or error or type(error).__name__).split())
 
 
-def main(sessions: list[str]) -> int:
-    """Read the sessions of a run; the last row has the outcome."""
+def main(session: str) -> int:
+    """Read a session; the last row has the outcome."""
     # Output of libraries must not mix with the rows.
     with os.fdopen(os.dup(1), 'wb') as stream:
         os.dup2(2, 1)
@@ -244,10 +239,10 @@ def main(sessions: list[str]) -> int:
         except Exception as error:      # includes bindings that do not fit their library
             add('missing', f'{type(error).__name__}: {error}')
             return 0
-        add('ready', str(getattr(bt2, '__version__', '')))
+        add('ready')
         stream.flush()
         try:
-            Session(bt2, add).read(sessions)
+            Session(bt2, add).read(session)
             add('end')
         except BrokenPipeError:
             os._exit(1)     # the importer has ended
@@ -260,4 +255,4 @@ if __name__ == '__main__':
     # Don't import from this file's folder: it has modules of the project.
     _here = os.path.dirname(os.path.abspath(__file__))
     sys.path[:] = [_path for _path in sys.path if os.path.abspath(_path or '.') != _here]
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(sys.argv[1]))

@@ -163,6 +163,3 @@ _ALL = (
 EVENTS = {event.key: event for event in _ALL}
 
 PROCESS = 'mddag:process'
-
-#: The providers whose events replay uses, including other recorders.
-PROVIDERS = frozenset({event.provider for event in _ALL} | {'dds', 'ros2_hook'})

@@ -14,7 +14,7 @@ from ..trace.ctf_session import session
 
 HELPER = """\
 import json
-rows = [['ready', '2'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']]],
+rows = [['ready'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']]],
         ['event', 0, 5, 1, 2, 'p', [3]], [{last!r}]]
 for row in rows:
     print(json.dumps(row))
@@ -116,23 +116,3 @@ def test_processes_of_several_containers_may_have_the_same_numbers(tmp_path, cal
     result = call('replay', out, '--json', '-').result
     assert [(use['executions'], use['unfinished'], use['busy_ns'])
             for use in result['recorded_callbacks'].values()] == [(5, 0, 30), (5, 0, 30)]
-
-
-@pytest.mark.parametrize('version, reads', [
-    ('2.0.4', False), ('2.0.6-rc1', False), ('2.1.0', True), ('2.10', True), ('3.0', True)])
-def test_ctf_2_needs_babeltrace_2_1(version, reads, recording, call):
-    out, metadata = recording.with_name('out.mcap'), recording / 'metadata'
-    metadata.write_text('\x1e{"type": "preamble", "version": 2}\n\x1e{"type": "trace-class", '
-                        '"environment": {"hostname": "robot", "trace_name": "drive"}}\n')
-    helper = recording.with_name('helper.py')
-    helper.write_text(helper.read_text().replace("'2'", repr(version)))
-    status, text, errors = call('import', 'ctf', recording, '-o', out)
-    if reads:
-        assert (status, errors) == (0, '')
-        assert [event['callback'] for event in read_events(out)] == [3]
-    else:
-        assert (status, text) == (2, '')
-        assert errors == (
-            f'error: {recording}: it is CTF 2, which babeltrace2 {version} does not read: install '
-            'babeltrace2 2.1 or newer, or record with lttng create --trace-format=ctf-1.8\n')
-        assert not out.exists()
