@@ -6,9 +6,8 @@ The stamps in ordinary rosbag2 recordings: arrival times and header stamps of me
 Theory of operation
 -------------------
 * A bag is a folder with `metadata.yaml` and the files that it names, or one such file.  The first
-  bytes of a file, not its name, say its kind: MCAP (read with ``trace.TraceReader``), SQLite (read
-  with rosbags) or zstd around one of them (a file-compressed bag, unpacked to a temporary file). A
-  write-ahead log next to an SQLite file belongs to it.
+  bytes of a file, not its name, say its kind: MCAP (read with ``trace.TraceReader``), SQLite, or
+  zstd around one of them (a file-compressed bag, unpacked to a temporary file).
 * A message has its arrival (log time), its publication if the recorder stored it separately, and
   the stamp at the beginning of its content, if its type begins with a `std_msgs/Header` or a time.
   The rest is not decoded.
@@ -26,15 +25,13 @@ import io
 import os
 from pathlib import Path
 import re
-import shutil
 import sqlite3
 import struct
 import tempfile
-from typing import Any
 
 from mddag_executor.errors import InputError
 from mddag_executor.text import counted
-from mddag_executor.trace import TraceError, TraceReader
+from mddag_executor.trace import TraceReader
 from mddag_executor.trace.channels import Topic
 from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.times import joined, NEVER, stretches
@@ -43,15 +40,11 @@ import zstandard
 _METADATA_LIMIT = 4 * 1024 * 1024
 _MCAP, _SQLITE, _ZSTD = b'\x89MCAP0\r\n', b'SQLite format 3\0', b'\x28\xb5\x2f\xfd'
 _REMEDY = 'give a folder with metadata.yaml that ros2 bag record wrote, or one of its files'
-_SPARE = 1 << 30            # bytes of disk space that unpacking leaves free
-_MOST_TIMES = 1000
-_PIECE = 1 << 20
-_BAG_FILE = re.compile(r'metadata\.yaml|.*\.(mcap|db3)(\.zstd)?')
+_MESSAGE_LIMIT = 1 << 30    # bytes of a message, decompressed
+_BAG_FILE = re.compile(r'.*\.(mcap|db3)(\.zstd)?')
 _STAMP = 12                 # bytes: encapsulation, seconds, nanoseconds
 _WINDOW = 128 * 1024 * 1024
-_STAMPED = {
-    'std_msgs/Header', 'std_msgs/msg/Header', 'Header', 'builtin_interfaces/Time',
-    'builtin_interfaces/msg/Time'}
+_STAMPED = {'std_msgs/msg/Header', 'builtin_interfaces/msg/Time'}
 UNKNOWN = -1
 """A stamp that a message does not have."""
 
@@ -96,106 +89,75 @@ class Bag:
         self._impossible = 0
         self.warnings: list[str] = []
         self._stamped: dict[tuple[str, str], bool] = {}
-        self._stated: int | None = None     # number of messages according to metadata.yaml
         files = self._files()
         for file in files:
-            self._read(file, topics, len(files) == 1)
+            try:
+                with _unpacked(file) as (unpacked, kind):
+                    read = self._read_mcap if kind == _MCAP else self._read_sqlite
+                    read(unpacked, self._called(file), topics)
+            except InputError as error:
+                if len(files) == 1:
+                    raise BagError(self._called(file), error.problem, error.remedy) from None
+                self.warnings.append(f'{file}: {error.problem}: it is left out')
         if self._impossible:
             self.warnings.append(
                 f'{self.name}: left out: {counted(self._impossible, "message")} at an impossible '
                 'time')
-        if self._stated is not None and self._stated != self.count and not self.warnings:
-            self.warnings.append(
-                f'{self.name}: metadata.yaml counts {counted(self._stated, "message")}, but '
-                f'there are {self.count}')
 
     def _files(self) -> list[Path]:
         path = Path(self.path)
         if not path.is_dir():
             return [path]
         metadata = path / 'metadata.yaml'
-        if not metadata.is_file():
-            found = sorted(
-                (p for p in path.iterdir() if _BAG_FILE.fullmatch(p.name)), key=_natural)
-            found = [p for p in found if p.name != 'metadata.yaml']
-            if not found:
-                raise BagError(self.name, 'there is neither metadata.yaml nor a bag file', _REMEDY)
-            self.warnings.append(
-                f'{self.name}: metadata.yaml is missing (the recorder was killed): used '
-                f'{counted(len(found), "bag file")} from the folder')
-            return found
-        names, self._stated = _named_files(metadata)
-        there = [path / name for name in names if (path / name).is_file()]
-        if not there:
-            raise BagError(
-                str(metadata), 'none of the bag files that it names is there', 'copy them, too')
-        if len(there) < len(names):
-            self.warnings.append(
-                f'{self.name}: {len(names) - len(there)} of {counted(len(names), "file")} are '
-                'missing: what they held is not replayed')
-        return there
+        if metadata.is_file():
+            return [path / name for name in _named_files(metadata)]
+        found = sorted(p for p in path.iterdir() if _BAG_FILE.fullmatch(p.name))
+        if not found:
+            raise BagError(self.name, 'there is neither metadata.yaml nor a bag file', _REMEDY)
+        self.warnings.append(
+            f'{self.name}: metadata.yaml is missing (the recorder was killed): used '
+            f'{counted(len(found), "bag file")} from the folder')
+        return found
 
-    def _read(self, file: Path, topics: Collection[str], only: bool) -> None:
-        try:
-            with _unpacked(file) as (unpacked, kind):
-                if kind == _MCAP:
-                    self._read_mcap(unpacked, file, topics)
-                elif kind == _SQLITE:
-                    self._read_sqlite(unpacked, file, topics)
-                else:
-                    raise BagError(str(file), 'is no rosbag2 recording', _REMEDY)
-        except (BagError, TraceError) as error:
-            if only:
-                raise type(error)(
-                    self.name if error.file == self.path else error.file, error.problem,
-                    error.remedy) from None
-            self.warnings.append(f'{file}: {error.problem}: it is left out')
-
-    def _read_mcap(self, unpacked: Path, file: Path, topics: Collection[str]) -> None:
-        try:
-            reader = TraceReader(unpacked)
-            relative = {topic[1:] for topic in topics}
-            for topic, log_time, publish_time, data in reader.messages({*topics, *relative}):
-                self._add(topic, log_time, publish_time, data)
-        except TraceError as error:
-            raise BagError(str(file), error.problem, error.remedy) from None
-        self.warnings += [
-            renamed(text, reader.path, self._called(file)) for text in reader.warnings]
+    def _read_mcap(self, file: Path, called: str, topics: Collection[str]) -> None:
+        reader = TraceReader(file)
+        relative = {topic[1:] for topic in topics}
+        for topic, log_time, publish_time, data in reader.messages({*topics, *relative}):
+            self._add(topic, log_time, publish_time, data)
+        self.warnings += [renamed(text, reader.path, called) for text in reader.warnings]
         self.topics |= {_absolute(topic.name) for topic in reader.topics.values()}
-        self.count += len(reader.times)
         self._look_through(reader.times)
 
-    def _read_sqlite(self, unpacked: Path, file: Path, topics: Collection[str]) -> None:
-        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-        used = 0
+    def _read_sqlite(self, file: Path, called: str, topics: Collection[str]) -> None:
+        times = array('q')
         try:
-            reader = Sqlite3Reader(unpacked)
-            reader.open()
-            try:
-                self.topics |= {_absolute(c.topic) for c in reader.connections}
-                count = reader.metadata.message_count
-                self.count += count
-                known = {c.id: _topic_of(c) for c in reader.connections
-                         if _absolute(c.topic) in topics}
-                wanted = [c for c in reader.connections if c.id in known]
-                for connection, time, data in reader.messages(wanted) if wanted else ():
-                    self._add(known[connection.id], time, UNKNOWN, data)
-                    used += 1
-            finally:
-                reader.close()
-                self._look_through(_sqlite_times(unpacked))
-        except Exception as error:      # of SQLite, of rosbags, or caused by damaged data
+            # immutable: reading must not write next to the file
+            with closing(sqlite3.connect(
+                    f'{file.absolute().as_uri()}?immutable=1', uri=True)) as storage:
+                known = _topics_of(storage)
+                self.topics |= {_absolute(topic.name) for topic in known.values()}
+                wanted = [number for number, topic in known.items()
+                          if _absolute(topic.name) in topics]
+                for number, time, data in storage.execute(
+                        'SELECT topic_id, timestamp, CASE WHEN topic_id IN '
+                        f'({", ".join("?" * len(wanted))}) THEN data END '
+                        'FROM messages ORDER BY id', wanted):
+                    times.append(time)
+                    if data is not None:
+                        self._add(known[number], time, UNKNOWN, bytes(data))
+        except Exception as error:      # of SQLite, or caused by damaged data
             what = f'its SQLite storage cannot be read ({" ".join(str(error).split())})'
-            if not used:
-                raise BagError(str(file), what, _REMEDY) from None
-            self.warnings.append(
-                f'{self._called(file)}: {what}: used {used} messages before that')
+            if not times:
+                raise BagError(called, what, _REMEDY) from None
+            self.warnings.append(f'{called}: {what}: used {len(times)} messages before that')
+        self._look_through(times)
 
     def _called(self, file: Path) -> str:
         return self.name if str(file) == self.path else str(file)
 
     def _look_through(self, times: Sequence[int]) -> None:
         """Store the arrivals of a file's messages."""
+        self.count += len(times)
         possible = [time for time in times if 0 <= time < NEVER]
         self._impossible += len(times) - len(possible)
         self.stretches = joined([*self.stretches, *stretches(possible)])
@@ -221,7 +183,7 @@ class Bag:
         if self._keep is not None:
             content = data
             if content.startswith(_ZSTD):
-                content = _unpacked_message(content, _SPARE)
+                content = _unpacked_message(content, _MESSAGE_LIMIT)
             self._keep(topic._replace(name=name), arrival, published, content)
         stamps.arrival.append(arrival)
         different = 0 < published < NEVER and published != arrival
@@ -248,128 +210,77 @@ class Bag:
 
 def is_ordinary(path: str) -> bool:
     """Return whether a path is a bag without traced events, so without jobs."""
-    if not os.path.isdir(path):
-        return _is_bag(path)
-    names = [name for name in os.listdir(path) if _BAG_FILE.fullmatch(name)]
-    files = [os.path.join(path, name) for name in names if name != 'metadata.yaml']
-    return all(opened_trace(file) is None for file in files) and (
-        'metadata.yaml' in names or any(map(_is_bag, files)))
+    files = [path]
+    if os.path.isdir(path):
+        files = [os.path.join(path, name) for name in os.listdir(path)
+                 if _BAG_FILE.fullmatch(name)]
+    return any(map(_is_bag, files)) and all(opened_trace(file) is None for file in files)
 
 
 def opened_trace(path: str) -> TraceReader | None:
     """Return the trace in a file; None for other files, and for damage."""
-    reader = _mcap(path)
-    return reader if reader is not None and _has_trace(reader) else None
+    try:
+        reader = TraceReader(path)
+        return reader if reader.written_here or reader.has_events() else None
+    except InputError:
+        return None
 
 
 def _is_bag(path: str) -> bool:
-    reader = _mcap(path)
+    """Return whether a file is a bag; what is left of a trace is none."""
     try:
-        return _kind(Path(path)) in (_SQLITE, _ZSTD) if reader is None else not _has_trace(reader)
+        return _kind(Path(path)) != _MCAP or not TraceReader(path).written_here
     except InputError:
         return False
-
-
-def _mcap(path: str) -> TraceReader | None:
-    try:
-        return TraceReader(path)
-    except (InputError, OSError):
-        return None     # another kind, or damaged: the reader reports the reason
-
-
-def _has_trace(reader: TraceReader) -> bool:
-    return reader.written_here or reader.has_events()
 
 
 def _absolute(topic: str) -> str:
     return topic if topic.startswith('/') else f'/{topic}'
 
 
-def _natural(path: Path) -> list[Any]:
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
-
-
-def _named_files(metadata: Path) -> tuple[list[str], int | None]:
-    """
-    Return the names of a bag's files and the number of messages in them.
-
-    Names outside of its folder are ignored.
-    """
+def _named_files(metadata: Path) -> list[str]:
+    """Return the names of a bag's files; names outside of its folder are ignored."""
     import yaml
     try:
         if metadata.stat().st_size > _METADATA_LIMIT:
             raise ValueError('it is too large')
         about = yaml.safe_load(metadata.read_text(encoding='utf-8'))
-        about = about['rosbag2_bagfile_information']
-        names = [os.path.basename(name) for name in about['relative_file_paths']]
+        names = about['rosbag2_bagfile_information']['relative_file_paths']
         if not names:
             raise ValueError('it names no file')
-        count = about.get('message_count')
-        return names, count if isinstance(count, int) else None
-    except (OSError, ValueError, TypeError, KeyError, AttributeError,
-            RecursionError, yaml.YAMLError) as error:
+        return [os.path.basename(name) for name in names]
+    except (OSError, ValueError, TypeError, KeyError, RecursionError, yaml.YAMLError) as error:
         what = ' '.join(str(error).split())[:200]
         raise BagError(str(metadata), f'this is no metadata of a bag ({what})', _REMEDY) from None
 
 
 @contextmanager
 def _unpacked(file: Path) -> Iterator[tuple[Path, bytes]]:
-    """
-    Yield a readable file and the first bytes of its kind.
-
-    A zstd file is unpacked.  An SQLite file with a write-ahead log, which a killed recorder
-    leaves, is copied, because reading the log changes the file.
-    """
-    kind, log = _kind(file), Path(f'{file}-wal')
-    has_log = kind == _SQLITE and log.is_file() and log.stat().st_size > 0
-    if kind != _ZSTD and not has_log:
+    """Yield a file, unpacked if it is compressed, and the first bytes of its kind."""
+    kind = _kind(file)
+    log = Path(f'{file}-wal')
+    if kind == _SQLITE and log.is_file() and log.stat().st_size:
+        raise BagError(str(file), f'its last messages are in {log.name} (the recorder was killed)',
+                       'let ros2 bag reindex repair the bag')
+    if kind != _ZSTD:
         yield file, kind
         return
     with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
         target = Path(folder, 'bag')
         try:
-            if has_log:
-                _copy_with_log(file, log, target)
-            else:
-                _unpack(file, target)
-        except (zstandard.ZstdError, sqlite3.Error) as error:
+            with open(file, 'rb') as packed, open(target, 'wb') as out:
+                zstandard.ZstdDecompressor(max_window_size=_WINDOW).copy_stream(packed, out)
+        except zstandard.ZstdError as error:
             raise BagError(str(file), f'cannot be unpacked ({error})', _REMEDY) from None
         except OSError as error:
             raise BagError(
-                str(file), f'cannot be unpacked ({error.strerror})', 'free space') from None
+                str(file), f'cannot be unpacked into {tempfile.gettempdir()} ({error.strerror})',
+                'free space, or name another folder in TMPDIR') from None
         yield target, _kind(target)
 
 
-def _unpack(file: Path, target: Path) -> None:
-    with open(file, 'rb') as packed, open(target, 'wb') as out:
-        reader = zstandard.ZstdDecompressor(max_window_size=_WINDOW).stream_reader(packed)
-        while piece := reader.read(_PIECE):
-            if out.tell() > _SPARE and out.tell() > _MOST_TIMES * packed.tell():
-                raise BagError(
-                    str(file), f'it unpacks to more than {_MOST_TIMES} times its size',
-                    'unpack it yourself if you trust it')
-            _check_space(file, target, len(piece))
-            out.write(piece)
-
-
-def _copy_with_log(file: Path, log: Path, target: Path) -> None:
-    """Copy a database, and apply its write-ahead log to the copy."""
-    _check_space(file, target, file.stat().st_size + 2 * log.stat().st_size)
-    shutil.copyfile(file, target)
-    shutil.copyfile(log, f'{target}-wal')
-    with closing(sqlite3.connect(target)) as storage:
-        storage.execute('PRAGMA wal_checkpoint(TRUNCATE)')
-
-
-def _check_space(file: Path, target: Path, size: int) -> None:
-    if shutil.disk_usage(target.parent).free < _SPARE + size:
-        raise BagError(
-            str(file), f'unpacked it does not fit into {tempfile.gettempdir()}',
-            'free space, or name another folder in TMPDIR')
-
-
 def _kind(file: Path) -> bytes:
-    """Return the first bytes of a file if they are those of a known kind."""
+    """Return the first bytes of a bag file, which say its kind."""
     try:
         if not file.is_file():
             raise BagError(str(file), 'is no file', _REMEDY)
@@ -379,7 +290,10 @@ def _kind(file: Path) -> bytes:
         raise BagError(str(file), f'cannot be read ({error.strerror})', _REMEDY) from None
     except ValueError:
         raise BagError(str(file), 'is no file name', _REMEDY) from None
-    return next((kind for kind in (_MCAP, _SQLITE, _ZSTD) if head.startswith(kind)), b'')
+    for kind in (_MCAP, _SQLITE, _ZSTD):
+        if head.startswith(kind):
+            return kind
+    raise BagError(str(file), 'is no rosbag2 recording', _REMEDY)
 
 
 def _unpacked_message(data: bytes, size: int) -> bytes:
@@ -391,44 +305,28 @@ def _unpacked_message(data: bytes, size: int) -> bytes:
         return b''
 
 
-def _sqlite_times(file: Path) -> list[int]:
-    """Return the arrivals of messages in the order of storage, as far as readable."""
-    times: list[int] = []
-    with closing(sqlite3.connect(f'{file.absolute().as_uri()}?mode=ro', uri=True)) as storage:
-        try:
-            for time, in storage.execute('SELECT timestamp FROM messages ORDER BY id'):
-                times.append(int(time))
-        except (sqlite3.Error, TypeError, ValueError):
-            pass        # the reader of the messages reports the reason
-    return times
-
-
-def _topic_of(connection: Any) -> Topic:
-    definition = connection.msgdef
-    encoding = {'MSG': 'ros2msg', 'IDL': 'ros2idl'}.get(definition.format.name, '')
-    return Topic(
-        connection.topic, connection.ext.serialization_format, connection.msgtype, encoding,
-        definition.data)
+def _topics_of(storage: sqlite3.Connection) -> dict[int, Topic]:
+    """Return the topics of an SQLite file by number; before Iron it has no definitions."""
+    definitions: dict[str, tuple[str, str]] = {}
+    if storage.execute('PRAGMA table_info(message_definitions)').fetchall():
+        definitions = {kind: (encoding, text) for kind, encoding, text in storage.execute(
+            'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions')}
+    return {number: Topic(name, encoding, kind, *definitions.get(kind, ('', '')))
+            for number, name, kind, encoding in storage.execute(
+                'SELECT id, name, type, serialization_format FROM topics')}
 
 
 def _is_stamped(topic: Topic) -> bool:
     """Return whether messages of a type begin with a header or a time."""
-    if topic.definition_encoding == 'ros2msg' and topic.definition.strip():
-        for line in topic.definition.splitlines():
-            words = line.split('#')[0].split()
-            if words[:1] and words[0].startswith('==='):
-                return False
-            if len(words) == 2 and '=' not in words[1]:
-                return words[0] in _STAMPED
-            if len(words) > 2 and '=' not in line:
-                return words[0] in _STAMPED     # with a default value
-        return False
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
     try:
-        from rosbags.typesys import get_types_from_idl, get_typestore, Stores
-        if topic.definition_encoding == 'ros2idl':
-            fields = get_types_from_idl(topic.definition)[topic.message_type][1]
+        if topic.definition_encoding == 'ros2msg' and topic.definition.strip():
+            types = get_types_from_msg(topic.definition, topic.message_type)
+        elif topic.definition_encoding == 'ros2idl':
+            types = get_types_from_idl(topic.definition)
         else:
-            fields = get_typestore(Stores.ROS2_JAZZY).fielddefs[topic.message_type][1]
+            types = get_typestore(Stores.ROS2_JAZZY).fielddefs
+        fields = types[topic.message_type][1]
         return bool(fields) and fields[0][1][1] in _STAMPED
     except Exception:   # a type unknown to rosbags, or an unreadable definition
         return False

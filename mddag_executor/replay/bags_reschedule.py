@@ -28,7 +28,7 @@ from mddag_executor.core import DEFAULT_DEADLINE_NS
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import Recording, RELEASES, rows, sort_by
-from mddag_executor.replay.bags import Bag, BagError, UNKNOWN
+from mddag_executor.replay.bags import Bag, BagError
 from mddag_executor.replay.reschedule import Reschedule, reschedule
 from mddag_executor.simulate.workload import check_execution_times
 from mddag_executor.text import counted, listed
@@ -107,20 +107,16 @@ class _Releases:
             jobs = [(arrival, arrival) for arrival in arrivals]
             return Source(sorted(jobs), f'{counted(len(jobs), "job")} from the arrival of {topic}')
         column = getattr(stamps, _STAMP_OF[dag.release_from])
-        jobs = [(arrival, stamp if stamp <= arrival and credible(stamp, arrival) else arrival)
-                for arrival, stamp in zip(arrivals, column)]
+        usable = [stamp <= arrival and bool(credible(stamp, arrival))
+                  for arrival, stamp in zip(arrivals, column)]
+        jobs = [(arrival, stamp if fits else arrival)
+                for arrival, stamp, fits in zip(arrivals, column, usable)]
         what = _CALLED[dag.release_from]
-        without = sum(stamp in (UNKNOWN, 0) for stamp in column)
-        later = sum(stamp > arrival for arrival, stamp in zip(arrivals, column))
-        far = sum(0 < stamp and not credible(stamp, arrival)
-                  for arrival, stamp in zip(arrivals, column))
-        for count, why in ((without, f'without a {what}'),
-                           (far, f'with a {what} years before the arrival'),
-                           (later, f'with a {what} after the arrival')):
-            if count:
-                self.warnings.append(
-                    f'{self._bag.name}: {count} of {counted(len(jobs), "message")} of {topic} '
-                    f'({stamps.type}) {why}: released at the arrival')
+        if not all(usable):
+            self.warnings.append(
+                f'{self._bag.name}: {usable.count(False)} of {counted(len(jobs), "message")} of '
+                f'{topic} ({stamps.type}) without a {what}, or with one after the arrival or '
+                'years before: released at the arrival')
         return Source(sorted(jobs), f'{counted(len(jobs), "job")} from the {what} of {topic}')
 
     def _timer_jobs(self, period: int) -> list[tuple[int, int]]:

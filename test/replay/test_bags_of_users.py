@@ -10,10 +10,12 @@ installs, as the recorder stores them.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 import json
 import os
 from pathlib import Path
 import shutil
+import sqlite3
 import sys
 from typing import Any
 
@@ -94,6 +96,12 @@ def with_rosbags(
     return write
 
 
+def without_definitions(path: Path, given: Messages) -> None:
+    with_rosbags(StoragePlugin.SQLITE3)(path, given)
+    with closing(sqlite3.connect(path / f'{path.name}.db3')) as storage:
+        storage.execute('DROP TABLE message_definitions')
+
+
 def with_mcap(**options: Any) -> Callable[[Path, Messages], None]:
     """Write as rosbag2_storage_mcap does with one of its presets, without metadata.yaml."""
     def write(path, given):
@@ -120,6 +128,7 @@ BAGS: dict[str, Callable[[Path, Messages], None]] = {
         StoragePlugin.MCAP, CompressionMode.MESSAGE),
     '-s mcap --compression-mode file': with_rosbags(StoragePlugin.MCAP, CompressionMode.FILE),
     '-s sqlite3': with_rosbags(StoragePlugin.SQLITE3),
+    '-s sqlite3 of Humble': without_definitions,
     '-s sqlite3 --compression-mode message': with_rosbags(
         StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
     '-s sqlite3 --compression-mode file': with_rosbags(
