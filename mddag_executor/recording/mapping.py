@@ -22,8 +22,7 @@ Callbacks are matched by node and trigger; ``msg_graph.binding`` has the rules. 
 started several times, or in several processes, is matched each time.  Of several callbacks with
 the same trigger the first declared one matches the first created one.
 
-A CARET or ros2_tracing recording has no other information.  If a node's timers have other periods
-than declared, but the same number, they are matched by order; a warning reports it.
+A CARET or ros2_tracing recording has no other information.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.tables import Recording, Table
 from mddag_executor.text import counted, listed
 from msg_graph import Callback as Declared
-from msg_graph import Dag, format_duration, NO_GRAPH, TaskSet, Vertex
+from msg_graph import Dag, NO_GRAPH, TaskSet, Vertex
 from msg_graph.binding import Binder, entities_of, Entity, meant
 import numpy as np
 
@@ -268,35 +267,16 @@ class Matching:
         self.warnings: list[str] = []
         #: By number of a recorded callback.
         self.target: dict[int, Target] = {}
-        self._other_periods: list[str] = []
         if judge is None:
             return
         for callbacks in nodes_of(who):
-            self.target.update(self._match(callbacks, judge))
+            self.target.update(match(callbacks, judge))
         found = {target.callback.key for target in self.target.values()}
         self.warnings += report_missing(
             name, judge, found, [c.label for c in who.every if c.kind != 'service'],
             [c.entity for c in who.every if c.entity is not None and c.number not in self.target])
-        if self._other_periods:
-            self.warnings.append(
-                f'{name}: {counted(len(self._other_periods), "timer")} with another '
-                f'period than declared: {listed(self._other_periods)}')
         processes = len({pid for pid, _ in threads})
         if processes > 1:
             self.warnings.append(
                 f'{name}: {processes} processes ran callbacks, each with workers of its own: '
                 f'{counted(len(threads), "thread")} are taken together')
-
-    def _match(self, callbacks: list[Callback], judge: TaskSet) -> dict[int, Target]:
-        found = match(callbacks, judge)
-        node, known = callbacks[0].node_name, {t.callback.key for t in found.values()}
-        timers = [c for c in judge.callbacks
-                  if c.node == node and c.kind == 'timer' and c.key not in known]
-        left = [c for c in callbacks
-                if c.kind == 'timer' and c.number and c.number not in found]
-        for one, callback in zip(timers, left) if len(timers) == len(left) else ():
-            found[callback.number] = Target(one, 0, '')
-            self._other_periods.append(
-                f'{one.key} ({format_duration(callback.period)} instead of '
-                f'{format_duration(one.timer_period_ns or 0)})')
-        return found

@@ -148,11 +148,16 @@ class System:
         return draft
 
     def _ordered(self, nodes: dict[str, DraftNode]) -> list[DraftNode]:
-        """Return the nodes in the order of the recorded declaration, which decides ties."""
+        """
+        Return the nodes in the order of the recorded declaration, which decides ties.
+
+        Others are sorted by name: an executor's nodes are recorded in any order.
+        """
+        by_name = [nodes[name] for name in sorted(nodes)]
         if self.task_set is None:
-            return list(nodes.values())
+            return by_name
         place = self.task_set.places()
-        every = [callback for node in nodes.values() for callback in node.callbacks.values()]
+        every = [callback for node in by_name for callback in node.callbacks.values()]
         found: list[DraftNode] = []
         for callback in sorted(every, key=lambda c: place.get(c.key, len(place))):
             if not found or found[-1].name != callback.node:

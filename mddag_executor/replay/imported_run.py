@@ -58,10 +58,8 @@ import numpy as np
 _SLACK_NS = 1_000_000
 _OWN = ('mddag:job_release', 'mddag:dispatch')
 _OFF_THE_GRID = {
-    'without': ('execution', 'of timers whose initialisation is not in it: released when '
-                'it started'),
-    'off': ('execution', 'of timers off the grid of the period (reset, or by another '
-            'clock): released when it started'),
+    'off': ('execution', 'of timers off the grid of the period (reset, by another clock, or '
+            'without initialisation in it): released when it started'),
     'skipped': ('period', 'of timers passed without an execution (late by more than one, '
                 'or events were lost): without a job')}
 
@@ -79,7 +77,6 @@ class ImportedRun:
     kinds = KINDS
     others: Sequence[str] = (*INIT_EVENTS, *_OWN)
     links_type = Links
-    no_grid = 'without'
 
     def __init__(
         self, reader: TraceReader, name: str, task_set: TaskSet | None, head: Head | None = None,
@@ -245,7 +242,7 @@ class ImportedRun:
             timer = self.links.callbacks[number[mine[0]]]
             grid, period = timer.grid, timer.period
             if grid is None or abs(grid) >= NEVER or period <= 0:
-                self._odd.count(self.no_grid, timer.label, len(mine))
+                self._odd.count('off', timer.label, len(mine))
                 continue
             n = (time[mine] - grid + min(_SLACK_NS, period // 10)) // period
             newer = n > np.maximum.accumulate(np.append(0, n))[:-1]

@@ -87,16 +87,10 @@ _ARRIVALS = (DISPATCH, DISPATCH_ERASED, TAKE, WITHIN, DEQUEUE, READY)
 _SAID = {
     'ends': ('execution', 'without an end in it (the event was lost)'),
     'starts': ('execution', 'without a start in it (the event was lost): left out'),
-    'messages': ('execution', 'for a message whose publication is not in it: of no job and no '
+    'messages': ('execution', 'for a message whose publication is not known: of no job and no '
                  'path'),
-    'unlinked': ('execution', 'for a message whose publication is not known (not all of its topic '
-                 'have a source timestamp in it): of no job and no path'),
-    'without_message': ('execution', 'of a subscription with no event in it that says which '
-                        'message was taken: of no job and no path'),
     'partial': ('publication', 'without the tracepoint rclcpp_publish that others of the '
                 'publisher have: counted from rcl_publish on'),
-    'ambiguous': ('execution', 'for a message with the topic and source timestamp of another one: '
-                  'of no job and no path'),
     'overwritten': ('message', 'overwritten in a ring buffer, never taken'),
     'unknown': ('execution', 'of a callback whose initialisation is not in it')}
 
@@ -503,7 +497,7 @@ class Links:
         return np.array(fits, dtype=np.bool_)[which]
 
     def _find_messages(self) -> None:
-        """Find messages by their source timestamps; count missing ones."""
+        """Find messages by their source timestamps; count executions without one."""
         rows = np.flatnonzero(self.runs['message'] < 0)
         runs = self.runs[rows]
         number, stamped = runs['callback'], runs['stamp'] != 0
@@ -511,18 +505,12 @@ class Links:
         topic = self._numbers(each.start for each in self.callbacks)[number[stamped]]
         message[stamped] = self._find(topic, runs['stamp'][stamped])
         self.runs['message'][rows] = np.maximum(message, -1)
-        unstamped = self.topic_of[(self.messages['stamp'] == 0) & ~self.messages['within']]
-        unstamped_topics = set(np.unique(unstamped).tolist())
-        several, missing = message == _SEVERAL, stamped & (message == _NONE)
-        for kind, which in (('ambiguous', several), ('messages', missing),
-                            ('without_message', ~stamped & (runs['taken'] == 0))):
-            for each, n in zip(*(c.tolist() for c in np.unique(
-                    number[which], return_counts=True))):
-                callback = self.callbacks[each]
-                if kind == 'messages' and unstamped_topics & {0, self.topics.get(callback.start)}:
-                    self.losses.count('unlinked', callback.label, n)
-                elif kind != 'without_message' or callback.kind == 'subscription':
-                    self.losses.count(kind, callback.label, n)
+        several = message == _SEVERAL
+        subscribes = np.array([each.kind == 'subscription' for each in self.callbacks], bool)
+        missing = (stamped & (message < 0)) | (
+            ~stamped & (runs['taken'] == 0) & subscribes[number])
+        for each, n in zip(*(c.tolist() for c in np.unique(number[missing], return_counts=True))):
+            self.losses.count('messages', self.callbacks[each].label, n)
         self._lost += [Lost(at, callback, -1, start) for at, callback, start in zip(*(
             runs[name][several].tolist() for name in ('at', 'callback', 'start')))]
 

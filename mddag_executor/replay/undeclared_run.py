@@ -135,7 +135,6 @@ class UndeclaredRun(ImportedRun):
     kinds = {**KINDS, **OWN_KINDS}
     others = (*INIT_EVENTS, _DROP)
     links_type = _OwnLinks
-    no_grid = 'off'
 
     def read(self) -> Recording:
         """Return the recording."""

@@ -96,8 +96,8 @@ def test_a_lost_take_of_august_2021_links_nothing(recorded):
     got, warnings = linked(recorded.write(but=[lost]))
     assert [link[2] for link in got.links if link[0].startswith('/detector')] == [101 * MS, None]
     assert warnings == [
-        '1 execution of a subscription with no event in it that says which message was taken: of '
-        'no job and no path: /detector subscription /image (1)']
+        '1 execution for a message whose publication is not known: of no job and no path: '
+        '/detector subscription /image (1)']
 
 
 @pytest.mark.parametrize('dispatch', [
@@ -198,9 +198,8 @@ def test_same_stamps_on_other_topics_and_on_the_same(recorded):
     recorded.publish(IMAGE, 3, 102 * MS, stamp=50)
     got, warnings = linked(recorded.write())
     assert got.links[-1][2] is None
-    assert warnings == ['1 execution for a message with the topic and source timestamp of another '
-                        'one: of no job and no path: '
-                        '/detector subscription /image (1)']
+    assert warnings == ['1 execution for a message whose publication is not known: of no job and '
+                        'no path: /detector subscription /image (1)']
 
 
 def test_what_was_initialised_before_the_recording(tmp_path):

@@ -94,6 +94,16 @@ def recorded(tmp_path):
     return trace(tmp_path / 'r.mcap', events)
 
 
+def test_nodes_are_sorted(tmp_path):
+    """An executor has a set of nodes, which it records in any order."""
+    path = trace(tmp_path / 'r.mcap', [event for n, name in enumerate('bca') for event in (
+        ('rcl_node_init', n, 1, 10 + n, 0, name, '/'),
+        ('rcl_timer_init', n, 1, 20 + n, 10 * MS),
+        ('rclcpp_timer_callback_added', n, 1, 20 + n, 30 + n),
+        ('rclcpp_timer_link_node', n, 1, 20 + n, 10 + n), *run(30 + n, 1, 100 + 10 * n, 5))])
+    assert [node.name for node in System(path).draft().nodes] == ['/a', '/b', '/c']
+
+
 def test_from_a_trace(recorded):
     text = declaration_of(System(recorded).draft())
     assert f'# From the trace {recorded}.' in text

@@ -159,7 +159,7 @@ def test_messages_of_others_are_of_no_job(run):
     assert result['callbacks']['/detect:run']['executions'] == 4
     assert result['undeclared']['executions'] == 8
     warning, = result['warnings']
-    assert '8 executions for a message whose publication is not in it' in warning
+    assert '8 executions for a message whose publication is not known' in warning
 
 
 @pytest.mark.parametrize('in_order', [True, False])
