@@ -136,7 +136,7 @@ def files(tmp_path_factory):
     ('graph place g.yaml --processes 1 --trace run.mcap --utilisation 0.2 -o out.yaml',
      '--utilisation: execution times are those of --trace: leave one of them out'),
     # recordings
-    ('replay folder', 'folder: is an empty folder: give a trace, an .mcap file'),
+    ('replay folder', 'folder: is a folder without a trace: give a trace, an .mcap file'),
     ('replay run.mcap other.yaml',
      'run.mcap: none of the callbacks of other.yaml is in it: it has /n:t, /n:x, /m:t: '),
     ('replay run.mcap --workers 2', '--workers: a run is replayed as it was recorded: add --resc'),
