@@ -108,6 +108,12 @@ def test_warnings_have_counts(tmp_path, sample):
     assert read(path)[1] == [
         f'{path}: the file ends without a finish record (at byte {chunk[0]}): used 2 chunks with '
         '7 messages before it; what there should be is not known']
+    begin, end = spans(data)[3]
+    padding = struct.pack('<BQ', 0x90, end - begin - 9) + bytes(end - begin - 9)
+    path.write_bytes(data[:begin] + padding + data[end:])
+    assert read(path)[1] == [
+        f'{path}: events are missing or doubled: used 3 chunks with 8 messages; the file says '
+        'that it holds 4 chunks with 14 messages']
     path.write_bytes(data[:-1])
     assert read(path)[1] == [f'{path}: the summary at the end is damaged or missing: used all of '
                              'the data, 4 chunks with 14 messages']
@@ -135,31 +141,6 @@ def test_flipped_bits(tmp_path, sample):
         if where.get(position) in in_summary:
             assert found == len(chunks)
             assert len(read(path)[1]) == 1          # the summary's CRC
-
-
-def test_a_lost_chunk_is_noticed(tmp_path, sample):
-    """A chunk turned into a record of unknown kind would be passed over but for its indexes."""
-    data, _ = sample
-    path = tmp_path / 'a.mcap'
-    found = records_of(data)
-    place = next(number for number, record in enumerate(found) if record[0] == Opcode.CHUNK) + 1
-    place = next(number for number, record in enumerate(found[place:], place)
-                 if record[0] == Opcode.CHUNK)
-    for opcode in (0x86, 0x46, 0x0C, 0x09):
-        changed = bytearray(data)
-        changed[found[place][1]] = opcode
-        path.write_bytes(changed)
-        events, warnings = read(path)
-        assert len(events) == SIZES[0] and len(warnings) == 1
-        assert 'a message index belongs to no chunk' in warnings[0]
-    # without the indexes too, the summary's counts tell
-    end = next(start for opcode, start, _ in found[place + 1:] if opcode != Opcode.MESSAGE_INDEX)
-    gap = end - found[place][1] - 9
-    padding = struct.pack('<BQ', 0x90, gap) + bytes(gap)
-    path.write_bytes(data[:found[place][1]] + padding + data[end:])
-    events, warnings = read(path)
-    assert ('events are missing or doubled: used 3 chunks with 10 messages; the file says that '
-            'it holds 4 chunks') in warnings[0]
 
 
 def test_what_is_no_file(tmp_path):
@@ -204,20 +185,6 @@ def spans(data: bytes) -> list[tuple[int, int]]:
     starts = [start for opcode, start, _ in records_of(data)
               if opcode in (Opcode.CHUNK, Opcode.DATA_END)]
     return list(zip(starts, starts[1:]))
-
-
-@pytest.mark.parametrize('number', range(len(SIZES)))
-def test_a_chunk_that_was_cut_out_or_doubled_is_noticed(tmp_path, sample, number):
-    data, chunks = sample
-    path = tmp_path / 'a.mcap'
-    start, end = spans(data)[number]
-    every = [event for chunk in chunks for event in chunk]
-    for changed in (data[:start] + data[end:], data[:end] + data[start:]):
-        path.write_bytes(changed)
-        events, warnings = read(path)
-        assert set(events) <= set(every)
-        assert number == 0 or len(events) != len(every)
-        assert 'the summary at the end is damaged' in warnings[0]
 
 
 def test_a_file_that_goes_away_or_shrinks(tmp_path, sample):
@@ -375,19 +342,3 @@ def test_hostile_lengths(tmp_path, finished):
         assert text.startswith(str(path)), (path, text)
         assert len(text) < 600
     assert texts[::2] == texts[1::2]
-
-
-@pytest.mark.parametrize('change', [
-    {'summary_start': 2**63}, {'summary_start': 2**40}, {'summary_start': 1},
-    {'length': 2**63}, {'crc': 1},
-])
-def test_hostile_footers(tmp_path, sample, change):
-    data, chunks = sample
-    path = tmp_path / 'a.mcap'
-    start, = struct.unpack_from('<Q', data, len(data) - 28)
-    path.write_bytes(data[:-37] + struct.pack(
-        '<BQQQI', 2, change.get('length', 20), change.get('summary_start', start), 0,
-        change.get('crc', 0)) + records.MAGIC)
-    events, warnings = read(path)
-    assert events == [event for chunk in chunks for event in chunk]
-    assert len(warnings) == 1 and 'the summary at the end is damaged' in warnings[0]
