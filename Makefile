@@ -31,7 +31,7 @@ help:
 	@echo 'make mutations  break the executor on purpose; a test must notice each change'
 	@echo 'make soak       the Autoware workload with random faults for SOAK_SECONDS (600)'
 	@echo 'make stress     deadline misses reported to all kinds of handlers, STRESS_SECONDS (20) each'
-	@echo 'make fuzz       read damaged traces and bags for FUZZ_SECONDS (600) each'
+	@echo 'make fuzz       read damaged recordings for FUZZ_SECONDS (600) each'
 	@echo 'make lint       run the linters and mypy only'
 	@echo 'make docs       build the documentation, build/docs/index.html'
 	@echo 'make env        make or refresh the environment in $(VENV)/ (the others do it, too)'

@@ -30,7 +30,7 @@ from mcap.records import Chunk
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.bags import Bag
-from mddag_executor.trace import records
+from mddag_executor.trace import import_ctf, records
 from mddag_executor.trace.blocks import Content
 from mddag_executor.trace.trace_file import written
 from msg_graph import GraphError
@@ -38,6 +38,7 @@ import pytest
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 import zstandard
 
+from ..trace.ctf_session import session
 from .helpers import MS, small, VirtualRun
 from .test_ordinary_bags import write_bag
 
@@ -268,3 +269,24 @@ def test_damaged_bags(tmp_path, storage, compression):
             found = list(bag.stamps['/points'].arrival) if bag.stamps else []
             assert found == whole[:len(found)]
             assert bag.warnings or found == whole
+
+
+@pytest.mark.needs('babeltrace2')
+@pytest.mark.timeout(180 + 2 * LONG_S)
+def test_damaged_ctf_sessions(tmp_path):
+    """babeltrace2 reads them in a process of its own: a trace, or an error."""
+    kinds = [(f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')]
+    folder = session(tmp_path / 'session', kinds, [
+        (at % 2, at, 1, 1, 'p', 0x5550) for at in range(40)])
+    files = {name: (folder / name).read_bytes() for name in ('metadata', 'channel_0')}
+    for number, seed in enumerate(rounds(3)):
+        if number == 20 and not LONG_S:
+            break
+        rng = random.Random(seed)
+        name = rng.choice(list(files))
+        changed = bytearray(files[name])
+        rng.choice((flip, cut, stretch))(changed, rng)
+        (folder / name).write_bytes(changed)
+        attempt(folder / name, lambda _: import_ctf(
+            folder, tmp_path / 'trace.mcap', overwrite=True), seed)
+        (folder / name).write_bytes(files[name])
