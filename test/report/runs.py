@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +42,13 @@ paths:
 
 def by_hand(
     path: Path, hostile: bool = False, finished: bool = True, undeclared: bool = True,
-    extra_ms: int = 0,
+    extra_ms: int = 0, took: Sequence[int] = (1, 2, 6),
 ) -> Path:
     """
     Write a trace of three jobs; the third is 2 ms late; then an undeclared callback runs.
 
     :param extra_ms: how much longer the last callback takes.
+    :param took: how long the first callback takes in each job, ms; with more than 4 it is late.
     """
     with TraceFile(path, overwrite=True) as file:
         def add(name, ms, *fields):
@@ -62,18 +64,20 @@ def by_hand(
             False)
         if undeclared:
             add('rclcpp_callback_register', 0, 77, HOSTILE if hostile else 'extra')
-        for job, first in enumerate((1, 2, 6)):
+        for job, first in enumerate(took):
             at = 10 + 10 * job
+            end = at + first + 4 + extra_ms
             add('job_release', at, 0, job, START + at * MS)
             run(0, job, at, at, at + first)
-            run(1, job, at + first, at + first + 1, at + first + 4 + extra_ms)
-        add('deadline', 40 + extra_ms, 0, 1, 2, START + 38 * MS, START + (40 + extra_ms) * MS)
+            run(1, job, at + first, at + first + 1, end)
+            if end > at + 8:
+                add('deadline', end, 0, 1, job, START + (at + 8) * MS, START + end * MS)
         if undeclared:
-            add('dispatch', 41, 77, -1, -1, -1, -1, START + 41 * MS, 0)
-            add('callback_start', 41, 77, False)
-            add('callback_end', 43, 77)
+            add('dispatch', at + 11, 77, -1, -1, -1, -1, START + (at + 11) * MS, 0)
+            add('callback_start', at + 11, 77, False)
+            add('callback_end', at + 13, 77)
         if finished:
-            add('shutdown', 50, START + 50 * MS)
+            add('shutdown', at + 20, START + (at + 20) * MS)
     return path
 
 

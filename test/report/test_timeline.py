@@ -4,14 +4,10 @@
 
 from __future__ import annotations
 
-from mddag_executor.recording import tables
-from mddag_executor.recording.entities import Entities
-from mddag_executor.recording.head import Head
-from mddag_executor.recording.tables import Recording, Rows
+from mddag_executor.recording.tables import Recording
 from mddag_executor.replay import open_recording, replay, reschedule
 from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.replay.computed import ComputedRun
-from mddag_executor.replay.deadlines import Judged
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.report import html
 from mddag_executor.report.timeline import Timeline
@@ -105,54 +101,21 @@ def test_a_bag_has_the_verdicts_of_its_report(tmp_path):
     assert data.replay.chains.breakdown()[1]['worst']['release_lag_ns'] == 5 * runs.MS
 
 
-ONE = """\
-mddag: 1
-nodes: [{node: /n, callbacks: [{name: a, timer: 100us, deadline: 60us}]}]
-"""
-
-
-def ran(
-    *executions: tuple[int, int, int, int, int], end: int = 10 ** 6
-) -> tuple[Timeline, tables.Table]:
-    """
-    Return the timeline of executions, and their table.
-
-    An execution is: callback, vertex, job (released at its start), ….
-    """
-    task_set = msg_graph.loads(ONE, 'g.yaml')
-    rows = Rows(tables.EXECUTIONS, 'callback', 'vertex', 'dag', 'job', 'ready', 'began', 'start',
-                'end', 'completes', 'order')
-    releases = Rows(tables.RELEASES, 'job', 'release', 'noticed', 'order')
-    for order, (callback, vertex, job, start, until) in enumerate(executions):
-        if vertex >= 0:
-            releases.add(job, start, start, 2 * order)
-        rows.add(callback, vertex, vertex, job, start, start, start, until,
-                 tables.VERTEX if vertex >= 0 and until >= 0 else 0, 2 * order + 1)
-    who = Entities(by_address=True)
-    who.note('ros2:rclcpp_callback_register', {
-        '_timestamp': 0, '_vpid': 0, 'callback': 7, 'symbol': 'spin_some'})
-    recording = Recording(
-        'by hand', Head(0, '', '', 'rad', 1, 0, 0, False), task_set, task_set, who,
-        releases=releases.table(), executions=rows.table(), end=end, judged_until=end)
-    timeline = Timeline(recording, Judged(recording), most=100, block=10)
-    return timeline, recording.executions[timeline.rows]
-
-
-def test_detail_is_bounded_and_keeps_the_misses():
-    us = 1000
-    timeline, executions = ran(*(
-        (1, 0, i, 100 * us * i, 100 * us * i + (70 if i in (333, 777) else 50) * us)
-        for i in range(1000)))
-    assert timeline.n_executions == 1000 and timeline.n_missed == 2
-    assert len(executions) <= 100
-    assert {333, 777} <= set(executions['job'].tolist())
-    assert {333, 777} <= set(timeline.verdicts['job'].tolist())
-    jobs = executions['job']
+def test_detail_is_bounded_and_keeps_the_misses(tmp_path):
+    outcome = replay(runs.by_hand(
+        tmp_path / 'run.mcap', took=[6 if job in (333, 777) else 2 for job in range(1000)]))
+    timeline = Timeline(outcome.recording, outcome.judged, most=200, block=10)
+    assert timeline.n_executions == 2001 and timeline.n_missed == 2
+    executions = outcome.recording.executions[timeline.rows]
+    assert len(executions) <= 200
+    jobs = executions['job'][executions['vertex'] >= 0]
+    for job in (333, 777):
+        assert (jobs == job).sum() == 2 and job in timeline.verdicts['job']
     assert jobs[0] == 0 and jobs[-1] >= 960
     assert int(np.diff(jobs).max()) <= 330      # what is shown is spread over the run
     for left, right in timeline.gaps:
         inside = (executions['start'] > left) & (executions['end'] < right)
         assert not inside.any() and left < right
     assert len(timeline.gaps) >= 3
-    assert sum(timeline.busy_over_time.result()['busy_ns']) == (998 * 50 + 2 * 70) * us
+    assert sum(timeline.busy_over_time.result()['busy_ns']) == (998 * 5 + 2 * 9) * runs.MS
     assert sum(timeline.missed_over_time.result()['busy_ns']) == 2
