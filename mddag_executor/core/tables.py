@@ -156,8 +156,13 @@ class Tables(NamedTuple):
         return columns.finish(default_deadline)
 
     def source_depth(self, dag: int) -> int:
-        """Return how many releases of a timer source may wait: as many as can be in time."""
-        return max(1, -(-self.dag_deadline[dag] // self.period[dag]))
+        """
+        Return how many releases of a timer source may wait: as many as can be in time.
+
+        If only the newest is kept, the second drops the first (rule 13).
+        """
+        least = 1 + self.keep_newest[self.source[dag]]
+        return max(least, -(-self.dag_deadline[dag] // self.period[dag]))
 
 
 class _Columns:

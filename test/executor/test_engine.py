@@ -88,6 +88,27 @@ class Driver:
                 Work(after, print), Origin(slot, dag, job, vertex), -1, -1, now)
 
 
+@pytest.mark.parametrize(('keep', 'release', 'dropped'), [('newest', 40, 2), ('all', 0, 0)])
+def test_the_newest_release_of_a_timer_is_kept_if_declared(keep, release, dropped):
+    task_set = loads(f"""\
+mddag: 1
+nodes:
+  - node: /motor
+    callbacks: [{{name: drive, timer: 20ms, deadline: 20ms, dag: motor, keep: {keep}}}]
+""", 'graph.yaml')
+    engine = Engine(task_set, 1, 'rad', default_deadline=1, max_active_jobs=NEVER,
+                    expire_after=NEVER)
+    timer = entity_of(engine, task_set, 0, 0)
+    timer.depth = engine.tables.source_depth(0)
+    for due in (0, 20_000_000, 40_000_000):
+        engine.timer_due(Work(timer, print), due, due)
+        engine.validate()
+    work = engine.dispatch(0, 41_000_000)
+    assert engine.release_of(work) == release * 1_000_000
+    assert (timer.dropped, timer.skipped) == (dropped, 2 - dropped)
+    assert engine.dispatch(0, 41_000_000) is None
+
+
 @pytest.mark.parametrize('policy', ['rad', 'gedf', 'fifo'])
 def test_a_second_message_of_a_publication_comes_after_the_first(policy):
     """It belongs to no job, and would have the earlier deadline."""
