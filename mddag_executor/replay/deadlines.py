@@ -437,12 +437,3 @@ def _judge_from(recording: Recording, skip: int) -> int:
     if skip > 0 and len(releases):
         return int(releases['release'][releases['order'].argmin()]) + skip
     return begin
-
-
-def judge(recording: Recording, skip: int = 0) -> Judged:
-    """
-    Judge the deadlines of a recording.
-
-    :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
-    """
-    return Judged(recording, skip)

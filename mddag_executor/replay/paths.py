@@ -190,9 +190,10 @@ class Paths:
         else:       # publications are not recorded
             parts = []
             for callback in self._task_set.callbacks:
-                mine, _ = self._ends_of(callback.key)
-                parts += [(mine, self._topics[topic]) for topic in callback.publishes
-                          if topic in self._topics]
+                topics = [each for each in callback.publishes if each in self._topics]
+                if topics:
+                    mine, _ = self._ends_of(callback.key)
+                    parts += [(mine, self._topics[topic]) for topic in topics]
             by = np.concatenate([mine for mine, _ in parts] or [self._first[:0]])
             topic = np.repeat(np.array([topic for _, topic in parts], dtype=np.int64),
                               [len(mine) for mine, _ in parts])

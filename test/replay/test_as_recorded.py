@@ -298,6 +298,16 @@ def test_misses_that_are_not_those_recorded_are_said(tmp_path):
     assert replay(path, loads(SMALL.replace('12ms', '13ms'), 'g.yaml')).warnings == []
 
 
+def test_a_completion_without_execution_is_said(tmp_path):
+    with begin_trace(tmp_path / 'a.mcap', SMALL) as file:
+        file.add('job_release', START_TIME, 1, 1, 1, 0, START_TIME)
+        file.add('complete', START_TIME + MS, 1, 1, 9, 1, 0, 0, True, START_TIME + MS, 0)
+        end_trace(file, START_TIME + MS)
+    said = replay(tmp_path / 'a.mcap').warnings
+    assert [text.partition(': ')[2] for text in said] == [
+        '1 execution completed in it that did not run in it']
+
+
 @pytest.mark.parametrize(('text', 'says'), [
     ('', 'it was recorded without a declaration'),
     ('nonsense', r'the declaration that it was recorded with is wrong \(small.yaml'),

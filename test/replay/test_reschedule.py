@@ -303,6 +303,9 @@ def test_what_computes_without_the_interpreter_shares_the_cpus(tmp_path):
     assert responses(path) == [12, 12]
     assert sorted(responses(path, cpus=1)) == [21, 24]
     assert responses(path, workers=1) == [12, 24]
+    # what holds the interpreter waited for other threads of the executor
+    of_python(path, [(0, 0, 20, 10, True)])
+    assert (responses(path), responses(path, workers=1)) == ([20], [10])
     # recorded with one CPU they took turns
     of_python(path, [(0, 0, 21, 12, False), (1, 0, 24, 12, False)], cpus=1)
     assert responses(path, cpus=2) == [12, 12]
