@@ -21,7 +21,6 @@ from .helpers import add_execution, begin_trace, end_trace, START_TIME
 
 MS = 1_000_000
 PID = 7
-BAGS = Path(__file__).resolve().parents[2] / 'bags'
 ARCHITECTURE = """\
 named_paths: []
 nodes:
@@ -190,19 +189,6 @@ def test_what_is_no_system(tmp_path):
     path = trace(tmp_path / 'e.mcap', [('callback_start', 1, 1, 5, False)])
     with pytest.raises(InputError, match='no timer, subscription or service of a node'):
         System(path)
-
-
-def test_a_recorded_declaration_gives_names_and_deadlines():
-    bag = BAGS / 'demo_short.mcap'
-    system = System(bag, 'bag')
-    text = declaration_of(system.draft())
-    again = loads(text)
-    before = system.task_set
-    assert [c.key for c in again.callbacks] == [c.key for c in before.callbacks]
-    assert [(d.name, d.period_ns, d.edges, [v.name for v in d.vertices]) for d in again.dags] == [
-        (d.name, d.period_ns, d.edges, [v.name for v in d.vertices]) for d in before.dags]
-    assert [v.deadline_ns for v in again.vertices] == [v.deadline_ns for v in before.vertices]
-    assert MARK not in text.split('mddag: 1')[1]
 
 
 def test_drift_of_an_imported_recording(recorded):
