@@ -23,6 +23,7 @@ nodes note their starts themselves.)
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 import inspect
 import threading
 import time
@@ -30,12 +31,14 @@ from typing import Any
 
 from benchmarks.campaign import NONE, OURS, Spec
 from mddag_executor.executor.compat import message_taker, timer_functions
-from mddag_executor.hosting.peers import make_peer
 from msg_graph import TaskSet
-from rclpy.executors import Executor
+from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
+from rclpy.task import Future
 from rclpy.timer import Timer
+from rclpy.utilities import ok as context_ok
 
 
 def make_executor(spec: Spec, task_set: TaskSet | None) -> Executor:
@@ -49,7 +52,22 @@ def make_executor(spec: Spec, task_set: TaskSet | None) -> Executor:
         from mddag_executor.executor.executor import MultiDeadlineExecutor
         return MultiDeadlineExecutor(
             task_set, num_workers=spec.workers, policy=spec.policy, process=spec.process)
-    return NoExecutor() if spec.executor == NONE else make_peer(spec.executor, spec.workers)
+    if spec.executor == 'multi':
+        return MultiThreadedExecutor(spec.workers)
+    return {NONE: NoExecutor, 'single': SingleThreadedExecutor, 'events': EventsExecutor}[
+        spec.executor]()
+
+
+def spin_of(executor: Executor) -> Callable[[], None] | None:
+    """Return what spins an executor, None: its ``spin``."""
+    # The native EventsExecutor is not derived from rclpy's Executor.
+    return None if isinstance(executor, Executor) else partial(_spin_events_executor, executor)
+
+
+def _spin_events_executor(executor: Executor) -> None:
+    """Spin rclpy's EventsExecutor, whose ``spin`` does not dispatch without a timeout (7.1.5)."""
+    while context_ok():
+        executor.spin_until_future_complete(Future(), 1000.0)
 
 
 class NoExecutor(Executor):

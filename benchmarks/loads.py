@@ -26,7 +26,7 @@ import time
 from typing import Any, cast
 
 from benchmarks.campaign import DECLARED, OURS, ROBOT, Spec
-from benchmarks.executors import make_executor, noting, Start, within
+from benchmarks.executors import make_executor, noting, spin_of, Start, within
 from benchmarks.publisher import PublisherProcess
 from mddag_executor.core.tally import quantiles_us
 from mddag_executor.executor import current_job
@@ -95,7 +95,7 @@ def run_declared(spec: Spec) -> dict[str, Any]:
     for node in workload.nodes:
         for subscription in node.subscriptions:
             subscription.callback = noting(starts, subscription.callback)
-    run_nodes(executor, workload, spec.seconds, spec.warm_up_s)
+    run_nodes(executor, workload, spec.seconds, spec.warm_up_s, spin_of(executor))
     # rclpy's EventsExecutor advances a timer before it queues the call, so the due time of a call
     # in a backlog is unknown: only messages are counted there.
     if spec.executor != 'events':
@@ -178,7 +178,7 @@ def run_messages(spec: Spec) -> dict[str, Any]:
     for i in range(spec.idle):
         _subscribe(node, f'{prefix}/idle_{i}', starts)
     executor.add_node(node)
-    session = UnfinishedSession(executor)
+    session = UnfinishedSession(executor, spin_of(executor))
     seed = None if spec.phases == 'together' else spec.seed
     with session, PublisherProcess(topics, spec.rate_hz, seed) as publisher:
         publisher.wait_until_ready()
@@ -258,7 +258,7 @@ def run_robot(spec: Spec) -> dict[str, Any]:
     nodes = _make_nodes(spec.scale)
     for node in nodes:
         executor.add_node(node)
-    session = UnfinishedSession(executor)
+    session = UnfinishedSession(executor, spin_of(executor))
     with session:
         ended = session.wait(spec.warm_up_s + 1.0)  # time for discovery
         begin, cpu = time.time_ns(), time.process_time_ns()

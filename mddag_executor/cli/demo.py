@@ -71,8 +71,8 @@ def main(args: argparse.Namespace) -> int:
     show(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), {seconds:g} s ==")
     from mddag_executor.hosting.peers import measure_peer
     with Progress('measuring', seconds + 3) as progress:
-        peer = measure_peer('multi', graph, WORKERS, seconds=seconds, seed=SEED,
-                            utilisation=args.utilisation, mode='sleep', tick=progress.update)
+        peer = measure_peer(graph, WORKERS, seconds=seconds, seed=SEED,
+                            utilisation=args.utilisation, tick=progress.update)
     show(_side_by_side(live['measured'], peer))
     common.write_result(args, {
         'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': peer,

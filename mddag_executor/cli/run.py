@@ -17,6 +17,7 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack, redirect_stdout
 from dataclasses import asdict, replace
+import faulthandler
 from functools import partial
 import os
 from pathlib import Path
@@ -31,7 +32,6 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options, verdicts
-from mddag_executor.cli.stuck import dump_when_stuck
 from mddag_executor.cli.text import Progress, warn
 from mddag_executor.errors import MddagError, UsageError, UserCodeError
 from mddag_executor.report.live_runs import live_lines
@@ -55,6 +55,9 @@ mddag run --node my_package/driver --node my_package/filter --trace run.mcap"""
 # SIGINTs within this time are one: Ctrl-C sends one to all processes of the group, and `ros2
 # launch` without a terminal another one to those that it started.
 _SAME_INTERRUPT_S = 1.0
+# An end that takes longer than this writes the stack of each thread: well above the duration of an
+# end with slow callbacks, middleware and disk.
+STUCK_S = 30.0
 # A part ends at last, whatever its nodes do.
 _PART_ENDS_S = 60
 # How long nodes of several processes wait for each other, once the programs have started: if the
@@ -134,6 +137,7 @@ def part(args: argparse.Namespace) -> int:
     from mddag_executor.hosting.processes import belong_to_parent, Part
     the_part = Part.read(args.part)
     belong_to_parent(the_part.parent)
+    vars(args).update(the_part.options)
     task_set = loads(the_part.text, name=args.graph)
     if args.process is None:
         from mddag_executor.hosting.host import nodes_of
@@ -169,9 +173,10 @@ def run_here(
     if args.synthetic is not None:
         from mddag_executor.hosting.measure import ExecutionPlan
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
-    with dump_when_stuck() as ends, Signals(
-            _PART_ENDS_S if args.part else 0) as signals, _rclpy(
-            args.ros_args or []), ExitStack() as stack:
+    with ExitStack() as stack:
+        stack.callback(faulthandler.cancel_dump_traceback_later)
+        signals = stack.enter_context(Signals(_PART_ENDS_S if args.part else 0))
+        stack.enter_context(_rclpy(args.ros_args or []))
         if args.synthetic is None:
             from mddag_executor.hosting.host import Host
             from mddag_executor.hosting.loading import ros_arguments
@@ -187,7 +192,7 @@ def run_here(
         output = sys.stdout if common.wants_tables(args) else sys.stderr
         try:
             with redirect_stdout(output):
-                return _run(args, task_set, executor, host, programs, plan, signals, ends)
+                return _run(args, task_set, executor, host, programs, plan, signals)
         except MddagError:
             if args.trace is not None:  # nothing ran: leave no empty trace behind
                 Path(args.trace).unlink(missing_ok=True)
@@ -228,17 +233,12 @@ def _check_arguments(args: argparse.Namespace) -> None:
             '--utilisation: it scales synthetic nodes only: add --synthetic or leave it out')
 
 
-def warn_of(
-    plan: ExecutionPlan, ros_args: Sequence[str] | None, n_processes: int = 1
-) -> None:
-    """Warn of what the draw makes impossible, and of options without effect."""
+def warn_of(plan: ExecutionPlan, n_processes: int = 1) -> None:
+    """Warn of what the draw makes impossible."""
     for sink in plan.infeasible():
         warn(f'{sink.vertex}: no scheduler can keep its deadline of '
              f'{sink.deadline_ns / 1e6:.1f} ms: with seed {plan.seed} its critical path takes '
              f'{sink.critical_path_ns / 1e6:.1f} ms')
-    if not {'-r', '--remap'}.isdisjoint(ros_args or ()):
-        warn('--ros-args: remappings do not apply to synthetic nodes: they keep the names of the '
-             'declaration')
     if plan.mode == 'spin' and plan.utilisation * plan.workers > 0.9 * n_processes:
         warn('spinning callbacks share the interpreter lock, and so one core for each process; '
              f'these need {plan.utilisation * plan.workers:.2f} cores: lower --utilisation, give '
@@ -287,7 +287,6 @@ def _init(arguments: list[str]) -> None:
 def _run(
     args: argparse.Namespace, task_set: TaskSet, executor: MultiDeadlineExecutor,
     host: Host | None, programs: list[Program], plan: ExecutionPlan | None, signals: Signals,
-    ends: Callable[[], None],
 ) -> tuple[dict[str, Any], BaseException | None]:
     """Run until the end; see ``run_here``."""
     from mddag_executor.executor.statistics import Watch
@@ -295,7 +294,8 @@ def _run(
     from mddag_executor.hosting.session import Session
 
     def end_begins() -> None:
-        ends()
+        # a native thread writes the stacks, even if the thread that holds the GIL is stuck
+        faulthandler.dump_traceback_later(STUCK_S, file=2)
         if args.part is not None:
             signal.alarm(_PART_ENDS_S)
 
@@ -309,7 +309,7 @@ def _run(
     elif plan is not None:
         with Progress('running', seconds) as progress:
             if args.part is None:
-                warn_of(plan, args.ros_args)
+                warn_of(plan)
             ledger = _run_synthetic(args, session, task_set, plan, seconds, progress)
     counts = executor.statistics()
     result: dict[str, Any] = {

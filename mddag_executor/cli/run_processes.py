@@ -29,6 +29,8 @@ from msg_graph.edit import load_processes, with_processes
 from msg_graph.errors import listed, shown
 
 EXIT_DIED = 70
+_COMMON_OPTIONS = ('policy', 'on_late', 'workers', 'duration', 'seed', 'utilisation',
+                   'diagnostics', 'overwrite', 'ros_args')
 _PROBE_TIMEOUT_S = 120.0
 
 
@@ -55,7 +57,6 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     :raises msg_graph.GraphError: when the declaration is wrong
     :raises mddag_executor.errors.MddagError: when anything else cannot be used
     """
-    from mddag_executor.hosting.loading import ros_arguments
     from mddag_executor.hosting.measure import ExecutionPlan
     from mddag_executor.hosting.processes import left, Part, Run, Supervisor, together
     plan = None
@@ -63,20 +64,22 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         workers = defaults.workers(args.workers, task_set)
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     with tempfile.TemporaryDirectory(prefix='mddag-') as folder, Signals() as signals:
-        Part.make(folder, task_set.text)
+        common_options = {name: getattr(args, name) for name in _COMMON_OPTIONS}
+        Part.make(folder, task_set.text, common_options)
         task_set, specs = _placed(args, task_set, plan, folder)
-        Part.make(folder, task_set.text)
+        Part.make(folder, task_set.text, common_options)
         names = [process.name for process in task_set.processes]
         _warn_of_contested(task_set)
         for name in names:
-            _check_traces(args, name)
+            common.check_output(
+                _trace(args.trace, name), recording=True, overwrite=args.overwrite)
         if plan is not None:
-            warn_of(plan, args.ros_args, len(names))
+            warn_of(plan, len(names))
 
         def command(name: str) -> list[str]:
             trace = _trace(args.trace, name)
-            return [*_command(args, folder, specs.get(name, ())), '--process', name,
-                    *(() if trace is None else ('--trace', trace)), *ros_arguments(args.ros_args)]
+            return [*_command(args, folder, specs[name]), '--process', name,
+                    *(() if trace is None else ('--trace', trace))]
 
         out = sys.stdout if common.wants_tables(args) else sys.stderr
 
@@ -175,14 +178,12 @@ def _probe(
     args: argparse.Namespace, folder: str, specs: Sequence[str]
 ) -> Mapping[str, Sequence[str]]:
     """Return the names of the nodes that each SPEC brings."""
-    from mddag_executor.hosting.loading import ros_arguments
     from mddag_executor.hosting.processes import left, ProcessError
     # These nodes must not be discovered.
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
     with subprocess.Popen(
-        [*_command(args, folder, specs), *ros_arguments(args.ros_args)], stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors='replace',
-        env=environment,
+        _command(args, folder, specs), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True, errors='replace', env=environment,
     ) as process:
         try:
             said, _ = process.communicate(timeout=_PROBE_TIMEOUT_S)
@@ -200,29 +201,10 @@ def _probe(
 
 
 def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> list[str]:
-    """Return the command line of a part, up to its name."""
-    command = [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
-               '--policy', args.policy, '--on-late', args.on_late,
-               '--diagnostics', f'{args.diagnostics}ns' if args.diagnostics else 'off']
-    if args.overwrite:
-        command.append('--overwrite')
-    if args.synthetic is None:
-        for spec in specs:
-            command += ['--node', spec]
-    else:
-        command += ['--synthetic', args.synthetic, '--seed', str(args.seed)]
-    duration = None if args.duration is None else f'{args.duration}ns'
-    for option, value in (('--utilisation', args.utilisation), ('--workers', args.workers),
-                          ('--duration', duration)):
-        if value is not None:
-            command += [option, str(value)]
-    return command
-
-
-def _check_traces(args: argparse.Namespace, name: str) -> None:
-    """Find out whether a process can record."""
-    common.check_output(
-        _trace(args.trace, name), recording=True, overwrite=args.overwrite)
+    """Return the command line of a part, up to its name; see ``_COMMON_OPTIONS``."""
+    nodes = [word for spec in specs for word in ('--node', spec)]
+    return [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
+            *(nodes if args.synthetic is None else ('--synthetic', args.synthetic))]
 
 
 def _trace(given: str | None, name: str) -> str | None:

@@ -122,8 +122,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param num_threads: the name of ``num_workers`` in ``MultiThreadedExecutor``.
     :param overwrite: whether ``trace`` may replace a file.
     :raises msg_graph.GraphError: when the declaration is invalid.
-    :raises mddag_executor.errors.MddagError: on an unknown policy or thread setting, a value of
-        the wrong kind, and when the trace cannot be written.
+    :raises mddag_executor.errors.MddagError: on an unknown policy or thread setting, a number out
+        of range, and when the trace cannot be written.
     :raises rclpy.exceptions.NotInitializedException: when ``rclpy.init`` was not called before.
     """
 
@@ -155,12 +155,10 @@ class MultiDeadlineExecutor(BareExecutor):
         every_ns = settings.diagnostics_period_ns(diagnostics_period)
         max_active_jobs = settings.whole_number(
             'max_active_jobs', max_active_jobs, settings.MOST_JOBS)
-        settings.check_callable('on_deadline_miss', on_deadline_miss)
         find_policy(policy)
         settings.check_on_late(on_late)
         settings.check_context(context)
         settings.check_process(process, task_set)
-        thresholds = settings.check_thresholds(thresholds)
         # All parameters are checked by now: an error leaves no trace and no thread behind.
         publishing.install()
         self._trace_clock = TraceClock()
@@ -206,7 +204,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if every_ns is not None:
             self._diagnostics = Diagnostics(
                 self.context, task_set, self._pool, self._registry, self._recorder, every_ns,
-                thresholds, process, self._notifier)
+                thresholds or Thresholds(), process, self._notifier)
         if process is not None and task_set is not None and (
                 self._engine.other_processes is not None
                 and self._engine.other_processes.announces):

@@ -123,8 +123,7 @@ class Registry:
                 for rclpy_entity in some:
                     key = id(rclpy_entity)
                     entity = self.by_id.get(key)
-                    if entity is None or entity.rclpy is not rclpy_entity or self._retimed(entity):
-                        present.pop(key, None)
+                    if entity is None or entity.rclpy is not rclpy_entity:
                         new.append((kind, rclpy_entity, name))
                     else:
                         present[key] = entity
@@ -140,24 +139,6 @@ class Registry:
             self._fold()
         self._free_groups()
         return added, gone
-
-    def is_stale(self) -> bool:
-        """
-        Return whether `refresh` would change anything though no entity has come or gone.
-
-        This is the case if the period of an undeclared timer has changed, which may make it
-        declared, or if the last execution of a removed entity has ended.
-        """
-        return (any(self._retimed(entity) for entity in self.timers())
-                or any(entity.is_through() for entity in self._retired))
-
-    def _retimed(self, entity: Entity) -> bool:
-        if entity.kind != TIMER or entity.callback is not None or self._binder is None:
-            return False
-        try:
-            return entity.label != exact_duration(entity.rclpy.timer_period_ns)
-        except InvalidHandle:
-            return False  # it was destroyed meanwhile
 
     def _name(self, node: Any) -> str:
         """Return a node's name, also if it has been destroyed but not removed."""
@@ -204,21 +185,9 @@ class Registry:
         return sum(bool(e.ran and e.habit.holds) for e in list(self.by_id.values()))
 
     def totals(self) -> dict[str, int]:
-        """
-        Return the sums of the counts of all callbacks, from any thread.
-
-        Unlike ``counts``, an unused entity costs almost nothing.
-        """
-        totals = dict.fromkeys(COUNTS, 0)
-        with self._counting:
-            for past in self._past.values():
-                for key in COUNTS:
-                    totals[key] += past[key]
-            for entity in (*self._retired, *self.by_id.values()):
-                if entity.ready or entity.skipped:
-                    for key in COUNTS:
-                        totals[key] += getattr(entity, key)
-        return totals
+        """Return the sums of the counts of all callbacks, from any thread."""
+        every = self.counts().values()
+        return {key: sum(each[key] for each in every) for key in COUNTS}
 
     def hosted(self) -> set[str]:
         """Return the keys of the declared callbacks that an entity is bound to now."""

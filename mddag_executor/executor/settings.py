@@ -36,38 +36,18 @@ def whole_number(name: str, value: Any, most: int, unit: str = '') -> int:
     try:
         number = operator.index(value)
     except TypeError:
-        number = None
-    if number is None or isinstance(value, bool):
-        raise UsageError(f'{name}: {value!r} must be an integer: give 1{unit} or more')
-    if number < 1:
-        raise UsageError(f'{name}: {number}{unit} is too {"short" if unit else "few"}: '
-                         'give at least 1')
-    if number > most:
-        raise UsageError(f'{name}: {number}{unit} is too much: give at most {most}{unit}')
+        number = 0
+    if not 1 <= number <= most:
+        raise UsageError(f'{name}: {value!r}{unit}: give an integer from 1 to {most}{unit}')
     return number
 
 
-def check_callable(name: str, value: Any) -> None:
-    """Check a value that must be callable, or None."""
-    if value is not None and not callable(value):
-        raise UsageError(f'{name}: {value!r} cannot be called: give a function or None')
-
-
-def check_thresholds(value: Any) -> Thresholds:
-    """Return the thresholds of the diagnostics, the defaults for None."""
-    if value is not None and not isinstance(value, Thresholds):
-        raise UsageError(f'thresholds: {value!r} are none: give Thresholds(...), or None')
-    return value or Thresholds()
-
-
-def check_context(context: Any) -> None:
+def check_context(context: Context | None) -> None:
     """
     Check the context of an executor, None for the default one.
 
     :raises NotInitializedException: when it has not been initialised.
     """
-    if context is not None and not isinstance(context, Context):
-        raise UsageError(f'context: {context!r} is no rclpy context: give one, or None')
     if (get_default_context() if context is None else context).handle is None:
         raise NotInitializedException('an executor needs a context: call rclpy.init() before')
 
@@ -190,12 +170,13 @@ def thread_setting(
     if policy is not None and policy not in THREAD_POLICIES:
         raise UsageError(
             f"worker_policy: '{policy}' is unknown: give one of {', '.join(THREAD_POLICIES)}")
-    if not hasattr(os, 'sched_setscheduler'):
-        raise UsageError('worker_policy: this system has none: leave it out')
     if priority is not None and priority != 0:  # 0: that of SCHED_OTHER
         whole_number('worker_priority', priority, 99)
     if cpus is not None:
-        cpus = _cpus(cpus)
+        mine, cpus = os.sched_getaffinity(0), set(cpus)
+        if not cpus or not cpus <= mine:
+            raise UsageError(f'worker_cpus: {cpus or "none"} are not CPUs that this process may '
+                             f'use: choose from {sorted(mine)}')
 
     def prepare() -> None:
         if cpus is not None:
@@ -210,19 +191,3 @@ def thread_setting(
                 'raise its rtprio limit (ulimit -r) or run it with CAP_SYS_NICE') from None
 
     return prepare
-
-
-def _cpus(cpus: Any) -> set[int]:
-    """Return a set of CPUs that this process may use, at least one."""
-    mine = os.sched_getaffinity(0)
-    try:
-        found = set(cpus)
-    except TypeError:
-        found = set()
-    if isinstance(cpus, str) or not found:
-        raise UsageError(f'worker_cpus: {cpus!r} is no set of CPUs: choose from {sorted(mine)}')
-    if not found <= mine:
-        raise UsageError(
-            f'worker_cpus: {sorted(found, key=str)} has CPUs that this process may not use: '
-            f'choose from {sorted(mine)}')
-    return found

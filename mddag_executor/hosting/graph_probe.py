@@ -64,25 +64,25 @@ class Seen(Releases):
     """
     The messages of a topic by their source timestamps.
 
-    :ivar lost: how many messages between them were published but not received.
+    :ivar published: how many the sender of the last message has published since the first one.
     """
 
-    lost: int = 0
-    _number: int | None = None
+    published: int = 0
+    _first_number: int = 0
 
-    def message(self, stamp: int, number: int | None = None) -> None:
-        """Count a message; its number is its publisher's, and useless with several publishers."""
+    def message(self, stamp: int, number: int | None) -> None:
+        """Count a message; its number is its publisher's."""
+        if not self.count:
+            self._first_number = number or 0
         self.add(stamp)
-        if number is not None and self._number is not None and number > self._number:
-            self.lost += number - self._number - 1
-        self._number = number
+        self.published = (number or 0) - self._first_number + 1
 
     def interval_ns(self, publishers: int = 1) -> int | None:
         """Return the mean time between two messages; None if there are too few."""
-        lost = self.lost if publishers == 1 else 0
-        if self.count < 2 or self.count + lost < _LEAST_MESSAGES or self.last <= self.first:
+        count = max(self.count, self.published) if publishers == 1 else self.count
+        if count < _LEAST_MESSAGES or self.last <= self.first:
             return None
-        return self.mean_ns(lost)
+        return (self.last - self.first) // (count - 1)
 
 
 @dataclass

@@ -5,11 +5,10 @@ Signal handlers of hosted programs, none of which runs in the main thread.
 
 Theory of operation
 -------------------
-Python runs handlers in the main thread, and only the main thread may set them.  So the handlers of
-programs are stored here.  For the first handler of a signal the main thread sets a common handler
-for all programs; a signal of this module interrupts the main thread for that.  When the signal
-arrives, first its earlier handler runs (SIGINT ends the run), then those of the programs.  An
-exception of a program's handler is raised in the program's own thread, as soon as that runs
+Python runs handlers in the main thread, and only the main thread may set them.  So this module
+sets a common handler for the signals that programs use, and stores the handlers of programs.  When
+a signal arrives, first its earlier handler runs (SIGINT ends the run), then those of the programs.
+An exception of a program's handler is raised in the program's own thread, as soon as that runs
 Python.
 """
 
@@ -25,10 +24,7 @@ from typing import Any, TYPE_CHECKING
 if TYPE_CHECKING:
     from mddag_executor.hosting.host import Guest, Host
 
-_DOORBELL = signal.SIGURG
-"""Without a handler it is ignored, so a late one does no harm."""
-_UNAVAILABLE = (signal.SIGKILL, signal.SIGSTOP, _DOORBELL)
-_PATIENCE_S = 5.0
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 
 
 class GuestSignals:
@@ -36,15 +32,16 @@ class GuestSignals:
 
     def __init__(self, host: Host) -> None:
         self._host = host
-        self._handlers: dict[int, dict[Guest | None, Any]] = {}
+        # of programs (None: of callbacks), by signal, and those of the main thread
+        self._handlers: dict[int, dict[Guest | None, Any]] = {each: {} for each in _SIGNALS}
         self._before: dict[int, Any] = {}
-        self._asked: list[tuple[int, Any]] = []
 
     def install(self, replace: Callable[[Any, str, Callable[[Any], Any]], None]) -> None:
         """Store handlers of programs, if the calling thread is the main thread."""
         self._set = signal.signal
         if threading.current_thread() is threading.main_thread():
-            self._before[_DOORBELL] = signal.signal(_DOORBELL, self._answer)
+            for number in _SIGNALS:
+                self._before[number] = signal.signal(number, self._handle)
             replace(signal, 'signal', self._signal)
             replace(signal, 'getsignal', self._getsignal)
 
@@ -56,21 +53,16 @@ class GuestSignals:
     def _signal(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def set_handler(number: int, handler: Any) -> Any:
             guest = self._host.current_guest()
-            is_main = threading.current_thread() is threading.main_thread()
-            if is_main and guest is None or number in _UNAVAILABLE or (
-                    number not in signal.valid_signals() or not callable(handler)
-                    and handler not in (signal.SIG_DFL, signal.SIG_IGN)):
+            if number not in _SIGNALS or (
+                    not callable(handler) and handler not in (signal.SIG_DFL, signal.SIG_IGN)):
                 return original(number, handler)
             before = signal.getsignal(number)
-            handlers = self._handlers.setdefault(number, {})
-            if handler == signal.SIG_DFL:
-                handlers.pop(guest, None)
+            if guest is None and threading.current_thread() is threading.main_thread():
+                self._before[number] = handler
+            elif handler == signal.SIG_DFL:
+                self._handlers[number].pop(guest, None)
             else:
-                handlers[guest] = handler
-                if is_main:
-                    self._handle_too(number)
-                elif number not in self._before:
-                    self._ask_main_thread(number)
+                self._handlers[number][guest] = handler
             return before
 
         return set_handler
@@ -83,32 +75,12 @@ class GuestSignals:
 
         return getsignal
 
-    def _ask_main_thread(self, number: int) -> None:
-        done = threading.Lock()  # waiting for it takes no virtual time
-        done.acquire()
-        self._asked.append((number, done))
-        main = threading.main_thread().ident
-        assert main is not None
-        signal.pthread_kill(main, _DOORBELL)
-        if not done.acquire(timeout=_PATIENCE_S):
-            raise ValueError(f'signal {number}: the main thread does not answer')
-
-    def _answer(self, *args: Any) -> None:
-        while self._asked:
-            number, done = self._asked.pop()
-            self._handle_too(number)
-            done.release()
-
-    def _handle_too(self, number: int) -> None:
-        if number not in self._before:
-            self._before[number] = self._set(number, self._handle)
-
     def _handle(self, number: int, frame: Any) -> None:
         before, handlers = self._before[number], self._handlers[number]
         if callable(before):
             before(number, frame)
-        elif before == signal.SIG_DFL and not handlers:  # all have been removed again
-            self._set(number, self._before.pop(number))
+        elif before == signal.SIG_DFL and not handlers:
+            self._set(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
         for guest, handler in list(handlers.items()):
             if callable(handler) and not (guest is not None and guest.ended):

@@ -7,12 +7,10 @@ Theory of operation
 -------------------
 A SPEC is
 
-* ``package/executable``, as for ``ros2 run``.  It is searched in ``PREFIX/lib/PACKAGE/`` of the
-ament index (``AMENT_PREFIX_PATH``), then among the console scripts of the Python distribution with
-that name, as installed by pip.  A Python script is executed as ``__main__``, as by Python.
+* ``package/executable``, as for ``ros2 run``: a file in ``PREFIX/lib/PACKAGE/`` of the ament index
+(``AMENT_PREFIX_PATH``).  A Python script is executed as ``__main__``, as by Python.
 * ``module:NodeClass``: a subclass of ``rclpy.node.Node``; it is constructed without arguments.
-* ``module:function``: it may return one or several nodes, or be a ``main()`` that spins.  One
-required argument receives the list of command line arguments.
+* ``module:function``: it may return one or several nodes, or be a ``main()`` that spins.
 
 ``resolve`` finds the file or imports the module, so an error in a SPEC is reported before any node
 starts; ``hosting`` then runs the returned ``Program``.
@@ -23,8 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib import import_module, metadata
-import inspect
+from importlib import import_module
 import os
 from pathlib import Path
 import shlex
@@ -127,15 +124,11 @@ def _attribute(spec: str, module_name: str, attribute: str) -> Program:
                 spec, f"module '{module_name}' has no '{attribute}'", _suggest(attribute, [
                     name for name, value in vars(module).items()
                     if not name.startswith('_') and callable(value)])) from None
-    if isinstance(target, type) and issubclass(target, Node):
-        return Program(spec, module_name, target)
-    if isinstance(target, type) or not callable(target):
-        what = 'a class, but no rclpy node' if isinstance(target, type) else (
-            f'no function and no class, but of type {type(target).__name__}')
+    if not callable(target) or isinstance(target, type) and not issubclass(target, Node):
         raise LoadingError(
-            spec, f"'{attribute}' is {what}",
+            spec, f"'{attribute}' makes no node",
             'name a function or a subclass of rclpy.node.Node')
-    return Program(spec, module_name, lambda: _call(spec, target))
+    return Program(spec, module_name, target)
 
 
 def _import(spec: str, module_name: str) -> ModuleType:
@@ -162,53 +155,22 @@ def _failure(error: Exception) -> type[LoadingError]:
     return LoadingError if isinstance(error, (ImportError, SyntaxError)) else ProgramFailed
 
 
-def _call(spec: str, function: Callable[..., Any]) -> Any:
-    """Call with the command line arguments if the function requires one argument."""
-    try:
-        parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):  # a builtin without a signature
-        parameters = []
-    required = [
-        p for p in parameters
-        if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-    if not required:
-        return function()
-    if len(required) == 1 and required[0].kind is not inspect.Parameter.KEYWORD_ONLY:
-        return function(sys.argv)
-    raise LoadingError(
-        spec, f'the function requires the arguments {", ".join(p.name for p in required)}',
-        'name one that needs none, or only the list of command line arguments')
-
-
 def _executable(spec: str, package: str, name: str) -> Program:
-    found, scripts = False, {}
-    try:
-        entries = metadata.distribution(package).entry_points
-        scripts = {e.name: e for e in entries if e.group == 'console_scripts'}
-        found = True
-    except (metadata.PackageNotFoundError, ValueError):
-        pass
-    files: list[str] = []
     try:
         folder = Path(get_package_prefix(package), 'lib', package)
-        found = True
-        if (folder / name).is_file():
-            return _script(spec, folder / name)
-        files = [p.name for p in folder.iterdir() if p.is_file() and os.access(p, os.X_OK)]
-    except (PackageNotFoundError, ValueError, OSError):
-        pass  # no such package, an invalid name, no folder, or no AMENT_PREFIX_PATH
-    if name in scripts:
-        return replace(_attribute(spec, scripts[name].module, scripts[name].attr), argv0=name)
-    if found:
+    except (PackageNotFoundError, ValueError, OSError):  # ValueError: an invalid name
+        packages: list[str] = []
+        with suppress(OSError):
+            packages = [*get_packages_with_prefixes()]
         raise LoadingError(
-            spec, f"package '{package}' has no executable '{name}'",
-            _suggest(name, [*scripts, *files]))
-    packages = {name for d in metadata.distributions() if (name := d.metadata['Name'])}
-    with suppress(OSError):
-        packages.update(get_packages_with_prefixes())
+            spec, f"there is no package '{package}'",
+            did_you_mean(package, packages, "source its workspace's setup file, or install it")
+        ) from None
+    if (folder / name).is_file():
+        return _script(spec, folder / name)
+    files = [p.name for p in folder.glob('*') if p.is_file() and os.access(p, os.X_OK)]
     raise LoadingError(
-        spec, f"there is no package '{package}'",
-        did_you_mean(package, packages, "source its workspace's setup file, or install it"))
+        spec, f"package '{package}' has no executable '{name}'", _suggest(name, files))
 
 
 def _script(spec: str, path: Path) -> Program:

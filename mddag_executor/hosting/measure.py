@@ -13,7 +13,8 @@ measured with one seed is valid for that seed only.
 
 The nodes themselves write the ledger, so all executors are measured in the same way: each body
 appends its duration, each sink appends (release, completion).  Appending to a list is one
-indivisible step in CPython, so a callback locks nothing.
+indivisible step in CPython, so a callback locks nothing.  The ledger is closed after
+``MOST_MEASURED_S``, so its memory is bounded (Autoware's: 2 MB a minute).
 
 *Due* are the nominal releases (first release plus k periods) whose deadline lies inside the
 measured window, whether or not the executor noticed them.  Of these a sink is *in time* when it
@@ -29,14 +30,13 @@ not complete the join are not counted as callbacks: their cost is overhead.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 import random
 import time
 from typing import Any, Literal, NamedTuple
 
 from mddag_executor.clocks import epoch_offset_ns
-from mddag_executor.core.tally import quantiles_us, SinkTally
+from mddag_executor.core.tally import SinkTally
 from mddag_executor.simulate.workload import draw_execution_times, scale_execution_times
 from mddag_executor.simulate.workload import utilisation as normalised
 from msg_graph import Dag, TaskSet, Vertex
@@ -46,6 +46,8 @@ Body = Literal['sleep', 'spin', 'native']
 Mode = Literal[Body, 'mixed']
 BODIES: tuple[Body, ...] = ('sleep', 'spin', 'native')
 
+MOST_MEASURED_S = 600.0
+"""The longest window; a longer run goes on without being measured."""
 _EARLY_NS = 1_000_000
 """How much before its nominal time a release may be noted, ns: clocks are read twice."""
 
@@ -131,23 +133,20 @@ class Ledger:
     * ``first_release``, by DAG: ns since the epoch.
     * ``misattributed``: vertex name, release by the message and by the executor, if they differ.
     * ``unattributed``: the names of vertices that ran without a job.
-    * ``dropped_joins``: the names of the vertices of dropped joins.
 
-    :param keep: how many of the latest entries of each to keep; None: all.
     :ivar window: the readings at the beginning and the end of the measurement.
+    :ivar is_open: whether observations are noted.
     """
 
-    def __init__(self, task_set: TaskSet, keep: int | None = None) -> None:
-        self.durations: dict[str, deque[int]] = {
-            v.name: deque(maxlen=keep) for v in task_set.vertices}
-        self.completions: dict[str, deque[tuple[int, int]]] = {
-            v.name: deque(maxlen=keep) for v in task_set.vertices if v.deadline_ns is not None}
-        self.delays: dict[str, deque[tuple[int, int]]] = {
-            dag.name: deque(maxlen=keep) for dag in task_set.dags}
-        self.misattributed: deque[tuple[str, int, int]] = deque(maxlen=keep)
-        self.unattributed: deque[str] = deque(maxlen=keep)
-        self.dropped_joins: deque[str] = deque(maxlen=keep)
+    def __init__(self, task_set: TaskSet) -> None:
+        self.durations: dict[str, list[int]] = {v.name: [] for v in task_set.vertices}
+        self.completions: dict[str, list[tuple[int, int]]] = {
+            v.name: [] for v in task_set.vertices if v.deadline_ns is not None}
+        self.delays: dict[str, list[tuple[int, int]]] = {dag.name: [] for dag in task_set.dags}
+        self.misattributed: list[tuple[str, int, int]] = []
+        self.unattributed: list[str] = []
         self.first_release: dict[str, int] = {}
+        self.is_open = False
         self.window = Reading(0, 0, ()), Reading(0, 0, ())
         self.warm_up_ns = 0
         self.clock_offset_ns = epoch_offset_ns()
@@ -155,6 +154,11 @@ class Ledger:
         self.busy_below_ns = 0
         #: The tolerance between two readings of one release: each process has its own trace clock.
         self.tolerance_ns = 0
+
+    def note(self, entries: list[Any], entry: Any) -> None:
+        """Add an observation, while the ledger is open; from any thread."""
+        if self.is_open:
+            entries.append(entry)
 
     def reading(self) -> Reading:
         """Read the counters now."""
@@ -177,7 +181,7 @@ class Ledger:
             for name in ('durations', 'completions', 'delays'):
                 for key, entries in part[name].items():
                     getattr(whole, name)[key].extend(entries)
-            for name in ('misattributed', 'unattributed', 'dropped_joins'):
+            for name in ('misattributed', 'unattributed'):
                 getattr(whole, name).extend(part[name])
             for name in ('busy_below_ns', 'warm_up_ns'):
                 setattr(whole, name, max(getattr(whole, name), part[name]))
@@ -212,15 +216,13 @@ def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:
     return {
         'mode': plan.mode, 'seed': plan.seed, 'workers': plan.workers,
         'utilisation': plan.utilisation, 'utilisation_taken': _taken(ledger, plan),
-        'window_start_ns': start.at_ns, 'window_ns': end.at_ns - start.at_ns,
+        'window_ns': end.at_ns - start.at_ns,
         'warm_up_ns': ledger.warm_up_ns, **sums,
         'on_time_ratio': sums['on_time'] / due if due else None,
         **_throughput(ledger, plan, start, end),
-        'source_delay_us': quantiles_us([
-            delay for delays in ledger.delays.values() for _, delay in list(delays)]),
         'attribution': {
             'wrong': len(ledger.misattributed), 'none': len(ledger.unattributed)},
-        'incomplete_joins_dropped': len(ledger.dropped_joins), 'dags': dags}
+        'dags': dags}
 
 
 def totals(sinks: Iterable[Mapping[str, Any]]) -> dict[str, int]:
@@ -239,7 +241,7 @@ def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> di
     if first is None:
         return judge_sink(deadline, (), {})
     completed: dict[int, int] = {}
-    for release, completion in list(ledger.completions[vertex.name]):
+    for release, completion in ledger.completions[vertex.name]:
         job = (release - first + min(_EARLY_NS, period // 4)) // period
         completed.setdefault(first + job * period, completion)
     first_job = max(0, (start - deadline - first) // period + 1)

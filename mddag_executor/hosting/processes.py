@@ -29,7 +29,7 @@ Theory of operation
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 import json
@@ -85,7 +85,7 @@ class Run:
     process: subprocess.Popen[bytes]
     status: int | None = None
     asked: bool = False
-    _words: deque[str] = field(default_factory=lambda: deque(maxlen=50))
+    _last_words: str = ''
     _errors: list[str] = field(default_factory=list)
     _threads: list[threading.Thread] = field(default_factory=list)
 
@@ -98,21 +98,14 @@ class Run:
 
     @property
     def said(self) -> str:
-        """Return the last line that it wrote to standard error, or where it was stuck."""
-        lines = [line for line in (*self._words, *self._errors) if line.strip()]
-        threads = [i for i, line in enumerate(lines) if line.endswith('(most recent call first):')]
-        if threads and threads[-1] + 1 < len(lines) and lines[-1].startswith('  File '):
-            return f'stuck: {lines[threads[-1] + 1].strip()}'  # the main thread comes last
-        return lines[-1] if lines else ''
+        """Return the last line that it wrote to standard error."""
+        return (self._errors or [self._last_words])[-1]
 
     @property
     def how(self) -> str:
         """Return how it ended."""
         if self.status is not None and self.status < 0:
-            try:
-                return f'was ended by {signal.Signals(-self.status).name}'
-            except ValueError:
-                return f'was ended by signal {-self.status}'
+            return f'was ended by signal {-self.status} ({signal.strsignal(-self.status)})'
         return f'ended with status {self.status}'
 
 
@@ -192,7 +185,7 @@ class Supervisor:
                 if line.startswith('error: '):
                     run._errors.append(line)
                     continue
-                run._words.append(line)
+                run._last_words = line.strip() or run._last_words
             self._print(f'[{run.name}] {line}', target)
 
     def _print(self, line: str, target: TextIO) -> None:
@@ -247,16 +240,19 @@ class Part:
 
     :ivar parent: the process id of the run.
     :ivar text: the declaration.
+    :ivar options: those of the command line that are common to all processes.
     """
 
     folder: Path
     parent: int
     text: str
+    options: dict[str, Any]
 
     @classmethod
-    def make(cls, folder: str, text: str) -> None:
+    def make(cls, folder: str, text: str, options: dict[str, Any]) -> None:
         """Prepare the folder of a run."""
-        Path(folder, 'run.json').write_text(json.dumps({'parent': os.getpid(), 'text': text}))
+        Path(folder, 'run.json').write_text(json.dumps(
+            {'parent': os.getpid(), 'text': text, 'options': options}))
 
     @classmethod
     def read(cls, folder: str) -> Part:

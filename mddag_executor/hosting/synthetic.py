@@ -12,7 +12,7 @@ Theory of operation
    index of the publishing vertex.  So a callback that several publishers start (OR) knows which of
    its vertices it runs as.  A sync callback (AND) has one subscription for each topic; it executes
    in the leg that receives the last of the messages with equal stamps.  Incomplete joins of the
-   last ``JOIN_LIMIT`` jobs are kept; older ones are dropped and counted.
+   last ``JOIN_LIMIT`` jobs are kept.
 3. *Releases.*  Under this package's executor a source gets its release from ``current_job``.
    Under another executor it is the nominal due time of the timer: rcl's next call time at the
    previous call.  A late call does not make a release later.
@@ -51,7 +51,7 @@ from mddag_executor.hosting.bodies import (
     typical_oversleep_ns,
 )
 from mddag_executor.hosting.child import Tick
-from mddag_executor.hosting.measure import Body, ExecutionPlan, Ledger
+from mddag_executor.hosting.measure import Body, ExecutionPlan, Ledger, MOST_MEASURED_S
 from mddag_executor.hosting.session import Session
 from msg_graph import Callback, TaskSet, Vertex
 from rcl_interfaces.srv import ListParameters
@@ -74,7 +74,7 @@ QOS = QoSProfile(
 SENSORS_NODE = '/mddag_sensors'
 WARM_UP_S = 1.0
 JOIN_LIMIT = 64
-"""How many incomplete joins a sync vertex keeps; the oldest is dropped and counted."""
+"""How many incomplete joins a sync vertex keeps."""
 SENSOR = '#sensor '
 """The prefix of ``frame_id`` of a stand-in sensor's message; its topic follows."""
 _LEAD_NS = 20_000_000
@@ -131,7 +131,6 @@ class Role:
                 return True
             if len(self.waiting) > JOIN_LIMIT:
                 del self.waiting[next(iter(self.waiting))]
-                self._ledger.dropped_joins.append(self.vertex.name)
             return False
 
     def execute(self, message: Header, release: int) -> None:
@@ -139,12 +138,13 @@ class Role:
         monotonic_ns = time.monotonic_ns
         start = monotonic_ns()
         self._emulate(self._execution_ns)
-        self._durations.append(monotonic_ns() - start)
+        self._ledger.note(self._durations, monotonic_ns() - start)
         message.frame_id = self._sender
         for publisher in self._publishers:
             publisher.publish(message)
         if self._completions is not None:
-            self._completions.append((release, monotonic_ns() + self._ledger.clock_offset_ns))
+            self._ledger.note(
+                self._completions, (release, monotonic_ns() + self._ledger.clock_offset_ns))
 
 
 class Grid:
@@ -211,11 +211,11 @@ def attributed(role: Role, release: int, ledger: Ledger, current_job: CurrentJob
     """
     job = current_job()
     if job is None:
-        ledger.unattributed.append(role.vertex.name)
+        ledger.note(ledger.unattributed, role.vertex.name)
     elif not role.vertex.predecessors:
         return int(job.release_ns)
     elif abs(job.release_ns - release) > ledger.tolerance_ns:
-        ledger.misattributed.append((role.vertex.name, release, job.release_ns))
+        ledger.note(ledger.misattributed, (role.vertex.name, release, job.release_ns))
     return release
 
 
@@ -239,18 +239,17 @@ class SyntheticWorkload:
     :param current_job: ``mddag_executor.executor.current_job`` under this package's executor;
         leave it out under others.
     :param context: of the nodes; None is rclpy's default context.
-    :param keep: how much of each series the ledger keeps; None: all.
     :param process: make only the nodes that the declaration assigns to this process.
     :ivar timers: by the DAG that they release.
     """
 
     def __init__(
         self, task_set: TaskSet, plan: ExecutionPlan, *, current_job: CurrentJob = no_job,
-        context: Context | None = None, keep: int | None = None, process: str | None = None,
+        context: Context | None = None, process: str | None = None,
     ) -> None:
         self.task_set = task_set
         self.plan = plan
-        self.ledger = Ledger(task_set, keep)
+        self.ledger = Ledger(task_set)
         if process is not None:
             self.ledger.tolerance_ns = _CLOCKS_NS
         self._current_job = current_job
@@ -299,8 +298,8 @@ class SyntheticWorkload:
         """
         Run in a session that spins already, and end the session.
 
-        :param duration_s: length of the measured window, which begins ``warm_up_s`` after the
-            timers; None: until the session is stopped.
+        :param duration_s: how long after ``warm_up_s``; None: until the session is stopped.  The
+            measured window ends after ``MOST_MEASURED_S`` at the latest.
         :param begin: waits until publishers and subscriptions have discovered each other, and for
             other processes.
         :return: whether there is a window: the run was not stopped before it began.
@@ -308,20 +307,34 @@ class SyntheticWorkload:
         """
         ledger, was_measured = self.ledger, False
         ledger.warm_up_ns = round(warm_up_s * 1e9)
+        ledger.is_open = True
         try:
             executors: Callable[[], list[str]] = getattr(session.executor, 'unmatched', list)
             begin(session, lambda: self.unmatched() + executors())
             if not session.stopped:
                 self.start(session.executor.wake)
                 if not session.wait(warm_up_s):
-                    start = ledger.reading()
-                    session.wait(duration_s, tick)
-                    ledger.window = start, ledger.reading()
+                    self._measure(session, duration_s, tick)
                     was_measured = True
         finally:
             self.stop()
             session.end()
         return was_measured
+
+    def _measure(self, session: Session, duration_s: float | None, tick: Tick | None) -> None:
+        ledger = self.ledger
+        start = ledger.reading()
+
+        def watch(passed: float) -> None:
+            if passed > MOST_MEASURED_S and ledger.is_open:
+                ledger.window = start, ledger.reading()
+                ledger.is_open = False
+            if tick is not None:
+                tick(passed)
+
+        session.wait(duration_s, watch)
+        if ledger.is_open:
+            ledger.window = start, ledger.reading()
 
     def unmatched(self) -> list[str]:
         """Return the topics whose publishers and subscriptions have not discovered each other."""
@@ -434,14 +447,14 @@ class SyntheticWorkload:
     ) -> None:
         dag = self._dag(role.vertex)
         current_job = self._current_job
-        offset = self.ledger.clock_offset_ns
-        delays = self.ledger.delays[dag]
+        ledger = self.ledger
+        offset, delays = ledger.clock_offset_ns, ledger.delays[dag]
 
         def on_timer() -> None:
             start = time.monotonic_ns() + offset
             job = current_job()
             release = grid.release() if job is None else job.release_ns
-            delays.append((start, start - release))
+            ledger.note(delays, (start, start - release))
             role.execute(stamped(release), release)
 
         timer = node.create_timer(

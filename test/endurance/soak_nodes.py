@@ -16,8 +16,6 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-KEEP = 100
-
 
 class SoakFault(Exception):
     """What a callback raises on purpose."""
@@ -32,7 +30,7 @@ class SoakNodes:
     """
 
     def __init__(self, task_set: TaskSet, plan: ExecutionPlan) -> None:
-        self.workload = SyntheticWorkload(task_set, plan, current_job=current_job, keep=KEEP)
+        self.workload = SyntheticWorkload(task_set, plan, current_job=current_job)
         self.started = 0
         self.raise_next = False
         self.cut_off = 0

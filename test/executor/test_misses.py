@@ -27,7 +27,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
-from .conftest import run_program, Spinning, wait_for
+from .conftest import Spinning, wait_for
 from .declared import Declared
 
 SECONDS = float(os.environ.get('MISS_STRESS_SECONDS', 0))
@@ -278,35 +278,3 @@ def test_what_was_reported_is_what_a_replay_judges(make_executor, make_node, tmp
     replayed = replay(trace)
     assert replayed.warnings == []
     assert judged(replayed.result()['dags']) == judged(statistics['dags'])
-
-
-LOGS_A_MISS = """
-import sys
-from types import SimpleNamespace
-
-from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.executor.misses import MissLog
-import rclpy
-
-rclpy.init()
-MultiDeadlineExecutor(num_workers=1)  # makes a log of its own
-verdicts = SimpleNamespace(missed=0, last_missed=lambda: ('d', '/n:tick', 1, 30_000_000))
-log = MissLog(verdicts)
-calls = []
-for _ in range(2):
-    verdicts.missed += 1
-    log._at = 0.0
-    calls.append(0)
-    sys.setprofile(lambda *_: calls.append(calls.pop() + 1))
-    log.write()
-    sys.setprofile(None)
-print(*calls)
-"""
-
-
-def test_the_first_miss_is_logged_as_cheaply_as_the_next():
-    """In a fresh process, as the first lookup of rclpy's log fills a cache of Python."""
-    out, err = run_program(LOGS_A_MISS)
-    assert err.count('1 deadline missed') == 2
-    first, second = map(int, out.split())
-    assert second < first < 3 * second

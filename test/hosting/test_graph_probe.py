@@ -19,10 +19,11 @@ from ..executor.conftest import Spinning, wait_for
 MS = 1_000_000
 
 
-def seen(interval_ms: float) -> Seen:
-    """Return the messages of a second."""
-    return Seen(count=int(1000 / interval_ms) + 1, first=5,
-                last=5 + round(int(1000 / interval_ms) * interval_ms * MS))
+def test_lost_messages_of_one_publisher_are_known_by_their_numbers():
+    seen = Seen()
+    for number in (7, 8, 11):
+        seen.message(number * 10 * MS, number)
+    assert (seen.interval_ns(1), seen.interval_ns(2)) == (10 * MS, 20 * MS)
 
 
 @pytest.fixture

@@ -79,9 +79,8 @@ def heard(result: dict[str, Any]) -> int:
 
 
 @pytest.mark.parametrize(('listener', 'said'), [
-    ('pip-nodes/listener', 'listener ended after its spin'),
+    ('chat:main', 'listener ended after its spin'),
     ('chat:two', ''),
-    ('chat:with_arguments', ''),
     ('chat:own_executor', 'own executor ended'),
     ('chat:events_executor', ''),
     ('chat:spins_once_for_ever', 'no longer ok'),
@@ -130,7 +129,6 @@ def test_the_run_ends_when_all_programs_have_ended(world):
     ('chat:other_domain', 'it asks for ROS domain 7, and this process is in another: set '),
     ('chat:returns_text', 'it returned a str, which is no rclpy node'),
     ('chat:returns_nothing', 'it ended and neither returned a node nor initialised rclpy'),
-    ('chat:needs_two', 'the function requires the arguments one, two'),
 ])
 def test_a_program_that_cannot_start_ends_the_run_with_one_line(world, mddag, spec, message):
     process = mddag('run', 'graph.yaml', '--node', spec, '--trace', 'out.mcap')
@@ -215,12 +213,12 @@ def test_rclpy_is_as_before_when_the_host_is_left(default_context):
             rclpy.shutdown, rclpy.try_shutdown, rclpy.get_global_executor,
             rclpy.install_signal_handlers, rclpy.experimental.EventsExecutor, signal.signal,
             signal.getsignal, Executor.__init__, threading.Thread.start, {*vars(context)},
-            signal.getsignal(signal.SIGURG), signal.getsignal(signal.SIGUSR1)]
+            signal.getsignal(signal.SIGUSR1)]
 
     before = parts()
     with Host() as host:
         host.start(SingleThreadedExecutor(), [Program('main', 'main', main)])
-        assert not any(now == was for now, was in zip(parts()[:-2], before))
+        assert not any(now == was for now, was in zip(parts()[:-1], before))
     assert parts() == before
     host.executor.shutdown()
 
@@ -252,8 +250,6 @@ def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host, kind):
 
 @pytest.mark.parametrize(('spec', 'argv0'), [
     ('chat_nodes/talker', '{world}/ws/lib/chat_nodes/talker'),
-    ('pip-nodes/listener', 'listener'),
-    ('pip_nodes/listener', 'listener'),
     ('chat:main', 'chat'),
     ('chat:Listener', 'chat'),
 ])
@@ -279,17 +275,13 @@ def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(world, mon
     ('talker', 'this names no node: write package/executable, module:function'),
     ('', 'this names no node'),
     ('a/b/c', 'this names no node'),
-    ('/talker', 'this names no node'),
     ('chat:', 'this names no node'),
-    (':main', 'this names no node'),
     ('chat:main()', 'this names no node'),
     ('chat_node/talker', "there is no package 'chat_node': did you mean 'chat_nodes'"),
     ('zzzzzzzz/talker', "there is no package 'zzzzzzzz': source its workspace's setup file"),
     ('chat_nodes/talkr', "package 'chat_nodes' has no executable 'talkr': did you mean 'talker'?"),
     ('chat_nodes/zzz', "has no executable 'zzz': it has broken.py, native, shell, talker"),
     ('empty_nodes/x', "package 'empty_nodes' has no executable 'x': it has none"),
-    ('pip-nodes/lisener', "has no executable 'lisener': did you mean 'listener'?"),
-    ('pip-nodes/stale', "module 'chat' has no 'gone': it has "),
     ('chat_nodes/native', 'only Python nodes can run in this process, and '),
     ('chat_nodes/shell', "shell is no Python program: start it by itself with 'ros2 run'"),
     ('chat_nodes/broken.py', 'broken.py is not valid Python (SyntaxError'),
@@ -300,8 +292,8 @@ def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(world, mon
     ('wrong:main',
      "'wrong' cannot be imported (RuntimeError: no licence here, {site}/wrong.py:2)"),
     ('chat:mian', "module 'chat' has no 'mian': did you mean 'main'"),
-    ('chat:NoNode', "'NoNode' is a class, but no rclpy node"),
-    ('chat:NUMBER', "'NUMBER' is no function and no class, but of type int"),
+    ('chat:NoNode', "'NoNode' makes no node: name a function or "),
+    ('chat:NUMBER', "'NUMBER' makes no node"),
 ])
 def test_what_does_not_exist_is_said_on_one_line(world, spec, message):
     with pytest.raises(LoadingError) as error:

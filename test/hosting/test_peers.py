@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic nodes under rclpy's executors, each run in a process of its own."""
+"""Synthetic nodes under rclpy's executor; functions in a process of their own."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ import signal
 import subprocess
 import sys
 
-from mddag_executor.errors import UsageError
 from mddag_executor.hosting.child import ChildError, CrashError, run_child
 from mddag_executor.hosting.peers import measure_peer
-from msg_graph import GraphError
 import pytest
 
 from .conftest import has_ended, wait_for
@@ -23,26 +21,15 @@ nodes:
   - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 500ms, execution_time: 1ms}]}
 """
 
-def test_nodes_are_measured_as_one_run(tmp_path):
+
+def test_nodes_run_under_rclpys_executor(tmp_path):
     graph = tmp_path / 'graph.yaml'
-    graph.write_text(GRAPH + 'processes: {one: [/a], two: [/b]}\n')
-    result = measure_peer(
-        'single', str(graph), 2, seconds=1.0, seed=3, utilisation=0.05, mode='sleep')
+    graph.write_text(GRAPH)
+    result = measure_peer(str(graph), 2, seconds=1.0, seed=3, utilisation=0.05)
     assert 0 < result['on_time'] <= result['sink_jobs_due']
-    assert (result['seed'], result['workers'], result['mode']) == (3, 2, 'sleep')
+    assert (result['seed'], result['workers']) == (3, 2)
     assert result['utilisation'] == pytest.approx(0.05)
     assert list(result['dags']['/a']['sinks']) == ['/b:s'] and result['callbacks'] > 0
-
-
-def test_what_is_wrong_is_one_line(tmp_path):
-    (tmp_path / 'bad.yaml').write_text(GRAPH.replace('500ms', '0ms'))
-    with pytest.raises(GraphError, match=r'bad.yaml:5: '):
-        measure_peer('multi', str(tmp_path / 'bad.yaml'), 2, seconds=1.0, seed=0, utilisation=0.1,
-                     mode='sleep')
-    (tmp_path / 'untimed.yaml').write_text(GRAPH.replace(', execution_time: 1ms', ''))
-    with pytest.raises(UsageError, match='untimed.yaml: no callback has an execution time'):
-        measure_peer('multi', str(tmp_path / 'untimed.yaml'), 2, seconds=1.0, seed=0,
-                     utilisation=0.1, mode='sleep')
 
 
 @pytest.mark.parametrize(('function', 'arguments', 'says'), [

@@ -145,7 +145,7 @@ class Beside:
 
 def test_processes_start_together(tmp_path, monkeypatch):
     """However late another process is: it is waited for until its nodes are made, and ready."""
-    processes.Part.make(str(tmp_path), CHAIN)
+    processes.Part.make(str(tmp_path), CHAIN, {})
     monkeypatch.setattr(processes.time, 'monotonic_ns', lambda: 5 * 10 ** 9)
     unmatched = ['/half']
     seen = []
@@ -204,9 +204,9 @@ def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
         run.process.send_signal(signal.SIGTERM)
         result, out, errors = run.end()
     assert run.process.returncode == 70
-    assert 'process up was ended by SIGKILL' in errors
+    assert 'process up was ended by signal 9 (Killed)' in errors
     up, down = result['processes']
-    assert (up['died'], up['how'], down['died']) == (True, 'was ended by SIGKILL', False)
+    assert (up['died'], up['how'], down['died']) == (True, 'was ended by signal 9 (Killed)', False)
     assert result['dags']['chain']['sinks']['/last:sink']['completed'] > 0
     assert sum(e['_name'] == 'mddag:complete' for e in read_events('out.down.mcap')) >= 60
     assert f'trace: {world / "out.up.mcap"}' in out

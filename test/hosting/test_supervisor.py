@@ -85,7 +85,7 @@ def test_one_that_dies_is_named_with_what_it_said():
     by_name = {run.name: run for run in case.died}
     assert set(by_name) == {'a', 'b'}
     assert by_name['a'].said == 'ValueError: boom' and by_name['a'].how == 'ended with status 1'
-    assert by_name['b'].how == 'was ended by SIGKILL'
+    assert by_name['b'].how == 'was ended by signal 9 (Killed)'
 
 
 def test_all_end_when_asked_and_who_does_not_is_killed(monkeypatch):
@@ -94,7 +94,7 @@ def test_all_end_when_asked_and_who_does_not_is_killed(monkeypatch):
     case = Case(a=deaf)
     case.stop_when('[a] waits')
     assert case.run() == [('a', -signal.SIGKILL)]
-    assert [run.how for run in case.died] == ['was ended by SIGKILL']
+    assert [run.how for run in case.died] == ['was ended by signal 9 (Killed)']
     assert case.err.getvalue() == (
         'warning: process a has not ended within 0.1 s: it is killed\n')
 

@@ -23,7 +23,7 @@ nodes:
 
 
 def make_workspace(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Make an ament package, a distribution with console scripts and modules; go there."""
+    """Make an ament package and modules; go there."""
     prefix = folder / 'ws'
     index = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'
     index.mkdir(parents=True)
@@ -38,11 +38,7 @@ def make_workspace(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (library / name).write_text(text)
         (library / name).chmod(0o755)
     site = folder / 'site'
-    info = site / 'pip_nodes-1.0.dist-info'
-    info.mkdir(parents=True)
-    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: pip-nodes\nVersion: 1.0\n')
-    (info / 'entry_points.txt').write_text(
-        '[console_scripts]\nlistener = chat:main\nstale = chat:gone\n[other]\nx = chat:main\n')
+    site.mkdir()
     (site / 'chat.py').write_text((GUESTS / 'chat.py').read_text())
     (site / 'half.py').write_text('import not_installed_anywhere\n')
     (site / 'wrong.py').write_text('x = 1\nraise RuntimeError("no licence\\nhere")\n')

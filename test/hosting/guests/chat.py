@@ -31,11 +31,6 @@ def two():
     return [Listener(), Node('idle')]
 
 
-def with_arguments(args):
-    assert args[1:] == [], args
-    return Listener()
-
-
 def own_executor():
     from rclpy.executors import MultiThreadedExecutor
     rclpy.init()
@@ -296,10 +291,6 @@ def returns_text():
 
 
 def returns_nothing():
-    pass
-
-
-def needs_two(one, two):
     pass
 
 
