@@ -38,6 +38,7 @@ from mddag_executor.hosting.measure import (
     Ledger,
     measure,
     Mode,
+    Reading,
     totals,
 )
 from mddag_executor.hosting.peers import run_nodes, UnfinishedSession
@@ -131,8 +132,39 @@ def of_processes(spec: Spec, parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return the figures of a run from the results of its processes."""
     plan = _plan(spec)
     return result_of(
-        plan, Ledger.of_processes(plan.task_set, [part['ledger'] for part in parts]),
+        plan, ledger_of_processes(plan.task_set, [part['ledger'] for part in parts]),
         [latency for part in parts for latency in part['latencies']])
+
+
+def ledger_of_processes(task_set: TaskSet, parts: Sequence[dict[str, Any]]) -> Ledger:
+    """
+    Return the ledger of a run from those of its processes (``vars``), at least one.
+
+    The window is that in which all of them measured.  The counts of a process in its own window,
+    which is almost the same, are scaled to it.
+    """
+    whole = Ledger(task_set)
+    for part in parts:
+        whole.first_release.update(part['first_release'])
+        for name in ('durations', 'completions', 'delays'):
+            for key, entries in part[name].items():
+                getattr(whole, name)[key].extend(entries)
+        for name in ('misattributed', 'unattributed'):
+            getattr(whole, name).extend(part[name])
+        for name in ('busy_below_ns', 'warm_up_ns'):
+            setattr(whole, name, max(getattr(whole, name), part[name]))
+    windows = [part['window'] for part in parts]
+    begin = max(start.at_ns for start, _ in windows)
+    until = max(begin, min(end.at_ns for _, end in windows))
+    cpu = 0
+    bodies = [0] * len(task_set.vertices)
+    for start, end in windows:
+        share = (until - begin) / max(1, end.at_ns - start.at_ns)
+        cpu += round((end.cpu_ns - start.cpu_ns) * share)
+        for i, (before, after) in enumerate(zip(start.bodies, end.bodies)):
+            bodies[i] += round((after - before) * share)
+    whole.window = Reading(begin, 0, [0] * len(bodies)), Reading(until, cpu, bodies)
+    return whole
 
 
 def hot_path(task_set: TaskSet, result: dict[str, Any]) -> dict[str, Any] | None:

@@ -319,7 +319,7 @@ def _run(
     if not session.clean:
         warn('a callback has not ended in time; it is left behind')
     if args.part is not None:
-        result.update(observed=asdict(watch.observed(counts)), ledger=ledger and vars(ledger))
+        result.update(observed=asdict(watch.observed(counts)))
     return result, _with_place(session.error, result, [] if host is None else host.guests)
 
 

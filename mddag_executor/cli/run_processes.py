@@ -97,7 +97,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
         'policy': args.policy, 'on_late': args.on_late,
         'workers': defaults.workers(args.workers, task_set),
-        **together(task_set, results, plan), 'trace': None,
+        **together(task_set, results), 'trace': None,
         'processes': [{
             'name': run.name, 'nodes': next(
                 p.nodes for p in task_set.processes if p.name == run.name),

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 import math
 import shutil
 import sys
@@ -28,9 +28,7 @@ mddag top --once --json - | jq '.statuses[] | select(.level != "OK")'"""
 
 TOPIC = '/diagnostics'
 INTERVAL_S = 1.0
-# ECMA-48 and xterm: another screen, no cursor, long lines cut; and back; to the first line; clear
-_ENTER, _LEAVE = '\x1b[?1049h\x1b[?25l\x1b[?7l', '\x1b[?7h\x1b[?25h\x1b[?1049l'
-_HOME, _TO_END, _BELOW = '\x1b[H', '\x1b[K', '\x1b[J'
+_CLEAR = '\x1b[H\x1b[J'  # ECMA-48: to the first line, and erase from there
 _WAITING = """\
 waiting for an executor to publish its state: mddag run does, and a program with
 diagnostics_period (Ctrl-C ends)"""
@@ -57,15 +55,13 @@ def main(args: argparse.Namespace) -> int:
     board, wanted = Board(), common.wants_tables(args)
     live = sys.stdout.isatty() and not args.once and wanted
     # Ctrl-C is how one leaves it
-    with _listening(board) as spin, suppress(KeyboardInterrupt), (
-            _screen() if live else nullcontext()):
+    with _listening(board) as spin, suppress(KeyboardInterrupt):
         for _ in _ticks(spin, board, args.duration, args.timeout, args.once):
             statuses = board.statuses()
             if live:
                 columns, lines = shutil.get_terminal_size()
                 text = tables(statuses, columns) if statuses else _WAITING
-                shown = ''.join(f'{line}{_TO_END}\n' for line in text.splitlines()[:lines - 1])
-                print(f'{_HOME}{shown}{_BELOW}', end='', flush=True)
+                print(_CLEAR + '\n'.join(text.splitlines()[:lines - 1]), flush=True)
             elif statuses and wanted and not args.once:
                 print(tables(statuses), flush=True)
     if (args.once or args.duration is not None) and not board.statuses():
@@ -97,15 +93,6 @@ def _ticks(
         if now >= due:
             due += INTERVAL_S
             yield
-
-
-@contextmanager
-def _screen() -> Iterator[None]:
-    print(_ENTER, end='')
-    try:
-        yield
-    finally:
-        print(_LEAVE, end='', flush=True)
 
 
 @contextmanager

@@ -125,7 +125,7 @@ class Reading(NamedTuple):
 
 class Ledger:
     """
-    The observations of a run of synthetic nodes; as JSON, its ``vars`` are for ``of_processes``.
+    The observations of a run of synthetic nodes.
 
     * ``durations``, by vertex: the duration of each body (ns).
     * ``completions``, by sink: (release, completion) in ns since the epoch.
@@ -166,37 +166,6 @@ class Ledger:
             at_ns=time.monotonic_ns() + self.clock_offset_ns,
             cpu_ns=time.process_time_ns(),
             bodies=[len(durations) for durations in self.durations.values()])
-
-    @classmethod
-    def of_processes(cls, task_set: TaskSet, parts: Sequence[dict[str, Any]]) -> Ledger:
-        """
-        Return the ledger of a run from those of its processes, at least one.
-
-        The window is that in which all of them measured.  The counts of a process in its own
-        window, which is almost the same, are scaled to it.
-        """
-        whole = cls(task_set)
-        for part in parts:
-            whole.first_release.update(part['first_release'])
-            for name in ('durations', 'completions', 'delays'):
-                for key, entries in part[name].items():
-                    getattr(whole, name)[key].extend(entries)
-            for name in ('misattributed', 'unattributed'):
-                getattr(whole, name).extend(part[name])
-            for name in ('busy_below_ns', 'warm_up_ns'):
-                setattr(whole, name, max(getattr(whole, name), part[name]))
-        windows = [[Reading(*each) for each in part['window']] for part in parts]
-        begin = max(start.at_ns for start, _ in windows)
-        until = max(begin, min(end.at_ns for _, end in windows))
-        cpu = 0
-        bodies = [0] * len(task_set.vertices)
-        for start, end in windows:
-            share = (until - begin) / max(1, end.at_ns - start.at_ns)
-            cpu += round((end.cpu_ns - start.cpu_ns) * share)
-            for i, (before, after) in enumerate(zip(start.bodies, end.bodies)):
-                bodies[i] += round((after - before) * share)
-        whole.window = Reading(begin, 0, [0] * len(bodies)), Reading(until, cpu, bodies)
-        return whole
 
 
 def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:

@@ -18,8 +18,8 @@ Theory of operation
    are reported in one line with the name of the process.
 5. *Results.*  The run makes a folder with the declaration for all processes.  Each process leaves
    its result there, under its process id.  Sinks are judged and callbacks are counted where they
-   run.  The core combines the verdicts (``core.tally.of_processes``).  Rules that need all
-   processes (drift, measurements of the synthetic nodes) get the sum of the observations.
+   run.  The core combines the verdicts (``core.tally.of_processes``).  The rules of drift get the
+   sum of the observations.
 6. *Common start.*  Synthetic nodes start at the same time in all processes.  Each process notes in
    the folder that its nodes are *made*.  When all have, it waits until publishers and
    subscriptions have discovered each other, and notes that it is *ready*.  The start is
@@ -46,7 +46,6 @@ from mddag_executor.core.tally import of_processes
 from mddag_executor.errors import MddagError
 from mddag_executor.executor.entity import add_counts
 from mddag_executor.hosting.child import signal_at_end_of
-from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure
 from mddag_executor.hosting.session import MATCH_TIMEOUT_S, Session
 from msg_graph import TaskSet
 from msg_graph.binding import Entity
@@ -315,18 +314,13 @@ def left(folder: str, pid: int) -> Any:
         return None
 
 
-def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) -> dict[str, Any]:
-    """
-    Return the result of a run, combined from those of its processes.
-
-    :param plan: of the synthetic nodes, if the run has such.
-    """
+def together(task_set: TaskSet, results: Results) -> dict[str, Any]:
+    """Return the result of a run, combined from those of its processes."""
     parts = list(results.values())
     callbacks: dict[str, dict[str, Any]] = {}
     for part in parts:  # executors' internal callbacks may share a name
         for name, counts in part['callbacks'].items():
             add_counts(callbacks, name, counts)
-    ledgers = [part['ledger'] for part in parts if part['ledger'] is not None]
     return {
         **of_processes(task_set, results),
         'stops': {key: sum(part['stops'][key] for part in parts)
@@ -339,9 +333,7 @@ def together(task_set: TaskSet, results: Results, plan: ExecutionPlan | None) ->
                          for key in ('unknown', 'doubtful')},
         'never_ran': [c.key for c in task_set.callbacks
                       if not callbacks.get(c.key, {'ran': 0})['ran']],
-        # the window that all of them measured
-        'measured': None if plan is None or len(ledgers) < len(task_set.processes) else measure(
-            Ledger.of_processes(task_set, ledgers), plan),
+        'measured': None,
         'drift': [each.result() for each in drift(task_set, _observed(task_set, results))]}
 
 

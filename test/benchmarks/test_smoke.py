@@ -10,6 +10,8 @@ import subprocess
 import sys
 from typing import Any
 
+from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Reading
+from msg_graph import loads
 import pytest
 
 TOP = Path(__file__).resolve().parent.parent.parent
@@ -103,3 +105,32 @@ def test_a_wrong_command_line_is_one_line():
     assert done.stderr == (
         "error: --executors: 'rad-events' is unknown: give some of rad, single, multi, events, "
         'none\n')
+
+
+def test_the_ledgers_of_several_processes_are_that_of_one_run():
+    task_set = loads("""
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 10ms, publishes: [/x], execution_time: 1ms}]}
+  - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 5ms, execution_time: 1ms}]}
+""")
+    ms = 1_000_000
+    parts = []
+    for vertex, (begin, end) in enumerate(((100, 300), (150, 350))):
+        ledger = Ledger(task_set)
+        if vertex == 0:
+            ledger.first_release['/a'] = 0
+        for job in range(40):
+            ledger.durations[('/a:t', '/b:s')[vertex]].append(ms)
+            if vertex == 1:
+                ledger.completions['/b:s'].append((job * 10 * ms, (job * 10 + job % 8) * ms))
+        bodies = [0, 0]
+        bodies[vertex] = 20
+        ledger.window = Reading(begin * ms, 0, (0, 0)), Reading(end * ms, 8 * ms, bodies)
+        parts.append(vars(ledger))
+    from benchmarks.loads import ledger_of_processes
+    whole = ledger_of_processes(task_set, parts)
+    assert [reading.at_ns for reading in whole.window] == [150 * ms, 300 * ms]
+    result = measure(whole, ExecutionPlan(task_set, mode='spin'))
+    assert (result['sink_jobs_due'], result['on_time'], result['missing']) == (15, 12, 0)
+    assert (result['callbacks'], result['callbacks_per_s']) == (30, 200.0)

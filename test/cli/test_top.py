@@ -157,7 +157,7 @@ def test_live_in_a_terminal_until_the_user_ends_it(running):
     os.close(terminal)
     assert os.waitstatus_to_exitcode(status) == 0
     text = shown.decode()
-    assert '\x1b[?1049h' in text and '\x1b[?1049l' in text  # the terminal is as it was before
+    assert '\x1b[H\x1b[J' in text
     assert 'workers of' in text and 'Traceback' not in text
 
 

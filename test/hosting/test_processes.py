@@ -96,7 +96,7 @@ def running(*arguments: str) -> Iterator[Running]:
             process.kill()  # its processes end with it
 
 
-def test_synthetic_nodes_in_two_processes_are_measured_as_one_run(world, mddag):
+def test_synthetic_nodes_in_two_processes_are_one_run(world, mddag):
     (world / 'chain.yaml').write_text(CHAIN.replace('60s', '500ms'))
     run = mddag('run', 'chain.yaml', '--synthetic', 'sleep', '--processes', '2',
                 '--duration', '1s', '--trace', 'out.mcap', '--json', 'result.json')
@@ -106,12 +106,7 @@ def test_synthetic_nodes_in_two_processes_are_measured_as_one_run(world, mddag):
     assert sorted(n for p in result['processes'] for n in p['nodes']) == [
         '/first', '/last', '/second', '/sensor']
     sink = result['dags']['chain']['sinks']['/last:sink']
-    measured = result['measured']
     assert counts(sink).due >= sink['completed'] > 0
-    assert 0 < measured['on_time'] <= measured['sink_jobs_due']
-    # what waited 0.1 s for its announcement, as on a busy machine, is of no job
-    assert measured['attribution']['wrong'] == 0
-    assert measured['attribution']['none'] < measured['sink_jobs_due'] / 2
     assert result['undeclared'] == sum(
         each['unattributed'] for each in result['callbacks'].values())
     assert result['never_ran'] == result['drift'] == []
@@ -121,7 +116,7 @@ def test_synthetic_nodes_in_two_processes_are_measured_as_one_run(world, mddag):
                     if e['_name'] == 'mddag:task_set')
         assert len(loads(said['yaml']).processes) == 2
         assert said['file'] == 'chain.yaml'
-    assert 'measured by the nodes, ' in run.stdout and '1 declared callback' not in run.stdout
+    assert '1 declared callback' not in run.stdout
 
 
 class Beside:

@@ -78,16 +78,6 @@ def test_the_end_of_one_ends_all(tmp_path):
     assert case.out.getvalue() == '[a] ends\n' and not case.died
 
 
-def test_one_that_dies_is_named_with_what_it_said():
-    case = Case(True, a='raise ValueError("boom")',
-                b='import os, signal; os.kill(os.getpid(), signal.SIGKILL)', c='pass')
-    assert dict(case.run()) == {'a': 1, 'b': -signal.SIGKILL, 'c': 0}
-    by_name = {run.name: run for run in case.died}
-    assert set(by_name) == {'a', 'b'}
-    assert by_name['a'].said == 'ValueError: boom' and by_name['a'].how == 'ended with status 1'
-    assert by_name['b'].how == 'was ended by signal 9 (Killed)'
-
-
 def test_all_end_when_asked_and_who_does_not_is_killed(monkeypatch):
     monkeypatch.setattr(module, 'END_TIMEOUT_S', 0.1)
     deaf = WAITS.replace('lambda *_: end.set()', 'signal.SIG_IGN')

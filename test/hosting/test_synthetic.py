@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 import threading
 import time
 
@@ -15,11 +13,10 @@ from mddag_executor.hosting.bodies import spinner
 from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Reading
 from mddag_executor.hosting.session import Session
 from mddag_executor.hosting.synthetic import SyntheticWorkload
-from msg_graph import load, loads, TaskSet
+from msg_graph import loads
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
-TOP = Path(__file__).resolve().parents[2]
 MS = 1_000_000
 
 # AND (join), OR (/sink belongs to fast and slow), a source that is a subscription and one that is
@@ -65,29 +62,7 @@ def task_set():
     return loads(GRAPH, 'graph.yaml')
 
 
-@pytest.fixture(scope='module')
-def autoware():
-    return load(TOP / 'config' / 'autoware.yaml')
-
-
 # --- the plan ------------------------------------------------------------------------------------
-
-
-def drawn(task_set: TaskSet, plan: ExecutionPlan) -> list[list[int]]:
-    return [[plan.execution_ns(v) for v in d.vertices] for d in task_set.dags]
-
-
-def test_scaling_gives_the_utilisation_asked_for(autoware):
-    workers = 7
-    plan = ExecutionPlan(autoware, 1, 0.6, workers)
-    total = sum(plan.execution_ns(v) / autoware.dags[v.dag].period_ns
-                for v in autoware.vertices)
-    assert total / workers == pytest.approx(0.6, abs=1e-6)
-    assert plan.utilisation == pytest.approx(0.6, abs=1e-6)
-    before = ExecutionPlan(autoware, 1, None, workers)
-    ratios = [a / b for x, y in zip(drawn(autoware, plan), drawn(autoware, before))
-              for a, b in zip(x, y) if b > 100_000]
-    assert max(ratios) == pytest.approx(min(ratios), rel=1e-4)  # one factor for all
 
 
 def test_the_critical_path_tells_what_is_infeasible():
@@ -243,31 +218,3 @@ def test_every_nominal_release_whose_deadline_lies_in_the_window_is_due():
     assert sink['response_ns'] == {
         'min': 20 * MS, 'median': 40 * MS, 'p99': 250 * MS, 'max': 250 * MS}
     assert (result['sink_jobs_due'], result['on_time_ratio']) == (8, 0.5)
-
-
-def test_the_ledgers_of_several_processes_are_that_of_one_run():
-    task_set = loads("""
-mddag: 1
-nodes:
-  - {node: /a, callbacks: [{name: t, timer: 10ms, publishes: [/x], execution_time: 1ms}]}
-  - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 5ms, execution_time: 1ms}]}
-""")
-    ms = 1_000_000
-    parts = []
-    for vertex, (begin, end) in enumerate(((100, 300), (150, 350))):
-        ledger = Ledger(task_set)
-        if vertex == 0:
-            ledger.first_release['/a'] = 0
-        for job in range(40):
-            ledger.durations[('/a:t', '/b:s')[vertex]].append(ms)
-            if vertex == 1:
-                ledger.completions['/b:s'].append((job * 10 * ms, (job * 10 + job % 8) * ms))
-        bodies = [0, 0]
-        bodies[vertex] = 20
-        ledger.window = Reading(begin * ms, 0, (0, 0)), Reading(end * ms, 8 * ms, bodies)
-        parts.append(json.loads(json.dumps(vars(ledger), default=list)))
-    whole = Ledger.of_processes(task_set, parts)
-    assert [reading.at_ns for reading in whole.window] == [150 * ms, 300 * ms]
-    result = measure(whole, ExecutionPlan(task_set, mode='spin'))
-    assert (result['sink_jobs_due'], result['on_time'], result['missing']) == (15, 12, 0)
-    assert (result['callbacks'], result['callbacks_per_s']) == (30, 200.0)

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-import time
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -15,12 +14,11 @@ from std_msgs.msg import Header
 ENOUGH = 60
 
 
-def _relay(name: str, topic: str, *publishes: str, takes: float = 0.0) -> Node:
+def _relay(name: str, topic: str, *publishes: str) -> Node:
     node = Node(name, start_parameter_services=False, enable_rosout=False)
     publishers = [node.create_publisher(Header, t, 50) for t in publishes]
 
     def on_message(message):
-        time.sleep(takes)
         for publisher in publishers:
             publisher.publish(Header(stamp=message.stamp, frame_id=name))
 
@@ -33,10 +31,9 @@ def sensor() -> Node:
     """Publish with the time of the callback, once those who are to get it are there."""
     node = Node('sensor', start_parameter_services=False, enable_rosout=False)
     publisher = node.create_publisher(Header, '/raw', 50)
-    wanted = int(os.environ.get('RELAY_SUBSCRIBERS', '1'))
 
     def tick():
-        if publisher.get_subscription_count() >= wanted:
+        if publisher.get_subscription_count():
             publisher.publish(Header(stamp=node.get_clock().now().to_msg()))
 
     node.create_timer(0.02, tick)
@@ -54,8 +51,8 @@ def second() -> Node:
 
 
 def last() -> list[Node]:
-    """Take /whole, and take some time for it; make a mark when there have been enough."""
-    node = _relay('last', '/whole', takes=float(os.environ.get('RELAY_TAKES', '0')))
+    """Take /whole; make a mark when there have been enough."""
+    node = _relay('last', '/whole')
     counts = [0]
 
     def on_message(message):
