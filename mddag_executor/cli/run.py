@@ -175,7 +175,7 @@ def run_here(
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     with ExitStack() as stack:
         stack.callback(faulthandler.cancel_dump_traceback_later)
-        signals = stack.enter_context(Signals(_PART_ENDS_S if args.part else 0))
+        signals = stack.enter_context(Signals())
         stack.enter_context(_rclpy(args.ros_args or []))
         if args.synthetic is None:
             from mddag_executor.hosting.host import Host
@@ -409,12 +409,9 @@ class Signals:
     Let SIGINT and SIGTERM end the run, and its report be written; a context manager.
 
     A SIGINT that comes a while after the first interrupts the program itself.
-
-    :param limit_s: if it is not 0, the system ends the process so much later.
     """
 
-    def __init__(self, limit_s: int = 0) -> None:
-        self._limit_s = limit_s
+    def __init__(self) -> None:
         self._session: Session | Supervisor | None = None
         self._first: float | None = None
         self._before: dict[int, Any] = {}
@@ -440,8 +437,6 @@ class Signals:
         now = time.monotonic()
         if self._first is None:
             self._first = now
-            if self._limit_s:
-                signal.alarm(self._limit_s)
         elif number == signal.SIGINT and now - self._first > _SAME_INTERRUPT_S:
             signal.default_int_handler(number, frame)
         if self._session is not None:

