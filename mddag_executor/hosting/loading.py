@@ -101,8 +101,7 @@ def ros_arguments(given: Sequence[str] | None) -> list[str]:
 def _find(spec: str) -> Program:
     package, slash, executable = spec.partition('/')
     module, colon, attribute = spec.partition(':')
-    names = [*module.split('.'), *attribute.split('.')]
-    if colon and all(name.isidentifier() for name in names):
+    if colon and all(name.isidentifier() for name in [*module.split('.'), attribute]):
         return _attribute(spec, module, attribute)
     if not colon and package and executable and '/' not in executable:
         return _executable(spec, package, executable)
@@ -115,15 +114,12 @@ def _attribute(spec: str, module_name: str, attribute: str) -> Program:
     if '' not in sys.path and os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())  # as `python -m` does
     module = _import(spec, module_name)
-    target: Any = module
-    for name in attribute.split('.'):
-        try:
-            target = getattr(target, name)
-        except AttributeError:
-            raise LoadingError(
-                spec, f"module '{module_name}' has no '{attribute}'", _suggest(attribute, [
-                    name for name, value in vars(module).items()
-                    if not name.startswith('_') and callable(value)])) from None
+    target: Any = getattr(module, attribute, None)
+    if target is None:
+        raise LoadingError(
+            spec, f"module '{module_name}' has no '{attribute}'", _suggest(attribute, [
+                name for name, value in vars(module).items()
+                if not name.startswith('_') and callable(value)]))
     if not callable(target) or isinstance(target, type) and not issubclass(target, Node):
         raise LoadingError(
             spec, f"'{attribute}' makes no node",
@@ -135,24 +131,14 @@ def _import(spec: str, module_name: str) -> ModuleType:
     try:
         return import_module(module_name)
     except ModuleNotFoundError as error:
-        missing = error.name or module_name
-        if f'{module_name}.'.startswith(f'{missing}.'):
-            raise LoadingError(
-                spec, f"there is no module '{missing}'",
-                'check its name, or add its folder to PYTHONPATH') from None
-        package = missing.partition('.')[0].replace('_', '-')
         raise LoadingError(
-            spec, f"'{module_name}' needs the module '{missing}', which is not installed",
-            f'install it (if it is of ROS: apt install ros-DISTRO-{package})') from error
+            spec, f"there is no module '{error.name or module_name}'",
+            'check its name, install it, or add its folder to PYTHONPATH') from error
     except Exception as error:
-        raise _failure(error)(
+        wrong = isinstance(error, (ImportError, SyntaxError))  # else the program has raised
+        raise (LoadingError if wrong else ProgramFailed)(
             spec, f"'{module_name}' cannot be imported ({describe(error)})",
             'correct it') from error
-
-
-def _failure(error: Exception) -> type[LoadingError]:
-    """Return the kind of error of a failed import: a missing module, or a defect."""
-    return LoadingError if isinstance(error, (ImportError, SyntaxError)) else ProgramFailed
 
 
 def _executable(spec: str, package: str, name: str) -> Program:
@@ -174,11 +160,7 @@ def _executable(spec: str, package: str, name: str) -> Program:
 
 
 def _script(spec: str, path: Path) -> Program:
-    try:
-        source = path.read_bytes()
-    except OSError as error:
-        raise LoadingError(
-            spec, f'{path} cannot be read ({error.strerror})', 'change its permissions') from None
+    source = path.read_bytes()
     first_line = source.split(b'\n', 1)[0]
     if not (path.suffix == '.py' or first_line.startswith(b'#!') and b'python' in first_line):
         raise LoadingError(
