@@ -18,7 +18,7 @@ Theory of operation
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 import os
 from typing import BinaryIO, NamedTuple
@@ -73,16 +73,41 @@ class Content(ReadDataStream):
 @dataclass
 class Block:
     """
-    The records of a chunk, or records outside of chunks.
+    A chunk, or records outside of chunks.
 
     :ivar offset: position of its first byte in the file.
     :ivar indexes: contents of its message indexes.
+    :ivar chunk: the chunk; its data is packed.
+    :ivar plain: records outside of chunks.
     """
 
     offset: int
-    data: bytes | bytearray
     indexes: list[bytes]
-    is_chunk: bool
+    chunk: Chunk | None = None
+    plain: bytearray = field(default_factory=bytearray)
+
+    @property
+    def size(self) -> int:
+        """Return the size of its records, unpacked."""
+        return len(self.plain) if self.chunk is None else int(self.chunk.uncompressed_size)
+
+    def unpack(self, room: memoryview) -> None:
+        """
+        Write its records into a buffer of its size.
+
+        :raises Damage: if the records do not match the head of the chunk.
+        """
+        if self.chunk is None:
+            room[:] = self.plain
+            return
+        try:
+            _decompress(self.chunk.data, self.chunk.compression, room)
+        except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
+            raise Damage('a chunk cannot be decompressed', self.offset) from None
+        except ValueError as error:
+            raise Damage(str(error), self.offset) from None
+        if self.chunk.uncompressed_crc and zlib.crc32(room) != self.chunk.uncompressed_crc:
+            raise Damage('the CRC of a chunk is wrong', self.offset)
 
 
 class Summary(NamedTuple):
@@ -125,22 +150,22 @@ def blocks(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
     try:
         for opcode, offset, content in _records(stream.fileno(), start, size):
             if opcode == Opcode.MESSAGE_INDEX:
-                if block is None or not block.is_chunk:
+                if block is None or block.chunk is None:
                     raise Damage('a message index belongs to no chunk', offset)
                 block.indexes.append(content)
                 continue
             plain = records.record(opcode, content) if opcode in _PLAIN else b''
-            if plain and block is not None and not block.is_chunk and (
-                    len(block.data) < _PLAIN_BLOCK):
-                block.data += plain
+            if plain and block is not None and block.chunk is None and (
+                    block.size < _PLAIN_BLOCK):
+                block.plain += plain
                 continue
             if block is not None:
                 yield block
             block = None
             if opcode == Opcode.CHUNK:
-                block = Block(offset, _unpacked(content, offset), [], True)
+                block = Block(offset, [], chunk=_chunk(content, offset))
             elif plain:
-                block = Block(offset, bytearray(plain), [], False)
+                block = Block(offset, [], plain=bytearray(plain))
     except Damage:
         if block is not None:
             yield block
@@ -174,39 +199,42 @@ def _records(file: int, position: int, size: int) -> Iterator[tuple[int, int, by
         position = start + length
 
 
-def _unpacked(content: bytes, offset: int) -> bytes:
-    """Return the records of a chunk; raise Damage if they do not match its head."""
+def _chunk(content: bytes, offset: int) -> Chunk:
+    """Return a chunk; raise Damage if its head is wrong."""
     stream = Content(content)
     try:
-        chunk = Chunk.read(stream)
-        if stream.count < len(content):
-            raise ValueError('the lengths in the head of a chunk are wrong')
-        data = _decompressed(chunk.data, chunk.compression, chunk.uncompressed_size)
-    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
-        raise Damage('a chunk cannot be decompressed', offset) from None
+        chunk: Chunk = Chunk.read(stream)
     except ValueError as error:
         raise Damage(str(error), offset) from None
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise Damage('the CRC of a chunk is wrong', offset)
-    return data
+    if stream.count < len(content) or chunk.uncompressed_size > MAX_CHUNK:
+        raise Damage('the lengths in the head of a chunk are wrong', offset)
+    return chunk
 
 
-def _decompressed(data: bytes, compression: str, size: int) -> bytes:
-    """Decompress data, and allocate memory for the given size only."""
-    if size > MAX_CHUNK:
-        raise ValueError(_WRONG_SIZE)
-    if compression == 'zstd':
+def _decompress(data: bytes, compression: str, room: memoryview) -> None:
+    """Decompress data into a buffer; raise ValueError if it does not fill the buffer exactly."""
+    size = len(room)
+    if compression == '':
+        filled = len(data)
+        if filled == size:
+            room[:] = data
+    elif compression == 'zstd':
         if zstandard.frame_content_size(data) not in (size, -1):    # -1: not stated
             raise ValueError(_WRONG_SIZE)
-        data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+            filled = reader.readinto(room) + len(reader.read(1))
     elif compression == 'lz4':
-        stream = lz4.frame.open(BytesIO(data))      # one large read takes thrice the memory
-        data = b''.join(stream.read(_LZ4_PIECE) for _ in range(size // _LZ4_PIECE + 1))
-    elif compression:
+        stream = lz4.frame.open(BytesIO(data))
+        filled = 0
+        while piece := stream.read(_LZ4_PIECE):     # one large read takes thrice the memory
+            if filled + len(piece) > size:
+                raise ValueError(_WRONG_SIZE)
+            room[filled:filled + len(piece)] = piece
+            filled += len(piece)
+    else:
         raise ValueError(f'the compression of a chunk, {compression[:20]!r}, is unknown')
-    if len(data) != size:
+    if filled != size:
         raise ValueError(_WRONG_SIZE)
-    return data
 
 
 def read_summary(stream: BinaryIO, size: int) -> Summary | None:

@@ -58,7 +58,7 @@ class Table(NamedTuple):
 
 class Batch:
     """
-    The events of some chunks.
+    The events of some chunks; valid until the next batch is read.
 
     :param data: the records of the chunks.
     :param base: position of the first byte of the data in the order of the file.
@@ -66,7 +66,7 @@ class Batch:
     """
 
     def __init__(
-        self, data: bytes, base: int, columns: Sequence[Column],
+        self, data: bytearray, base: int, columns: Sequence[Column],
         others: Sequence[tuple[int, Event]],
     ) -> None:
         self.data, self.base = data, base
@@ -112,7 +112,7 @@ def with_fields(rows: Any, missing: dict[str, int]) -> Any:
     return wider
 
 
-def rows_at(data: bytes | bytearray, kind: Any, positions: Ints) -> Any:
+def rows_at(data: bytearray | memoryview, kind: Any, positions: Ints) -> Any:
     """Return the structures at positions in data; raise IndexError beyond its end."""
     room = len(data) - kind.itemsize + 1
     # as plain bytes: numpy copies structures field by field

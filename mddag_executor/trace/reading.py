@@ -38,12 +38,11 @@ from mddag_executor.trace.times import NEVER
 import numpy as np
 
 _BATCH_BYTES = 1 << 21
-_HEAD = np.dtype({
-    'names': ['opcode', 'length', 'channel', 'log_time', 'publish_time'],
-    'formats': ['u1', '<u8', '<u2', '<u8', '<u8'], 'offsets': [0, 1, 9, 15, 23],
-    'itemsize': 31})
-"""The begin of a message's record."""
+_HEAD = np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2')])
+"""The begin of a message's record; its times follow after four bytes."""
+_TIMES_AT, _TIMES = 15, np.dtype([('log_time', '<u8'), ('publish_time', '<u8')])
 _CONTENT = records.RECORD.size
+_LEAST = _CONTENT + records.MESSAGE_HEAD.size       # bytes of a message's record
 _ENCAPSULATION = np.dtype('<u2')
 _LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as read by _ENCAPSULATION
 _INDEX_HEAD = 6         # bytes: channel, size of the entries
@@ -61,15 +60,17 @@ class Message(NamedTuple):
 
 class _Loaded(NamedTuple):
     """
-    The data of some blocks.
+    The data of some blocks; valid until the next ones are loaded.
 
     :ivar data: their records.
-    :ivar at: positions of the messages in the data, ascending; ``heads``: their heads.
+    :ivar at: positions of the messages in the data, ascending.
+    :ivar lengths: of their contents; ``channels``: their channels.
     """
 
-    data: bytes
+    data: bytearray
     at: Ints
-    heads: Any
+    lengths: Ints
+    channels: Any
 
 
 class Reading:
@@ -92,6 +93,7 @@ class Reading:
         self._undecoded: Counter[str] = Counter()       # by topic and reason
         self._left_out: list[int] = []      # impossible times
         self._place = 0             # of the next batch in the order of the file
+        self._buffer = bytearray()  # of a batch
 
     def by_file(self) -> Iterator[Batch]:
         """Yield the events in the order of the file."""
@@ -109,59 +111,71 @@ class Reading:
     def messages_of(self, topics: Collection[str], times: array[int]) -> Iterator[Message]:
         """Yield the messages of some topics; add the times of all messages to ``times``."""
         known = self._channels.topics
-        for data, at, heads in self._messages():
+        for data, at, lengths, channels in self._messages():
+            heads = rows_at(data, _TIMES, at + _TIMES_AT)
             times.frombytes(heads['log_time'].tobytes())
-            undefined = heads['channel'][~np.isin(heads['channel'], list(known))]
+            undefined = channels[~np.isin(channels, list(known))]
             self._undecoded.update(
                 f'channel {channel}: {UNDEFINED}' for channel in undefined.tolist())
-            wanted = np.isin(heads['channel'], [n for n in known if known[n].name in topics])
-            for start, (_, length, channel, log_time, publish_time) in zip(
-                    at[wanted].tolist(), heads[wanted].tolist()):
+            wanted = np.isin(channels, [n for n in known if known[n].name in topics])
+            for start, length, channel, (log_time, publish_time) in zip(
+                    at[wanted].tolist(), lengths[wanted].tolist(), channels[wanted].tolist(),
+                    heads[wanted].tolist()):
                 yield Message(known[channel], log_time, publish_time,
-                              data[start + FIELDS - 4:start + _CONTENT + length])
+                              bytes(data[start + FIELDS - 4:start + _CONTENT + length]))
 
     # --- positions of messages -------------------------------------------------------------------
 
     def _messages(self) -> Iterator[_Loaded]:
         """Yield the messages of all blocks, some blocks at a time."""
-        parts: list[bytes | bytearray] = []
-        places: list[Ints] = []
+        places: list[tuple[Ints, Ints, Any]] = []
         size = 0
         try:
             for block in self._blocks:
+                if size and size + block.size > _BATCH_BYTES:
+                    yield _Loaded(self._buffer, *map(np.concatenate, zip(*places)))
+                    self._place += size
+                    places, size = [], 0
+                if size + block.size > len(self._buffer):   # only the first of a batch
+                    self._buffer = bytearray(max(block.size, _BATCH_BYTES))
+                room = memoryview(self._buffer)[size:size + block.size]
+                block.unpack(room)
                 try:
-                    at = self._located(block.data, block.indexes)
+                    at, lengths, channels = self._located(room, block.indexes)
                 except ValueError as error:
                     raise Damage(str(error), block.offset) from None
-                self.chunks += block.is_chunk
+                self.chunks += block.chunk is not None
                 self.messages += len(at)
-                parts.append(block.data)
-                places.append(at + size)
-                size += len(block.data)
-                if size >= _BATCH_BYTES:
-                    yield _joined(parts, places)
-                    self._place += size
-                    parts, places, size = [], [], 0
+                places.append((at + size, lengths, channels))
+                size += block.size
         except Damage as damage:
             self.damage = Damage(damage.what, damage.offset)    # no traceback: it keeps the data
-        if parts:
-            yield _joined(parts, places)
+        except MemoryError:
+            self.damage = Damage('a chunk does not fit into the memory', block.offset)
+        if places:
+            yield _Loaded(self._buffer, *map(np.concatenate, zip(*places)))
 
-    def _located(self, data: bytes | bytearray, indexes: Sequence[bytes]) -> Ints:
+    def _located(
+        self, data: memoryview, indexes: Sequence[bytes]
+    ) -> tuple[Ints, Ints, Any]:
         """
-        Return the positions of the messages in a block, and read its definitions.
+        Return positions, lengths and channels of the messages in a block; read its definitions.
 
         :raises ValueError: if the records are invalid.
         """
-        at, lengths = _indexed(data, indexes)
+        at, lengths, channels = _indexed(data, indexes)
         # definitions are between the messages; without usable indexes all messages are, too
         ends, begins = np.append(0, at + _CONTENT + lengths), np.append(at, len(data))
         gaps = np.flatnonzero(ends < begins)
         found = [position for begin, until in zip(ends[gaps].tolist(), begins[gaps].tolist())
                  for position in self._walk(data, begin, until)]
-        return np.sort(np.append(at, found)).astype(np.int64) if found else at
+        if found:
+            at = np.sort(np.append(at, found)).astype(np.int64)
+            heads = rows_at(data, _HEAD, at)
+            lengths, channels = heads['length'].astype(np.int64), heads['channel']
+        return at, lengths, channels
 
-    def _walk(self, data: bytes | bytearray, position: int, end: int) -> Iterator[int]:
+    def _walk(self, data: memoryview, position: int, end: int) -> Iterator[int]:
         """Yield the positions of messages between two positions; read definitions."""
         while position < end:
             opcode, length = data[position], data[position + 1:position + _CONTENT]
@@ -169,7 +183,7 @@ class Reading:
             if after > end:
                 raise ValueError('the records of a chunk do not fit into it')
             if opcode == Opcode.MESSAGE:
-                if after - position < _HEAD.itemsize:
+                if after - position < _LEAST:
                     raise ValueError('a message is shorter than its head')
                 yield position
             elif opcode == Opcode.SCHEMA:
@@ -183,14 +197,12 @@ class Reading:
     def _decoded(self, loaded: _Loaded) -> Batch:
         """Return the events of some blocks; count undecodable ones."""
         columns, others = [], list[tuple[int, Event]]()
-        order = np.argsort(loaded.heads['channel'], kind='stable')
-        every, begins = np.unique(loaded.heads['channel'][order], return_index=True)
-        for channel, mine in zip(every.tolist(), np.split(order, begins[1:])):
+        for channel in np.flatnonzero(np.bincount(loaded.channels)).tolist():
             if channel in self._channels.passed_over:
                 continue
-            at, heads = loaded.at[mine], loaded.heads[mine]
+            mine = np.flatnonzero(loaded.channels == channel)
+            at, lengths = loaded.at[mine], loaded.lengths[mine] + _CONTENT
             fixed = self._channels.fixed.get(channel)
-            lengths = heads['length'].astype(np.int64) + _CONTENT
             if fixed is not None:
                 plain = lengths >= FIELDS + fixed.kind.itemsize
                 plain[plain] = rows_at(
@@ -199,7 +211,7 @@ class Reading:
                 columns.append(Column(fixed, at[plain], size))
                 at, lengths = at[~plain], lengths[~plain]
             for start, length in zip(at.tolist(), lengths.tolist()):
-                event = self._any(channel, loaded.data[start:start + length])
+                event = self._any(channel, bytes(loaded.data[start:start + length]))
                 if event is not None:
                     others.append((start, event))
         others.sort(key=itemgetter(0))
@@ -235,23 +247,19 @@ class Reading:
                 f'most of them ({count}) of {reason}')
 
 
-def _indexed(data: bytes | bytearray, indexes: Sequence[bytes]) -> tuple[Ints, Ints]:
-    """Return positions and lengths of messages by the message indexes; none if these are wrong."""
+def _indexed(data: memoryview, indexes: Sequence[bytes]) -> tuple[Ints, Ints, Any]:
+    """Return what the message indexes say of a block's messages; nothing if they are wrong."""
     none = np.empty(0, dtype=np.int64)
+    nothing = none, none, none.astype(np.uint16)
     try:
         entries = [np.frombuffer(index, _INDEX_ENTRY, offset=_INDEX_HEAD) for index in indexes]
     except ValueError:      # not a number of whole entries
-        return none, none
+        return nothing
     at = np.sort(np.concatenate([none, *(each['offset'].astype(np.int64) for each in entries)]))
-    if not len(at) or at[0] < 0 or at[-1] > len(data) - _HEAD.itemsize:
-        return none, none
+    if not len(at) or at[0] < 0 or at[-1] > len(data) - _LEAST:
+        return nothing
     heads = rows_at(data, _HEAD, at)
     lengths = heads['length'].astype(np.int64)
     fits = (heads['opcode'] == Opcode.MESSAGE) & (lengths >= records.MESSAGE_HEAD.size) & (
         lengths <= len(data)) & (at + _CONTENT + lengths <= np.append(at[1:], len(data)))
-    return (at, lengths) if fits.all() else (none, none)
-
-
-def _joined(parts: Sequence[bytes | bytearray], places: Sequence[Ints]) -> _Loaded:
-    data, at = b''.join(parts), np.concatenate(places)
-    return _Loaded(data, at, rows_at(data, _HEAD, at))
+    return (at, lengths, heads['channel']) if fits.all() else nothing
