@@ -245,7 +245,7 @@ def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):
 
 
 @pytest.mark.parametrize('kwargs, says', [
-    ({'num_workers': 0}, 'give at least 1'),
+    ({'num_workers': 0}, 'give an integer from 1 to'),
     ({'policy': 'nonsense'}, 'choose one of'),
     ({'worker_policy': 'SCHED_NONSENSE'}, 'give one of'),
     ({'worker_priority': 5}, 'give worker_policy'),
