@@ -38,7 +38,6 @@ from msg_graph.yamltext import (
     MAX_BYTES,
     MAX_SIZE,
     parse_yaml,
-    plain,
     Scalar,
     Sequence,
     Tree,
@@ -49,7 +48,7 @@ MOST_FILES = 2_000
 MOST_DEPTH = 16
 LONGEST_VALUE = 4_096
 _ARGUMENT_USE = re.compile(r'\$\(([^()]*)\)')
-_DUMPER: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+_NUMBER = re.compile(r'[+-]?[0-9.]+|true|false')
 _NAMED = ('node', 'subscription', 'service', 'sync', 'publishes', 'reads')
 
 Chain = list[tuple[str, str]]
@@ -83,9 +82,31 @@ def resolve(tree: Mapping, path: str | None) -> Mapping:
 
 def as_text(tree: Tree) -> str:
     """Return a resolved tree as YAML."""
-    text: str = yaml.dump(plain(tree), Dumper=_DUMPER, sort_keys=False, default_flow_style=None,
+    text: str = yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None,
                           width=99, allow_unicode=True)
     return f'# put together from {ascii(tree.file)[1:-1]} and what it includes\n{text}'
+
+
+class _Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
+    """Writes trees; numbers without quotes, unless they were read with quotes."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write everything out."""
+        return True
+
+    def scalar(self, scalar: Scalar) -> Any:
+        """Return the node of a scalar."""
+        if scalar.is_null:
+            return self.represent_none(None)
+        if scalar.is_plain and _NUMBER.fullmatch(scalar.text):
+            return self.represent_scalar(
+                self.resolve(yaml.ScalarNode, scalar.text, (True, False)), scalar.text)
+        return self.represent_str(scalar.text)
+
+
+_Dumper.add_representer(Scalar, _Dumper.scalar)
+_Dumper.add_representer(Sequence, lambda dumper, tree: dumper.represent_list(tree.items))
+_Dumper.add_representer(Mapping, lambda dumper, tree: dumper.represent_dict(tree.entries))
 
 
 class _Resolver:

@@ -125,6 +125,23 @@ def test_the_flat_text_keeps_every_key(tmp_path):
     assert plain(loads(task_set.text)) == plain(loads(EVERYTHING)) == plain(task_set)
 
 
+def test_the_flat_text_has_quotes_where_the_files_have_them(tmp_path):
+    text = load(write(
+        tmp_path, top='mddag: 1\ninclude: [{file: a.yaml, set: {n: "7", b: true}}]\nworkers: 2\n',
+        a="""\
+mddag: 1
+arguments: {n: , b: , m: 0.5}
+nodes:
+  - node: /n
+    callbacks:
+      - {name: '5', timer: 1s, deadline: 1s, holds_interpreter: $(b)}
+      - {name: b, timer: 2s, deadline: 1s, execution_time: {quantiles_us: [$(m), $(n)]}}
+""")).text
+    assert text.splitlines()[1:3] == ['mddag: 1', 'workers: 2']
+    assert "{name: '5'" in text and 'holds_interpreter: true' in text and '[0.5, 7]' in text
+    assert [c.name for c in loads(text).callbacks] == ['5', 'b']
+
+
 def test_includes_within_includes(tmp_path):
     task_set = load(write(
         tmp_path, top='mddag: 1\ninclude: [{file: a/mid.yaml, namespace: /x, '
