@@ -48,7 +48,7 @@ MOST_FILES = 2_000
 MOST_DEPTH = 16
 LONGEST_VALUE = 4_096
 _ARGUMENT_USE = re.compile(r'\$\(([^()]*)\)')
-_NUMBER = re.compile(r'[+-]?[0-9.]+|true|false')
+_NUMBER = re.compile(r'[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?|true|false')
 _NAMED = ('node', 'subscription', 'service', 'sync', 'publishes', 'reads')
 
 Chain = list[tuple[str, str]]

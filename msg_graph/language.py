@@ -51,11 +51,13 @@ class Name:
     A kind of name.
 
     :ivar what: its description in errors.
+    :ivar allowed: what a name that is not global consists of.
     """
 
     what: str
     pattern: re.Pattern[str] = _WORD
     longest: int = 255
+    allowed: str = "letters, digits, '_', '-' and '.'"
 
     @property
     def is_global(self) -> bool:
@@ -71,7 +73,7 @@ class Name:
         elif not self.pattern.fullmatch(text):
             problem = f'{shown(text)} is not a valid {self.what} name'
             remedy = ("use '/' and words of letters, digits and '_' that start with no digit"
-                      if self.is_global else "use letters, digits, '_', '-' and '.'")
+                      if self.is_global else f'use {self.allowed}')
         elif len(text) > self.longest:
             problem = f'the {self.what} name {shown(text)} is too long'
             remedy = f'use at most {self.longest} characters'
@@ -100,7 +102,8 @@ GROUP = Name('callback group')
 DAG = Name('DAG', re.compile(r'/?[A-Za-z0-9_.-]+(?:/[A-Za-z0-9_.-]+)*'))
 PATH = Name('path')
 PROCESS = Name('process')
-ARGUMENT = Name('argument', re.compile(r'[A-Za-z_][A-Za-z0-9_]*'))
+ARGUMENT = Name('argument', re.compile(r'[A-Za-z_][A-Za-z0-9_]*'),
+                allowed="letters, digits and '_', and no digit first")
 
 
 def kind_of(tree: Tree) -> str:

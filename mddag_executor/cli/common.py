@@ -162,8 +162,7 @@ def check_files(args: argparse.Namespace) -> None:
         if isinstance(each, Output) and each.checked_early:
             check_output(each, each.is_recording, getattr(args, 'overwrite', False))
         if isinstance(each, Report):
-            from mddag_executor.report.html import check_available
-            check_available()
+            _check_report(each)
 
 
 def _files(args: argparse.Namespace) -> Iterator[tuple[str, Input | Output]]:
@@ -188,6 +187,14 @@ def check_output(path: str | None, recording: bool = False, overwrite: bool = Fa
     if not _is_special(target):
         _check_parent(path)
         check_replaced(path, recording=recording, overwrite=overwrite)
+
+
+def _check_report(path: Report) -> None:
+    # `replay run.mcap --report graph.yaml` must not replace a declaration.
+    if os.path.splitext(path)[1].lower() not in ('', '.html', '.htm'):
+        raise UsageError(f'--report {path}: a report is an HTML file: let its name end in .html')
+    from mddag_executor.report.html import check_available
+    check_available()
 
 
 def _is_special(path: Path) -> bool:
@@ -219,7 +226,7 @@ def output_file(path: str) -> Iterator[BinaryIO]:
             error.filename = error.filename or path
             raise
         return
-    target = target.resolve()  # a symbolic link stays one
+    target = Path(os.path.realpath(path))  # a symbolic link stays one
     part = target.with_name(f'.{target.name}.{os.getpid()}.part')
     try:
         with part.open('xb') as file:
@@ -243,8 +250,9 @@ def check_folder(path: str, names: Collection[str]) -> None:
 
 
 def _check_parent(path: str) -> None:
-    folder = Path(path).resolve().parent
-    if not folder.is_dir():
+    # not by Path.resolve, which raises if links lead in a circle
+    folder = os.path.dirname(os.path.realpath(path))
+    if not os.path.isdir(folder):
         raise InputError(path, f'there is no directory {Path(path).parent}', 'make it first')
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(path, 'the directory cannot be written to', 'name another one')

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--runs', type=options.positive_int, metavar='N',
         help='runs of each GRAPH, each with execution times of its own (default: '
         f'{_RUNS}; {_RUNS_OF_EACH} if there are several)')
-    add('--first-run', type=options.or_zero(options.positive_int), default=0, metavar='N',
+    add('--first-run', type=options.not_negative_int, default=0, metavar='N',
         help='number of the first run: results of ranges that do not overlap can be merged by '
         'adding their counts (default: 0)')
     add('--policies', default=','.join(defaults.POLICIES), metavar='P,P…',

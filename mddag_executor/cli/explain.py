@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_recording(parser, "a recorded run, an MCAP file ('-': standard input)")
     add('--sink', metavar='S',
         help='only jobs of this sink: /node:callback, or the end of its name, as tables show it')
-    add('--job', type=options.or_zero(options.positive_int), metavar='K',
+    add('--job', type=options.not_negative_int, metavar='K',
         help='only the job of this number')
     options.add(parser, '--from', '--to', '--skip', '--json')
 

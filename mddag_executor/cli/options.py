@@ -58,6 +58,7 @@ def workers(text: str) -> int:
 
 
 positive_int = _number(int, lambda value: value >= 1, 'an integer from 1 up')
+not_negative_int = _number(int, lambda value: value >= 0, 'an integer from 0 up')
 seed = _number(int, lambda value: 0 <= value < 2 ** 64, 'an integer from 0 to 2**64 - 1')
 number = _number(float, math.isfinite, 'a number')
 positive_float = _number(float, lambda value: 0 < value < math.inf, 'a number above zero')

@@ -44,6 +44,7 @@ def files(tmp_path_factory):
     (folder / 'binary.yaml').write_bytes(bytes(range(256)))
     (folder / 'latin.yaml').write_bytes(b'mddag: 1\n# \xe4\n')
     np.savez(folder / 'few.npz', **{'/n:t': [1]})
+    (folder / 'link').symlink_to('link')
     (folder / 'folder').mkdir()
     (folder / 'full').mkdir()
     (folder / 'full' / 'file').touch()
@@ -102,15 +103,19 @@ def files(tmp_path_factory):
     ('simulate g.yaml --execution-times hostile.json', 'hostile.json: execution time of /n:t of'),
     # files to write
     ('graph check g.yaml --json none/out.json', 'none/out.json: there is no directory none: make'),
+    ('graph check g.yaml --json link/out.json', 'link/out.json: there is no directory link: make'),
     ('graph check g.yaml --json folder', 'folder: this is a directory: name a file'),
     ('simulate g.yaml --trace -', '--trace -: it is not written to standard output: name a file'),
     ('graph assign-deadlines g.yaml --json -',
      '-: standard output can be only one of json and output: name a file for each other one'),
     ('graph draw g.yaml -o out.jpeg', 'out.jpeg: no ending that says what to draw: use one of .s'),
+    ('replay run.mcap --report g.yaml', '--report g.yaml: a report is an HTML file: let its name'),
     ('export run.mcap -o out.xlsx', '-o out.xlsx: it is not known what to write: let the name en'),
     ('export run.mcap -o out.pftrace --rows jobs', '--rows: a .pftrace gets both, executions and'),
     ('export run.mcap -o none/out/', 'none/out/: there is no directory none: make it first'),
     # the laboratory
+    ('evaluate g.yaml --first-run -1',
+     "mddag evaluate: argument --first-run: '-1' is not an integer from 0 up"),
     ('evaluate g.yaml --runs 99999999999', 'runs: 99999999999 is too many: give at most '),
     ('evaluate folder', 'folder: there is no *.yaml in this folder: name a declaration, or make'),
     ('evaluate g.yaml --samples g.yaml', 'g.yaml: this is no .npz file: write one array of measu'),
@@ -132,7 +137,7 @@ def files(tmp_path_factory):
     ('generate --sinks 5 --vertices 5', '--sinks 5: a DAG of 5 vertices has at most 4: give few'),
     # placement
     ('graph place g.yaml --processes 4 -o out.yaml',
-     '--processes 4: there are only 2 nodes to place, or groups of nodes: give fewer processes'),
+     '--processes 4: to place are only 2 nodes, or groups of nodes: give fewer processes'),
     ('graph place g.yaml --processes 1 --trace run.mcap --utilisation 0.2 -o out.yaml',
      '--utilisation: execution times are those of --trace: leave one of them out'),
     # recordings

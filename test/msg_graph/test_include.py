@@ -14,7 +14,7 @@ from msg_graph import GraphError, load, loads, Process, TaskSet
 from msg_graph.edit import without_lines
 import pytest
 
-from .test_language import EVERYTHING
+from .test_language import EVERYTHING, schema_errors
 
 TWO = """\
 mddag: 1
@@ -123,6 +123,7 @@ def test_the_flat_text_keeps_every_key(tmp_path):
         tmp_path, top=EVERYTHING.replace('workers: 7', 'workers: 7\narguments: {}')))
     assert 'arguments' not in task_set.text
     assert plain(loads(task_set.text)) == plain(loads(EVERYTHING)) == plain(task_set)
+    assert schema_errors(task_set.text) == []
 
 
 def test_the_flat_text_has_quotes_where_the_files_have_them(tmp_path):
@@ -170,7 +171,8 @@ def test_includes_within_includes(tmp_path):
      'top.yaml:8', 'cannot be read (No such file or directory)'),
     ('namespace: /rear', 'namespace: /front/left', 'parts/sensor.yaml:9',
      'this name is taken in line 9'),
-    ('  period: 100ms', '  1period: 100ms', 'parts/sensor.yaml:4', 'not a valid argument name'),
+    ('  period: 100ms', '  1period: 100ms', 'parts/sensor.yaml:4',
+     "argument name: use letters, digits and '_',"),
     ('    remap: {/cropped: /behind, /shared: /twist}', '    remap: [1]', 'top.yaml:10',
      "'remap': a list is not a mapping: write one with"),
 ])
