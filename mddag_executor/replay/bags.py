@@ -210,11 +210,13 @@ class Bag:
 
 def is_ordinary(path: str) -> bool:
     """Return whether a path is a bag without traced events, so without jobs."""
-    files = [path]
+    files, has_metadata = [path], False
     if os.path.isdir(path):
-        files = [os.path.join(path, name) for name in os.listdir(path)
-                 if _BAG_FILE.fullmatch(name)]
-    return any(map(_is_bag, files)) and all(opened_trace(file) is None for file in files)
+        names = os.listdir(path)
+        files = [os.path.join(path, name) for name in names if _BAG_FILE.fullmatch(name)]
+        has_metadata = 'metadata.yaml' in names     # a bag, even if its files are damaged or gone
+    return (has_metadata or any(map(_is_bag, files))) and all(
+        opened_trace(file) is None for file in files)
 
 
 def opened_trace(path: str) -> TraceReader | None:

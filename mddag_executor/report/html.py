@@ -134,8 +134,8 @@ def _page(
     yield f'{overview}\n{_note(_BARS)}'
     yield f'<h3>By worker</h3>\n{workers}\n<h3>By callback</h3>\n'
     if prepared.n_hidden:
-        yield _note('DAGs that missed the largest share of their deadlines come first; '
-                    f'{counted(prepared.n_hidden, "callback")} more are left out.')
+        yield _note('DAGs that missed the largest share of their deadlines come first. Left '
+                    f'out: {counted(prepared.n_hidden, "callback")}.')
     yield f'{callbacks}\n'
     if data.result.get('paths'):
         yield '<h2>End to end</h2>\n' + _note(

@@ -26,6 +26,7 @@ MOST_ROWS = 50
 """Number of sinks in the page itself; a script adds the others."""
 RED, ORANGE, BLUE = '#d7191c', '#fd8d3c', '#3182bd'
 
+
 class Html(str):
     """Text that is already markup."""
 

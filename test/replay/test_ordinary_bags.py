@@ -161,6 +161,7 @@ def test_several_files(tmp_path, storage):
     assert len(half.stamps['/points'].header) == 10
     assert half.warnings == [f'{path}/drive_1.{suffix}: is no file: it is left out']
     (path / f'drive_0.{suffix}').unlink()
+    assert is_ordinary(str(path))       # not a folder without a trace
     with pytest.raises(BagError, match='is no file: it is left out'):
         read_bag(path, loads(GRAPH, 'g.yaml'))
 
