@@ -96,6 +96,10 @@ def rerun(
 @contextmanager
 def _made_whole(path: str) -> Iterator[str]:
     """Give a file name that becomes `path` if the block ends well; otherwise the file vanishes."""
+    path = os.path.realpath(path)  # a symbolic link stays one
+    if os.path.exists(path) and not os.path.isfile(path):  # a pipe or device is not replaced
+        yield path
+        return
     part = f'{path}.{os.getpid()}.part'
     try:
         yield part

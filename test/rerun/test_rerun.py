@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+import os
 import random
 import threading
 from typing import Any
@@ -368,6 +369,17 @@ def test_a_failed_run_leaves_the_files_of_before(bag, graph, tmp_path):
     with pytest.raises(CallbackFailed, match='it raised ZeroDivisionError: .* at 0.000000 s'):
         run_filter(bag, graph, lambda node, number: 1 / number, overwrite=True, **files)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_links_and_devices_stay(bag, graph, tmp_path):
+    link, pipe = tmp_path / 'link.mcap', tmp_path / 'pipe'
+    link.symlink_to('target.mcap')
+    run_filter(bag, graph, output=link)
+    assert link.is_symlink() and (tmp_path / 'target.mcap').stat().st_size
+    os.mkfifo(pipe)
+    with open(os.open(pipe, os.O_RDWR), 'rb', buffering=0), pytest.raises(OSError, match='seek'):
+        run_filter(bag, graph, output=pipe)  # as little as any MCAP file
+    assert pipe.is_fifo()
 
 
 def test_a_callback_destroys_its_node(bag, graph):
