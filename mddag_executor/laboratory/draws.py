@@ -40,7 +40,7 @@ Bools = npt.NDArray[np.bool_]
 Samples = Mapping[str, Times]
 
 _REMEDY = "write one array of measured ns for each 'node:callback' with numpy.savez"
-_DAMAGED = (TypeError, ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error)
+_DAMAGED = (TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 def read_samples(task_set: TaskSet, path: Path, name: str) -> dict[str, Times]:
@@ -66,7 +66,7 @@ def _read_values(archive: Any, key: str, name: str) -> Times:
         raise InputError(name, f'no values for {key}', 'add an array of that name')
     try:
         values = archive[key].astype(np.float64)
-    except _DAMAGED:
+    except (*_DAMAGED, OSError):
         values = np.empty(0)
     # false for what is no number
     if values.ndim != 1 or not values.size or not np.all((values >= 0) & (values < DAY)):

@@ -232,7 +232,7 @@ class Requests:
     def _status(self, handle: Any) -> None:
         from action_msgs.msg import GoalStatus, GoalStatusArray
         _, server = self._actions[id(handle)]
-        # made here, so that it needs no copy, which would take long: goals do not expire
+        # made here, so that it needs no copy, which takes long for many goals
         message = GoalStatusArray(status_list=[
             GoalStatus(goal_info=info, status=status) for info, status in goal_states(server)])
 

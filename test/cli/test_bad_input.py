@@ -119,6 +119,7 @@ def files(tmp_path_factory):
     ('evaluate g.yaml --runs 99999999999', 'runs: 99999999999 is too many: give at most '),
     ('evaluate folder', 'folder: there is no *.yaml in this folder: name a declaration, or make'),
     ('evaluate g.yaml --samples g.yaml', 'g.yaml: this is no .npz file: write one array of measu'),
+    ('evaluate g.yaml --samples none.npz', 'none.npz: no such file or directory: check the path'),
     ('evaluate g.yaml --samples few.npz', 'few.npz: no values for /n:x: add an array of that nam'),
     ('evaluate g.yaml --plot out.gif', 'out.gif: the ending names no kind of picture: use one of'),
     ('evaluate g.yaml --dask nonsense', '--dask nonsense: '),
