@@ -591,8 +591,8 @@ class _Source:
                 f'{name}: left out: {counted(sum(self._strange.values()), "event")} that make no '
                 f'sense, most often ({n}) {what}')
         if self._orphans:
-            lines.append(f'{name}: {counted(self._orphans, "execution")} completed in it that did '
-                         'not run in it')
+            lines.append(f'{name}: {counted(self._orphans, "completed execution")} whose start is '
+                         'not in it')
         return lines
 
 

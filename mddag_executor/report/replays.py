@@ -22,7 +22,9 @@ from msg_graph.binding import is_background
 
 _PARTS = {
     'release lag': 'release_lag_ns', 'waiting': 'waiting_ns', 'for group': 'waiting_group_ns',
-    'executing': 'executing_ns', 'suspended': 'suspended_ns', 'transport': 'transport_ns'}
+    'executing': 'executing_ns', 'suspended': 'suspended_ns', 'transport': 'transport_ns',
+    'unknown': 'unknown_ns'}
+_RARE = 'for group', 'suspended', 'unknown'
 _CALLBACKS = (
     'callback', 'executions', 'busy', 'mean', 'longest', 'mean wait', 'longest wait', 'CPU',
     'interpreter')
@@ -48,9 +50,9 @@ def times_table(
     :param which: ``mean``, or ``worst`` for the worst job of each sink.
     """
     rows = [(name, each and each[which]) for name, each in found]
-    # most programs have neither groups that wait nor coroutines
-    parts = {name: key for name, key in _PARTS.items() if name not in (
-        'for group', 'suspended') or any(each and each[key] for _, each in rows)}
+    # most programs have neither groups that wait nor coroutines, and most recordings no gaps
+    parts = {name: key for name, key in _PARTS.items()
+             if name not in _RARE or any(each and each[key] for _, each in rows)}
     job = ['job'] if which == 'worst' else []
     return ['sink', *job, *parts], [
         [name, *((each or {}).get(key) for key in job), *times(each, *parts.values())]

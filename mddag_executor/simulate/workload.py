@@ -79,7 +79,7 @@ def read_execution_times(
     """
     try:
         data = json.loads(text)
-    except (ValueError, RecursionError) as error:  # also what is no text
+    except (ValueError, RecursionError) as error:  # also bytes that are not text
         raise InputError(
             name, f'not usable JSON ({error})', _FORMAT, getattr(error, 'lineno', None)) from None
     if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+import re
 import tempfile
 
 from hypothesis import example, given, settings
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.recording.head import declared, Head
 from mddag_executor.replay import replay, ReplayError
+from mddag_executor.report.replays import times_tables
 from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
@@ -299,13 +301,15 @@ def test_misses_that_are_not_those_recorded_are_said(tmp_path):
 
 
 def test_a_completion_without_execution_is_said(tmp_path):
-    with begin_trace(tmp_path / 'a.mcap', SMALL) as file:
-        file.add('job_release', START_TIME, 1, 1, 1, 0, START_TIME)
-        file.add('complete', START_TIME + MS, 1, 1, 9, 1, 0, 0, True, START_TIME + MS, 0)
+    text = 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, timer: 10ms, deadline: 9ms}]}]'
+    with begin_trace(tmp_path / 'a.mcap', text) as file:
+        file.add('job_release', START_TIME, 1, 1, 0, 0, START_TIME)
+        file.add('complete', START_TIME + MS, 1, 1, 9, 0, 0, 0, True, START_TIME + MS, 0)
         end_trace(file, START_TIME + MS)
-    said = replay(tmp_path / 'a.mcap').warnings
-    assert [text.partition(': ')[2] for text in said] == [
-        '1 execution completed in it that did not run in it']
+    result = replay(tmp_path / 'a.mcap').result()
+    assert [text.partition(': ')[2] for text in result['warnings']] == [
+        '1 completed execution whose start is not in it']
+    assert any(re.search('unknown\n.* 1 ms\n', each) for each in times_tables(result['dags']))
 
 
 @pytest.mark.parametrize(('text', 'says'), [
