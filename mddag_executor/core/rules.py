@@ -338,6 +338,8 @@ def start_on(s: State, x: int, worker: int, now: int) -> None:
     """Start a ready execution, which is no longer in a queue, on this idle worker."""
     s.x_state[x] = RUNNING
     s.x_worker[x] = worker
+    if s.x_started[x] < 0:
+        s.passed_on[s.x_vertex[x]] = -1
     s.x_started[x] = now
     s.worker_x[worker] = x
     s.scalars[N_IDLE] -= 1

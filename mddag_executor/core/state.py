@@ -96,8 +96,8 @@ class State(NamedTuple):
     # by vertex: from when on its executions are checked (see ``overload``); with ``keep: newest``,
     # the execution that became ready last; a heap of the demoted executions that wait, by order;
     # the order of the one that a newer one made urgent last, or -1; ``job_demoted`` of the one
-    # dropped last, for the next one; the known mean execution time, and whether it holds the
-    # interpreter
+    # dropped last, until the next one starts, or -1; the known mean execution time, and whether it
+    # holds the interpreter
     start_by: list[int]
     newest_ready: list[int]
     demoted: list[list[QueueEntry]]

@@ -459,6 +459,8 @@ class BruteForce:
 
     def _start(self, execution: Execution, worker: int) -> None:
         self.waiting.remove(execution)
+        if not execution.has_run:
+            self.passed_on.pop((execution.job.dag.index, execution.vertex.index), None)
         execution.has_run = True
         execution.left += self.dispatch_overhead
         self.running[worker] = execution

@@ -10,7 +10,7 @@ from typing import Any
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from mddag_executor.core.state import SINK_LATE, SINK_MISSED
+from mddag_executor.core.state import DROPPED, SINK_LATE, SINK_MISSED
 from mddag_executor.core.tally import counts
 from mddag_executor.simulate import Settings, simulate
 from msg_graph import ExecutionTime
@@ -314,3 +314,33 @@ def test_only_the_newest_is_kept():
     sinks = results(callbacks, [30, 1], 350)
     assert sinks['fast']['dropped'] >= 10
     assert sinks['fast']['response_ns']['max'] <= 20 * TICK
+
+
+def test_the_age_of_a_dropped_execution_is_passed_on_to_the_next_one_only():
+    """If that is in time, an execution that is late much later is demoted like any other."""
+    core = live(declaration([
+        single(name, 100, 100, on_late='demote', keep=keep)
+        for name, keep in (('slow', 'newest'), ('other', 'all'))]), workers=1)
+
+    def ready(dag, job, now):
+        x = core.source(core.release(dag, job, now * TICK, now * TICK))
+        core.ready(x, now * TICK)
+        return x
+
+    def take(now):
+        return core.take(0, now * TICK)
+
+    job = 0
+    for begin in (0, 1_000_000):
+        first = ready(1, job, begin)
+        assert take(begin) == first
+        late = ready(0, job, begin)
+        core.complete(first, (begin + 150) * TICK)
+        other = ready(1, job + 1, begin + 150)
+        assert take(begin + 150) == other
+        newest = ready(0, job + 1, begin + 160)  # drops the late one
+        assert core.state.x_state[late] == DROPPED
+        core.complete(other, (begin + 170) * TICK)
+        assert take(begin + 170) == newest
+        core.complete(newest, (begin + 180) * TICK)
+        job += 2
