@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
+import inspect
 import os
 from pathlib import Path
 import shlex
@@ -124,6 +125,14 @@ def _attribute(spec: str, module_name: str, attribute: str) -> Program:
         raise LoadingError(
             spec, f"'{attribute}' makes no node",
             'name a function or a subclass of rclpy.node.Node')
+    with suppress(ValueError):  # a builtin may have no signature
+        parameters = inspect.signature(target)
+        try:
+            parameters.bind()
+        except TypeError as error:
+            raise LoadingError(
+                spec, f"'{attribute}' cannot be called without arguments ({error})",
+                'name a function or class that needs none') from None
     return Program(spec, module_name, target)
 
 
@@ -150,7 +159,8 @@ def _executable(spec: str, package: str, name: str) -> Program:
             packages = [*get_packages_with_prefixes()]
         raise LoadingError(
             spec, f"there is no package '{package}'",
-            did_you_mean(package, packages, "source its workspace's setup file, or install it")
+            did_you_mean(package, packages, "source its workspace's setup file, or write "
+                         'module:function if pip installed it')
         ) from None
     if (folder / name).is_file():
         return _script(spec, folder / name)

@@ -278,7 +278,8 @@ def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(world, mon
     ('chat:', 'this names no node'),
     ('chat:main()', 'this names no node'),
     ('chat_node/talker', "there is no package 'chat_node': did you mean 'chat_nodes'"),
-    ('zzzzzzzz/talker', "there is no package 'zzzzzzzz': source its workspace's setup file"),
+    ('zzzzzzzz/talker', "there is no package 'zzzzzzzz': source its workspace's setup file, or "
+     'write module:function'),
     ('chat_nodes/talkr', "package 'chat_nodes' has no executable 'talkr': did you mean 'talker'?"),
     ('chat_nodes/zzz', "has no executable 'zzz': it has broken.py, native, shell, talker"),
     ('empty_nodes/x', "package 'empty_nodes' has no executable 'x': it has none"),
@@ -293,6 +294,8 @@ def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(world, mon
     ('chat:mian', "module 'chat' has no 'mian': did you mean 'main'"),
     ('chat:NoNode', "'NoNode' makes no node: name a function or "),
     ('chat:NUMBER', "'NUMBER' makes no node"),
+    ('chat:needs_two', "'needs_two' cannot be called without arguments (missing a required "
+     "argument: 'one'): name a function or class that needs none"),
 ])
 def test_what_does_not_exist_is_said_on_one_line(world, spec, message):
     with pytest.raises(LoadingError) as error:

@@ -286,6 +286,10 @@ def other_domain():
     rclpy.init(domain_id=7)
 
 
+def needs_two(one, two):
+    pass
+
+
 def returns_text():
     return 'text'
 
