@@ -54,9 +54,9 @@ class Releases:
         self.last = max(self.last, release)
         self.count += 1
 
-    def mean_ns(self, lost: int = 0) -> int:
-        """Return the mean time between releases, with ``lost`` unseen; at least two are needed."""
-        return (self.last - self.first) // (self.count + lost - 1)
+    def mean_ns(self) -> int:
+        """Return the mean time between releases; at least two are needed."""
+        return (self.last - self.first) // (self.count - 1)
 
 
 @dataclass

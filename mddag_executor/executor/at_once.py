@@ -36,7 +36,7 @@ class AtOnce:
         self, engine: Engine, lock: Any, executor: Any, fail: Callable[[BaseException], None]
     ) -> None:
         self.loop = EventLoop(())
-        self.timers = TimerQueue(self.loop.wake, lambda: None, fail)
+        self.timers = TimerQueue(self.loop.wake, fail)
         self.executor = executor
         self.fail = fail
         self.has_run = False

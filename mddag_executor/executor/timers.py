@@ -123,18 +123,15 @@ class TimerQueue:
 
     :param on_jump: called, from any thread, when the clock of a timer has jumped: call ``fire``
         soon.
-    :param on_retimed: called when the period of a timer has changed.
     :param on_error: receives errors of rcl.
     :ivar has_new: whether there are new due times since it was set to False.
     :ivar has_jumped: whether the clock of a timer has jumped since ``fire``.
     """
 
     def __init__(
-        self, on_jump: Callable[[], None], on_retimed: Callable[[], None],
-        on_error: Callable[[BaseException], None],
+        self, on_jump: Callable[[], None], on_error: Callable[[BaseException], None]
     ) -> None:
         self._on_jump = on_jump
-        self._on_retimed = on_retimed
         self._on_error = on_error
         self._timers: dict[int, TimerSource] = {}
         self._heap: list[tuple[int, int, TimerSource]] = []
@@ -277,9 +274,7 @@ class TimerQueue:
         after: int | None = due + period
         if period <= 0 or due + period <= now or period != source.last_period:
             after = source.next_due()  # rcl skips missed periods
-        if period != source.last_period:
-            source.last_period = period
-            self._on_retimed()
+        source.last_period = period
         if after is None:
             return None
         if period <= 0:

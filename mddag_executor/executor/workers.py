@@ -169,7 +169,7 @@ class WorkerPool:
         self._deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
         self.announcements: Announcements | None = None
-        self.timers = TimerQueue(self.loop.wake, executor.wake, fail)
+        self.timers = TimerQueue(self.loop.wake, fail)
         self.running = False
         self.stopped_at = 0
         self.is_current = False
