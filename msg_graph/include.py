@@ -193,7 +193,14 @@ def _argument_values(tree: Mapping, given: dict[str, str]) -> dict[str, str]:
     """Return the values of a file's arguments: those that are set, or the defaults."""
     top = Entry(tree, 'the declaration', FILE)
     declared: Entry = top.get('arguments')
-    values = {name: given[name] if name in given else declared.get(name) for name in declared}
+    values: dict[str, str] = {}
+    for name in declared:
+        try:
+            values[name] = given[name] if name in given else declared.get(name)
+        except GraphError as error:
+            raise GraphError(
+                error.file, error.line, error.problem,
+                "set it with 'set:' of the include, or give it a default here") from None
     for name in given.keys() - values.keys():
         raise top.error(
             'arguments', f'an include sets {shown(name)}, which is not an argument of this file',
