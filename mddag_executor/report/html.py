@@ -124,7 +124,7 @@ def _page(
     legend = ''.join(f'<span><i style="background:{colour}"></i>{text}</span>'
                      for colour, text in zip(COLOURS, _LEGEND))
     yield (f'<h2 id="mddag-timeline">Timeline</h2>\n<p class="legend">{legend}'
-           '<span><b class="miss">&#9660;</b>a missed deadline of the table</span></p>\n')
+           '<span><b class="miss">&#9660;</b>a missed deadline that the table lists</span></p>\n')
     yield _note('Times count from the beginning of the run. Drag the window of the first picture, '
                 'or its edges. In the others drag to move, zoom with Ctrl and the wheel (or the '
                 'tools above a picture), and point at a bar for its facts.')
