@@ -65,7 +65,7 @@ def _read_values(archive: Any, key: str, name: str) -> Times:
     if key not in archive.files:
         raise InputError(name, f'no values for {key}', 'add an array of that name')
     try:
-        values = archive[key].astype(np.float64)
+        values: Floats = archive[key].astype(np.float64)
     except (*_DAMAGED, OSError):
         values = np.empty(0)
     # false for what is no number
