@@ -282,6 +282,6 @@ def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
         help=f'{what}; for one run of several processes the traces of all')
     parser.add_argument(
         'graph', metavar='GRAPH', nargs='?', type=Input,
-        help="the declaration to judge by, a YAML file ('-': standard input; default: the one "
-        'that the trace was recorded with)')
+        help="the declaration to judge by, a .yaml or .yml file ('-': standard input; "
+        'default: the one that the trace was recorded with)')
     add(parser, '--offset')
