@@ -36,6 +36,7 @@ MAX_CHUNK = 256 * 1024 * 1024
 """Bytes before compression; a larger chunk is damage."""
 _PLAIN_BLOCK = 256 * 1024
 _LZ4_PIECE = 1 << 20
+NO_MEMORY = 'a chunk does not fit into the memory'
 _WRONG_SIZE = 'a chunk does not have the size that its head says'
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _FOOTER_SIZE = records.RECORD.size + records.FOOTER_CONTENT.size + len(records.MAGIC)
@@ -192,7 +193,10 @@ def _records(file: int, position: int, size: int) -> Iterator[tuple[int, int, by
         if opcode in (*_PLAIN, Opcode.CHUNK, Opcode.MESSAGE_INDEX):
             if length > MAX_CHUNK:
                 raise Damage('a record is too large', position)
-            content = os.pread(file, length, start)
+            try:
+                content = os.pread(file, length, start)
+            except MemoryError:
+                raise Damage(NO_MEMORY, position) from None
             if len(content) < length:
                 raise Damage('the file has become shorter', position)
         yield opcode, position, content
@@ -204,8 +208,8 @@ def _chunk(content: bytes, offset: int) -> Chunk:
     stream = Content(content)
     try:
         chunk: Chunk = Chunk.read(stream)
-    except ValueError as error:
-        raise Damage(str(error), offset) from None
+    except (ValueError, MemoryError) as error:
+        raise Damage(str(error) or NO_MEMORY, offset) from None
     if stream.count < len(content) or chunk.uncompressed_size > MAX_CHUNK:
         raise Damage('the lengths in the head of a chunk are wrong', offset)
     return chunk

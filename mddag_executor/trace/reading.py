@@ -30,7 +30,7 @@ from typing import Any, BinaryIO, NamedTuple
 from mcap.opcode import Opcode
 from mddag_executor.text import counted
 from mddag_executor.trace import records
-from mddag_executor.trace.blocks import blocks, Damage
+from mddag_executor.trace.blocks import blocks, Damage, NO_MEMORY
 from mddag_executor.trace.cdr import ENCAPSULATION
 from mddag_executor.trace.channels import Channels, Topic, UNDEFINED
 from mddag_executor.trace.events import Batch, Column, Event, FIELDS, Ints, rows_at
@@ -151,7 +151,7 @@ class Reading:
         except Damage as damage:
             self.damage = Damage(damage.what, damage.offset)    # no traceback: it keeps the data
         except MemoryError:
-            self.damage = Damage('a chunk does not fit into the memory', block.offset)
+            self.damage = Damage(NO_MEMORY, block.offset)
         if places:
             yield _Loaded(self._buffer, *map(np.concatenate, zip(*places)))
 

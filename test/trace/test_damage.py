@@ -187,6 +187,23 @@ def spans(data: bytes) -> list[tuple[int, int]]:
     return list(zip(starts, starts[1:]))
 
 
+def test_too_little_memory_for_a_chunk(tmp_path, sample, monkeypatch):
+    data, chunks = sample
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(data)
+    pread = os.pread
+    for number, (begin, _) in enumerate(spans(data)[:2]):
+        def limited(file, length, position, start=begin + records.RECORD.size):
+            if position == start:
+                raise MemoryError
+            return pread(file, length, position)
+
+        monkeypatch.setattr(os, 'pread', limited)
+        events, warnings = read(path)
+        assert events == [event for each in chunks[:number] for event in each]
+        assert f'a chunk does not fit into the memory (at byte {begin})' in warnings[0]
+
+
 def test_a_file_that_goes_away_or_shrinks(tmp_path, sample):
     data, chunks = sample
     path = tmp_path / 'a.mcap'
