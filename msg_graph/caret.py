@@ -78,7 +78,12 @@ def read_architecture(text: str, file: str) -> Draft:
 def _node(tree: Plain) -> DraftNode:
     node = DraftNode(NODE.check(tree['node_name']))
     for each in tree.get('callbacks') or ():
-        node.callbacks[each['callback_name']] = _callback(each, node.name)
+        callback = _callback(each, node.name)
+        if each['callback_name'] in node.callbacks:
+            raise ValueProblem(
+                f"two callbacks of {node.name} are called {shown(each['callback_name'])}",
+                'give each callback of a node its own name')
+        node.callbacks[each['callback_name']] = callback
     for each in tree.get('callback_groups') or ():
         _group(node, each)
     for each in tree.get('subscribes') or ():

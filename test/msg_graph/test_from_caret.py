@@ -174,6 +174,8 @@ def test_a_file_of_2021():
     (HEAD + node('/a', 'timer soon'), "'period_ns' of '/a/callback_0' is 'soon'"),
     (HEAD + node('/a', 'timer 5000').replace('timer_callback', 'magic'), "'magic' of '/a/callbac"),
     (HEAD + node('/a', 'timer 5000').replace('/callback_0', '/c 0'), 'not a valid callback name'),
+    (HEAD + node('/a', 'timer 5000', 'timer 5000').replace('/callback_1', '/callback_0'),
+     "two callbacks of /a are called '/a/callback_0'"),
 ])
 def test_what_is_no_architecture_file(text, problem):
     with pytest.raises(GraphError, match=re.escape(problem)) as caught:
