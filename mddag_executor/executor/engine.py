@@ -210,11 +210,12 @@ class Engine:
 
     def _enqueue(self, work: Work) -> None:
         entity, since = work.entity, work.ready_ns
-        if entity.callback is not None and self._keys_are_deadlines:
-            # It belongs to no job, but comes after the messages that wait already.
-            for x in entity.waiting:
-                if x >= 0:
-                    since = max(since, self._state.x_key[x][0] + 1 - self._default_deadline)
+        if entity.callback is not None and entity.waiting and self._keys_are_deadlines:
+            # It belongs to no job, but comes after the message that waits already.  Only the last
+            # one is compared: there may be many.
+            last = next(reversed(entity.waiting))
+            if last >= 0:
+                since = max(since, self._state.x_key[last][0] + 1 - self._default_deadline)
         x = work.x = self.scheduler.ready_undeclared(
             entity.ready, entity.group, entity.habit.holds, since)
         entity.waiting[x] = None

@@ -109,6 +109,36 @@ nodes:
     assert engine.dispatch(0, 41_000_000) is None
 
 
+def test_a_message_of_no_job_costs_as_much_when_many_wait():
+    """The lock is held meanwhile: else a fast foreign publisher would starve the jobs."""
+    task_set = loads("""\
+mddag: 1
+nodes:
+  - node: /sensor
+    callbacks: [{name: tick, timer: 500ms, publishes: [/data], dag: data}]
+  - node: /user
+    callbacks: [{name: use, subscription: /data, deadline: 300ms}]
+""", 'graph.yaml')
+    engine = Engine(task_set, 1, 'rad', default_deadline=100_000_000, max_active_jobs=NEVER,
+                    expire_after=NEVER)
+    user = entity_of(engine, task_set, 0, 1)
+    engine._core()
+    reads = []
+
+    class Keys(list):
+        def __getitem__(self, x):
+            reads.append(x)
+            return super().__getitem__(x)
+
+    engine._state.x_key = Keys(engine._state.x_key)
+    costs = []
+    for time in range(300):
+        reads.clear()
+        engine.arrived(Work(user, print), None, -1, -1, time)
+        costs.append(len(reads))
+    assert len(user.waiting) == 300 and 0 < costs[-1] == costs[10]
+
+
 @pytest.mark.parametrize('policy', ['rad', 'gedf', 'fifo'])
 def test_a_second_message_of_a_publication_comes_after_the_first(policy):
     """It belongs to no job, and would have the earlier deadline."""
