@@ -70,8 +70,8 @@ class Placing:
         self._blocks = sorted(set(self._block.values()))
         if n_processes > len(self._blocks):
             raise UsageError(
-                f'--processes {n_processes}: to place are only '
-                f'{counted(len(self._blocks), "node")}, or groups of nodes: give fewer processes')
+                f'--processes {n_processes}: only {counted(len(self._blocks), "node")}, or groups '
+                'of nodes, can be placed: give fewer processes')
         self._own = dict.fromkeys(self._blocks, 0.0)
         self._between: dict[int, dict[int, float]] = {block: {} for block in self._blocks}
         self._measure(execution_ns)

@@ -138,7 +138,7 @@ def files(tmp_path_factory):
     ('generate --sinks 5 --vertices 5', '--sinks 5: a DAG of 5 vertices has at most 4: give few'),
     # placement
     ('graph place g.yaml --processes 4 -o out.yaml',
-     '--processes 4: to place are only 2 nodes, or groups of nodes: give fewer processes'),
+     '--processes 4: only 2 nodes, or groups of nodes, can be placed: give fewer processes'),
     ('graph place g.yaml --processes 1 --trace run.mcap --utilisation 0.2 -o out.yaml',
      '--utilisation: execution times are those of --trace: leave one of them out'),
     # recordings

@@ -294,7 +294,7 @@ def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path, call):
 @pytest.mark.parametrize(('arguments', 'message'), [
     (['--processes', '2'], 'add --reschedule'),
     (['--reschedule', '--processes', '0'], 'give 1 or more'),
-    (['--reschedule', '--processes', '3'], 'there are only 2 nodes'),
+    (['--reschedule', '--processes', '3'], 'only 2 nodes, or groups'),
     (['--reschedule', '--processes', 'none.yaml'], 'none.yaml'),
     (['--reschedule', '--policy', 'ros2'], 'polling is known of one process only'),
     (['--reschedule', '--preemptive'], 'preemption is known of one process only'),
