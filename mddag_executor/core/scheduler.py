@@ -51,8 +51,9 @@ class Scheduler:
         self.tables = as_object(tables)
         self.policy = policy(policy_name)
         state = empty(State)
-        fill_state(tables, state, n_workers, 0, 0, 0, 0, int(self.policy.polling),
-                   self.policy.urgency)
+        fill_state(
+            tables, state, n_workers, preemptive=0, propagate=0, dispatch_overhead=0,
+            switch_overhead=0, polling=int(self.policy.polling), urgency=self.policy.urgency)
         self.state = as_object(state)
         self._free_groups: list[int] = []
         # bound here: a method would be one more call for each execution

@@ -109,8 +109,8 @@ nodes:
     assert engine.dispatch(0, 41_000_000) is None
 
 
-def test_a_message_of_no_job_costs_as_much_when_many_wait():
-    """The lock is held meanwhile: else a fast foreign publisher would starve the jobs."""
+def engine_of_one_user(policy):
+    """Return a declaration with one subscription, of deadline 300 ms, and an engine for it."""
     task_set = loads("""\
 mddag: 1
 nodes:
@@ -119,8 +119,13 @@ nodes:
   - node: /user
     callbacks: [{name: use, subscription: /data, deadline: 300ms}]
 """, 'graph.yaml')
-    engine = Engine(task_set, 1, 'rad', default_deadline=100_000_000, max_active_jobs=NEVER,
-                    expire_after=NEVER)
+    return task_set, Engine(task_set, 1, policy, default_deadline=100_000_000,
+                            max_active_jobs=NEVER, expire_after=NEVER)
+
+
+def test_a_message_of_no_job_costs_as_much_when_many_wait():
+    """The lock is held meanwhile: else a fast foreign publisher would starve the jobs."""
+    task_set, engine = engine_of_one_user('rad')
     user = entity_of(engine, task_set, 0, 1)
     engine._core()
     reads = []
@@ -142,16 +147,7 @@ nodes:
 @pytest.mark.parametrize('policy', ['rad', 'gedf', 'fifo'])
 def test_a_second_message_of_a_publication_comes_after_the_first(policy):
     """It belongs to no job, and would have the earlier deadline."""
-    task_set = loads("""\
-mddag: 1
-nodes:
-  - node: /sensor
-    callbacks: [{name: tick, timer: 500ms, publishes: [/data], dag: data}]
-  - node: /user
-    callbacks: [{name: use, subscription: /data, deadline: 300ms}]
-""", 'graph.yaml')
-    engine = Engine(task_set, 1, policy, default_deadline=100_000_000, max_active_jobs=NEVER,
-                    expire_after=NEVER)
+    task_set, engine = engine_of_one_user(policy)
     source, user = (entity_of(engine, task_set, 0, index) for index in (0, 1))
     engine.timer_due(Work(source, print), 0, 0)
     running = engine.dispatch(0, 0)
