@@ -12,10 +12,7 @@ A test marked `needs('graphviz')` is skipped where `.ci/tools` misses that progr
 line says so. With CI in the environment nothing may be missing: such a test fails.
 """
 
-from __future__ import annotations
-
 from collections import Counter
-from collections.abc import Callable
 import contextlib
 from functools import cache
 import importlib
@@ -32,7 +29,7 @@ import threading
 import time
 import traceback
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import hypothesis
 import pytest
@@ -56,7 +53,7 @@ if __name__ == 'test.conftest':
         _package.__path__ = [str(HERE), *_paths]
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     # A shell's job in the background ignores Ctrl-C, and so would all programs that tests start.
     if (signal.getsignal(signal.SIGINT) is signal.SIG_IGN
             and threading.current_thread() is threading.main_thread()):
@@ -82,7 +79,7 @@ def pytest_configure(config: pytest.Config) -> None:
         pytest.importorskip = lambda name, *_, **__: importlib.import_module(name)
 
 
-def pytest_unconfigure(config: pytest.Config) -> None:
+def pytest_unconfigure(config):
     _session.close()
     reporter = config.pluginmanager.get_plugin('terminalreporter')
     if reporter is None:
@@ -97,7 +94,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
             + ': sudo apt install ' + ' '.join(missing_tools()[tool] for tool in counts))
 
 
-def _claim_domain() -> int:
+def _claim_domain():
     """Return a domain that no other session has for as long as this one lasts."""
     start = os.getpid() % len(DOMAINS)
     for domain in (*DOMAINS[start:], *DOMAINS[:start]):
@@ -117,14 +114,14 @@ def _claim_domain() -> int:
 
 
 @cache
-def missing_tools() -> dict[str, str]:
+def missing_tools():
     """Return the programs that tests lack, and Debian's packages with them."""
     done = subprocess.run(['sh', str(HERE.parent / '.ci' / 'tools'), 'missing'],
                           capture_output=True, text=True, check=True)
     return dict(line.split(' ', 1) for line in sorted(done.stdout.splitlines()))
 
 
-def pytest_runtest_setup(item: pytest.Item) -> None:
+def pytest_runtest_setup(item):
     for mark in item.iter_markers('needs'):
         tool, = mark.args
         if tool in missing_tools():
@@ -145,7 +142,7 @@ ROS = (
 COMPILE = ('simulate/test_compiled.py', 'laboratory/test_evaluate.py')
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     if 'PYTEST_XDIST_WORKER' in os.environ:
         # The longest first, so that no process has to wait for the other at the end.
         items.sort(key=lambda item: (
@@ -158,7 +155,7 @@ def pytest_xdist_make_scheduler(config, log):
 
     class Scheduling(LoadScopeScheduling):
 
-        def _split_scope(self, nodeid: str) -> str:
+        def _split_scope(self, nodeid):
             if _is_in(nodeid, COMPILE):
                 return 'compile'
             return nodeid.partition('::')[0] if _is_in(nodeid, ROS) else nodeid
@@ -167,7 +164,7 @@ def pytest_xdist_make_scheduler(config, log):
     return Scheduling(config, log)
 
 
-def _is_in(nodeid: str, places: tuple[str, ...]) -> bool:
+def _is_in(nodeid, places):
     file = PurePosixPath(nodeid.partition('::')[0])
     return any(file.is_relative_to(PurePosixPath(HERE.name, each)) for each in places)
 
@@ -194,7 +191,7 @@ def nothing_left_behind():
     assert (processes, files) == ({}, []), 'the tests left these processes and files behind'
 
 
-def _processes() -> dict[int, str]:
+def _processes():
     """Return what runs with this session's folder in its environment."""
     found = {}
     mark = f'TMPDIR={tempfile.gettempdir()}\0'.encode()
@@ -244,13 +241,12 @@ class Done(NamedTuple):
     stderr: str
 
     @property
-    def result(self) -> Any:
+    def result(self):
         """What it printed as JSON; its status must be 0."""
         assert self.returncode == 0, self.stderr
         return json.loads(self.stdout)
 
 
-Call = Callable[..., Done]
 
 
 @pytest.fixture

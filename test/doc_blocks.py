@@ -25,8 +25,6 @@ Comments (HTML, invisible on the page) right before a block change that:
   running it is: Python must compile, YAML must parse, options of `mddag` must exist.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 import os
 from pathlib import Path
@@ -65,19 +63,19 @@ class Block:
     marks: dict[str, list[str]] = field(default_factory=dict)
 
     @property
-    def place(self) -> str:
+    def place(self):
         return f'{self.page}:{self.line}'
 
     @property
-    def reason(self) -> str | None:
+    def reason(self):
         """Return why it is not run, None if it is."""
         return self.mark('not run')
 
-    def mark(self, kind: str) -> str | None:
+    def mark(self, kind):
         return self.marks.get(kind, [None])[0]
 
     @property
-    def to_try(self) -> str:
+    def to_try(self):
         """Return the text with what the test has in place of it."""
         text = self.text
         for each in self.marks.get('in the test', []):
@@ -87,7 +85,7 @@ class Block:
         return text
 
 
-def pages() -> list[str]:
+def pages():
     """Return all pages of the project, by their paths in the checkout."""
     found = [TOP / name for name in ('README.md', 'CONTRIBUTING.md', 'CHANGELOG.md')]
     found += [TOP / 'bags' / 'README.md', *(TOP / 'examples').glob('*.md'),
@@ -95,13 +93,13 @@ def pages() -> list[str]:
     return [path.relative_to(TOP).as_posix() for path in found if path.exists()]
 
 
-def blocks(page: str, text: str | None = None) -> list[Block]:
+def blocks(page, text=None):
     """Return the code blocks of a page."""
     if text is None:
         text = (TOP / page).read_text(encoding='utf-8')
     found = []
     for match in _BLOCK.finditer(text):
-        marks: dict[str, list[str]] = {}
+        marks = {}
         for kind, value in _MARK.findall(match['marks']):
             marks.setdefault(kind, []).append(value)
         assert len(marks.get('not run', [])) < 2, f'{page}: a block is marked twice'
@@ -113,7 +111,7 @@ def blocks(page: str, text: str | None = None) -> list[Block]:
     return found
 
 
-def _before(variable: str, *paths: Path) -> str:
+def _before(variable, *paths):
     """Return the value of a variable of the environment that lists paths, with some before it."""
     return os.pathsep.join([*map(str, paths), *filter(None, [os.environ.get(variable)])])
 
@@ -126,7 +124,7 @@ class Folder:
     :param files: further files that the page takes for granted.
     """
 
-    def __init__(self, path: Path, files: dict[str, str] | None = None) -> None:
+    def __init__(self, path, files=None):
         self.path = path
         self.output = ''
         for name in ('config', 'bags', 'examples'):
@@ -146,14 +144,14 @@ class Folder:
                 'AMENT_PREFIX_PATH', path / 'examples' / 'third_party' / 'install'),
             'PATH': os.pathsep.join([str(programs), os.environ['PATH']])}
 
-    def write(self, name: str, text: str) -> Path:
+    def write(self, name, text):
         """Write a file below the folder."""
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding='utf-8')
         return path
 
-    def try_all(self, found: list[Block]) -> None:
+    def try_all(self, found):
         """Try blocks, one after the other; those that are files are there from the first on."""
         for block in found:
             name = block.mark('file')
@@ -162,7 +160,7 @@ class Folder:
         for block in found:
             self.try_one(block)
 
-    def try_one(self, block: Block) -> None:
+    def try_one(self, block):
         """Try a block; an AssertionError says what is wrong with it."""
         assert block.language, f'{block.place}: a block has no language'
         if block.reason is not None:
@@ -186,7 +184,7 @@ class Folder:
         elif block.mark('file') is None or block.language == 'python':
             self._look_at(block)
 
-    def _look_at(self, block: Block) -> None:
+    def _look_at(self, block):
         if block.language == 'python':
             compile(block.text, block.place, 'exec')
         elif block.language == 'yaml':
@@ -195,7 +193,7 @@ class Folder:
             assert block.reason is not None, (
                 f'{block.place}: {block.language!r} cannot be tried: mark it')
 
-    def _run(self, block: Block, command: list[str]) -> None:
+    def _run(self, block, command):
         expected = int(block.mark('exit') or 0)
         done = subprocess.run(
             command, cwd=self.path, env=self._environment, text=True, stdin=subprocess.DEVNULL,

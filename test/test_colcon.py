@@ -6,9 +6,6 @@ The package in a colcon workspace: built, tested and used from there.
 Without an installation of ROS, the rclpy that colcon's packages find is that of the package index.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from importlib.util import find_spec
 import os
 from pathlib import Path
@@ -48,15 +45,13 @@ def workspace(tmp_path_factory):
     return place
 
 
-def colcon(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def colcon(place, *arguments):
     return subprocess.run(
         [sys.executable, '-c', COLCON, *arguments], cwd=place, capture_output=True, text=True,
         timeout=170, check=False, stdin=subprocess.DEVNULL)
 
 
-def in_workspace(
-    place: Path, command: str, folder: Path = Path('/')
-) -> subprocess.CompletedProcess[str]:
+def in_workspace(place, command, folder=Path('/')):
     """Run a command in a shell that has sourced the workspace."""
     return subprocess.run(
         ['bash', '-c', f'. "{place}/install/setup.bash" && cd "{folder}" && {command}'],
@@ -100,7 +95,6 @@ nodes:
   - node: /n
     callbacks: [{name: tick, timer: 20ms, deadline: DEADLINE, execution_time: 5ms}]
 """
-
 
 @needs_ros2
 @pytest.mark.parametrize(('deadline', 'status'), [
@@ -158,7 +152,7 @@ def test_a_signal_ends_ros2_launch_and_the_run(workspace, tmp_path, number, to_a
     assert (replayed.returncode, replayed.stderr) == (0, ''), replayed.stdout
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
+def wait_until(condition):
     end = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < end

@@ -7,8 +7,6 @@ What is built and installed works without the checkout, without the optional pac
 not installed.
 """
 
-from __future__ import annotations
-
 from configparser import ConfigParser
 import json
 from pathlib import Path
@@ -51,9 +49,7 @@ nodes:
 TRACE = str(TOP / 'bags' / 'demo_short.mcap')
 
 
-def run_without(
-    missing: tuple[str, ...], commands: list[list[str]], folder: Path
-) -> list[tuple[int, str]]:
+def run_without(missing, commands, folder):
     """Run commands of `mddag` in a process that lacks packages; return status and errors."""
     (folder / 'graph.yaml').write_text(GRAPH)
     done = subprocess.run(
@@ -107,7 +103,7 @@ HEAVY = {'bokeh', 'ctypes', 'distributed', 'llvmlite', 'lz4', 'matplotlib', 'mca
          'zstandard'}
 
 
-def loaded(code: str) -> set[str]:
+def loaded(code):
     """Return the modules that are there after some code."""
     done = subprocess.run(
         [sys.executable, '-c',
@@ -164,14 +160,14 @@ def built(tmp_path_factory):
     return place
 
 
-def build(source: Path, kind: str, to: Path) -> None:
+def build(source, kind, to):
     code = f'from setuptools import build_meta; build_meta.build_{kind}({str(to)!r})'
     done = subprocess.run([sys.executable, '-c', code], cwd=source, capture_output=True,
                           text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
 
 
-def files_in(folder: Path, *places: str) -> set[str]:
+def files_in(folder, *places):
     """Return the files below some places in a folder, without what was made from them."""
     return {path.relative_to(folder).as_posix() for place in places
             for path in (folder / place).rglob('*')

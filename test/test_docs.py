@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What README and documentation show works, and the documentation builds, offline."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os
@@ -66,7 +64,7 @@ def test_no_block_is_overlooked():
 # --- commands ------------------------------------------------------------------------------------
 
 
-def command_lines() -> list[tuple[str, str]]:
+def command_lines():
     """Return every command line of `mddag` in blocks and between backquotes, and its page."""
     found = []
     for page in PAGES:
@@ -86,7 +84,7 @@ def command_lines() -> list[tuple[str, str]]:
     return sorted(set(lines))
 
 
-def known_options(words: list[str]) -> tuple[str, set[str]]:
+def known_options(words):
     """Return the help of the verb that a command line names, and its options."""
     verbs = [word for word in words[:2] if re.fullmatch(r'[a-z-]+', word)]
     for count in range(len(verbs), 0, -1):

@@ -10,10 +10,7 @@ Imports are read from the sources, those inside functions and for type checkers 
 (`SLF`) checks which modules use private names of rclpy.
 """
 
-from __future__ import annotations
-
 import ast
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -59,7 +56,7 @@ MAY_USE_ROS = {'mddag_executor.executor', 'mddag_executor.hosting', 'mddag_execu
                'mddag_executor.cli'}
 
 
-def part_of(module: str) -> str | None:
+def part_of(module):
     """Return the part of the program that a module belongs to; None for foreign ones."""
     names = PASSED_ON.get(module, module).split('.')
     part = '.'.join(names[:2])
@@ -68,7 +65,7 @@ def part_of(module: str) -> str | None:
     return part if part in LEVELS else names[0]
 
 
-def imports(module: str, text: str, is_package: bool) -> Iterator[tuple[int, str]]:
+def imports(module, text, is_package):
     """Yield line and full name of what a module imports."""
     package = module.split('.') if is_package else module.split('.')[:-1]
     for node in ast.walk(ast.parse(text)):
@@ -80,7 +77,7 @@ def imports(module: str, text: str, is_package: bool) -> Iterator[tuple[int, str
             yield from ((node.lineno, f'{name}.{alias.name}') for alias in node.names)
 
 
-def violations(module: str, text: str, is_package: bool = False) -> Iterator[str]:
+def violations(module, text, is_package=False):
     """Yield what a module imports and must not."""
     mine = part_of(module)
     for line, name in imports(module, text, is_package):
@@ -95,7 +92,7 @@ def violations(module: str, text: str, is_package: bool = False) -> Iterator[str
             yield f'{module}:{line} imports {name}: {mine} works without ROS'
 
 
-def modules() -> Iterator[tuple[str, str, bool]]:
+def modules():
     """Yield name and text of each module, and whether it is a package."""
     for package in ('msg_graph', 'mddag_executor'):
         for path in sorted((TOP / package).rglob('*.py')):

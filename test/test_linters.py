@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ruff and mypy, and what they leave out: headers and dependencies."""
 
-from __future__ import annotations
-
 import ast
-from collections.abc import Iterator
 from pathlib import Path
 import re
 import subprocess
@@ -30,7 +27,7 @@ HEADER = re.compile(
 
 # What the packages import, with the key in package.xml and the name in setup.py that bring it.
 # None in setup.py: the extra `ros` does. None in package.xml: another key does.
-THIRD_PARTY: dict[str, tuple[str | None, str | None]] = {
+THIRD_PARTY = {
     'ament_index_python': ('ament_index_python', None),
     'action_msgs': ('action_msgs', None),
     'argcomplete': ('python3-argcomplete', 'argcomplete'),
@@ -63,7 +60,7 @@ THIRD_PARTY: dict[str, tuple[str | None, str | None]] = {
 }
 
 
-def run(*command: str) -> None:
+def run(*command):
     result = subprocess.run([sys.executable, '-m', *command], cwd=TOP, text=True,
                             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
     if result.returncode != 0:
@@ -89,7 +86,7 @@ def test_copyright():
     assert 'Apache License' in (TOP / 'LICENSE').read_text(encoding='utf-8')
 
 
-def package_xml() -> ElementTree.Element:
+def package_xml():
     return ElementTree.parse(TOP / 'package.xml').getroot()
 
 
@@ -104,11 +101,11 @@ def test_names_and_versions_agree():
     assert (TOP / 'resource' / name).is_file()
 
 
-def run_nodes(node: ast.AST) -> Iterator[ast.AST]:
+def run_nodes(node):
     """Yield all nodes but those that only type checkers read."""
     yield node
     if isinstance(node, ast.If) and ast.unparse(node.test).endswith('TYPE_CHECKING'):
-        children: list[ast.AST] = list(node.orelse)
+        children = list(node.orelse)
     else:
         children = list(ast.iter_child_nodes(node))
     for child in children:
@@ -116,7 +113,7 @@ def run_nodes(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def test_what_is_imported_is_declared():
-    imported: dict[str, str] = {}
+    imported = {}
     for path in SOURCES:
         parts = path.relative_to(TOP).parts
         if parts[0] not in ('mddag_executor', 'msg_graph', 'launch') and (

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `import mddag_executor` gives, and how its messages count and list."""
 
-from __future__ import annotations
-
 import mddag_executor
 from mddag_executor.text import counted, listed
 import pytest
@@ -14,7 +12,7 @@ def test_public_names_are_those_of_the_live_executor():
     from mddag_executor.executor.verdicts import DeadlineMiss
     assert mddag_executor.MultiDeadlineExecutor is MultiDeadlineExecutor
     assert mddag_executor.DeadlineMiss is DeadlineMiss
-    names: dict[str, object] = {}
+    names = {}
     exec('from mddag_executor import *', names)
     assert {'MultiDeadlineExecutor', 'DeadlineMiss'} <= set(names) & set(dir(mddag_executor))
     with pytest.raises(AttributeError, match="no attribute 'Nonsense'"):

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shipped files are found in a checkout and in every kind of installation."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import subprocess
 import sys
@@ -25,7 +23,7 @@ def test_what_is_nowhere_is_one_line():
         resources.find('config/none.yaml')
 
 
-def share(prefix: Path) -> Path:
+def share(prefix):
     """Lay out what an installation shares; return a file of it."""
     file = prefix / 'share' / 'mddag_executor' / 'config' / 'probe.yaml'
     marker = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages' / 'mddag_executor'

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Benchmarks measure the executor as it is used: without the checks for debugging."""
 
-from __future__ import annotations
-
 import pytest
 
 

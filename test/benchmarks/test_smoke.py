@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each benchmark once, as short as can be: it works, and its figures add up."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 import subprocess
 import sys
-from typing import Any
 
 from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Reading
 from msg_graph import loads
@@ -28,7 +25,6 @@ nodes:
       - {name: join, sync: [/x, /b], deadline: 9ms, execution_time: 1ms}
 """
 
-
 @pytest.fixture
 def graph(tmp_path):
     path = tmp_path / 'graph.yaml'
@@ -36,13 +32,13 @@ def graph(tmp_path):
     return path
 
 
-def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+def call(*arguments):
     return subprocess.run(
         [sys.executable, '-m', 'benchmarks', *map(str, arguments)], cwd=TOP,
         capture_output=True, text=True, check=False, timeout=150)
 
 
-def result_of(*arguments: object) -> Any:
+def result_of(*arguments):
     done = call(*arguments, '--json', '-')
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What tests of verbs share: a declaration in the working directory."""
 
-from __future__ import annotations
-
 import pytest
 
 

@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison with the files in golden/, without what is different in each run."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import re
-from typing import Any
 
 from mddag_executor import __version__
 
@@ -20,7 +17,7 @@ _CHANGING = (
     (re.compile(f'"mddag": "{re.escape(__version__)}"'), '"mddag": "VERSION"'))
 
 
-def compare(name: str, found: str) -> None:
+def compare(name, found):
     """Compare a text with a file; with UPDATE_GOLDEN in the environment, write the file."""
     found = found.replace('\r\n', '\n')
     for pattern, constant in _CHANGING:
@@ -31,7 +28,7 @@ def compare(name: str, found: str) -> None:
     assert found == path.read_bytes().decode()
 
 
-def words(text: str) -> str:
+def words(text):
     """Return the text of a live run without its numbers, and without what a busy machine adds."""
     text = re.sub(r'-?\d+(\.\d+)?( (ns|us|ms|s)\b)?', '#', re.sub(' +', ' ', text))
     text = re.sub('(, #)? (expired|demoted)', '', text)     # counts that are shown if not 0
@@ -40,7 +37,7 @@ def words(text: str) -> str:
                                     'differences? between', line))
 
 
-def shape(value: Any) -> Any:
+def shape(value):
     """Return a result without its values: the names of all that it has whatever happens."""
     if isinstance(value, dict):
         return {key: '...' if key == 'dropped' else shape(each)

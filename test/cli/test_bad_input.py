@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bad input of each command: one line on standard error, status 2, and nothing is written."""
 
-from __future__ import annotations
-
 import json
 
 from mddag_executor.cli import main as program

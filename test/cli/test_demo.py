@@ -1,8 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verbs `evaluate` and `generate`: pictures, several declarations, Ctrl-C."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -30,7 +28,6 @@ nodes:
         execution_time: {quantiles_us: [10000, 10000, 14000, 14000], percent: [0, 50, 50.01, 100]}
 """
 
-
 @pytest.mark.parametrize(('ending', 'start'), [
     ('png', b'\x89PNG'), ('svg', b'<?xml'), ('pdf', b'%PDF')])
 def test_figure(graph, tmp_path, call, ending, start):
@@ -47,7 +44,7 @@ def test_figure(graph, tmp_path, call, ending, start):
             assert b'<!-- ' + text in pictures[0]
 
 
-def group_seconds(group: int) -> float:
+def group_seconds(group):
     """Return the processor time that the processes of a group have taken so far."""
     total = 0.0
     for file in Path('/proc').glob('[0-9]*/stat'):
@@ -60,7 +57,7 @@ def group_seconds(group: int) -> float:
     return total
 
 
-def interrupted_after(folder: Path, seconds: float, *arguments: str) -> tuple[str, str]:
+def interrupted_after(folder, seconds, *arguments):
     """Press Ctrl-C, which goes to all processes of the terminal; return what was said."""
     process = subprocess.Popen(
         [sys.executable, '-m', 'mddag_executor', 'evaluate', *arguments],

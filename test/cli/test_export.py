@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verbs `export` and `diff`, and `--report`: files, exit status, bad input in one line."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import subprocess
@@ -22,7 +20,6 @@ nodes:
       - {name: t, timer: 10ms, publishes: [/a], execution_time: 2ms}
       - {name: s, subscription: /a, deadline: 5ms, execution_time: %s}
 """
-
 
 @pytest.fixture
 def graph(tmp_path):

@@ -7,8 +7,6 @@ After a wanted change: `UPDATE_GOLDEN=1 python -m pytest test/cli`; look at the 
 you commit it.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 
@@ -65,7 +63,6 @@ nodes:
 paths:
   - {name: seen, callbacks: ['/camera:grab', '/detect:detect']}
 """
-
 
 @pytest.fixture
 def files(folder):

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verbs `graph check`, `place`, `analyse`, `draw`, `from-caret` and `schema`."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 import shutil
@@ -24,7 +22,6 @@ nodes:
   - node: /c
     callbacks: [{name: t, timer: 100ms, deadline: 100ms, execution_time: 10ms}]
 """
-
 
 def test_standard_input_and_output(call, monkeypatch):
     monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verbs `graph from-trace` and `graph from-ros`, `--trace` of `from-caret`, and drift."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 import re
@@ -69,7 +67,6 @@ executor.shutdown()
 print(node.asked)
 """
 
-
 def test_from_trace(call, tmp_path):
     done = call('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, 'no blanks to fill in\n', '')
@@ -98,7 +95,7 @@ def test_from_trace_keeps_what_was_declared(call, mddag, tmp_path):
         'abort', 900, False)
 
 
-def composed(path: Path) -> Path:
+def composed(path):
     """Write five messages within a process: rclcpp runs the subscription's second callback."""
     r = Recorded(path)
     r.node(1, '/camera')

@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verb `import`: the trace as a whole or nothing, bad input in one line."""
 
-from __future__ import annotations
-
-from pathlib import Path
 import sys
 
 from mddag_executor.trace import ctf, read_events
@@ -19,7 +16,6 @@ rows = [['ready'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']]],
 for row in rows:
     print(json.dumps(row))
 """
-
 
 @pytest.fixture
 def recording(tmp_path, monkeypatch):
@@ -62,9 +58,7 @@ def test_bad_sessions(name, what, tmp_path, call):
     assert not list(tmp_path.glob('*.mcap')) + list(tmp_path.glob('.*'))
 
 
-def of_session(
-    folder: Path, name: str, made: str, host: str = 'robot', callback: int = 1
-) -> None:
+def of_session(folder, name, made, host='robot', callback=1):
     """Write a trace of a session: an event of a callback."""
     session(folder, [('ros2:callback_end', [('callback', 'u64')])],
             [(0, callback, callback, 1, 'p', callback)],

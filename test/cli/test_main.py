@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The program as a whole: verbs, exit status, one line of error, text for people, `ros2 mddag`."""
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Callable
 from contextlib import nullcontext
 from importlib.metadata import distribution
 from importlib.util import find_spec
@@ -45,7 +42,7 @@ def verb(monkeypatch):
     return install
 
 
-def fail_with(error: BaseException) -> Callable[[argparse.Namespace], int]:
+def fail_with(error):
     def action(_):
         raise error
     return action
@@ -117,7 +114,7 @@ def test_the_wrong_word_is_blamed_and_the_right_one_suggested(capsys, words, say
     'a b --number 3 c', '--number 3 a b c', 'a --number=3 b c', 'a b c --number 3',
     '--number 3 -- a b c'])
 def test_options_and_files_come_in_any_order(verb, words):
-    found: list[argparse.Namespace] = []
+    found = []
     verb(lambda args: found.append(args) or 0)
     assert program.main(['probe', *words.split()]) == 0
     assert (found[0].files, found[0].number) == (['a', 'b', 'c'], 3)
@@ -267,16 +264,16 @@ def test_no_control_character_reaches_the_terminal(text):
 
 class Terminal(io.StringIO):
 
-    def isatty(self) -> bool:
+    def isatty(self):
         return True
 
 
 class Clock:
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.now = 100.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.now
 
 
@@ -308,7 +305,6 @@ mddag: 1
 nodes:
   - {node: /n, callbacks: [{name: tick, timer: 10ms, deadline: 10ms, execution_time: 1ms}]}
 """
-
 
 @pytest.fixture
 def ros2(monkeypatch):

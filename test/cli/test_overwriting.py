@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is recorded stays: no output is an input, and no recording is replaced unasked."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -24,7 +22,6 @@ nodes:
       - {name: t, timer: 10ms, publishes: [/a], execution_time: 2ms}
       - {name: s, subscription: /a, deadline: 5ms, execution_time: 4ms}
 """
-
 
 @pytest.fixture
 def run(graph, call):

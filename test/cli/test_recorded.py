@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verbs `export` and `diff` take every kind of recording that `replay` takes."""
 
-from __future__ import annotations
-
 from contextlib import redirect_stdout
 import csv
 import io
-from typing import Any
 
 from mddag_executor.cli import main as program
 import pytest
@@ -42,7 +39,7 @@ def files(tmp_path_factory):
     return {name: str(path) for name, path in found.items()}
 
 
-def sink(result: Any) -> Any:
+def sink(result):
     return result['dags']['/camera']['sinks']['/detect:detect']
 
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verb `replay`: tables, JSON, exit status, and bad input in one line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -86,12 +84,12 @@ def test_standard_input(trace, call):
     assert call('replay', trace, '-', stdin=GRAPH)[::2] == (0, '')
 
 
-def nothing_recorded(path: Path) -> None:
+def nothing_recorded(path):
     with TraceFile(path) as file:
         file.add('caret_init', START, 1, 1, 5, 'jazzy')
 
 
-def no_declaration(path: Path) -> None:
+def no_declaration(path):
     with TraceFile(path) as file:
         file.add('task_set', START, 1, 1, '', '', 'rad', 7, 0, 0, False)
 

@@ -1,8 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -32,9 +30,7 @@ def drive(tmp_path_factory):
     return folder
 
 
-def mddag(
-    folder: Path, *args: str, status: int = 0, **more: str
-) -> subprocess.CompletedProcess[str]:
+def mddag(folder, *args, status=0, **more):
     """Run mddag in a folder, as a user would."""
     done = subprocess.run(
         [sys.executable, '-m', 'mddag_executor', *args], cwd=folder, capture_output=True,
@@ -43,7 +39,7 @@ def mddag(
     return done
 
 
-def digest(folder: Path, *args: str, **more: str) -> str:
+def digest(folder, *args, **more):
     done = mddag(folder, 'rerun', 'drive.mcap', *args, '--json', '-', **more)
     return json.loads(done.stdout)['digest']
 

@@ -1,9 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 import json
 from pathlib import Path
@@ -12,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from typing import Any
 
 from mddag_executor.core.tally import counts, total
 from mddag_executor.report.tables import percent, sink_table
@@ -159,7 +155,7 @@ def test_fail_on_miss_judges_by_what_the_declaration_tolerates(
 
 
 @contextmanager
-def started(graph: Path) -> Iterator[subprocess.Popen[str]]:
+def started(graph):
     """Give a synthetic run that goes on until it is told to end."""
     with subprocess.Popen(
         [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'sleep',
@@ -172,7 +168,7 @@ def started(graph: Path) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def wait_for(process: subprocess.Popen[str], condition: Callable[[], bool]) -> None:
+def wait_for(process, condition):
     """Wait until something is true of a run."""
     end = time.monotonic() + 60
     while not condition():
@@ -181,7 +177,7 @@ def wait_for(process: subprocess.Popen[str], condition: Callable[[], bool]) -> N
         time.sleep(0.01)
 
 
-def releases() -> list[int]:
+def releases():
     """Return when the jobs were due of which /slow:cb was late, as far as the trace has them."""
     with suppress(OSError, TraceError):
         return [deadline - 10_000_000 for *_, vertex, _, deadline, completed
@@ -190,7 +186,7 @@ def releases() -> list[int]:
     return []
 
 
-def recorded_ns() -> int:
+def recorded_ns():
     """Return from which release to which the trace has got."""
     found = releases()
     return found[-1] - found[0] if found else 0
@@ -253,7 +249,7 @@ def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph):
 # --- tables --------------------------------------------------------------------------------------
 
 
-def sink(completed: int, late: int = 0, **more: Any) -> dict[str, Any]:
+def sink(completed, late=0, **more):
     return {
         'relative_deadline_ns': 30_000_000, 'completed': completed, 'late': late, 'expired': 0,
         'response_ns': {'min': 1, 'median': 2_000_000, 'p99': 3_000_000, 'max': 4_000_000}, **more}

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`mddag simulate`: results, tables, traces, exit status, and one line for whatever is wrong."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,8 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -14,7 +12,6 @@ import subprocess
 import sys
 import time
 from types import SimpleNamespace
-from typing import Any
 
 from mddag_executor.cli.top import _ticks
 from mddag_executor.report.board import Board, GONE_AFTER_S, tables
@@ -28,7 +25,7 @@ CONFIG = Path(__file__).resolve().parents[2] / 'config'
 EVIL = 'mddag: \x1b]0;owned\x07\x1b[2J[bold]x[/bold]\nrm'
 
 
-def array(*statuses: tuple[str, str, int, dict[str, str]]) -> Any:
+def array(*statuses):
     return SimpleNamespace(status=[
         SimpleNamespace(
             hardware_id=process, name=name, level=bytes([level]), message='fine\x1b[31m',
@@ -62,7 +59,7 @@ def test_names_cannot_command_the_terminal():
         assert '\\x1b]0;owned' in text
 
 
-def board_of_autoware(*processes: str) -> Board:
+def board_of_autoware(*processes):
     """Return what a run of Autoware's workload reports."""
     values = {
         'window_missed_ratio': '0.0123', 'window_missed': '12', 'window_results': '970',
@@ -167,7 +164,7 @@ def test_no_process_to_hear(call):
     assert done.stderr.startswith('error: /diagnostics: no executor has published its state')
     done = call('top', '--duration', '300ms')
     assert done.returncode == 2
-    spent: list[float] = []
+    spent = []
     board = Board()
     list(_ticks(spent.append, board, 3600 * 10**9, 50_000_000))     # gives up long before an hour
     assert spent

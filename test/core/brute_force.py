@@ -37,21 +37,18 @@ Its reading of the documents:
   A callback with several vertices has the priority of the first of them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from fractions import Fraction
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from msg_graph import Callback, Dag, TaskSet, Vertex
+from msg_graph import Dag, Vertex
 
 from .dag_paths import laxity, reachable_sinks, ways_to
 
 Event = tuple[int, str, int, int, int, int]
 """(tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job)."""
-
 
 @dataclass(eq=False)
 class Job:
@@ -92,11 +89,11 @@ class BruteForce:
     """One simulated run; ``events``, ``misses`` and ``result()`` tell what came out of it."""
 
     def __init__(
-        self, task_set: TaskSet, ticks: tuple[tuple[int, ...], ...], *, tick: int, horizon: int,
-        workers: int, policy: str, preemptive: bool, dispatch_overhead: int = 0,
-        switch_overhead: int = 0, judge: str = 'horizon', stop_at_first_miss: bool = False,
-        last_release: int | None = None, on_late: str = 'continue',
-    ) -> None:
+        self, task_set, ticks, *, tick, horizon,
+        workers, policy, preemptive, dispatch_overhead=0,
+        switch_overhead=0, judge='horizon', stop_at_first_miss=False,
+        last_release=None, on_late='continue',
+    ):
         self.task_set = task_set
         self.dags = task_set.dags
         self.ticks = ticks
@@ -106,21 +103,21 @@ class BruteForce:
         self.preemptive = preemptive
         self.dispatch_overhead = dispatch_overhead
         self.switch_overhead = switch_overhead
-        self.running: list[Execution | None] = [None] * workers
-        self.waiting: list[Execution] = []
+        self.running = [None] * workers
+        self.waiting = []
         # by DAG and vertex: the demoted executions by arrival, and the arrival of the urged one
-        self.demoted: dict[tuple[int, int], list[tuple[int, Execution]]] = {}
-        self.passed_on: dict[tuple[int, int], int] = {}
-        self.urged: dict[tuple[int, int], int] = {}
-        self.round: list[Execution] = []
-        self.jobs: list[Job] = []
-        self.events: list[Event] = []
-        self.misses: list[Miss] = []
+        self.demoted = {}
+        self.passed_on = {}
+        self.urged = {}
+        self.round = []
+        self.jobs = []
+        self.events = []
+        self.misses = []
         self.counts = {
             (dag.index, sink): {'completed': 0, 'late': 0, 'overdue': 0, 'expired': 0,
                                 'failed': 0, 'aborted': 0, 'dropped': 0}
             for dag in self.dags for sink in dag.sinks}
-        self.responses: dict[tuple[int, int], list[int]] = {key: [] for key in self.counts}
+        self.responses = {key: [] for key in self.counts}
         # by DAG, vertex and sink that it leads to: the latest start, ns after the release
         self.laxity = {
             (dag.index, v): {sink: laxity(dag, v, sink) for sink in reachable_sinks(dag, v)}
@@ -134,7 +131,7 @@ class BruteForce:
         if judge == 'horizon' and self.now == horizon:
             self._judge_open()
 
-    def _simulate(self, horizon: int, stop: bool, last_release: int) -> None:
+    def _simulate(self, horizon, stop, last_release):
         for self.now in range(horizon + 1):
             happened = self._complete_all()
             if self.now == horizon:
@@ -154,26 +151,26 @@ class BruteForce:
 
     # --- times and keys --------------------------------------------------------------------------
 
-    def _period(self, dag: Dag) -> int:
+    def _period(self, dag):
         return dag.period_ns // self.tick
 
-    def _mean(self, vertex: Vertex) -> int:
+    def _mean(self, vertex):
         declared = vertex.callback.execution_time
         return 0 if declared is None else declared.mean_ns
 
-    def _deadline(self, job: Job, sink: int) -> int:
+    def _deadline(self, job, sink):
         """Return the absolute deadline of a sink."""
         relative = job.dag.vertices[sink].deadline_ns
         return job.release + relative // self.tick
 
-    def priority(self, execution: Execution) -> int:
+    def priority(self, execution):
         """Return what decides about preemption."""
         if execution.lowered is not None:
             return execution.lowered
         return self._priority(
             execution, {*self.laxity[execution.job.dag.index, execution.vertex.index]})
 
-    def _demote(self, execution: Execution) -> bool:
+    def _demote(self, execution):
         """Change a priority if the next execution is late or behind one; return whether it did."""
         job, vertex = execution.job, execution.vertex
         if ((job.dag.on_late or self.on_late) != 'demote'
@@ -202,9 +199,7 @@ class BruteForce:
         self.urged[key] = older.arrival
         return True
 
-    def _demoted_priority(
-        self, execution: Execution, older: Execution | None, ahead: int
-    ) -> int:
+    def _demoted_priority(self, execution, older, ahead):
         """Return the priority by the deadlines within reach, or later if there is none."""
         job, vertex = execution.job, execution.vertex
         unit = 1 if self.policy == 'llf' else self.tick
@@ -227,7 +222,7 @@ class BruteForce:
             lowest += (job.demoted - job.release * self.tick) // unit
         return lowest
 
-    def _priority(self, execution: Execution, sinks: set[int]) -> int:
+    def _priority(self, execution, sinks):
         job = execution.job
         if self.policy == 'rad':
             return min(self._deadline(job, sink) for sink in sinks)
@@ -250,7 +245,7 @@ class BruteForce:
         assert self.policy == 'fifo'
         return execution.arrival
 
-    def _place(self, callback: Callback) -> int:
+    def _place(self, callback):
         """Return the place of a callback in the wait set."""
         waits_for_topics = ('subscription', 'sync')
         timers = [c for c in self.task_set.callbacks if c.kind == 'timer']
@@ -258,7 +253,7 @@ class BruteForce:
         return (timers + others).index(callback)
 
     @functools.cache  # noqa: B019
-    def _fixed_priorities(self) -> dict[str, int]:
+    def _fixed_priorities(self):
         """Return the priority of each callback, by its name."""
         order = []
         for dag in self.dags:
@@ -268,16 +263,16 @@ class BruteForce:
                     dag.vertices[s].deadline_ns or 0 for s in reachable_sinks(dag, vertex.index))
                 order.append((
                     least, dag.period_ns, dag.index, -ahead, vertex.index, vertex.callback.key))
-        first: dict[str, int] = {}
+        first = {}
         for place, entry in enumerate(sorted(order)):
             first.setdefault(entry[-1], place)
         return first
 
-    def key(self, execution: Execution) -> tuple[Any, ...]:
+    def key(self, execution):
         """Return the order in which ready executions run."""
         job = execution.job
         if self.policy in ('rad', 'gedf', 'llf'):
-            ties: tuple[Any, ...] = (execution.vertex.index, job.dag.index)
+            ties = (execution.vertex.index, job.dag.index)
         elif self.policy in ('rm', 'dm'):
             ties = (job.index,)
         else:
@@ -286,10 +281,10 @@ class BruteForce:
 
     # --- jobs ------------------------------------------------------------------------------------
 
-    def _open_jobs(self, dag: Dag) -> list[Job]:
+    def _open_jobs(self, dag):
         return [job for job in self.jobs if job.dag is dag and job.outcome is None]
 
-    def _release(self, dag: Dag) -> None:
+    def _release(self, dag):
         of_dag = self._open_jobs(dag)
         if dag.max_active_jobs is not None and len(of_dag) == dag.max_active_jobs:
             self._give_up(of_dag[0], 'expired')
@@ -297,14 +292,14 @@ class BruteForce:
         self.jobs.append(job)
         self._ready(job, dag.vertices[dag.source])
 
-    def _ready(self, job: Job, vertex: Vertex) -> None:
+    def _ready(self, job, vertex):
         new = Execution(job, vertex, self.ticks[job.dag.index][vertex.index], self._arrival())
         self.waiting.append(new)
         if vertex.callback.keep == 'newest':
             self._keep_newest([
                 e for e in self.waiting if e.vertex is vertex and not e.has_run])
 
-    def _keep_newest(self, waiting: list[Execution]) -> None:
+    def _keep_newest(self, waiting):
         for old in waiting:
             if old.job.index == max(e.job.index for e in waiting):
                 continue
@@ -324,14 +319,14 @@ class BruteForce:
             else:
                 self._give_up(job, 'dropped')
 
-    def _arrival(self) -> int:
+    def _arrival(self):
         self.sequence += 1
         return self.sequence
 
-    def _open_sinks(self, job: Job) -> list[int]:
+    def _open_sinks(self, job):
         return [sink for sink in job.dag.sinks if sink not in job.done]
 
-    def _give_up(self, job: Job, outcome: str) -> None:
+    def _give_up(self, job, outcome):
         job.outcome = outcome
         for sink in self._open_sinks(job):
             self.counts[job.dag.index, sink][outcome] += 1
@@ -339,12 +334,12 @@ class BruteForce:
         if outcome == 'aborted':
             self.waiting = [e for e in self.waiting if e.job is not job or e.has_run]
 
-    def _miss(self, job: Job, sink: int, completed: int | None) -> None:
+    def _miss(self, job, sink, completed):
         self.misses.append(Miss(
             job.dag.name, job.dag.vertices[sink].name, job.index, self._deadline(job, sink),
             completed))
 
-    def _judge_open(self) -> None:
+    def _judge_open(self):
         overdue = []
         for dag in self.dags:
             for job in self._open_jobs(dag):
@@ -358,7 +353,7 @@ class BruteForce:
 
     # --- completions -----------------------------------------------------------------------------
 
-    def _complete_all(self) -> bool:
+    def _complete_all(self):
         happened = False
         for worker, execution in enumerate(self.running):
             if execution is not None and execution.left == 0:
@@ -368,7 +363,7 @@ class BruteForce:
                 self._complete(execution.job, execution.vertex)
         return happened
 
-    def _complete(self, job: Job, vertex: Vertex) -> None:
+    def _complete(self, job, vertex):
         job.done.add(vertex.index)
         if job.outcome is not None:
             return
@@ -379,7 +374,7 @@ class BruteForce:
                 if job.done.issuperset(job.dag.vertices[after].predecessors):
                     self._ready(job, job.dag.vertices[after])
 
-    def _complete_sink(self, job: Job, sink: int) -> None:
+    def _complete_sink(self, job, sink):
         late = self.now > self._deadline(job, sink)
         key = job.dag.index, sink
         self.counts[key]['completed'] += 1
@@ -395,7 +390,7 @@ class BruteForce:
 
     # --- workers ---------------------------------------------------------------------------------
 
-    def _blocked(self, execution: Execution) -> bool:
+    def _blocked(self, execution):
         """Tell whether another execution that has begun and not ended holds the group."""
         callback = execution.vertex.callback
         if callback.group is None:
@@ -406,7 +401,7 @@ class BruteForce:
             e is not execution and (e.vertex.callback.node, e.vertex.callback.group)
             == (callback.node, callback.group) for e in begun)
 
-    def _hand_out(self) -> bool:
+    def _hand_out(self):
         """Hand out one execution; False when that is not possible."""
         if self.policy == 'ros2':
             best = self._next_of_round()
@@ -440,13 +435,13 @@ class BruteForce:
         self.waiting.append(victim)
         return True
 
-    def _next_of_round(self) -> Execution | None:
+    def _next_of_round(self):
         """Return what a free worker finds next, in this round or in a new one."""
         if None not in self.running:
             return None
         for new_round in (False, True):
             if new_round:
-                by_callback: dict[str, list[Execution]] = {}
+                by_callback = {}
                 for e in self.waiting:
                     by_callback.setdefault(e.vertex.callback.key, []).append(e)
                 self.round = [min(each, key=lambda e: e.arrival) for each in by_callback.values()]
@@ -457,7 +452,7 @@ class BruteForce:
                     return first
         return None
 
-    def _start(self, execution: Execution, worker: int) -> None:
+    def _start(self, execution, worker):
         self.waiting.remove(execution)
         if not execution.has_run:
             self.passed_on.pop((execution.job.dag.index, execution.vertex.index), None)
@@ -466,13 +461,13 @@ class BruteForce:
         self.running[worker] = execution
         self._note('start', worker, execution)
 
-    def _note(self, kind: str, worker: int, execution: Execution) -> None:
+    def _note(self, kind, worker, execution):
         job, vertex = execution.job, execution.vertex
         self.events.append((self.now, kind, worker, job.dag.index, vertex.index, job.index))
 
     # --- what came out of it ---------------------------------------------------------------------
 
-    def result(self) -> dict[str, Any]:
+    def result(self):
         """Return the part of the result format that concerns jobs and sinks, times in ns."""
         return {
             dag.name: {
@@ -484,7 +479,7 @@ class BruteForce:
                 'sinks': {dag.vertices[sink].name: self._sink(dag, sink) for sink in dag.sinks}}
             for dag in self.dags}
 
-    def _sink(self, dag: Dag, sink: int) -> dict[str, Any]:
+    def _sink(self, dag, sink):
         responses = sorted(self.responses[dag.index, sink])
         response = None
         if responses:
@@ -496,7 +491,7 @@ class BruteForce:
         return {'relative_deadline_ns': dag.vertices[sink].deadline_ns,
                 **self.counts[dag.index, sink], 'response_ns': response}
 
-    def first_miss(self) -> dict[str, Any] | None:
+    def first_miss(self):
         """Return the miss of the earliest deadline, in the result format."""
         if not self.misses:
             return None

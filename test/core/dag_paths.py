@@ -2,14 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What follows from the graph of a DAG, by going through all its paths: for the slow simulator."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-
-from msg_graph import Dag, Vertex
-
-
-def reachable_sinks(dag: Dag, index: int) -> set[int]:
+def reachable_sinks(dag, index):
     """Return the sinks that a vertex leads to, itself included."""
     vertex = dag.vertices[index]
     if not vertex.successors:
@@ -17,7 +10,7 @@ def reachable_sinks(dag: Dag, index: int) -> set[int]:
     return set().union(*(reachable_sinks(dag, after) for after in vertex.successors))
 
 
-def paths(dag: Dag, index: int) -> Iterator[list[Vertex]]:
+def paths(dag, index):
     """Yield every path from a vertex to a sink."""
     vertex = dag.vertices[index]
     for after in vertex.successors:
@@ -27,7 +20,7 @@ def paths(dag: Dag, index: int) -> Iterator[list[Vertex]]:
         yield [vertex]
 
 
-def ways_to(dag: Dag, index: int) -> Iterator[list[int]]:
+def ways_to(dag, index):
     """Yield every path from the source to a vertex."""
     before = dag.vertices[index].predecessors
     for one in before:
@@ -37,7 +30,7 @@ def ways_to(dag: Dag, index: int) -> Iterator[list[int]]:
         yield [index]
 
 
-def laxity(dag: Dag, index: int, sink: int) -> int:
+def laxity(dag, index, sink):
     """Return the deadline of a sink less the mean times of the longest path to it, in ns."""
     return (dag.vertices[sink].deadline_ns or 0) - max(
         sum(v.callback.execution_time.mean_ns for v in path

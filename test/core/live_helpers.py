@@ -2,12 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Short ways to drive the scheduler as the live executor does."""
 
-from __future__ import annotations
-
-from typing import Any
-
 from mddag_executor.core import Scheduler, Tables
-from msg_graph import TaskSet
 
 from .task_sets import declaration
 
@@ -22,27 +17,27 @@ JOIN = declaration([
 S, X, Y, J = range(4)
 
 
-def live(task_set: TaskSet | None = JOIN, workers: int = 2, **more: Any) -> Scheduler:
+def live(task_set=JOIN, workers=2, **more):
     options = {name: more.pop(name) for name in ('max_active_jobs', 'expire_after', 'on_late')
                if name in more}
     tables = Tables.build(task_set, legs=True, groups=False, **options)
     return Scheduler(tables, workers, **more)
 
 
-def run_one(scheduler: Scheduler, x: int, now: int) -> bool:
+def run_one(scheduler, x, now):
     """Make an execution ready and run it at once."""
     scheduler.ready(x, now)
     assert scheduler.take(scheduler.state.worker_x.index(-1), now) == x
     return scheduler.complete(x, now)
 
 
-def start_job(scheduler: Scheduler, job: int = 0, now: int = 0, dag: int = 0) -> int:
+def start_job(scheduler, job=0, now=0, dag=0):
     """Release a job and run its source."""
     slot = scheduler.release(dag, job, now, now)
     assert run_one(scheduler, scheduler.source(slot), now)
     return slot
 
 
-def undeclared(scheduler: Scheduler, job: int, group: int, now: int, holds: int = 0) -> int:
+def undeclared(scheduler, job, group, now, holds=0):
     """Make a callback that no DAG declares ready; return its execution."""
     return scheduler.ready_undeclared(job, group, holds, now)

@@ -7,26 +7,14 @@ One *tick* is a microsecond, the least period that a declaration may have; every
 task set is a whole number of ticks, so that a slow simulator can go tick by tick.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import json
 import os
-from typing import Any
 
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from mddag_executor.core import POLICIES
-from mddag_executor.simulate import (
-    END,
-    Load,
-    periodic_load,
-    PREEMPT,
-    Settings,
-    simulate,
-    SimulatedRun,
-    START,
-)
+from mddag_executor.simulate import END, periodic_load, PREEMPT, Settings, simulate, START
 from msg_graph import loads, TaskSet
 
 TICK = 1_000
@@ -38,7 +26,7 @@ Event = tuple[int, str, int, int, int, int]
 _FACTOR = int(os.environ.get('MDDAG_THOROUGH', '1'))
 
 
-def examples(count: int) -> settings:
+def examples(count):
     """Return settings for that many examples; MDDAG_THOROUGH=20 in the environment: 20 fold."""
     return settings(
         max_examples=count * _FACTOR, deadline=None,
@@ -58,16 +46,15 @@ class Case:
     switch_overhead: int = 0
 
     @property
-    def times_ns(self) -> list[list[int]]:
+    def times_ns(self):
         """Return the execution times as the simulator takes them."""
         return [[tick * TICK for tick in row] for row in self.ticks]
 
-    def load(self, ticks: int) -> Load:
+    def load(self, ticks):
         """Return the periodic load of all releases before a time."""
         return periodic_load(self.task_set, self.times_ns, ticks * TICK)
 
-    def run(self, horizon: int, judge: str = 'horizon', stop: bool = False,
-            last_release: int | None = None) -> SimulatedRun:
+    def run(self, horizon, judge='horizon', stop=False, last_release=None):
         """Simulate it; times in ticks."""
         settings = Settings(
             policy=self.policy, workers=self.workers, duration_ns=horizon * TICK,
@@ -76,7 +63,7 @@ class Case:
             switch_overhead_ns=self.switch_overhead * TICK)
         return simulate(self.task_set, self.load(last_release or horizon), settings, log=True)
 
-    def events(self, run: SimulatedRun) -> list[Event]:
+    def events(self, run):
         """Return a run's log in ticks, with each vertex by its index in its DAG."""
         first = [0]
         for dag in self.task_set.dags:
@@ -84,18 +71,18 @@ class Case:
         return [(time // TICK, KINDS[kind], worker, dag, vertex - first[dag], job)
                 for time, kind, worker, dag, vertex, job in run.log]
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         """Show what is needed to try it by hand."""
         rest = (self.ticks, self.workers, self.policy, self.preemptive, self.dispatch_overhead,
                 self.switch_overhead)
         return f'Case(loads({self.task_set.text!r}), {", ".join(map(repr, rest))})'
 
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+    def _repr_pretty_(self, printer, cycle):
         """Show the same in hypothesis' reports."""
         printer.text(repr(self))
 
 
-def declaration(callbacks: list[dict[str, Any]]) -> TaskSet:
+def declaration(callbacks):
     """Derive callbacks that each name their node; they stand in the file in this order."""
     nodes = [{'node': callback['node'],
               'callbacks': [{k: v for k, v in callback.items() if k != 'node'}]}
@@ -103,11 +90,11 @@ def declaration(callbacks: list[dict[str, Any]]) -> TaskSet:
     return loads(json.dumps({'mddag': 1, 'nodes': nodes}), 'random.yaml')
 
 
-def _ticks(draw: st.DrawFn, least: int, most: int) -> str:
+def _ticks(draw, least, most):
     return f'{draw(st.integers(least, most))}us'
 
 
-def _triggers(draw: st.DrawFn, callbacks: list[dict[str, Any]]) -> dict[str, Any]:
+def _triggers(draw, callbacks):
     """Return what starts a callback: one before it, one of two (OR) or both of two (AND)."""
     kind = draw(st.sampled_from(['one', 'one', 'and', 'or'])) if len(callbacks) > 1 else 'one'
     if kind == 'one':
@@ -128,9 +115,9 @@ def _triggers(draw: st.DrawFn, callbacks: list[dict[str, Any]]) -> dict[str, Any
 
 @st.composite
 def task_sets(
-    draw: st.DrawFn, /, max_dags: int = 3, max_callbacks: int = 5, groups: bool = True,
-    bounds: bool = True, newest: bool = False, importance: bool = False,
-) -> TaskSet:
+    draw, /, max_dags=3, max_callbacks=5, groups=True,
+    bounds=True, newest=False, importance=False,
+):
     """
     Draw a task set: one to some DAGs with AND, OR, unequal deadlines, shared callbacks.
 
@@ -139,12 +126,12 @@ def task_sets(
     :param newest: some sources and sinks keep only the newest.
     :param importance: sinks have an importance, and some tolerate misses.
     """
-    every: list[dict[str, Any]] = []
+    every = []
     n_dags = draw(st.integers(1, max_dags))
     for dag in range(n_dags):
-        mine: list[dict[str, Any]] = []
+        mine = []
         for number in range(draw(st.integers(1, max_callbacks))):
-            callback: dict[str, Any] = {
+            callback = {
                 'node': f'/n{draw(st.integers(0, 1))}', 'name': f'd{dag}c{number}',
                 'topic': f'/d{dag}/t{number}', 'publishes': set()}
             if number:
@@ -190,10 +177,7 @@ def task_sets(
 
 
 @st.composite
-def cases(
-    draw: st.DrawFn, /, policies: tuple[str, ...] = tuple(POLICIES),
-    overheads: bool = False, **options: Any,
-) -> Case:
+def cases(draw, /, policies=tuple(POLICIES), overheads=False, **options):
     """Draw a task set and how to run it."""
     task_set = draw(task_sets(**options))
     policy = draw(st.sampled_from(policies))

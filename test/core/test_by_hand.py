@@ -2,11 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schedules worked out by hand: order, ties, preemption, groups, verdicts, ends."""
 
-from __future__ import annotations
-
-from typing import Any
-
-from msg_graph import TaskSet
 import pytest
 
 from .task_sets import Case, declaration
@@ -14,48 +9,47 @@ from .task_sets import Case, declaration
 Log = list[tuple[int, str, int, str]]
 
 
-def single(name: str, period: int, deadline: int | None = None, **more: Any) -> dict[str, Any]:
+def single(name, period, deadline=None, **more):
     """Declare a DAG of one callback; times in ticks."""
     return {'node': '/n', 'name': name, 'dag': name, 'timer': f'{period}us',
             'deadline': f'{deadline or period}us', **more}
 
 
-def source(name: str, period: int, **more: Any) -> dict[str, Any]:
+def source(name, period, **more):
     return {'node': '/n', 'name': name, 'dag': name, 'timer': f'{period}us',
             'publishes': [f'/{name}'], **more}
 
 
-def after(before: str, name: str, deadline: int | None = None, **more: Any) -> dict[str, Any]:
+def after(before, name, deadline=None, **more):
     """Declare a callback started by another one; it is a sink where it has a deadline."""
-    rest: dict[str, Any] = {'publishes': [f'/{name}']}
+    rest = {'publishes': [f'/{name}']}
     if deadline is not None:
         rest = {'deadline': f'{deadline}us'}
     return {'node': '/n', 'name': name, 'subscription': f'/{before}', **rest, **more}
 
 
-def case(callbacks: list[dict[str, Any]], ticks: dict[str, int], *, workers: int = 1,
-         policy: str = 'rad', preemptive: bool = False, **more: Any) -> Case:
+def case(callbacks, ticks, *, workers=1, policy='rad', preemptive=False, **more):
     task_set = declaration(callbacks)
     times = tuple(tuple(ticks[v.callback.name] for v in dag.vertices) for dag in task_set.dags)
     return Case(task_set, times, workers, policy, preemptive, **more)
 
 
-def names(task_set: TaskSet, dag: int, vertex: int) -> str:
+def names(task_set, dag, vertex):
     return task_set.dags[dag].vertices[vertex].callback.name
 
 
-def log(of: Case, horizon: int, **how: Any) -> Log:
+def log(of, horizon, **how):
     """Return (tick, what, worker, callback.job) for each event."""
     return [(now, kind, worker, f'{names(of.task_set, dag, vertex)}.{job}')
             for now, kind, worker, dag, vertex, job in of.events(of.run(horizon, **how))]
 
 
-def starts(of: Case, horizon: int, **how: Any) -> list[str]:
+def starts(of, horizon, **how):
     """Return what starts, in order."""
     return [who for _, kind, _, who in log(of, horizon, **how) if kind == 'start']
 
 
-def sink(of: Case, horizon: int, name: str, **how: Any) -> dict[str, Any]:
+def sink(of, horizon, name, **how):
     result = of.run(horizon, **how).result()
     return next(
         values for dag in result['dags'].values()

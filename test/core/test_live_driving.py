@@ -7,25 +7,16 @@ The model remembers every execution that was made ready, under an identity of it
 became of it; it knows nothing of slots, heaps and keys but what the scheduler's interface shows.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass
 from operator import attrgetter, methodcaller
 
 from hypothesis import strategies as st
-from hypothesis.stateful import (
-    initialize,
-    invariant,
-    precondition,
-    rule,
-    RuleBasedStateMachine,
-)
+from hypothesis.stateful import initialize, invariant, precondition, rule, RuleBasedStateMachine
 from mddag_executor.core import legs_of, POLICIES, Scheduler, Tables
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
-    Decision,
     DROP,
     EXPIRED,
     FREE,
@@ -94,14 +85,14 @@ class LiveDriver(RuleBasedStateMachine):
         self.workers = workers
         self.groups = [-1, self.scheduler.new_group(), self.scheduler.new_group()]
         self.now = 0
-        self.runs: list[Run] = []
-        self.by_x: dict[int, Run] = {}
-        self.jobs: list[Job] = []
-        self.messages: list[tuple[Job, int, int]] = []
+        self.runs = []
+        self.by_x = {}
+        self.jobs = []
+        self.messages = []
         self.counter = Counter[str]()
-        self.sinks: Counter[tuple[int, int, int]] = Counter()
-        self.completed_sinks: Counter[tuple[int, int]] = Counter()
-        self.legs_done: Counter[tuple[int, int, int]] = Counter()
+        self.sinks = Counter()
+        self.completed_sinks = Counter()
+        self.legs_done = Counter()
 
     # --- what happens ----------------------------------------------------------------------------
 
@@ -152,13 +143,13 @@ class LiveDriver(RuleBasedStateMachine):
         self.note(Run(x, (self.tables.n_dags, index), self.tables.n_vertices, 0,
                       self.groups[group], self.state.x_key[x][0]))
 
-    def make_ready(self, job: Job, vertex: int, leg: int, group: int) -> None:
+    def make_ready(self, job, vertex, leg, group):
         x = self.scheduler.execution(job.slot, vertex, leg)
         self.state.x_group[x] = group
         self.scheduler.ready(x, self.now)
         self.note(Run(x, (job.dag, job.index), vertex, leg, group, self.state.x_key[x][0]))
 
-    def note(self, run: Run) -> None:
+    def note(self, run):
         assert run.x not in self.by_x, 'an execution that is still alive'
         self.by_x[run.x] = run
         self.runs.append(run)
@@ -190,7 +181,7 @@ class LiveDriver(RuleBasedStateMachine):
     def complete(self, data):
         self.complete_one(data.draw(st.sampled_from(self.with_fate(RUNNING))))
 
-    def complete_one(self, run: Run) -> None:
+    def complete_one(self, run):
         key = (*run.job, run.vertex)
         self.legs_done[key] += 1
         legs = self.tables.n_legs[run.vertex]
@@ -203,7 +194,7 @@ class LiveDriver(RuleBasedStateMachine):
             self.publish(job, run.vertex)
         self.settle()
 
-    def publish(self, job: Job, vertex: int) -> None:
+    def publish(self, job, vertex):
         first = self.tables.first_vertex[job.dag]
         dag = self.task_set.dags[job.dag]
         me = dag.vertices[vertex - first]
@@ -245,7 +236,7 @@ class LiveDriver(RuleBasedStateMachine):
             self.scheduler.refuse(run.x)
             run.fate, run.began, run.lent = REFUSED, False, False
 
-    def owners(self) -> list[Run]:
+    def owners(self):
         return [run for run in self.with_fate(RUNNING) if run.group >= 0]
 
     @rule(data=st.data())
@@ -274,7 +265,7 @@ class LiveDriver(RuleBasedStateMachine):
 
     # --- decisions -------------------------------------------------------------------------------
 
-    def settle(self) -> None:
+    def settle(self):
         """Carry out what was decided, as the live executor does, before anything else happens."""
         for decision in self.scheduler.decisions():
             kind = decision[0]
@@ -289,7 +280,7 @@ class LiveDriver(RuleBasedStateMachine):
                 self.completed_sinks[dag, job] += kind in SINK_COMPLETED
                 assert kind in (*SINK_COMPLETED, SINK_ABORTED, SINK_EXPIRED)
 
-    def dropped(self, decision: Decision) -> None:
+    def dropped(self, decision):
         _, dag, vertex, job, x, now = decision
         run = self.by_x.pop(x)
         assert (run.vertex, now) == (vertex, self.now)
@@ -297,7 +288,7 @@ class LiveDriver(RuleBasedStateMachine):
         assert run.fate in (WAITING, REFUSED) and not run.began
         run.fate = DROPPED
 
-    def ended(self, decision: Decision) -> None:
+    def ended(self, decision):
         _, dag, _, index, end, now = decision
         job = next(job for job in self.jobs if (job.dag, job.index) == (dag, index))
         assert job.end is None, 'ended twice'
@@ -313,28 +304,28 @@ class LiveDriver(RuleBasedStateMachine):
 
     # --- what must hold --------------------------------------------------------------------------
 
-    def alive(self) -> list[Run]:
+    def alive(self):
         return list(self.by_x.values())
 
-    def with_fate(self, fate: str) -> list[Run]:
+    def with_fate(self, fate):
         return [run for run in self.alive() if run.fate == fate]
 
-    def over(self) -> list[Job]:
+    def over(self):
         """Return the open jobs that can no longer complete."""
         active = {self.state.x_slot[run.x] for run in self.alive()}
         return [
             job for job in self.open_jobs() if job.slot not in active
             and self.now > job.release + self.tables.dag_deadline[job.dag] + EXPIRE_AFTER]
 
-    def open_jobs(self) -> list[Job]:
+    def open_jobs(self):
         return [job for job in self.jobs if job.end is None]
 
-    def blocked(self, run: Run) -> bool:
+    def blocked(self, run):
         return run.group >= 0 and any(
             other is not run and other.owns and other.group == run.group
             for other in self.alive())
 
-    def polled(self, runs: list[Run]) -> list[Run]:
+    def polled(self, runs):
         """Return those that a poll would find: not what waits behind another one of its entity."""
         if not self.scheduler.policy.polling:
             return runs
@@ -344,12 +335,12 @@ class LiveDriver(RuleBasedStateMachine):
                 self.subscription(other) == self.subscription(run)
                 for other in waiting[:waiting.index(run)])]
 
-    def subscription(self, run: Run) -> int:
+    def subscription(self, run):
         """Return the entity of the message that started a run."""
         tables = self.tables
         return tables.entity[run.vertex] + tables.leg_topic[tables.first_leg[run.vertex] + run.leg]
 
-    def region(self, dag: int, slot: int) -> range:
+    def region(self, dag, slot):
         base = self.state.job_base[slot]
         return range(base, base + self.tables.n_region[dag])
 
@@ -396,7 +387,7 @@ class LiveDriver(RuleBasedStateMachine):
             assert len(mine) == self.state.n_open[dag.index]
             assert len(mine) <= (dag.max_active_jobs or MAX_ACTIVE)
 
-    def teardown(self) -> None:
+    def teardown(self):
         """Let all that is left happen; then nothing may be left."""
         if not hasattr(self, 'scheduler'):
             return

@@ -2,11 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the core does in an overload, and that it does nothing without one (rules 7 and 13)."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -20,7 +16,7 @@ from .live_helpers import J, live, start_job, US
 from .task_sets import Case, cases, declaration, examples, TICK
 
 
-def with_times(case: Case, on_late: Any = None, **more: Any) -> Case:
+def with_times(case, on_late=None, **more):
     """Return a case that declares its execution times, and ``more`` for each callback."""
     return replace(case, task_set=replace(case.task_set, dags=tuple(
         replace(dag, on_late=on_late, vertices=tuple(
@@ -41,7 +37,7 @@ def test_demote_without_an_overload_changes_nothing(case, horizon):
     assert _until(case, run, horizon - latest) == _until(case, demoted, horizon - latest)
 
 
-def demand(case: Case) -> float:
+def demand(case):
     """Return how many workers the executions need."""
     return sum(sum(row) * TICK / dag.period_ns
                for dag, row in zip(case.task_set.dags, case.ticks))
@@ -62,7 +58,7 @@ def test_importance_means_nothing_if_late_jobs_are_not_demoted(case, horizon):
        st.integers(5, 60))
 def test_messages_of_a_callback_keep_their_order(case, horizon):
     case = replace(with_times(case, on_late='demote'), workers=1, preemptive=False)
-    latest: dict[tuple[int, int], int] = {}
+    latest = {}
     for _, kind, _, dag, vertex, job in case.events(case.run(horizon)):
         if kind == 'start':
             assert job == latest.get((dag, vertex), -1) + 1
@@ -98,18 +94,17 @@ def test_messages_of_each_topic_of_a_sync_keep_their_order(steps):
     assert ran == arrived
 
 
-def _until(case: Case, run: Any, end: int) -> list[Any]:
+def _until(case, run, end):
     """Return the events before a time: what is released later may be too much for the workers."""
     return [event for event in case.events(run) if event[0] < end]
 
 
-def single(name: str, period: int, deadline: int, **more: Any) -> dict[str, Any]:
+def single(name, period, deadline, **more):
     return {'node': '/n', 'name': name, 'timer': f'{period}us', 'deadline': f'{deadline}us',
             'dag': name, **more}
 
 
-def results(callbacks: list[dict[str, Any]], ticks: Sequence[int], horizon: int,
-            preemptive: bool = False) -> Any:
+def results(callbacks, ticks, horizon, preemptive=False):
     """Return of each sink what came of it, on one worker."""
     case = Case(declaration(callbacks), tuple((each,) for each in ticks), 1, 'rad', preemptive)
     dags = case.run(horizon).result()['dags']
@@ -203,7 +198,7 @@ def test_less_important_work_leaves_room_for_all_important_jobs():
 
 
 @pytest.mark.parametrize('last', [0, 100])
-def test_room_is_left_for_one_release_after_the_last(last: int) -> None:
+def test_room_is_left_for_one_release_after_the_last(last):
     """If the source stops, less important work goes on although nothing else happens."""
     case = Case(declaration([
         single('low', 40, 40, execution_time='30us', importance='low', on_late='demote'),
@@ -258,14 +253,12 @@ def test_a_backlog_of_a_heavy_callback_leaves_the_others_in_time():
         assert (counts(publisher).in_time >= 0.96 * 500) == (on_late == 'demote')
 
 
-def misses_of_a_burst(
-    case: Case, period: int, extra: int, horizon: int, on_late: str
-) -> list[tuple[int, int]]:
+def misses_of_a_burst(case, period, extra, horizon, on_late):
     """Return DAG and release (ticks) of the misses, if the first DAG is released more often."""
     load = case.load(horizon)
     releases = sorted([*zip(load.times, load.dags),
                        *((500 * TICK + period * each, 0) for each in range(extra))])
-    times: list[list[int]] = [[] for _ in case.ticks]
+    times = [[] for _ in case.ticks]
     jobs = []
     for time, dag in releases:
         jobs.append(len(times[dag]))
@@ -279,7 +272,7 @@ def misses_of_a_burst(
 
 
 @pytest.mark.parametrize('extra', [3, 6, 10, 20])
-def test_a_burst_is_worked_off(extra: int) -> None:
+def test_a_burst_is_worked_off(extra):
     """No more is late than with ``continue``, and nothing once there is room for the backlog."""
     periods = {'burst': (20, 40), 'other': (10, 10), 'slow': (60, 60)}
     ticks = (8, 4, 3)
@@ -294,7 +287,7 @@ def test_a_burst_is_worked_off(extra: int) -> None:
 
 
 @pytest.mark.parametrize('extra', [5, 10, 20])
-def test_the_slowest_callback_of_a_burst_works_off_its_backlog(extra: int) -> None:
+def test_the_slowest_callback_of_a_burst_works_off_its_backlog(extra):
     """As soon as it can, though its newest message cannot be in time behind the others."""
     case = Case(declaration([
         {'node': '/n', 'name': 'source', 'timer': '10us', 'dag': 'burst', 'publishes': ['/a'],

@@ -2,21 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What holds of every schedule and of its tables; the core against its twin by brute force."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import POLICIES, policy, rad_offsets, Tables
-from msg_graph import Dag, TaskSet
 import pytest
 
 from .brute_force import BruteForce
-from .task_sets import Case, cases, declaration, examples, task_sets, TICK
+from .task_sets import cases, declaration, examples, task_sets, TICK
 
 
-def paths_to_sinks(dag: Dag, index: int) -> Iterator[int]:
+def paths_to_sinks(dag, index):
     """Yield the sink at the end of each path from a vertex."""
     open_paths = [index]
     while open_paths:
@@ -27,7 +22,7 @@ def paths_to_sinks(dag: Dag, index: int) -> Iterator[int]:
             yield vertex.index
 
 
-def rad_offset(dag: Dag, index: int) -> int:
+def rad_offset(dag, index):
     """Return RAD minus release as the paper defines it, ns."""
     deadlines = [dag.vertices[sink].deadline_ns for sink in paths_to_sinks(dag, index)]
     return min(deadline for deadline in deadlines if deadline is not None)
@@ -44,8 +39,7 @@ def test_rad_is_the_least_deadline_of_the_sinks_it_leads_to(task_set):
         assert tables.rad_offset[first:first + len(dag.vertices)] == brute
 
 
-def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False,
-            last_release: int | None = None) -> BruteForce:
+def compare(case, horizon, judge='horizon', stop=False, last_release=None):
     """Run a case both ways; every event and every verdict must be the same."""
     run = case.run(horizon, judge, stop, last_release)
     brute = BruteForce(
@@ -88,7 +82,7 @@ def test_until_all_is_done(case, last_release):
 US = 1_000
 
 
-def two_dags() -> TaskSet:
+def two_dags():
     return declaration([
         {'node': '/a', 'name': 's', 'timer': '10us', 'publishes': ['/s', '/all'], 'dag': 'first',
          'max_active_jobs': 4, 'on_late': 'abort', 'group': 'g'},

@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Jobs from release to end: legs, groups, bounds, aborts, deadlines, polls, the interpreter."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 import random
-from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -29,11 +26,10 @@ from mddag_executor.core.state import (
 from mddag_executor.core.tables import NEVER
 from mddag_executor.errors import UsageError
 from mddag_executor.simulate import Settings, simulate
-from msg_graph import TaskSet
 import pytest
 
 from .live_helpers import J, live, run_one, start_job, undeclared, US, X
-from .task_sets import Case, declaration, examples
+from .task_sets import declaration, examples
 from .test_by_hand import case, single
 
 
@@ -56,7 +52,7 @@ def test_a_job_fails_with_what_fails_of_it():
     assert scheduler.state.job_state[slot] == FREE
 
 
-def aborting() -> TaskSet:
+def aborting():
     return declaration([
         {'node': '/n', 'name': 's', 'timer': '100us', 'publishes': ['/s'], 'dag': 'd',
          'on_late': 'abort'},
@@ -133,9 +129,9 @@ def test_each_overdue_sink_is_found_once_and_in_time(steps, gaps):
     scheduler = live(SINKS)
     tables, state = scheduler.tables, scheduler.state
     deadlines = Deadlines(tables, state)
-    jobs: list[tuple[int, int, int]] = []
-    open_sinks: dict[tuple[int, int, int], int] = {}  # DAG, job, vertex -> deadline
-    overdue: list[tuple[int, int, int]] = []
+    jobs = []
+    open_sinks = {}  # DAG, job, vertex -> deadline
+    overdue = []
     now = 0
     for (what, which, more), gap in zip(steps, gaps):
         now += gap * US
@@ -173,14 +169,14 @@ def test_each_overdue_sink_is_found_once_and_in_time(steps, gaps):
             assert now <= deadlines.next <= min(later, default=NEVER)
 
 
-def ros2(callbacks: list[dict[str, Any]], ticks: dict[str, int], **more: Any) -> Case:
+def ros2(callbacks, ticks, **more):
     return case(callbacks, ticks, policy='ros2', **more)
 
 
 # --- the core by itself --------------------------------------------------------------------------
 
 
-def scheduler(workers: int = 1) -> Scheduler:
+def scheduler(workers=1):
     tables = Tables.build(declaration([
         {'node': '/n', 'name': 'one', 'subscription': '/x', 'period': '10us', 'dag': 'x',
          'publishes': ['/a', '/b']},
@@ -223,13 +219,13 @@ URGENT = 0
 DEADLINES = (10, 20, 30)
 
 
-def computing(workers: int, policy: str = 'rad') -> Scheduler:
+def computing(workers, policy='rad'):
     """Return one with a DAG of one callback for each urgency."""
     dags = [single(f'd{deadline}', 1000, deadline) for deadline in DEADLINES]
     return Scheduler(Tables.build(declaration(dags), groups=False), workers, policy)
 
 
-def start_next(core: Scheduler, now: int) -> int:
+def start_next(core, now):
     """Start one execution on an idle worker and return it; -1: there is none."""
     workers = core.state.worker_x
     return core.take(workers.index(-1), now) if -1 in workers else -1
@@ -245,7 +241,7 @@ class Driver:
     started: list[int] = field(default_factory=list)
     urgency: dict[int, int] = field(default_factory=dict)
 
-    def ready(self, urgency: int, *, holds: bool, group: int = -1) -> int:
+    def ready(self, urgency, *, holds, group=-1):
         self.now += 1
         x = self.core.source(self.core.release(urgency, self.jobs, 0, self.now))
         self.jobs += 1
@@ -255,14 +251,14 @@ class Driver:
         self.core.ready(x, self.now)
         return x
 
-    def go(self) -> list[int]:
+    def go(self):
         """Return what starts now."""
         started = []
         while (x := start_next(self.core, self.now)) >= 0:
             started.append(x)
         return started
 
-    def complete(self, x: int) -> None:
+    def complete(self, x):
         self.now += 1
         self.core.complete(x, self.now)
 
@@ -278,7 +274,7 @@ def test_one_that_turns_out_to_wait_gives_the_interpreter_back():
     assert drive.core.state.worker_x.count(-1) == 7
 
 
-def may_start(core: Scheduler, x: int) -> bool:
+def may_start(core, x):
     """Tell by the words of the rules whether a waiting execution may start."""
     state = core.state
     if state.x_group[x] >= 0 and state.group_owner[state.x_group[x]] not in (-1, x):
@@ -295,7 +291,7 @@ def test_whatever_happens_the_most_urgent_that_may_start_starts(seed, workers, g
     drive = Driver(computing(workers))
     core, state = drive.core, drive.core.state
     group_numbers = [core.new_group() for _ in range(2)] if groups else []
-    alive: set[int] = set()
+    alive = set()
     count = dict.fromkeys(('ready', 'ended'), 0)
     for step in range(120):
         here = sorted(alive)

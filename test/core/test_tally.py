@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counts of the core's decisions, stops of the machine, and the worst window of a sink."""
 
-from __future__ import annotations
-
 from collections import deque
 from fractions import Fraction
 import math
@@ -14,7 +12,6 @@ from mddag_executor.core import quantile, Tables, Tally
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
-    Decision,
     DROP,
     EXPIRED,
     JOB_END,
@@ -35,7 +32,7 @@ from .task_sets import declaration, examples
 US = 1_000
 
 
-def tally(keep: int | None = None) -> Tally:
+def tally(keep=None):
     task_set = declaration([
         {'node': '/n', 'name': 's', 'timer': '100us', 'publishes': ['/s'], 'dag': 'd'},
         {'node': '/n', 'name': 'x', 'subscription': '/s', 'deadline': '10us'},
@@ -43,7 +40,7 @@ def tally(keep: int | None = None) -> Tally:
     return Tally(task_set, Tables.build(task_set), keep)
 
 
-def done(vertex: int, job: int, response: int) -> Decision:
+def done(vertex, job, response):
     """Return the decision on a completion; jobs are released each 100 us."""
     release = 100 * US * job
     deadline, time = release + 10 * US * vertex, release + response
@@ -176,7 +173,7 @@ def test_what_is_kept_is_bounded_and_the_counts_are_whole():
     assert len(stops._unexplained) == KEEP_MISSES
 
 
-def worst_of(missed: list[bool], of: int) -> int:
+def worst_of(missed, of):
     return max(sum(missed[begin:begin + of]) for begin in range(max(1, len(missed))))
 
 

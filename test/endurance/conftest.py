@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Let the tests import the programs of this folder as these import each other."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import sys
 

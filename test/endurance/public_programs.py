@@ -21,8 +21,6 @@ starting with the first message.  The two runs are the same if
   itself.  (``mddag run`` has the exit status 0 after SIGINT, a program often another.)
 """
 
-from __future__ import annotations
-
 import argparse
 from collections import Counter
 from dataclasses import dataclass
@@ -55,7 +53,6 @@ _KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 URDF = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">
 <parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>"""
-
 
 @dataclass(frozen=True)
 class Program:
@@ -114,10 +111,10 @@ PROGRAMS = (
 class Probe:
     """A node that publishes a program's inputs and counts what the program publishes."""
 
-    def __init__(self, program: Program) -> None:
-        self.counts: Counter[str] = Counter()
-        self.types: dict[str, str] = {}
-        self.last: dict[str, Any] = {}
+    def __init__(self, program):
+        self.counts = Counter()
+        self.types = {}
+        self.last = {}
         self.node = Node('public_programs_probe')
         self._inputs = {topic for topic, _ in program.inputs}
         self._executor = SingleThreadedExecutor()
@@ -127,7 +124,7 @@ class Probe:
             self.node.create_timer(0.05, lambda p=publisher, m=message: p.publish(m))
         self.node.create_timer(0.1, self._look)
 
-    def _look(self) -> None:
+    def _look(self):
         for topic, types in self.node.get_topic_names_and_types():
             if topic in self.types or topic in IGNORED or topic in self._inputs:
                 continue
@@ -140,17 +137,17 @@ class Probe:
                 lambda message, topic=topic: self._count(topic, message),
                 qos_profile_sensor_data)
 
-    def _count(self, topic: str, message: Any) -> None:
+    def _count(self, topic, message):
         self.counts[topic] += 1
         self.last[topic] = message
 
-    def spin_for(self, seconds: float, process: subprocess.Popen[Any], first: bool) -> None:
+    def spin_for(self, seconds, process, first):
         """Spin for some seconds, or until the first message; not longer than a process runs."""
         end = time.monotonic() + seconds
         while time.monotonic() < end and process.poll() is None and not (first and self.counts):
             self._executor.spin_once(0.05)
 
-    def close(self) -> None:
+    def close(self):
         """Destroy the node."""
         self._executor.shutdown()
         self.node.destroy_node()
@@ -168,7 +165,7 @@ class Run:
     said: str
 
 
-def observe(program: Program, path: list[str], hosted: bool, seconds: float) -> Run:
+def observe(program, path, hosted, seconds):
     """Run a program under one of the executors; return what it did."""
     domain = str(random.randrange(1, 40))  # the tests use those from 40 on
     os.environ['ROS_DOMAIN_ID'] = domain  # of this process's context, too
@@ -201,7 +198,7 @@ def observe(program: Program, path: list[str], hosted: bool, seconds: float) -> 
     return Run(probe.types, probe.counts, constant, end, process.returncode, said)
 
 
-def differences(theirs: Run, ours: Run) -> list[str]:
+def differences(theirs, ours):
     """Return in what two runs differ."""
     found = []
     if theirs.types != ours.types:
@@ -219,7 +216,7 @@ def differences(theirs: Run, ours: Run) -> list[str]:
     return found
 
 
-def missing(program: Program, path: list[str]) -> str:
+def missing(program, path):
     """Return why a program cannot run; '' if it can."""
     if not all(Path(folder).is_dir() for folder in path[:len(program.folders)]):
         return 'no sources'
@@ -230,7 +227,7 @@ def missing(program: Program, path: list[str]) -> str:
     return done.stderr.strip().splitlines()[-1] if done.returncode else ''
 
 
-def main() -> int:
+def main():
     """Compare the programs; return 1 if one differs."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
     parser.add_argument('sources', type=Path)

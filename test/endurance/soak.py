@@ -26,12 +26,9 @@ deadline for waits (``unjudged_sinks`` in the result: no policy keeps these), an
 the machine stopped: another process, which only sleeps, was woken more than ``STALL_S`` late.
 """
 
-from __future__ import annotations
-
 import argparse
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable
 import ctypes
 from dataclasses import asdict
 import gc
@@ -43,16 +40,13 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Any
 
-from mddag_executor.executor import DeadlineMiss
 from mddag_executor.executor.executor import MultiDeadlineExecutor
 from mddag_executor.hosting.measure import ExecutionPlan
-from msg_graph import load, TaskSet
+from msg_graph import load
 from msg_graph.model import path_lengths
 import rclpy
 from rclpy.executors import ExternalShutdownException
-from rclpy.timer import Timer
 from rclpy.utilities import try_shutdown
 from soak_nodes import SimulatedTime, SoakFault, SoakNodes
 
@@ -75,33 +69,32 @@ while True:
         print(time.time_ns(), flush=True)
 """
 
-
 class StallWatch:
     """Notes when a process that only sleeps was woken late, ns since the epoch."""
 
-    def __init__(self) -> None:
-        self.stalls: list[int] = []
+    def __init__(self):
+        self.stalls = []
         self._process = subprocess.Popen(
             [sys.executable, '-c', _SLEEPER], stdout=subprocess.PIPE, text=True)
         self._thread = threading.Thread(target=self._read, daemon=True, name='soak-stalls')
         self._thread.start()
 
-    def _read(self) -> None:
+    def _read(self):
         for line in self._process.stdout:
             self.stalls.append(int(line))
 
-    def within(self, start: int, end: int) -> bool:
+    def within(self, start, end):
         """Return whether one was noted between two times."""
         return any(start <= stall < end for stall in self.stalls)
 
-    def stop(self) -> None:
+    def stop(self):
         """End the process."""
         self._process.kill()
         self._process.wait()
         self._thread.join()
 
 
-def usage() -> dict[str, int]:
+def usage():
     """
     Return the process' memory (bytes), threads and file handles.
 
@@ -116,7 +109,7 @@ def usage() -> dict[str, int]:
         'threads': len(os.listdir('/proc/self/task')), 'handles': len(os.listdir('/proc/self/fd'))}
 
 
-def unjudged_sinks(plan: ExecutionPlan) -> list[str]:
+def unjudged_sinks(plan):
     """Return the sinks whose critical path leaves too little of their deadline for waits."""
     found = []
     for dag in plan.task_set.dags:
@@ -135,16 +128,14 @@ class Soak:
     """
 
     def __init__(
-        self, task_set: TaskSet, seconds: float, *, utilisation: float = 0.8, workers: int = 7,
-        seed: int = 0, say: Callable[[str], None] = lambda text: None,
-    ) -> None:
+            self, task_set, seconds, *, utilisation=0.8, workers=7, seed=0, say=lambda text: None):
         self._seconds = seconds
         self._say = say
         self._random = random.Random(seed)
         plan = ExecutionPlan(task_set, seed, utilisation, workers, 'sleep')
         self._unjudged = unjudged_sinks(plan)
-        self._missed: deque[DeadlineMiss] = deque()
-        self._clean_missed: list[tuple[str, DeadlineMiss]] = []
+        self._missed = deque()
+        self._clean_missed = []
         deadlines = [v.deadline_ns or 0 for v in task_set.vertices]
         self._settle_s = min(2.0, max(deadlines) / 1e9)
         self.executor = MultiDeadlineExecutor(
@@ -153,17 +144,17 @@ class Soak:
         self._simulated = SimulatedTime()
         self._stalls = StallWatch()
         self.counts = dict.fromkeys((*FAULTS, 'raised'), 0)
-        self._errors: list[str] = []
+        self._errors = []
         # start, end, and the fault before
-        self._clean: list[tuple[int, int, str]] = []
+        self._clean = []
         self._ending = False
         self._thread = threading.Thread(target=self._spin, name='soak-spin', daemon=True)
 
-    def _on_miss(self, miss: DeadlineMiss) -> None:
+    def _on_miss(self, miss):
         if miss.vertex not in self._unjudged:
             self._missed.append(miss)
 
-    def _sort_out(self) -> int:
+    def _sort_out(self):
         """Keep of the misses only those in clean windows; return how many have come to these."""
         starts = [start for start, _, _ in self._clean]
         before = len(self._clean_missed)
@@ -174,7 +165,7 @@ class Soak:
                 self._clean_missed.append((self._clean[place][2], miss))
         return len(self._clean_missed) - before
 
-    def _spin(self) -> None:
+    def _spin(self):
         while not self._ending:
             try:
                 self.executor.spin()
@@ -187,7 +178,7 @@ class Soak:
                 if len(self._errors) > 100:
                     return
 
-    def run(self) -> dict[str, Any]:
+    def run(self):
         """Run, and return the result; its ``failed`` has what should not be, one line each."""
         for node in (*self.nodes.nodes.values(), self._simulated.node):
             self.executor.add_node(node)
@@ -208,7 +199,7 @@ class Soak:
         after = usage()
         return self._end(before, after, time.monotonic() - begin)
 
-    def _misuse_once(self) -> None:
+    def _misuse_once(self):
         """
         Inject each fault once before the first measurement: the memory that it needs is kept.
 
@@ -221,7 +212,7 @@ class Soak:
         self._burst(FAULT_S, list(self.nodes.workload.timers.values()))
         time.sleep(RECOVERY_S)
 
-    def _one_fault(self) -> None:
+    def _one_fault(self):
         fault = self._random.choice(FAULTS)
         self.counts[fault] += 1
         self._inject(fault, FAULT_S)
@@ -235,15 +226,15 @@ class Soak:
         time.sleep(self._settle_s)  # the last jobs end before the next fault
         self._say(f'{fault}: {self._sort_out()} misses in the clean window')
 
-    def _has_backlog(self) -> bool:
+    def _has_backlog(self):
         """Return whether several messages wait for one callback."""
         callbacks = self.executor.statistics()['callbacks'].values()
         return any(counts['waiting'] > 1 for counts in callbacks)
 
-    def _inject(self, fault: str, seconds: float) -> None:
+    def _inject(self, fault, seconds):
         getattr(self, f'_{fault}')(seconds)
 
-    def _destroy(self, seconds: float) -> None:
+    def _destroy(self, seconds):
         name = self._random.choice(list(self.nodes.nodes))
         self.nodes.nodes[name].destroy_node()
         self.executor.remove_node(self.nodes.nodes[name])
@@ -251,18 +242,18 @@ class Soak:
         self.executor.add_node(self.nodes.make_again(name))
         time.sleep(seconds * 3 / 4)
 
-    def _raise(self, seconds: float) -> None:
+    def _raise(self, seconds):
         self.nodes.raise_next = True
         time.sleep(seconds)
 
-    def _stop(self, seconds: float) -> None:
+    def _stop(self, seconds):
         timer = self._random.choice(list(self.nodes.workload.timers.values()))
         timer.cancel()
         time.sleep(seconds)
         timer.reset()
         self.executor.wake()
 
-    def _burst(self, seconds: float, timers: list[Timer] | None = None) -> None:
+    def _burst(self, seconds, timers=None):
         timers = timers or [self._random.choice(list(self.nodes.workload.timers.values()))]
         periods = [timer.timer_period_ns for timer in timers]
         for timer, period in zip(timers, periods):
@@ -273,14 +264,12 @@ class Soak:
             timer.timer_period_ns = period
             timer.reset()
 
-    def _clock(self, seconds: float) -> None:
+    def _clock(self, seconds):
         for _ in range(4):
             self._simulated.jump(self._random.choice((-1, 1)) * self._random.randrange(10 ** 11))
             time.sleep(seconds / 4)
 
-    def _end(
-        self, before: dict[str, int], after: dict[str, int], elapsed: float
-    ) -> dict[str, Any]:
+    def _end(self, before, after, elapsed):
         ticks = self._simulated.ticks
         time.sleep(2.0)
         simulated_goes_on = self._simulated.ticks > ticks
@@ -323,9 +312,7 @@ class Soak:
         result['failed'] += self._errors
         return result
 
-    def _failures(
-        self, result: dict[str, Any], statistics: dict[str, Any], n_open: list[int]
-    ) -> list[str]:
+    def _failures(self, result, statistics, n_open):
         before, after = result['before'], result['after']
         failed = []
         growth = result['memory_growth'] = after['memory'] / before['memory'] - 1
@@ -351,11 +338,11 @@ class Soak:
         return failed
 
 
-def _sum(statistics: dict[str, Any], key: str) -> int:
+def _sum(statistics, key):
     return sum(counts[key] for counts in statistics['callbacks'].values())
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments=None):
     """Run from the command line; return 1 when something does not hold."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
     parser.add_argument('graph', help='the declaration')

@@ -2,24 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nodes of an endurance run: synthetic ones, each of them destroyed and made again."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 import threading
 
 from mddag_executor.executor import current_job
 from mddag_executor.executor.quiet_nodes import quiet_node
-from mddag_executor.hosting.measure import ExecutionPlan
 from mddag_executor.hosting.synthetic import SyntheticWorkload
-from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
-from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 
 class SoakFault(Exception):
     """What a callback raises on purpose."""
-
 
 class SoakNodes:
     """
@@ -29,7 +22,7 @@ class SoakNodes:
     counts those whose node was destroyed while they ran, so that they could not publish.
     """
 
-    def __init__(self, task_set: TaskSet, plan: ExecutionPlan) -> None:
+    def __init__(self, task_set, plan):
         self.workload = SyntheticWorkload(task_set, plan, current_job=current_job)
         self.started = 0
         self.raise_next = False
@@ -39,7 +32,7 @@ class SoakNodes:
         for node in self.workload.nodes:
             self._watch(node)
 
-    def make_again(self, name: str) -> Node:
+    def make_again(self, name):
         """Make a node that was destroyed, and start its timers."""
         node = self.nodes[name] = self.workload.make(name)
         self._watch(node)
@@ -48,11 +41,11 @@ class SoakNodes:
                 self.workload.start_timer(dag)
         return node
 
-    def _watch(self, node: Node) -> None:
+    def _watch(self, node):
         for entity in (*node.timers, *node.subscriptions):
             entity.callback = self._watched(entity.callback)
 
-    def _watched(self, callback: Callable[..., None]) -> Callable[..., None]:
+    def _watched(self, callback):
         def timer():
             run()
 
@@ -76,7 +69,7 @@ class SoakNodes:
 class SimulatedTime:
     """A node that follows simulated time, and who publishes that."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.node = quiet_node('/soak_simulated', use_sim_time=True)
         self._sender = quiet_node('/soak_clock')
         self._publisher = self._sender.create_publisher(ClockMessage, '/clock', 10)
@@ -87,21 +80,21 @@ class SimulatedTime:
         self._thread = threading.Thread(target=self._run, daemon=True, name='soak-clock')
         self._thread.start()
 
-    def _tick(self) -> None:
+    def _tick(self):
         self.ticks += 1
 
-    def _run(self) -> None:
+    def _run(self):
         while not self._ending.wait(0.02):
             self._now_ns += 20_000_000
             message = ClockMessage()
             message.clock.sec, message.clock.nanosec = divmod(self._now_ns, 1_000_000_000)
             self._publisher.publish(message)
 
-    def jump(self, nanoseconds: int) -> None:
+    def jump(self, nanoseconds):
         """Let the time jump."""
         self._now_ns = max(1_000_000_000, self._now_ns + nanoseconds)
 
-    def stop(self) -> None:
+    def stop(self):
         """End the thread and destroy both nodes."""
         self._ending.set()
         self._thread.join()

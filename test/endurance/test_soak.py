@@ -1,13 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 import subprocess
 import sys
-from typing import Any
 
 import pytest
 from soak import FAULTS, MEMORY_RATIO
@@ -15,14 +12,14 @@ from soak import FAULTS, MEMORY_RATIO
 TOP = Path(__file__).resolve().parents[2]
 
 
-def soak(*arguments: str, timeout: float = 150.0) -> dict[str, Any]:
+def soak(*arguments, timeout=150.0):
     done = subprocess.run(
         [sys.executable, '-X', 'faulthandler', 'test/endurance/soak.py', *arguments], cwd=TOP,
         text=True, capture_output=True, timeout=timeout, check=False, stdin=subprocess.DEVNULL)
     said = f'status {done.returncode}\n{done.stderr}\n{done.stdout}'
     print(said)  # pytest shows it with a failure
     assert done.stdout and 'Traceback' not in done.stderr, said
-    result: dict[str, Any] = json.loads(done.stdout)
+    result = json.loads(done.stdout)
     assert done.returncode == (1 if result['failed'] else 0), said
     return result
 

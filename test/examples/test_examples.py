@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every example runs to its end as its README says, and does what it claims."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
 import re
 import subprocess
 import sys
-from typing import Any
 
 import msg_graph
 import pytest
@@ -20,7 +17,7 @@ NAMES = sorted(path.name for path in EXAMPLES.iterdir() if path.is_dir())
 COMMAND = re.compile(r'^\| \[(\w+)\]\((\S+)\) \| `(python|sh) examples/(\S+)` \|', re.MULTILINE)
 
 
-def run(example: str, *arguments: str | Path) -> str:
+def run(example, *arguments):
     """Run an example as the README says, from elsewhere; return what it printed."""
     file = EXAMPLES / COMMANDS[example][1]
     program = [sys.executable] if file.suffix == '.py' else ['sh']
@@ -33,7 +30,7 @@ def run(example: str, *arguments: str | Path) -> str:
     return done.stdout
 
 
-def result(example: str, tmp_path: Path) -> dict[str, Any]:
+def result(example, tmp_path):
     """Run an example that is a `mddag run`; return its result."""
     run(example, '--json', tmp_path / 'result.json')
     return json.loads((tmp_path / 'result.json').read_text())

@@ -2,15 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the tests of the executor share: executors that spin in a thread of their own."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 import contextlib
 import subprocess
 import sys
 import threading
 import time
-from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
 import pytest
@@ -20,32 +16,32 @@ from rclpy.node import Node
 class Spinning:
     """An executor that spins in a thread until it is left; keeps what spin raised."""
 
-    def __init__(self, executor: MultiDeadlineExecutor) -> None:
+    def __init__(self, executor):
         self.executor = executor
-        self.error: BaseException | None = None
+        self.error = None
         self._thread = threading.Thread(target=self._run)
 
-    def _run(self) -> None:
+    def _run(self):
         try:
             self.executor.spin()
         except BaseException as error:
             self.error = error
 
-    def __enter__(self) -> Spinning:
+    def __enter__(self):
         self._thread.start()
         return self
 
-    def __exit__(self, *args: object) -> None:
+    def __exit__(self, *args):
         assert self.executor.shutdown(30.0)
         self.join()
 
-    def join(self) -> None:
+    def join(self):
         """Wait until spin has ended."""
         self._thread.join(30.0)
         assert not self._thread.is_alive(), 'spin did not end'
 
 
-def wait_for(condition: Callable[[], Any], seconds: float = 15.0) -> bool:
+def wait_for(condition, seconds=15.0):
     """Wait until something is true; return whether it became so."""
     end = time.monotonic() + seconds
     while not condition():
@@ -55,15 +51,13 @@ def wait_for(condition: Callable[[], Any], seconds: float = 15.0) -> bool:
     return True
 
 
-def is_idle(executor: MultiDeadlineExecutor) -> bool:
+def is_idle(executor):
     """Tell whether nothing runs or waits."""
     statistics = executor.statistics()
     return bool(not statistics['queue'] and statistics['idle_workers'] == statistics['workers'])
 
 
-def run_program(
-    program: str, *arguments: str, send: int | None = None, after: float = 0.0
-) -> tuple[str, str]:
+def run_program(program, *arguments, send=None, after=0.0):
     """
     Run a program in a process of its own; return its output and errors.
 
@@ -102,7 +96,7 @@ def make_executor(ros_context):
 @pytest.fixture
 def make_node(ros_context):
     """Give a function that makes nodes; they are destroyed afterwards."""
-    nodes: list[Node] = []
+    nodes = []
 
     def make(name='node', **kwargs):
         kwargs.setdefault('start_parameter_services', False)

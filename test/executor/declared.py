@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes made of a declaration, whose callbacks note what they run for."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import partial
 from inspect import iscoroutinefunction
 from itertools import count
@@ -40,15 +37,12 @@ class Declared:
     :ivar ran: the executions by the name of the callback.
     """
 
-    def __init__(
-        self, make_node: Any, text: str, bodies: dict[str, Callable[[], Any]] | None = None,
-        reentrant: bool = True,
-    ) -> None:
+    def __init__(self, make_node, text, bodies=None, reentrant=True):
         self._bodies = bodies or {}
-        self.ran: dict[str, list[Ran]] = {}
-        self.nodes: dict[str, Any] = {}
-        self.timers: list[Any] = []
-        self._publishers: list[Any] = []
+        self.ran = {}
+        self.nodes = {}
+        self.timers = []
+        self._publishers = []
         group = ReentrantCallbackGroup() if reentrant else None
         callbacks = loads(text).callbacks
         self._topics = [topic for callback in callbacks for topic in callback.topics]
@@ -69,11 +63,11 @@ class Declared:
                     each.timer_period_ns / 1e9, partial(self._tick, run, node, count()), group,
                     autostart=False))
 
-    def _tick(self, run: Callable[..., None], node: Any, numbers: count[int]) -> None:
+    def _tick(self, run, node, numbers):
         now = node.get_clock().now().to_msg()
         run('', Header(stamp=now, frame_id=str(next(numbers))))
 
-    def _callback(self, name: str, publishers: list[Any]) -> Callable[..., Any]:
+    def _callback(self, name, publishers):
         body = self._bodies.get(name)
 
         def begin(topic, message):
@@ -96,22 +90,22 @@ class Declared:
             end(message)
         return wait if iscoroutinefunction(body) else run
 
-    def jobs(self, name: str) -> list[Any]:
+    def jobs(self, name):
         """Return the jobs that a callback ran for."""
         return [each.job for each in self.ran[name]]
 
-    def jobs_of_numbers(self, name: str) -> dict[int, Any]:
+    def jobs_of_numbers(self, name):
         """Return the job of each message that a callback ran for, which ran for none twice."""
         found = {each.number: each.job for each in self.ran[name]}
         assert len(found) == len(self.ran[name])
         return found
 
-    def connected(self) -> bool:
+    def connected(self):
         """Tell whether all publishers have met their subscriptions."""
         return all(each.get_subscription_count() == self._topics.count(each.topic)
                    for each in self._publishers)
 
-    def start(self, *executors: Any) -> None:
+    def start(self, *executors):
         """Start the timers when all are connected; one executor gets all nodes."""
         if len(executors) == 1:
             for node in self.nodes.values():
@@ -122,7 +116,7 @@ class Declared:
         for executor in executors:
             executor.wake()
 
-    def cancel(self) -> None:
+    def cancel(self):
         """Let no timer start a job any more."""
         for timer in self.timers:
             timer.cancel()

@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which publication a message comes from: within a process, and over several."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
-from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -45,10 +42,7 @@ nodes:
     callbacks: [{name: sink, subscription: /end, deadline: 60s}]
 """
 
-
-def split(
-    make_executor: Any, make_node: Any, **processes: str
-) -> tuple[Declared, dict[str, Any]]:
+def split(make_executor, make_node, **processes):
     """Run JOBS jobs or more over several executors; return nodes and executors by process."""
     text = GRAPH + 'processes:\n' + ''.join(
         f'  {name}: [{", ".join("/" + node for node in nodes.split())}]\n'
@@ -141,12 +135,12 @@ nodes:
 class Bench:
     """Jobs whose publications are given, with a publisher or two."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.jobs = Jobs(msg_graph.loads(ONE_TOPIC, 'g.yaml'))
         self.topic = self.jobs.topics[TOPIC]
         self.publishers = [PublisherState(TOPIC), PublisherState(TOPIC)]
 
-    def published(self, begin: int, end: int | None, job: int, publisher: int = 0) -> None:
+    def published(self, begin, end, job, publisher=0):
         state = self.publishers[publisher]
         state.count += 1
         publication = Publication(begin, state.numbers, Origin(0, 0, job, publisher), state.count)
@@ -154,7 +148,7 @@ class Bench:
         if end is not None:
             publication.end = end
 
-    def job(self, stamp: int, sequence: int | None = None) -> Any:
+    def job(self, stamp, sequence=None):
         origin = self.jobs.find(TOPIC, stamp, sequence)
         return None if origin is None else origin.job
 
@@ -220,13 +214,12 @@ def test_it_never_guesses(steps, data):
 # --- publications of other processes -------------------------------------------------------------
 
 
-def announced(bench: Bench, begin: int, end: int, number: int, sequence: int,
-              publisher: PublisherNumbers) -> None:
+def announced(bench, begin, end, number, sequence, publisher):
     bench.jobs.take_in(TOPIC, Publication(
         begin, publisher, Announced((1, number), 0, 0, 0), sequence, end))
 
 
-def number(bench: Bench, stamp: int, sequence: int | None = None) -> int | None:
+def number(bench, stamp, sequence=None):
     found = bench.jobs.find(TOPIC, stamp, sequence, counted=False)
     return found.name[1] if isinstance(found, Announced) else None
 
@@ -242,7 +235,7 @@ def test_a_publication_here_and_one_elsewhere_at_once_are_a_doubt_if_their_numbe
 
 def test_publications_that_overlap_are_announced_together_when_all_have_returned():
     bench = Bench()
-    announced_to: list[list[int]] = []
+    announced_to = []
     bench.jobs.announce = lambda send, topic, several: announced_to.append(
         [each.origin.job for each in several])
     bench.jobs.announce_on({TOPIC})

@@ -6,8 +6,6 @@ What users have asked rclpy and rclcpp for, by issue, as far as no other test he
 Overruns of timers, exceptions of tasks, shutdown from a callback.
 """
 
-from __future__ import annotations
-
 import time
 
 from mddag_executor.executor import current_job
@@ -30,7 +28,7 @@ nodes:
     callbacks: [{name: tick, timer: 20ms, dag: alone, deadline: 20ms}]
 """)
     node = make_node('source')
-    releases: list[int] = []
+    releases = []
 
     def tick():
         job = current_job()
@@ -51,11 +49,11 @@ nodes:
     assert executor.statistics()['dags']['alone']['jobs'] >= jobs
 
 
-def fails() -> None:
+def fails():
     raise KeyError('handled')
 
 
-async def fails_later() -> None:
+async def fails_later():
     fails()
 
 
@@ -99,7 +97,7 @@ def test_shutdown_from_inside_a_callback(make_executor, make_node, ros_context, 
     """It hangs in rclpy: rclpy#944, and #1646 of an executor's own shutdown."""
     node = make_node()
     executor = make_executor(nodes=[node])
-    calls: list[int] = []
+    calls = []
 
     def end():
         calls.append(1)

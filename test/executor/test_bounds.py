@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is bounded: descriptors, threads, what waits in Python, and what an idle executor does."""
 
-from __future__ import annotations
-
 import threading
-from typing import Any
 
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.sources import SERVICE_DEPTH
@@ -68,7 +65,6 @@ thread.join()
 rclpy.shutdown()
 """
 
-
 def test_many_subscriptions_share_few_descriptors():
     """300 of them, and no more than 256 files."""
     assert run_program(MANY)[0] == "True True ['late']\n"
@@ -77,13 +73,13 @@ def test_many_subscriptions_share_few_descriptors():
 # --- what waits ----------------------------------------------------------------------------------
 
 
-def waiting(executor: Any) -> int:
+def waiting(executor):
     return executor.statistics()['queue']
 
 
 def test_few_requests_wait_in_python_and_none_is_lost(make_executor, make_node):
     node, go_on, answered = make_node(), threading.Event(), []
-    most: list[int] = []
+    most = []
     executor = make_executor(num_workers=2)
 
     def answer(request, response):
@@ -119,8 +115,8 @@ def test_few_messages_of_keep_all_wait_in_python_and_none_is_lost(
         monkeypatch.setattr(
             'mddag_executor.executor.publishing.replace_delivery', lambda *args: None)
     node, go_on = make_node(), threading.Event()
-    got: list[int] = []
-    most: list[int] = []
+    got = []
+    most = []
     executor = make_executor(num_workers=1)
 
     def hear(message):
@@ -150,7 +146,7 @@ def test_few_messages_of_keep_all_wait_in_python_and_none_is_lost(
 # --- threads -------------------------------------------------------------------------------------
 
 
-def worker_threads() -> int:
+def worker_threads():
     return sum(thread.name.startswith('mddag-worker') for thread in threading.enumerate())
 
 

@@ -6,13 +6,9 @@ Entities of all kinds come and go in several threads, and nodes move between two
 What stays loses nothing meanwhile, and no spin ends.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
 import random
 import threading
 import time
-from typing import Any
 
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -28,11 +24,11 @@ SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 SECONDS = 3.0
 
 
-def nothing(*_: Any) -> None:
+def nothing(*_):
     pass
 
 
-def new_entity(node: Any, draw: random.Random) -> Callable[[], Any]:
+def new_entity(node, draw):
     """Make an entity of any kind; return what destroys it."""
     group = draw.choice([None, ReentrantCallbackGroup(), MutuallyExclusiveCallbackGroup()])
     kind, topic = draw.randrange(6), f'/topic{draw.randrange(6)}'
@@ -62,13 +58,13 @@ def new_entity(node: Any, draw: random.Random) -> Callable[[], Any]:
 class Churn(threading.Thread):
     """Makes and destroys entities of a node, and moves it between executors."""
 
-    def __init__(self, node: Any, executors: Any, moving: threading.Lock, seed: int) -> None:
+    def __init__(self, node, executors, moving, seed):
         super().__init__()
-        self.error: BaseException | None = None
+        self.error = None
         self._node, self._executors, self._moving = node, executors, moving
         self._draw = random.Random(seed)
 
-    def run(self) -> None:
+    def run(self):
         draw, present = self._draw, []
         end = time.monotonic() + SECONDS
         try:
@@ -89,8 +85,8 @@ class Churn(threading.Thread):
 def test_entities_come_and_go_in_several_threads(make_executor, make_node, seed):
     executors = [make_executor(num_workers=7), make_executor(num_workers=2)]
     stable = [make_node('here'), make_node('there')]
-    heard: list[list[int]] = [[], []]
-    answers: list[Any] = []
+    heard = [[], []]
+    answers = []
     publishers, clients = [], []
     for number, node in enumerate(stable):
         node.create_subscription(

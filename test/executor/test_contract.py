@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What rclpy promises of executors: spins, several executors, contexts and processes."""
 
-from __future__ import annotations
-
 import multiprocessing
 import signal
 import threading
 import time
-from typing import Any
 
 import pytest
 import rclpy
@@ -23,14 +20,14 @@ from std_srvs.srv import Trigger
 from .conftest import is_idle, run_program, Spinning, wait_for
 
 
-def counting(node: Node, period: float = 0.005) -> list[int]:
+def counting(node, period=0.005):
     """Give a node a timer; return what grows with its calls."""
-    calls: list[int] = []
+    calls = []
     node.create_timer(period, lambda: calls.append(threading.get_native_id()))
     return calls
 
 
-def goes_on(calls: list[int]) -> bool:
+def goes_on(calls):
     before = len(calls)
     return wait_for(lambda: len(calls) >= before + 3)
 
@@ -50,7 +47,7 @@ def test_rclpy_spin_as_the_global_executor(as_global, make_node, ros_context):
     """And on all workers, as with ``executor.spin()``."""
     node, together = make_node(), threading.Barrier(3)
     group = ReentrantCallbackGroup()
-    met: list[int] = []
+    met = []
 
     def meet():
         if not met:
@@ -131,7 +128,7 @@ def test_several_contexts_in_one_process(make_executor, make_node, ros_context):
     first = make_executor()
     first.add_node(near)
     second.add_node(far)
-    heard: list[Header] = []
+    heard = []
     near.create_subscription(Header, '/across', heard.append, 10)
     publisher = far.create_publisher(Header, '/across', 10)
     with Spinning(first) as spinning:
@@ -180,7 +177,6 @@ thread.join()
 print(sorted(ends))
 """
 
-
 def test_a_signal_ends_the_executors_of_all_contexts():
     out, err = run_program(CONTEXTS, send=signal.SIGINT)
     assert out in (
@@ -201,7 +197,7 @@ def test_one_of_rclpys_executors_in_the_same_process(make_executor, make_node, r
     here, there, done = make_node('here'), make_node('there'), threading.Event()
     to_there = here.create_publisher(Header, '/to_there', DEPTH)
     to_here = there.create_publisher(Header, '/to_here', DEPTH)
-    got: list[int] = []
+    got = []
 
     def back(message):
         got.append(message.stamp.sec)
@@ -225,7 +221,7 @@ def test_a_node_moves_between_executors_that_spin(make_executor, make_node):
     """Nothing that was published is heard twice, and what is published after the move is heard."""
     node, source, heard = make_node(), make_node('source'), []
     node.create_subscription(Header, '/a', lambda m: heard.append(m.stamp.sec), DEPTH)
-    ticks: list[int] = []
+    ticks = []
     node.create_timer(0.001, lambda: ticks.append(1))
     publisher = source.create_publisher(Header, '/a', DEPTH)
     executors = [make_executor(num_workers=2) for _ in range(2)]
@@ -250,12 +246,12 @@ def test_a_node_moves_between_executors_that_spin(make_executor, make_node):
 # --- fork ----------------------------------------------------------------------------------------
 
 
-def wait_until_told(connection: Any) -> None:
+def wait_until_told(connection):
     connection.send('here')
     connection.recv()
 
 
-def raise_in_the_child() -> None:
+def raise_in_the_child():
     raise SystemExit(3)
 
 

@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What rclpy's executors promise: lifecycle nodes, QoS events, parameters, what callbacks make."""
 
-from __future__ import annotations
-
 import threading
 import time
-from typing import Any
 
 from mddag_executor.executor import waitables
 import pytest
@@ -32,25 +29,25 @@ def test_a_lifecycle_node_goes_through_its_transitions(make_executor, make_node,
     lifecycle = pytest.importorskip('rclpy.lifecycle', reason='lifecycle_msgs is not installed')
     from lifecycle_msgs.msg import Transition
     from lifecycle_msgs.srv import ChangeState, GetState
-    seen: list[str] = []
+    seen = []
 
     class Managed(lifecycle.LifecycleNode):
 
-        def on_configure(self, state: Any) -> Any:
+        def on_configure(self, state):
             self.publisher = self.create_lifecycle_publisher(Header, '/managed', 10)
             self.timer = self.create_timer(0.005, lambda: self.publisher.publish(Header()))
             seen.append('configure')
             return super().on_configure(state)
 
-        def on_activate(self, state: Any) -> Any:
+        def on_activate(self, state):
             seen.append('activate')
             return super().on_activate(state)
 
-        def on_deactivate(self, state: Any) -> Any:
+        def on_deactivate(self, state):
             seen.append('deactivate')
             return super().on_deactivate(state)
 
-        def on_cleanup(self, state: Any) -> Any:
+        def on_cleanup(self, state):
             self.destroy_timer(self.timer)
             self.destroy_publisher(self.publisher)
             seen.append('cleanup')
@@ -60,7 +57,7 @@ def test_a_lifecycle_node_goes_through_its_transitions(make_executor, make_node,
     other = make_node('manager')
     change = other.create_client(ChangeState, '/managed/change_state')
     state = other.create_client(GetState, '/managed/get_state')
-    heard: list[Header] = []
+    heard = []
     other.create_subscription(Header, '/managed', heard.append, 10)
     executor = make_executor(nodes=[managed, other])
 
@@ -91,7 +88,7 @@ def test_a_lifecycle_node_goes_through_its_transitions(make_executor, make_node,
 def test_qos_events_reach_their_callbacks(make_executor, make_node):
     """Deadline missed and liveliness lost, on both sides, in a worker."""
     node = make_node()
-    got: dict[str, list[Any]] = {
+    got = {
         'requested': [], 'offered': [], 'changed': [], 'lost': []}
     qos = QoSProfile(
         depth=10, deadline=Duration(seconds=0.1), liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
@@ -118,7 +115,7 @@ def test_parameters_through_another_node_of_the_same_executor(make_executor, mak
     node, other = make_node('server', start_parameter_services=True), make_node('asker')
     node.declare_parameter('speed', 3)
     node.declare_parameter('name', 'first')
-    told: list[str] = []
+    told = []
     node.add_post_set_parameters_callback(lambda given: told.extend(p.name for p in given))
     client = AsyncParameterClient(other, 'server', callback_group=ReentrantCallbackGroup())
     executor = make_executor(nodes=[node, other])
@@ -149,10 +146,10 @@ def test_parameters_through_another_node_of_the_same_executor(make_executor, mak
 def test_entities_that_a_callback_makes_run(make_executor, make_node):
     """Entities of each kind, made in a worker, and a node."""
     node = make_node()
-    ran: dict[str, list[Any]] = {name: [] for name in (
+    ran = {name: [] for name in (
         'timer', 'message', 'request', 'response', 'guard', 'result', 'node')}
     executor = make_executor(nodes=[node])
-    kept: list[Any] = []
+    kept = []
     group = ReentrantCallbackGroup()
 
     def answer(request, response):
@@ -173,7 +170,7 @@ def test_entities_that_a_callback_makes_run(make_executor, make_node):
         ran['result'].append(await goal.get_result_async())
 
     async def pause():
-        future: Future = Future(executor=executor)
+        future = Future(executor=executor)
         timer = node.create_timer(0.005, lambda: future.set_result(None), group)
         await future
         node.destroy_timer(timer)
@@ -239,7 +236,7 @@ def test_a_callback_may_destroy_what_it_belongs_to(make_executor, make_node):
     with Spinning(executor) as spinning:
         for _ in range(10):
             node = make_node()
-            calls: list[str] = []
+            calls = []
 
             def heard(_, node=node, calls=calls):
                 calls.append('message')

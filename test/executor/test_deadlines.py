@@ -2,14 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declared DAGs on real rclpy nodes: which job, in which order, judged how, recorded how."""
 
-from __future__ import annotations
-
 from collections import Counter
 import subprocess
 import sys
 import threading
 import time
-from typing import Any
 
 from mddag_executor.executor import current_job
 from mddag_executor.executor.work import Work
@@ -34,9 +31,8 @@ nodes:
     callbacks: [{name: last, subscription: /b, deadline: 50ms}]
 """
 
-
-def sinks(executor: Any) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+def sinks(executor):
+    found = {}
     for dag in executor.statistics()['dags'].values():
         found.update(dag['sinks'])
     return found
@@ -199,7 +195,7 @@ nodes:
 def test_ready_callbacks_run_in_the_policys_order(make_executor, make_node, policy, expected):
     """One worker is kept busy until all three are ready; gedf knows but one deadline a DAG."""
     source, racer = make_node('source'), make_node('racer')
-    ran: list[str] = []
+    ran = []
     group = ReentrantCallbackGroup()
     publishers = [source.create_publisher(Header, f'/{name}', 10) for name in 'cab']
 
@@ -221,7 +217,7 @@ def test_ready_callbacks_run_in_the_policys_order(make_executor, make_node, poli
     assert ''.join(ran) == expected
 
 
-def tick_as_timer(executor: Any, timer: Any, tick: Any) -> None:
+def tick_as_timer(executor, timer, tick):
     """Have the engine told that the timer is due, instead of waiting ten seconds."""
     entity = executor._registry.by_id[id(timer)]
     executor._pool.report(

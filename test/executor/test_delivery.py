@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages between callbacks of one process: taken by who publishes, and none is lost."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading
 import time
-from typing import Any
 
 from mddag_executor.executor import compat
 import pytest
@@ -20,14 +17,14 @@ from std_msgs.msg import Header
 from .conftest import Spinning, wait_for
 
 
-def in_a_thread(function: Any, *args: Any) -> None:
+def in_a_thread(function, *args):
     """Call something in a thread of its own, and wait for its end."""
     thread = threading.Thread(target=function, args=args)
     thread.start()
     thread.join()
 
 
-def sees_all(publisher: Any, count: int = 1) -> bool:
+def sees_all(publisher, count=1):
     return wait_for(lambda: publisher.get_subscription_count() == count)
 
 
@@ -96,7 +93,6 @@ publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=10))
 rclpy.shutdown()
 """
 
-
 def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
         make_executor, make_node):
     node, got = make_node('here'), []
@@ -122,7 +118,7 @@ def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
 
 def test_nothing_is_lost_while_publishers_come_and_go(make_executor, make_node):
     node, other = make_node('here'), make_node('elsewhere')
-    got: list[int] = []
+    got = []
     node.create_subscription(Header, '/a', lambda m: got.append(int(m.frame_id)), 5000)
     publisher = node.create_publisher(Header, '/a', 5000)
     executor = make_executor(nodes=[node])

@@ -1,12 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 
-from __future__ import annotations
-
 import os
 import time
 from types import NoneType, UnionType
-from typing import Any, get_args, get_origin, get_type_hints, is_typeddict, Union
+from typing import get_args, get_origin, get_type_hints, is_typeddict, Union
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mddag_executor import MultiDeadlineExecutor
@@ -32,7 +30,7 @@ SECOND = 1_000_000_000
 class Watched:
     """Diagnostics of a live run, and the types of its statistics."""
 
-    def __init__(self, **thresholds: Any) -> None:
+    def __init__(self, **thresholds):
         task_set = loads(CHAIN)
         tables = Tables.build(task_set)
         self.tally = Tally(task_set, tables)
@@ -43,7 +41,7 @@ class Watched:
         self.watch = DagWatch(
             self.tally, task_set.dags[0], Thresholds(**thresholds), SECOND, self.in_stops)
 
-    def after(self, in_time: int = 0, late: int = 0, expired: int = 0) -> Any:
+    def after(self, in_time=0, late=0, expired=0):
         for kind, count, response in (
             (SINK_IN_TIME, in_time, 20_000_000), (SINK_LATE, late, 60_000_000),
             (SINK_EXPIRED, expired, -1),
@@ -98,18 +96,18 @@ def test_thresholds_that_make_no_sense(wrong):
 class Listener:
     """Keeps the newest status by name, from an executor of its own."""
 
-    def __init__(self, make_node: Any, make_executor: Any) -> None:
-        self.statuses: dict[str, Any] = {}
-        self.stamps: list[float] = []
+    def __init__(self, make_node, make_executor):
+        self.statuses = {}
+        self.stamps = []
         self.node = make_node('listener')
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_array, 10)
         self.executor = make_executor(nodes=[self.node])
 
-    def _on_array(self, message: Any) -> None:
+    def _on_array(self, message):
         self.stamps.append(message.header.stamp.sec + message.header.stamp.nanosec / 1e9)
         self.statuses = {status.name: status for status in message.status}
 
-    def level(self, name: str) -> Any:
+    def level(self, name):
         return self.statuses[name].level if name in self.statuses else None
 
 
@@ -120,7 +118,7 @@ ELSEWHERE = """
 """
 
 
-def values(status: Any) -> dict[str, str]:
+def values(status):
     return {pair.key: pair.value for pair in status.values}
 
 
@@ -173,7 +171,7 @@ nodes:
 """
 
 
-def check(value: Any, hint: Any, place: str) -> None:
+def check(value, hint, place):
     """Find out whether a value has the type that is declared, no key missing or more."""
     if is_typeddict(hint):
         hints = get_type_hints(hint)

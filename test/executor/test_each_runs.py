@@ -2,11 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Of many callbacks none is lost and none runs twice, whatever starts them."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 from builtin_interfaces.msg import Time
 import pytest
 from rclpy.task import Future
@@ -19,14 +14,13 @@ from .pulse import Pulse
 MANY = 60
 """More than twice twenty: every twentieth that is lost shows."""
 
-
-def of_tasks(executor: Any, node: Any, call: Callable[[int], None]) -> None:
+def of_tasks(executor, node, call):
     for number in range(MANY):
         executor.create_task(call, number)
 
 
-def of_coroutines(executor: Any, node: Any, call: Callable[[int], None]) -> None:
-    waiting: list[int] = []
+def of_coroutines(executor, node, call):
+    waiting = []
 
     async def work(number):
         waiting.append(number)
@@ -40,7 +34,7 @@ def of_coroutines(executor: Any, node: Any, call: Callable[[int], None]) -> None
         future.set_result(number)
 
 
-def of_subscriptions(executor: Any, node: Any, call: Callable[[int], None]) -> None:
+def of_subscriptions(executor, node, call):
     node.create_subscription(Header, '/topic', lambda m: call(m.stamp.sec), MANY)
     publisher = node.create_publisher(Header, '/topic', MANY)
     assert wait_for(lambda: publisher.get_subscription_count() == 1)
@@ -48,7 +42,7 @@ def of_subscriptions(executor: Any, node: Any, call: Callable[[int], None]) -> N
         publisher.publish(Header(stamp=Time(sec=number)))
 
 
-def of_services(executor: Any, node: Any, call: Callable[[int], None]) -> None:
+def of_services(executor, node, call):
     numbers = iter(range(MANY))
 
     def answer(request, response):
@@ -63,11 +57,11 @@ def of_services(executor: Any, node: Any, call: Callable[[int], None]) -> None:
         assert wait_for(future.done, 6.0)
 
 
-def of_guards(executor: Any, node: Any, call: Callable[[int], None]) -> None:
+def of_guards(executor, node, call):
     one_by_one(lambda ran: node.create_guard_condition(ran).trigger, call)
 
 
-def of_waitables(executor: Any, node: Any, call: Callable[[int], None]) -> None:
+def of_waitables(executor, node, call):
     def make(ran):
         async def execute(data):
             ran()
@@ -78,11 +72,9 @@ def of_waitables(executor: Any, node: Any, call: Callable[[int], None]) -> None:
     one_by_one(make, call)
 
 
-def one_by_one(
-    make: Callable[[Callable[[], None]], Callable[[], None]], call: Callable[[int], None]
-) -> None:
+def one_by_one(make, call):
     """Trigger what ``make`` makes of a callback, and again when that has run."""
-    done: list[int] = []
+    done = []
 
     def ran():
         call(len(done))
@@ -99,7 +91,7 @@ def one_by_one(
 def test_each_of_many_runs_once(make_executor, make_node, start):
     node = make_node()
     executor = make_executor(nodes=[node])
-    calls: list[int] = []
+    calls = []
     with Spinning(executor) as spinning:
         start(executor, node, calls.append)
         wait_for(lambda: len(calls) >= MANY, 6.0)

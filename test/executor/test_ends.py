@@ -2,16 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contexts that end, signals, and programs that end while an executor spins: the spin ends."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 import contextlib
 import itertools
 import signal
 import sys
 import threading
 import time
-from typing import Any
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor.shutdown import call_at_shutdown
@@ -30,7 +26,7 @@ from std_msgs.msg import Empty
 
 from .conftest import run_program
 
-ENDS: dict[str, Callable[[Context], Any]] = {
+ENDS = {
     'shutdown': Context.try_shutdown, 'destroy': Context.destroy,
     'both': lambda context: (context.try_shutdown(), context.destroy())}
 
@@ -39,13 +35,13 @@ ENDS: dict[str, Callable[[Context], Any]] = {
 @pytest.mark.parametrize('end', ENDS)
 @pytest.mark.parametrize('way', ['spin', 'steps'])
 def test_spin_ends_with_its_context(way, end, inside, no_thread_leak, monkeypatch):
-    in_threads: list[Any] = []
+    in_threads = []
     monkeypatch.setattr(threading, 'excepthook', in_threads.append)
     context = Context()
     rclpy.init(context=context)
     node = Node('node', context=context)
     node.create_subscription(Empty, '/topic', lambda m: None, 10)
-    errors: list[BaseException] = []
+    errors = []
     ran = threading.Event()
 
     def callback():
@@ -118,10 +114,10 @@ def test_no_interrupt_gets_lost_where_something_of_a_context_dies(ros_context, m
     """A KeyboardInterrupt in the Python code of a weak reference is printed and forgotten."""
     class Thing:
 
-        def wake(self) -> None:
+        def wake(self):
             pass
 
-    lost: list[Any] = []
+    lost = []
     monkeypatch.setattr(sys, 'unraisablehook', lost.append)
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
     interrupts = 0
@@ -181,7 +177,7 @@ SPIN = 'executor.spin()'
 STEPS = 'while rclpy.ok(): executor.spin_once(timeout_sec=0.005)'
 
 
-def run(**parts: str) -> None:
+def run(**parts):
     out, err = run_program(PROGRAM.format(**{'callback': 'sleep', 'end': '', **parts}))
     assert out.splitlines()[-1] == 'end'
     expected = 'cannot keep its rate', 'use of fork() may lead to deadlocks'
@@ -236,7 +232,6 @@ except (KeyboardInterrupt, ExternalShutdownException) as end:
 executor.shutdown()
 print([t.name for t in threading.enumerate() if t.name.startswith('mddag')])
 """
-
 
 @pytest.mark.parametrize(('number', 'spin'), [
     (signal.SIGTERM, 'executor.spin()'), (signal.SIGINT, 'rclpy.spin(node, executor)')])

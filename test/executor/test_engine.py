@@ -2,11 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine by itself, without threads and clocks; its invariants, each broken once."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER, POLICIES
@@ -17,17 +12,17 @@ from mddag_executor.executor.entity import Entity, SUBSCRIPTION
 from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.jobs import Origin
 from mddag_executor.executor.work import Work
-from msg_graph import loads, TaskSet
+from msg_graph import loads
 import pytest
 
-from ..core.task_sets import Case, cases, Event, examples, TICK
+from ..core.task_sets import Case, cases, examples, TICK
 from .conftest import Spinning, wait_for
 
 HORIZON = 60
 PLAIN = tuple(name for name, policy in POLICIES.items() if not policy.polling)
 
 
-def entity_of(engine: Engine, task_set: TaskSet, dag: int, index: int) -> Entity:
+def entity_of(engine, task_set, dag, index):
     """Return an entity that one vertex is bound to, with one leg for all of its messages."""
     vertex = task_set.dags[dag].vertices[index]
     entity = Entity('waitable', None, vertex.callback.node, vertex.callback, -1, 0, '')
@@ -41,7 +36,7 @@ def entity_of(engine: Engine, task_set: TaskSet, dag: int, index: int) -> Entity
 class Driver:
     """Plays a case as the pool would: virtual time, and executions of the case's lengths."""
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case):
         self.case = case
         self.engine = Engine(
             case.task_set, case.workers, case.policy, default_deadline=1,
@@ -51,15 +46,15 @@ class Driver:
             self.tables.first_vertex[dag.index] + vertex.index:
             entity_of(self.engine, case.task_set, dag.index, vertex.index)
             for dag in case.task_set.dags for vertex in dag.vertices}
-        self.running: dict[int, tuple[int, Work]] = {}
-        self.log: list[Event] = []
+        self.running = {}
+        self.log = []
 
-    def note(self, now: int, kind: str, work: Work) -> None:
+    def note(self, now, kind, work):
         _, dag, job, vertex = work.origin
         self.log.append(
             (now // TICK, kind, work.worker, dag, self.tables.index_in_dag[vertex], job))
 
-    def run(self) -> None:
+    def run(self):
         load = self.case.load(HORIZON)
         releases = list(zip(load.times, load.dags))
         for now in range(0, HORIZON * TICK + 1, TICK):
@@ -77,7 +72,7 @@ class Driver:
                 self.running[work.worker] = now + ticks * TICK, work
             self.engine.validate()
 
-    def complete(self, work: Work, now: int) -> None:
+    def complete(self, work, now):
         self.note(now, 'end', work)
         slot, dag, job, vertex = work.origin
         self.engine.finished(work, now, now, now, 0, work.worker)
@@ -184,9 +179,9 @@ def test_nothing_waits_that_may_run_during_a_computing_callback(steps):
     entities = [Entity('waitable', None, '/n', None, -1, 0, '') for _ in range(2)]
     for holds, entity in enumerate(entities):
         entity.habit = GilHabit(bool(holds))
-    running: dict[int, Work] = {}
+    running = {}
     for now, step in enumerate(steps):
-        begun: list[Work | None] = []
+        begun = []
         if isinstance(step, bool):
             engine.ready(Work(entities[step], print), now)
             begun.append(engine.dispatch(0, now))
@@ -210,11 +205,10 @@ nodes:
     callbacks: [{name: tick, timer: 10ms, deadline: 10ms}]
 """
 
-
 class Twin:
     """An engine with entities of several kinds, each work of which has a number."""
 
-    def __init__(self, policy: str) -> None:
+    def __init__(self, policy):
         self.engine = Engine(
             loads(GRAPH), 2, policy, default_deadline=10 ** 9, max_active_jobs=NEVER,
             expire_after=NEVER)
@@ -227,11 +221,11 @@ class Twin:
             entity.wall_ns = 0
         self.entities[0].wall_ns = 10 ** 6
         self.entities[4].source = 0
-        self.running: list[Work] = []
-        self.suspended: list[Work] = []
+        self.running = []
+        self.suspended = []
         self.count = 0
 
-    def do(self, step: str, which: int, now: int) -> tuple[Any, ...]:
+    def do(self, step, which, now):
         """Carry out one step; return what can be seen of it."""
         engine, entity, started = self.engine, self.entities[which], None
         if step == 'ready':
@@ -281,7 +275,7 @@ def test_what_bypasses_the_core_runs_as_the_core_would_run_it(policy, steps):
         assert seen[0] == seen[1], step
 
 
-def busy_engine() -> Engine:
+def busy_engine():
     """
     Return an engine in which something of each kind is under way.
 
@@ -321,20 +315,20 @@ def busy_engine() -> Engine:
     return engine
 
 
-def count(engine: Engine, column: int) -> None:
+def count(engine, column):
     engine._state.scalars[column] += 1
 
 
-def running(engine: Engine) -> int:
+def running(engine):
     """Return an execution of the group that runs."""
     return engine._state.group_owner[0]
 
 
-def set_state(engine: Engine, x: int, state: int) -> None:
+def set_state(engine, x, state):
     engine._state.x_state[x] = state
 
 
-BREAKS: dict[str, tuple[str, Callable[[Engine], Any]]] = {
+BREAKS = {
     'lost': ('in no queue', lambda e: e._state.held_back.pop()),
     'wrong group': ('waits for group', lambda e: e._state.x_group.__setitem__(
         e._state.group_heap[0][0][4], -1)),

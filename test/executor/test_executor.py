@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executor against real rclpy: each kind of callback, tasks, groups, queues, arguments."""
 
-from __future__ import annotations
-
 import threading
 import time
-from typing import Any
 
 from builtin_interfaces.msg import Time
 from mddag_executor import MultiDeadlineExecutor
@@ -21,7 +18,7 @@ from std_srvs.srv import Trigger
 from .conftest import Spinning, wait_for
 
 
-def publish_when_matched(publisher: Any, message: Any, count: int = 1) -> None:
+def publish_when_matched(publisher, message, count=1):
     assert wait_for(lambda: publisher.get_subscription_count() > 0)
     for _ in range(count):
         publisher.publish(message)
@@ -29,7 +26,7 @@ def publish_when_matched(publisher: Any, message: Any, count: int = 1) -> None:
 
 def test_subscriptions_of_each_kind(make_executor, make_node):
     node = make_node()
-    got: dict[str, list[Any]] = {'plain': [], 'info': [], 'raw': [], 'async': []}
+    got = {'plain': [], 'info': [], 'raw': [], 'async': []}
 
     async def coroutine(message):
         got['async'].append(message.frame_id)
@@ -136,7 +133,7 @@ def test_tasks_functions_coroutines_and_futures_across_them(make_executor):
 
 def test_tasks_and_nodes_wake_an_idle_executor(make_executor, make_node):
     executor = make_executor()
-    calls: list[int] = []
+    calls = []
     with Spinning(executor):
         time.sleep(0.2)
         assert wait_for(executor.create_task(lambda: None).done)
@@ -152,7 +149,7 @@ def test_tasks_and_nodes_wake_an_idle_executor(make_executor, make_node):
         assert wait_for(lambda: stays(calls))
 
 
-def stays(calls: list[Any]) -> bool:
+def stays(calls):
     before = len(calls)
     time.sleep(0.05)
     return len(calls) == before
@@ -179,7 +176,7 @@ def test_a_node_destroyed_while_it_spins_and_one_made_instead(make_executor, mak
     total = 0
     with Spinning(executor) as spinning:
         for _ in range(8):
-            calls: list[int] = []
+            calls = []
             node = make_node()
             node.create_timer(0.001, lambda some=calls: some.append(1))
             executor.add_node(node)

@@ -2,12 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Callbacks that raise did not deliver: their jobs end as failed, live and in every replay."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
-from mddag_executor import DeadlineMiss
 from mddag_executor.executor import current_job
 from mddag_executor.replay import replay, reschedule
 from msg_graph import loads
@@ -21,14 +15,13 @@ from .test_deadlines import CHAIN, sinks
 class Wrong(Exception):
     """What the callbacks of these tests raise."""
 
-
-def odd_jobs_raise() -> None:
+def odd_jobs_raise():
     job = current_job()
     if job.job % 2:
         raise Wrong(job.job)
 
 
-def spin_until(executor: Any, condition: Any) -> list[int]:
+def spin_until(executor, condition):
     """Spin until something is true; return the jobs of which spin raised an exception."""
     caught = []
 
@@ -43,7 +36,7 @@ def spin_until(executor: Any, condition: Any) -> list[int]:
     return caught
 
 
-def agrees(trace: Path, statistics: dict[str, Any]) -> None:
+def agrees(trace, statistics):
     """Compare the verdicts of the executor with those of its trace, also rescheduled."""
     recorded = replay(trace)
     assert recorded.warnings == []
@@ -60,7 +53,7 @@ def agrees(trace: Path, statistics: dict[str, Any]) -> None:
 
 
 def test_the_job_of_a_callback_that_raises_has_failed(make_executor, make_node, tmp_path):
-    misses: list[DeadlineMiss] = []
+    misses = []
     chain = Declared(make_node, CHAIN, {'relay': odd_jobs_raise})
     trace = tmp_path / 'run.mcap'
     graph = CHAIN.replace('50ms', '5s').replace('10ms', '5s')
@@ -92,7 +85,7 @@ def test_what_had_been_published_before_still_runs(make_executor, make_node, tmp
     """The source raises after it has published: its messages are received, and not judged."""
     node, sink = make_node('source'), make_node('sink')
     publisher = node.create_publisher(Header, '/a', 10)
-    came: list[int] = []
+    came = []
 
     def tick():
         job = current_job()
@@ -150,7 +143,7 @@ def test_a_listener_may_handle_exceptions_of_callbacks(make_executor, make_node)
 
 def test_a_coroutine_that_raises_after_it_has_waited(make_executor, make_node):
     node = make_node('source')
-    ran: list[int] = []
+    ran = []
 
     async def tick():
         job = current_job()

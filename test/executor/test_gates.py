@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Callback groups of a user's own class are asked, as rclpy's executors do."""
 
-from __future__ import annotations
-
 import threading
-from typing import Any
 
 import pytest
 from rclpy.callback_groups import CallbackGroup
@@ -18,18 +15,18 @@ from .conftest import Spinning, wait_for
 class Tokens(CallbackGroup):
     """Lets so many callbacks run as it has tokens, and notes what it is asked and told."""
 
-    def __init__(self, tokens: int = 0) -> None:
+    def __init__(self, tokens=0):
         super().__init__()
         self.lock = threading.Lock()
         self.tokens = tokens
         self.asked = self.running = self.most = self.begun = self.ended = 0
 
-    def can_execute(self, entity: Any) -> bool:
+    def can_execute(self, entity):
         with self.lock:
             self.asked += 1
             return self.tokens > 0
 
-    def beginning_execution(self, entity: Any) -> bool:
+    def beginning_execution(self, entity):
         with self.lock:
             if self.tokens == 0:
                 return False
@@ -39,12 +36,12 @@ class Tokens(CallbackGroup):
             self.most = max(self.most, self.running)
             return True
 
-    def ending_execution(self, entity: Any) -> None:
+    def ending_execution(self, entity):
         with self.lock:
             self.ended += 1
             self.running -= 1
 
-    def give(self, tokens: int = 1) -> None:
+    def give(self, tokens=1):
         with self.lock:
             self.tokens += tokens
 
@@ -52,7 +49,7 @@ class Tokens(CallbackGroup):
 class AtMost(Tokens):
     """Gives back the token of what ends: at most so many run at once."""
 
-    def ending_execution(self, entity: Any) -> None:
+    def ending_execution(self, entity):
         super().ending_execution(entity)
         self.give()
 

@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Callbacks that hold the GIL: one at a time, most urgent first, and never a deadlock."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time
-from typing import Any
 
 from mddag_executor.executor import publishing
 import msg_graph
@@ -21,7 +18,7 @@ from .declared import Declared
 MS = 1_000_000
 
 
-def compute(ms: float) -> None:
+def compute(ms):
     """Take so much CPU, in Python."""
     end = time.thread_time_ns() + int(ms * MS)
     while time.thread_time_ns() < end:
@@ -108,7 +105,7 @@ def test_what_a_callback_needs_when_nothing_disturbs_it(make_executor, make_node
     node, bell, ran = make_node(), threading.Event(), []
     group = ReentrantCallbackGroup()
 
-    def lends() -> None:
+    def lends():
         with executor.lend():
             bell.wait(0.02)
         ran.append('d')
@@ -151,7 +148,6 @@ nodes:
          holds_interpreter: true}
 """
 
-
 class Computing:
     """
     Three callbacks, one of which computes for long.
@@ -160,10 +156,10 @@ class Computing:
     :ivar meanwhile: called, while the long one computes, until it returns true.
     """
 
-    def __init__(self, make_executor: Any, make_node: Any) -> None:
-        self.ran: list[str] = []
+    def __init__(self, make_executor, make_node):
+        self.ran = []
         self.begun = threading.Event()
-        self.meanwhile: Any = lambda: True
+        self.meanwhile = lambda: True
         nodes = Declared(make_node, COMPUTING, {
             'long': self._long, 'urgent': lambda: self.ran.append('urgent'),
             'patient': lambda: self.ran.append('patient')})
@@ -175,16 +171,16 @@ class Computing:
         assert wait_for(lambda: all(
             p.get_subscription_count() == 1 for p in self.publishers.values()))
 
-    def publish(self, name: str) -> None:
+    def publish(self, name):
         self.publishers[name].publish(Header())
 
     @property
-    def habit(self) -> Any:
+    def habit(self):
         """Return what is known about how long the long one takes."""
         return next(each.habit for each in self.executor._registry.by_id.values()
                     if each.callback is not None and each.callback.name == 'long')
 
-    def _long(self) -> None:
+    def _long(self):
         self.ran.append('begins')
         self.begun.set()
         compute(60)
@@ -193,7 +189,7 @@ class Computing:
             compute(1)
         self.ran.append('ends')
 
-    def order(self, *names: str) -> list[str]:
+    def order(self, *names):
         """Publish some while the long one computes; return the order of all."""
         self.ran.clear()
         self.begun.clear()
@@ -245,7 +241,7 @@ def test_of_two_arrivals_during_a_long_callback_one_overtakes(computing):
 @pytest.mark.parametrize('computing', ['elsewhere'], indirect=True)
 def test_what_cannot_start_is_left_in_the_middleware(computing):
     """While the long one computes for as long as usual, no thread wakes for the patient one."""
-    queued: list[int] = []
+    queued = []
 
     def meanwhile():
         queued.append(computing.executor.statistics()['queue'])

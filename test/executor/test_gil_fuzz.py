@@ -7,13 +7,10 @@ They end under this executor, whatever was declared or learnt of them.  ``FUZZ_R
 rounds are run, from ``FUZZ_SEED`` on.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import threading
 import time
-from typing import Any
 
 import msg_graph
 from rcl_interfaces.srv import ListParameters
@@ -27,19 +24,18 @@ WORKERS = len(NAMES) + 1
 ROUNDS = int(os.environ.get('FUZZ_ROUNDS', '25'))
 PATIENCE_S = 60.0
 
-Step = tuple[str, int]
 
 
-def scripts(seed: int) -> dict[str, list[Step]]:
+def scripts(seed):
     """
     Return what each callback does in a round.
 
     Each waits only for those after it in the alphabet, so that there is an end.
     """
     draw = random.Random(seed)
-    found: dict[str, list[Step]] = {}
+    found = {}
     for place, name in enumerate(NAMES):
-        steps: list[Step] = [('set', place)]
+        steps = [('set', place)]
         for _ in range(draw.randint(1, 4)):
             kind = draw.choice(('compute', 'sleep', 'call', 'wait', 'wait', 'lock'))
             if kind == 'wait' and place + 1 < len(NAMES):
@@ -54,10 +50,10 @@ def scripts(seed: int) -> dict[str, list[Step]]:
 class Robot:
     """A node whose callbacks do what the script of the round says, and note what they did."""
 
-    def __init__(self, node: Any) -> None:
-        self.done: dict[str, list[Step]] = {}
-        self._scripts: dict[str, list[Step]] = {}
-        self._events: list[threading.Event] = []
+    def __init__(self, node):
+        self.done = {}
+        self._scripts = {}
+        self._events = []
         self._lock = threading.Lock()
         group = ReentrantCallbackGroup()
         self._publishers = {
@@ -70,14 +66,14 @@ class Robot:
             ListParameters, '/serve', lambda request, response: response, callback_group=group)
         self._client = node.create_client(ListParameters, '/serve', callback_group=group)
 
-    def start(self, seed: int) -> None:
+    def start(self, seed):
         self._scripts = scripts(seed)
         self._events = [threading.Event() for _ in NAMES]
         self.done = {}
         for name in random.Random(seed).sample(NAMES, len(NAMES)):
             self._publishers[name].publish(Header())
 
-    def _run(self, name: str) -> None:
+    def _run(self, name):
         done = []
         for kind, number in self._scripts[name]:
             if kind == 'compute':
@@ -99,7 +95,7 @@ class Robot:
         self.done[name] = done
 
 
-def run(executor: Any, node: Any, rounds: int, seed: int) -> list[dict[str, list[Step]]]:
+def run(executor, node, rounds, seed):
     """Return what the callbacks have done in each round."""
     robot = Robot(node)
     executor.add_node(node)
@@ -113,7 +109,7 @@ def run(executor: Any, node: Any, rounds: int, seed: int) -> list[dict[str, list
     return results
 
 
-def declaration(seed: int) -> msg_graph.TaskSet:
+def declaration(seed):
     """Declare callbacks that hold the interpreter, do not, or of which nothing is said."""
     draw = random.Random(seed)
     return msg_graph.loads('mddag: 1\nnodes:\n  - node: /node\n    callbacks:\n' + ''.join(

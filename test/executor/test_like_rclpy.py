@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Orders that rclpy's own tests rely on, with seven workers as with one thread."""
 
-from __future__ import annotations
-
 import threading
 import time
 
@@ -17,7 +15,7 @@ from .conftest import Spinning, wait_for
 def test_tasks_created_before_spin_run_in_rclpys_order(make_executor, ros_context):
     orders = []
     for executor in make_executor(), SingleThreadedExecutor(context=ros_context):
-        order: list[str] = []
+        order = []
         orders.append(order)
         for name in 'abc':
             executor.create_task(order.append, name)
@@ -29,7 +27,7 @@ def test_tasks_created_before_spin_run_in_rclpys_order(make_executor, ros_contex
 
 def test_a_coroutine_goes_on_in_the_step_after_its_future_is_done(make_executor):
     executor = make_executor()
-    future: Future = Future(executor=executor)
+    future = Future(executor=executor)
 
     async def wait():
         await future
@@ -48,8 +46,8 @@ def test_other_callbacks_of_an_awaited_future_run_where_rclpy_runs_them(
     """Since rclpy 7.1.9 in the executor, before that in the thread that completes the future."""
     here = []
     for executor in make_executor(), SingleThreadedExecutor(context=ros_context):
-        future: Future = Future()
-        threads: list[int] = []
+        future = Future()
+        threads = []
 
         async def wait(future=future):
             await future

@@ -2,12 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real runs are replayed, and their misses have the cause that they were given."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 import threading
 import time
-from typing import Any
 
 from benchmarks.known_causes import causes, record
 from mddag_executor import open_recording
@@ -48,16 +44,15 @@ nodes:
       - {name: show, subscription: /odometry, deadline: 6ms}
 """
 
-
-def every(jobs: int, seconds: float) -> Callable[[], None]:
+def every(jobs, seconds):
     """Return a body that sleeps in each so many-th job."""
     return lambda: time.sleep(0.0 if current_job().job % jobs else seconds)
 
 
-async def rectify() -> None:
+async def rectify():
     """Wait for something once in a while, without a worker."""
     if current_job().job % 5 == 0:
-        future: Any = Future()
+        future = Future()
         threading.Timer(0.004, future.set_result, (None,)).start()
         await future
 
@@ -208,8 +203,7 @@ nodes:
     assert [each.kind for each in outcome.drift()] == []
 
 
-def test_requests_that_arrive_together_are_recorded_one_by_one(
-        make_executor, make_node, tmp_path):
+def test_requests_that_arrive_together_are_recorded_one_by_one(make_executor, make_node, tmp_path):
     path = tmp_path / 'requests.mcap'
     executor = make_executor(loads(GRAPH, 'g.yaml'), num_workers=1, trace=str(path))
     node = make_node()

@@ -2,13 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What executors and hosts keep of nodes, executors and entities that are gone: nothing."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 import gc
 import os
-from typing import Any
 import weakref
 
 from mddag_executor.executor import publishing, waitables
@@ -37,9 +33,7 @@ SETTLED = 5
 class Brief:
     """Two nodes for a while: a declared chain, and everything else that a node can have."""
 
-    def __init__(
-        self, executor: Any, make_node: Callable[..., Any], made: list[weakref.ref[Any]]
-    ) -> None:
+    def __init__(self, executor, make_node, made):
         self.executor = executor
         self.nodes = make_node('source'), make_node('sink')
         source, sink = self.nodes
@@ -56,23 +50,23 @@ class Brief:
         for node in self.nodes:
             executor.add_node(node)
 
-    def _tick(self) -> None:
+    def _tick(self):
         with suppress(InvalidHandle):  # destroyed while it runs
             self._publisher.publish(Header())
 
-    def has_heard(self) -> bool:
+    def has_heard(self):
         return self.heard > 0
 
-    def _hear(self, message: Any) -> None:
+    def _hear(self, message):
         self.heard += 1
 
-    def end(self) -> None:
+    def end(self):
         for node in self.nodes:
             node.destroy_node()
             self.executor.remove_node(node)
 
 
-def sizes(*owners: Any) -> dict[str, int]:
+def sizes(*owners):
     """Return the sizes of everything that these have, and of what that has."""
     found = {}
     for owner in owners:
@@ -84,7 +78,7 @@ def sizes(*owners: Any) -> dict[str, int]:
     return found
 
 
-def used(scheduler: Any) -> dict[str, int]:
+def used(scheduler):
     """Return how much of the core's tables is in use; the rest waits to be used again."""
     state = scheduler.state
     free = 0
@@ -95,7 +89,7 @@ def used(scheduler: Any) -> dict[str, int]:
             'groups': len(state.group_owner) - len(scheduler._free_groups)}
 
 
-def tables(executor: Any) -> dict[str, int]:
+def tables(executor):
     engine, pool, at_once = executor._engine, executor._pool, executor._at_once
     found = used(engine.scheduler) | sizes(
         executor, engine, engine.jobs, engine.verdicts, executor._registry, executor._upkeep,
@@ -114,7 +108,7 @@ def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context)
                     start_parameter_services=False)
 
     executor = make_executor(loads(GRAPH))
-    made: list[weakref.ref[Any]] = []
+    made = []
 
     def cycle(times):
         for _ in range(times):
@@ -148,7 +142,7 @@ def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context)
 
 
 @contextmanager
-def without_collector() -> Iterator[None]:
+def without_collector():
     """Let only that be freed to which nothing refers."""
     gc.collect()
     gc.disable()

@@ -6,18 +6,14 @@ Misses are known when they happen, and what `on_deadline_miss` does never distur
 `make stress` runs the latter for MISS_STRESS_SECONDS (20) each.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 import os
 import random
 import sys
 import threading
 import time
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from mddag_executor import DeadlineMiss
 from mddag_executor.core.tally import total
 from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
@@ -41,44 +37,43 @@ LATE = 'mddag: 1\nnodes:\n  - node: /late\n    callbacks:\n' + ''.join(
 class Wrong(Exception):
     """What a handler of these tests raises."""
 
-
 class Handler:
     """Takes note of each miss, then does one of the things that users do."""
 
-    def __init__(self, does: str, node: Any) -> None:
-        self.misses: list[DeadlineMiss] = []
+    def __init__(self, does, node):
+        self.misses = []
         self.group = ReentrantCallbackGroup()
         self._node = node
         self._then = getattr(self, f'_{does}', None) or (lambda: time.sleep(float(does) / 1e3))
         self._publisher = node.create_publisher(Header, '/alarm', 10)
-        self.heard: list[Header] = []
+        self.heard = []
         node.create_subscription(
             Header, '/alarm', self.heard.append, 10, callback_group=self.group)
         self._client = node.create_client(Empty, '/stop', callback_group=self.group)
-        self.served: list[int] = []
+        self.served = []
         node.create_service(Empty, '/stop', self._serve, callback_group=self.group)
 
-    def __call__(self, miss: DeadlineMiss) -> None:
+    def __call__(self, miss):
         self.misses.append(miss)
         self._then()
 
-    def _serve(self, request: Any, response: Any) -> Any:
+    def _serve(self, request, response):
         self.served.append(1)
         return response
 
-    def _raise(self) -> None:
+    def _raise(self):
         raise Wrong
 
-    def _exit(self) -> None:
+    def _exit(self):
         sys.exit('a deadline was missed')
 
-    def _log(self) -> None:
+    def _log(self):
         self._node.get_logger().warning('a deadline was missed')
 
-    def _publish(self) -> None:
+    def _publish(self):
         self._publisher.publish(Header())
 
-    def _call(self) -> None:
+    def _call(self):
         future = self._client.call_async(Empty.Request())
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
@@ -88,7 +83,7 @@ class Handler:
 class SpinningOn(Spinning):
     """Spins again after an exception of the handler."""
 
-    def _run(self) -> None:
+    def _run(self):
         while self.error is None and not self.executor._is_shutdown:
             try:
                 self.executor.spin()
@@ -170,7 +165,7 @@ nodes:
 class Once:
     """The nodes of ONCE; ``go`` starts a job, whose callbacks do what they are given."""
 
-    def __init__(self, make_node: Any, begin: Any, end: Any) -> None:
+    def __init__(self, make_node, begin, end):
         self.nodes = [make_node('source'), make_node('sink')]
         self.group = ReentrantCallbackGroup()
         self._go = make_node('go').create_publisher(Header, '/start', 10)
@@ -179,13 +174,13 @@ class Once:
             node.create_subscription(
                 Header, topic, lambda _, body=body: body(), 10, callback_group=self.group)
 
-    def go(self) -> None:
+    def go(self):
         assert wait_for(lambda: self._go.get_subscription_count() == 1
                         and self.publisher.get_subscription_count() == 1)
         self._go.publish(Header())
 
 
-def judged(dags: dict[str, Any]) -> dict[str, Any]:
+def judged(dags):
     """Return the verdicts of a result, with the longest response times."""
     keys = ('completed', 'late', 'overdue', 'expired', 'failed', 'aborted')
     return {name: (dag['jobs'], dag['ends'], {
@@ -194,7 +189,7 @@ def judged(dags: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_a_result_that_never_comes_is_a_miss_at_its_deadline(make_executor, make_node, capfd):
-    misses: list[DeadlineMiss] = []
+    misses = []
     once = Once(make_node, lambda: None, lambda: None)
     executor = make_executor(loads(ONCE), on_deadline_miss=misses.append, nodes=once.nodes)
     with Spinning(executor):
@@ -216,10 +211,10 @@ def test_a_result_that_never_comes_is_a_miss_at_its_deadline(make_executor, make
 
 def test_a_callback_that_hangs_is_a_miss_once(make_executor, make_node, tmp_path):
     """Known while it hangs, to all who ask; what comes of it later is its verdict."""
-    misses: list[DeadlineMiss] = []
+    misses = []
     go_on = threading.Event()
     once = Once(make_node, lambda: once.publisher.publish(Header()), lambda: go_on.wait(60.0))
-    reported: list[dict[str, str]] = []
+    reported = []
 
     def diagnosed(message):
         for status in message.status:
@@ -260,7 +255,7 @@ nodes:
 def test_what_was_reported_is_what_a_replay_judges(make_executor, make_node, tmp_path):
     """Callbacks end just before and after their deadlines."""
     generator = random.Random(1)
-    misses: list[DeadlineMiss] = []
+    misses = []
     nodes = Declared(make_node, MANY, dict.fromkeys(
         ('soon', 'later'), lambda: time.sleep(generator.uniform(0.0, 0.008))))
     trace = str(tmp_path / 'run.mcap')

@@ -7,8 +7,6 @@ There a future that is awaited hands itself to the task, which goes on by itself
 and a coroutine that goes on before is told off.
 """
 
-from __future__ import annotations
-
 import inspect
 
 import pytest
@@ -25,9 +23,7 @@ from .test_like_rclpy import (  # noqa: F401
     test_a_coroutine_goes_on_in_the_step_after_its_future_is_done,
     test_a_task_awaits_one_future_after_another,
 )
-from .test_spin import (  # noqa: F401
-    test_a_coroutine_that_awaits_something_unknown_is_asked_again,
-)
+from .test_spin import test_a_coroutine_that_awaits_something_unknown_is_asked_again  # noqa: F401
 from .test_waitables import test_many_goals_at_once  # noqa: F401
 
 

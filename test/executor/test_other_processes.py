@@ -1,11 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 import time
-from typing import Any
 
 from mddag_executor.executor.jobs import header_stamp
 from msg_graph import loads
@@ -37,7 +33,7 @@ MS = 1_000_000
 class Thing:
     """A message of an odd kind."""
 
-    def __init__(self, **fields: Any) -> None:
+    def __init__(self, **fields):
         self.__dict__.update(fields)
 
 
@@ -57,10 +53,7 @@ def test_stamps_of_a_header_and_of_a_message_that_has_one():
 # --- two executors are as two processes ----------------------------------------------------------
 
 
-def in_two(
-    make_executor: Any, make_node: Any, text: str,
-    elsewhere: Sequence[str] = ('second', 'last'),
-) -> tuple[Declared, Any, Any]:
+def in_two(make_executor, make_node, text, elsewhere=('second', 'last')):
     """Run 20 jobs of the chain, some of its nodes in a second executor; return both."""
     nodes = Declared(make_node, text, reentrant=False)
     here, there = make_executor(loads(text)), make_executor(loads(text))
@@ -75,7 +68,7 @@ def in_two(
     return nodes, here, there
 
 
-def ends(executor: Any) -> dict[str, int]:
+def ends(executor):
     return executor.statistics()['dags']['chain']['ends']
 
 
@@ -128,7 +121,7 @@ def lone(make_executor, make_node):
         yield executor, half, nodes
 
 
-def stamped(nanoseconds: int) -> Header:
+def stamped(nanoseconds):
     message = Header()
     message.stamp.sec, message.stamp.nanosec = divmod(nanoseconds, 1_000_000_000)
     return message

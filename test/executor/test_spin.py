@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spinning: what ends it, what comes out of it, one callback at a time, waiting inside."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 import threading
 import time
 
@@ -24,7 +21,7 @@ def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
     """The only worker ends the spin right after it: who swallows it is found out at once."""
     node = make_node()
     executor = make_executor(num_workers=1, nodes=[node])
-    after: Future = Future(executor=executor)
+    after = Future(executor=executor)
 
     def fail(*args):
         if not after.done():
@@ -60,7 +57,7 @@ def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
 def test_what_fails_when_it_is_taken_comes_out_of_spin(make_executor, make_node):
     class Broken(Pulse):
 
-        def take_data(self) -> int:
+        def take_data(self):
             raise ZeroDivisionError('taken')
 
     node = make_node()
@@ -75,7 +72,7 @@ def test_what_fails_when_it_is_taken_comes_out_of_spin(make_executor, make_node)
 class Turn:
     """What a coroutine may await as well: nothing that says when it is ready."""
 
-    def __await__(self) -> Iterator[None]:
+    def __await__(self):
         yield
 
 
@@ -189,7 +186,7 @@ def test_shutdown_waits_for_a_running_callback(make_executor):
 def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros_context, end):
     before = set(threading.enumerate())
     node, calls = make_node(), []
-    done: Future = Future()
+    done = Future()
 
     def tick():
         calls.append(1)

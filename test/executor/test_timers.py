@@ -2,12 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Timers whose due time changes while the executor waits, and what is due before it spins."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 import threading
 import time
-from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 from msg_graph import loads
@@ -35,11 +31,10 @@ nodes:
         deadline: 1s
 """
 
-
 class Stepping(Spinning):
     """Spins by a loop of ``spin_once``."""
 
-    def _run(self) -> None:
+    def _run(self):
         try:
             while not self.executor._is_shutdown:
                 self.executor.spin_once()
@@ -53,7 +48,7 @@ def spinning(request):
     return request.param
 
 
-def waits_for_no_timer(executor: Any) -> bool:
+def waits_for_no_timer(executor):
     """Tell whether the executor knows of all timers, and none is to become due."""
     with executor._pool.lock:
         return executor._pool.is_current and not executor._pool.timers.next_due()
@@ -93,8 +88,7 @@ def test_a_timer_that_is_reset_before_it_is_due_never_runs_and_costs_no_memory(
 
 @pytest.mark.parametrize('sleeps', [False, True], ids=['timer', 'rate'])
 def test_a_timer_that_left_while_its_arrival_was_handled_is_not_asked_again(
-    make_executor, make_node, sleeps,
-):
+        make_executor, make_node, sleeps):
     """Else two executors would advance it, and one of them would drop what is due."""
     node = make_node()
     kept = node.create_rate(1.0) if sleeps else node.create_timer(1.0, print)
@@ -127,16 +121,16 @@ def test_timers_of_each_clock_run(make_executor, make_node, kind):
 class Simulation:
     """A node with simulated time, and a publisher of that time."""
 
-    def __init__(self, make_node: Any) -> None:
+    def __init__(self, make_node):
         self.node = make_node(
             'simulated', parameter_overrides=[Parameter('use_sim_time', value=True)])
         self._publisher = make_node('clock').create_publisher(
             ClockMessage, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
 
-    def matched(self) -> bool:
+    def matched(self):
         return wait_for(lambda: self._publisher.get_subscription_count() == 1)
 
-    def set_clock(self, now: int) -> bool:
+    def set_clock(self, now):
         """Publish the time until the node has it."""
         message = ClockMessage(clock=TimeMessage(sec=now // 10**9, nanosec=now % 10**9))
         clock = self.node.get_clock()
@@ -148,30 +142,30 @@ class Simulation:
 class Simulated(Simulation):
     """Simulated time, with an executor and a timer that notes its clock's time."""
 
-    def __init__(self, make_executor: Any, make_node: Any, start: int = 100 * 10**9) -> None:
+    def __init__(self, make_executor, make_node, start=100 * 10**9):
         super().__init__(make_node)
         self.now = start
-        self.ran: list[int] = []
+        self.ran = []
         self.executor = make_executor()
         self.executor.add_node(self.node)
 
-    def timer(self, period_s: float, **kwargs: Any) -> Any:
+    def timer(self, period_s, **kwargs):
         clock = self.node.get_clock()
         return self.node.create_timer(
             period_s, lambda: self.ran.append(clock.now().nanoseconds), **kwargs)
 
-    def step(self, ns: int) -> None:
+    def step(self, ns):
         self.now += ns
         assert self.set_clock(self.now)
 
-    def is_idle(self) -> bool:
+    def is_idle(self):
         """Tell whether all that has to do with the present time is done."""
         quiet = threading.Event()
         self.executor.create_task(quiet.set)
         return quiet.wait(15.0) and wait_for(
             lambda: self.executor._pool.is_current and is_idle(self.executor))
 
-    def until(self, done: Callable[[], bool]) -> None:
+    def until(self, done):
         assert wait_for(done), self.ran
 
 
@@ -238,7 +232,7 @@ def test_periods_before_the_spin_are_no_jobs_and_no_misses(make_executor, make_n
 
     node.create_timer(0.01, tick)
     executor = make_executor(loads(GRAPH), nodes=[node])
-    releases: list[int] = []
+    releases = []
     executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
     time.sleep(0.3)
     begin = executor._trace_clock.now()
@@ -256,7 +250,7 @@ def test_a_message_from_before_the_spin_is_released_when_it_begins(
     node.create_subscription(Header, '/topic', got.append, 10)
     assert wait_for(publisher.get_subscription_count)
     executor = make_executor(loads(STAMPED.format(stamp)), nodes=[node])
-    releases: list[int] = []
+    releases = []
     executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
     publisher.publish(Header(stamp=node.get_clock().now().to_msg()))
     time.sleep(0.2)
@@ -275,7 +269,7 @@ def test_a_pause_while_a_message_is_taken_does_not_move_its_release(
         Header, '/topic', lambda message, info: got.append(info['source_timestamp']), 10)
     assert wait_for(publisher.get_subscription_count)
     executor = make_executor(loads(STAMPED.format(stamp)), nodes=[node])
-    releases: list[int] = []
+    releases = []
     executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
     with Spinning(executor):
         assert wait_for(lambda: executor._pool.is_current)

@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Actions, QoS events, guard conditions, waitables of a user's own, and timers that have info."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time
-from typing import Any
 
 from mddag_executor.executor import compat
 from mddag_executor.executor.waitables import EventsSource
@@ -29,7 +26,7 @@ SUCCEEDED, CANCELED = 4, 5
 class Counting:
     """An action that counts up to its order, in a node of its own; and a client for it."""
 
-    def __init__(self, server_node: Any, client_node: Any, **kwargs: Any) -> None:
+    def __init__(self, server_node, client_node, **kwargs):
         self.group = ReentrantCallbackGroup()
         self.server = ActionServer(
             server_node, Fibonacci, 'count', self._execute, callback_group=self.group,
@@ -39,7 +36,7 @@ class Counting:
             client_node, Fibonacci, 'count', callback_group=self.group,
             feedback_sub_qos_profile=QoSProfile(depth=100))
 
-    def _execute(self, goal: Any) -> Any:
+    def _execute(self, goal):
         feedback = Fibonacci.Feedback()
         for number in range(goal.request.order):
             feedback.sequence.append(number)
@@ -51,9 +48,9 @@ class Counting:
             goal.succeed()
         return Fibonacci.Result(sequence=feedback.sequence)
 
-    async def ask(self, order: int, cancels: bool = False) -> tuple[int, list[int], list[int]]:
+    async def ask(self, order, cancels=False):
         """Return status, result and lengths of the feedback of a goal."""
-        lengths: list[int] = []
+        lengths = []
         goal = await self.client.send_goal_async(
             Fibonacci.Goal(order=order),
             feedback_callback=lambda m: lengths.append(len(m.feedback.sequence)))
@@ -63,7 +60,7 @@ class Counting:
         answer = await goal.get_result_async()
         return answer.status, list(answer.result.sequence), lengths
 
-    def destroy(self) -> None:
+    def destroy(self):
         self.server.destroy()
         self.client.destroy()
 
@@ -126,15 +123,15 @@ def test_a_goal_expires_when_its_time_is_over(make_executor, make_node, stepwise
 class spun:
     """Spin in a thread while entered, without shutting the executor down."""
 
-    def __init__(self, executor: Any) -> None:
+    def __init__(self, executor):
         self._future = executor.create_future()
         self._thread = threading.Thread(
             target=executor.spin_until_future_complete, args=(self._future, 30.0))
 
-    def __enter__(self) -> None:
+    def __enter__(self):
         self._thread.start()
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._future.set_result(None)
         self._thread.join(30.0)
         assert not self._thread.is_alive()
@@ -198,20 +195,20 @@ def test_the_middleware_writes_to_no_file_after_the_executor_has_ended(
 # --- guard conditions, and waitables of a user's own ---------------------------------------------
 
 
-def wait_set_threads() -> int:
+def wait_set_threads():
     return sum(thread.name == 'mddag-wait-set' for thread in threading.enumerate())
 
 
 class Counted(Pulse):
     """Counts its executions."""
 
-    def __init__(self, node: Any) -> None:
+    def __init__(self, node):
         super().__init__(node, node.default_callback_group)
         self.guard.destroy()  # its node had it for a moment
         self.guard = GuardCondition(None, None, node.context)
         self.executed = 0
 
-    async def execute(self, taken_data: int) -> None:
+    async def execute(self, taken_data):
         self.executed += 1
 
 
@@ -231,7 +228,7 @@ def test_each_trigger_of_a_guard_condition_is_noticed(make_executor, make_node, 
 
     def rounds():
         for _ in range(5):
-            calls: list[int] = []
+            calls = []
             guard = node.create_guard_condition(lambda calls=calls: calls.append(1))
             for number in range(1, 21):
                 triggered(guard, lambda c=calls, n=number: len(c) == n)
@@ -280,14 +277,14 @@ def test_a_timer_gives_its_info_to_who_asks_for_it(make_executor, make_node):
 class Empty(Pulse):
     """A waitable whose take gives nothing."""
 
-    def __init__(self, node: Any) -> None:
+    def __init__(self, node):
         super().__init__(node, node.default_callback_group)
-        self.got: list[Any] = []
+        self.got = []
 
-    def take_data(self) -> None:
+    def take_data(self):
         return None
 
-    async def execute(self, taken_data: Any) -> None:
+    async def execute(self, taken_data):
         self.got.append(taken_data)
 
 

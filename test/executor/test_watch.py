@@ -2,10 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a live run says of drift, of wrong names and of what never ran."""
 
-from __future__ import annotations
-
-from typing import Any
-
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor.statistics import Watch
 from mddag_executor.replay import open_recording
@@ -14,7 +10,6 @@ from mddag_executor.report.live_runs import live_lines
 from msg_graph import loads
 import pytest
 from rclpy.action import ActionClient, ActionServer
-from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_msgs.msg import Empty, Header, String
@@ -24,9 +19,7 @@ from test_msgs.action import Fibonacci
 from .conftest import Spinning, wait_for
 
 
-def add_camera_and_eye(
-        executor: Any, camera: Node, eye: Node, period: float, published: str,
-        *heard: str) -> list[int]:
+def add_camera_and_eye(executor, camera, eye, period, published, *heard):
     """Connect and add the nodes; the returned list grows with each message that the eye gets."""
     image, seen = camera.create_publisher(Empty, published, 10), list[int]()
     for topic in heard:
@@ -95,7 +88,7 @@ def check_soon(monkeypatch):
 def test_undeclared_callbacks_have_names(make_executor, make_node):
     executor = make_executor()
     node = make_node('robot')
-    done: list[str] = []
+    done = []
 
     def execute(goal):
         goal.succeed()
@@ -150,7 +143,6 @@ nodes:
     callbacks: [{name: detect, subscription: /image, deadline: 50ms}]
 """
 
-
 @pytest.mark.parametrize(('node', 'topic', 'expected'), [
     ('camera', 'image', None),
     ('kamera', 'image', '1 declared callback was found in no node: /camera:capture '
@@ -162,7 +154,7 @@ nodes:
 def test_a_wrong_name_is_warned_of_once(ros_context, make_node, capfd, node, topic, expected):
     camera, detector = make_node(node), make_node('detector')
     publisher = camera.create_publisher(String, topic, 10)
-    heard: list[Any] = []
+    heard = []
 
     def tick():
         publisher.publish(String())

@@ -7,16 +7,12 @@ What the language refuses, error by error, is in `test/msg_graph`; here are the 
 harm, at every verb that reads one.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
 import msg_graph
 import numpy as np
 import pytest
-
-from ..conftest import Done
 
 TOP = Path(__file__).resolve().parents[2]
 AUTOWARE = TOP / 'config' / 'autoware.yaml'
@@ -35,7 +31,7 @@ HARMFUL = {
 }
 
 
-def refused(done: Done, folder: Path) -> None:
+def refused(done, folder):
     """Check that something was refused, in lines, and did nothing."""
     assert done.returncode == 2, done.stdout + done.stderr
     lines = done.stderr.splitlines()
@@ -100,7 +96,7 @@ def test_harmful_tables_of_execution_times(call, tmp_path, text):
 class Owner:
     """Does something when it is unpickled."""
 
-    def __reduce__(self) -> tuple[object, tuple[str]]:
+    def __reduce__(self):
         return os.system, ('touch owned',)
 
 

@@ -7,9 +7,6 @@ A recorded run is written again with all of its texts changed into ones that wou
 escapes, HTML, paths, templates, formulas or code, and given to every verb that reads traces.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,7 +31,7 @@ HOSTILE = [
 ]
 
 
-def with_texts(path: Path, change: Callable[[str, str, int], str], most: int = 2500) -> Path:
+def with_texts(path, change, most=2500):
     """Write the recorded run with other texts: `change(event, field, number)` of each."""
     number = 0
     with TraceFile(path) as file:
@@ -62,7 +59,7 @@ def trace(tmp_path_factory):
                       lambda event, field, number: HOSTILE[number % len(HOSTILE)])
 
 
-def harmless(text: str) -> None:
+def harmless(text):
     """Check that a terminal has nothing to obey."""
     assert [c for c in text if not c.isprintable() and c != '\n'] == []
 
@@ -114,7 +111,7 @@ def test_a_hostile_declaration_in_a_trace(tmp_path, field):
         judge_with(tmp_path, field, text)
 
 
-def judge_with(tmp_path: Path, field: str, text: str) -> None:
+def judge_with(tmp_path, field, text):
     path = tmp_path / 'run.mcap'
     event = next(event for event in read_events(BAG) if event['_name'] == 'mddag:task_set')
     with TraceFile(path, overwrite=True) as file:

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executor under misuse: a clear exception, no hang, and everything as it was before."""
 
-from __future__ import annotations
-
 import threading
 import time
 
@@ -108,7 +106,7 @@ def test_after_shutdown(executor, node):
 
 def test_everything_from_many_threads_at_once(executor, ros_context):
     """Whatever threads do to an executor that spins, it goes on and ends."""
-    errors: list[BaseException] = []
+    errors = []
     stop = threading.Event()
     ran = []
 

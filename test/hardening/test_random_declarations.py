@@ -8,8 +8,6 @@ come from `mddag generate` and are then damaged. `HARDENING_EXAMPLES=10000` draw
 of each.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import tempfile
@@ -36,10 +34,10 @@ VERBS = (
 
 
 @st.composite
-def callbacks(draw: st.DrawFn, name: str) -> dict[str, object]:
+def callbacks(draw, name):
     """Draw a callback: usually one that could be meant."""
     topic = st.sampled_from(TOPICS)
-    found: dict[str, object] = {'name': name}
+    found = {'name': name}
     start = draw(st.sampled_from(['timer', 'timer', 'subscription', 'subscription', 'sync',
                                   'service', 'none']))
     if start == 'timer':
@@ -70,18 +68,18 @@ def callbacks(draw: st.DrawFn, name: str) -> dict[str, object]:
 
 
 @st.composite
-def composed(draw: st.DrawFn) -> str:
+def composed(draw):
     nodes = []
     for i in range(draw(st.integers(1, 3))):
         each = [draw(callbacks(name)) for name in NAMES[:draw(st.integers(1, 4))]]
         nodes.append({'node': f'/n{i}', 'callbacks': each})
-    data: dict[str, object] = {'mddag': 1, 'nodes': nodes}
+    data = {'mddag': 1, 'nodes': nodes}
     if draw(st.booleans()):
         data['workers'] = draw(st.sampled_from([1, 7, 4096, 10**9]))
     return str(yaml.safe_dump(data, sort_keys=False))
 
 
-def through_all_verbs(text: str) -> int:
+def through_all_verbs(text):
     """Give a declaration to all verbs; return how many used it."""
     used = 0
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as here:

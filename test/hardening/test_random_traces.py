@@ -9,13 +9,10 @@ changed into the numbers and texts that hurt most. One in eight is made of a rec
 others of a small simulated one. `HARDENING_EXAMPLES=10000` tries that many.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import random
 import tempfile
-from typing import Any
 
 from mddag_executor.cli import main as program
 from mddag_executor.trace import read_events, TraceFile
@@ -38,7 +35,6 @@ VERBS = (
     ('diff', 'run.mcap', 'run.mcap'), ('export', 'run.mcap', '-o', 'out.csv'),
     ('graph', 'from-trace', 'run.mcap', '-o', 'graph.yaml'),
 )
-Row = tuple[str, int, int, int, list[Any]]
 
 
 GRAPH = """
@@ -57,7 +53,6 @@ paths:
   - {name: whole, callbacks: ['/n:tick', '/n:left', '/m:both']}
 """
 
-
 @pytest.fixture(scope='module')
 def runs(tmp_path_factory):
     """Give the events of a small run and the first ones of a recorded run, entities and all."""
@@ -68,9 +63,9 @@ def runs(tmp_path_factory):
     return [rows_of(folder / 'run.mcap', 10_000), rows_of(BAG, 150)]
 
 
-def rows_of(path: Path, most: int) -> list[Row]:
+def rows_of(path, most):
     """Return the events of a trace, up to so many that jobs consist of."""
-    found: list[Row] = []
+    found = []
     at_work = 0
     for event in read_events(path):
         kind = EVENTS[event['_name']]
@@ -82,7 +77,7 @@ def rows_of(path: Path, most: int) -> list[Row]:
     return found
 
 
-def changed(rows: list[Row], dice: random.Random) -> list[Row]:
+def changed(rows, dice):
     """Return the events with a few that lie."""
     rows = list(rows)
     for _ in range(dice.choice((1, 1, 2, 5, 40))):
@@ -110,7 +105,7 @@ def changed(rows: list[Row], dice: random.Random) -> list[Row]:
     return rows
 
 
-def lie(kind: str, dice: random.Random) -> Any:
+def lie(kind, dice):
     """Return a value of an unexpected type."""
     if kind == 'string':
         return dice.choice(TEXTS)
@@ -124,12 +119,12 @@ def lie(kind: str, dice: random.Random) -> Any:
     return dice.choice((0.0, float('nan'), float('inf'), -1e308))
 
 
-def other(rows: list[Row], name: str, place: int, dice: random.Random) -> Any:
+def other(rows, name, place, dice):
     """Return what another event of the kind says there."""
     return dice.choice([row[4][place] for row in rows if row[0] == name])
 
 
-def give(rows: list[Row], seed: int) -> int:
+def give(rows, seed):
     """Give a trace to all verbs; return how many used it."""
     used = 0
     with TraceFile('run.mcap') as file:

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Running verbs in this process, on input that they use or refuse in lines that say why."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 
@@ -11,7 +9,7 @@ from mddag_executor.cli import main as program
 from mddag_executor.cli.text import printable
 
 
-def run(*words: str, about: object = '') -> tuple[int, str]:
+def run(*words, about=''):
     """Run a verb, and check how it ends; return its status and output."""
     out, err = (io.TextIOWrapper(io.BytesIO(), 'utf-8', newline='\n') for _ in range(2))
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

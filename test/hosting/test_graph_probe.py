@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drafts of the system that runs now: what a graph gives, and a real one."""
 
-from __future__ import annotations
-
 import re
 import threading
 
@@ -51,7 +49,7 @@ def system(make_node):
 
 
 def test_a_real_system(system, make_node, ros_context):
-    ticks: list[float] = []
+    ticks = []
     watcher = make_node('watcher')
     with Spinning(MultiDeadlineExecutor(diagnostics_period='100ms', context=ros_context)):
         assert wait_for(lambda: [

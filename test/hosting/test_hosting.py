@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unmodified programs on our executor, each a real `mddag run --node`; how they are found."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from contextlib import suppress
 import json
 import os
@@ -15,7 +12,6 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Any
 
 from mddag_executor.hosting.host import Host
 from mddag_executor.hosting.loading import LoadingError, Program, resolve
@@ -35,9 +31,7 @@ def world(tmp_path, monkeypatch):
     return make_workspace(tmp_path, monkeypatch)
 
 
-def run(
-    *specs: str, until: Callable[[], bool] | None = None, number: int = signal.SIGINT
-) -> tuple[dict[str, Any], str]:
+def run(*specs, until=None, number=signal.SIGINT):
     """
     Run programs until something is true, which a signal ends then, or until they end.
 
@@ -61,11 +55,11 @@ def run(
     expected = 'cannot keep its rate', 'Publisher already registered'
     assert [line for line in err.splitlines() if not any(text in line for text in expected)
             and not re.search(r'\d deadlines? missed', line)] == []
-    result: dict[str, Any] = json.loads(Path('result.json').read_text())
+    result = json.loads(Path('result.json').read_text())
     return result, Path('out.txt').read_text()
 
 
-def has_heard() -> bool:
+def has_heard():
     """Tell whether the trace has the listener's callback, the second of the graph, ten times."""
     with suppress(OSError, TraceError):
         complete = TraceReader('out.mcap').events({'mddag:complete'})
@@ -73,7 +67,7 @@ def has_heard() -> bool:
     return False
 
 
-def heard(result: dict[str, Any]) -> int:
+def heard(result):
     sink = result['dags']['/talker']['sinks']['/listener:heard']
     return int(sink['completed'])
 

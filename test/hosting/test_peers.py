@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Synthetic nodes under rclpy's executor; functions in a process of their own."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -20,7 +18,6 @@ nodes:
   - {node: /a, callbacks: [{name: t, timer: 20ms, publishes: [/x], execution_time: 1ms}]}
   - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 500ms, execution_time: 1ms}]}
 """
-
 
 def test_nodes_run_under_rclpys_executor(tmp_path):
     graph = tmp_path / 'graph.yaml'

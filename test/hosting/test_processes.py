@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real `mddag run`s of several processes."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import json
 import os
@@ -13,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from typing import Any
 
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
@@ -57,10 +53,10 @@ def world(tmp_path, monkeypatch):
 class Running:
     """A run that goes on; its processes by name."""
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
+    def __init__(self, process):
         self.process = process
 
-    def pids(self) -> dict[str, int]:
+    def pids(self):
         """Return the processes of the run that there are now."""
         found = {}
         children = Path(f'/proc/{self.process.pid}/task/{self.process.pid}/children')
@@ -70,14 +66,14 @@ class Running:
                 found[words[words.index('--process') + 1]] = int(pid)
         return found
 
-    def wait_for(self, condition: Callable[[], bool]) -> None:
+    def wait_for(self, condition):
         end = time.monotonic() + 60
         while not condition():
             assert self.process.poll() is None, self.process.communicate()
             assert time.monotonic() < end
             time.sleep(0.01)
 
-    def end(self) -> tuple[dict[str, Any], str, str]:
+    def end(self):
         """Wait for its end; return the result, and what it printed."""
         out, err = self.process.communicate(timeout=60)
         assert Path('result.json').exists(), err
@@ -85,7 +81,7 @@ class Running:
 
 
 @contextmanager
-def running(*arguments: str) -> Iterator[Running]:
+def running(*arguments):
     with subprocess.Popen(
         [sys.executable, '-m', 'mddag_executor', 'run', *arguments, '--json', 'result.json'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -122,18 +118,18 @@ def test_synthetic_nodes_in_two_processes_are_one_run(world, mddag):
 class Beside:
     """A session in which, at each wait, the next thing happens in the other process."""
 
-    def __init__(self, *happens: Callable[[], None]) -> None:
+    def __init__(self, *happens):
         self.happens = list(happens)
         self.waited = 0.0
 
-    def wait(self, seconds: float) -> bool:
+    def wait(self, seconds):
         if self.happens:
             self.happens.pop(0)()
         else:
             self.waited = seconds
         return False
 
-    def wait_until_matched(self, unmatched: Callable[[], list[str]], patience_s: float) -> None:
+    def wait_until_matched(self, unmatched, patience_s):
         while unmatched():
             self.wait(0.02)
 
@@ -151,7 +147,7 @@ def test_processes_start_together(tmp_path, monkeypatch):
             (tmp_path / f'second.{step}').write_text(str(at))
         return write
 
-    session: Any = Beside(note('made', 6 * 10 ** 9), unmatched.clear, note('ready', 7 * 10 ** 9))
+    session = Beside(note('made', 6 * 10 ** 9), unmatched.clear, note('ready', 7 * 10 ** 9))
     processes.Part.read(str(tmp_path)).start_together(
         'first', ['first', 'second'], session, lambda: unmatched)
     assert sorted(seen[0]) == ['first.made'] and 'first.ready' in seen[1]

@@ -2,18 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the processes of a run end, and how a session does, with programs that only pretend."""
 
-from __future__ import annotations
-
 import io
 import signal
 import subprocess
 import sys
 import threading
 import time
-from typing import Any
 
 from mddag_executor.hosting import processes as module
-from mddag_executor.hosting.processes import Run, Supervisor
+from mddag_executor.hosting.processes import Supervisor
 from mddag_executor.hosting.session import Session
 import pytest
 
@@ -28,28 +25,27 @@ end.wait(60)
 print('ends')
 """
 
-
 class Case:
     """A supervisor of programs by name."""
 
-    def __init__(self, goes_on: bool = False, **programs: str) -> None:
+    def __init__(self, goes_on=False, **programs):
         self.out, self.err = io.StringIO(), io.StringIO()
-        self.died: list[Run] = []
+        self.died = []
         self.programs = programs
         self.supervisor = Supervisor(self.command, goes_on, self.out, self.err, self.ended)
 
-    def ended(self, run: Run) -> None:
+    def ended(self, run):
         if run.died:
             self.died.append(run)
 
-    def command(self, name: str) -> list[str]:
+    def command(self, name):
         return [sys.executable, '-c', self.programs[name]]
 
-    def run(self, seconds: float | None = None) -> list[tuple[str, int | None]]:
+    def run(self, seconds=None):
         self.supervisor.run(list(self.programs), seconds)
         return [(run.name, run.status) for run in self.supervisor.runs]
 
-    def stop_when(self, wanted: str) -> None:
+    def stop_when(self, wanted):
         """Ask for the end as soon as something has been printed."""
         def wait():
             end = time.monotonic() + 60
@@ -131,18 +127,18 @@ DEEPEST = 60
 class Idle:
     """An executor that has nothing to run."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.ended = threading.Event()
 
-    def spin(self) -> None:
+    def spin(self):
         self.ended.wait()
 
-    def shutdown(self, timeout_sec: float) -> bool:
+    def shutdown(self, timeout_sec):
         self.ended.set()
         return True
 
 
-def stop_after(session: Session, steps: int) -> Any:
+def stop_after(session, steps):
     """Return a trace function that stops the session, as a signal's handler would, at a step."""
     left = steps
 
@@ -163,7 +159,7 @@ def test_a_signal_stops_a_session_wherever_it_interrupts_the_wait():
         stop_at(steps)
 
 
-def stop_at(steps: int) -> None:
+def stop_at(steps):
     session = Session(Idle())
     answers = []
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Synthetic nodes: what they draw and do, and what is measured of them."""
 
-from __future__ import annotations
-
 import threading
 import time
 
@@ -55,7 +53,6 @@ nodes:
     callbacks:
       - {name: cb, service: /gate/reset, period: 80ms, dag: gate, deadline: 400ms}
 """
-
 
 @pytest.fixture
 def task_set():
@@ -180,7 +177,7 @@ def test_the_ledger_of_a_long_run_is_bounded(task_set, ros_context, monkeypatch)
         executor.add_node(node)
     ledger, sizes = workload.ledger, []
 
-    def tick(passed: float) -> None:
+    def tick(passed):
         sizes.append([len(each) for lists in (ledger.durations, ledger.completions, ledger.delays)
                       for each in lists.values()])
 
@@ -192,7 +189,7 @@ def test_the_ledger_of_a_long_run_is_bounded(task_set, ros_context, monkeypatch)
     workload.destroy()
 
 
-def reading(at_ns: int, n: int = 0, cpu_ns: int = 0) -> Reading:
+def reading(at_ns, n=0, cpu_ns=0):
     return Reading(at_ns, cpu_ns, (n,))
 
 

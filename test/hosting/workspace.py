@@ -2,13 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A workspace with nodes that people could have written: see `guests/`."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import sys
-
-import pytest
 
 GUESTS = Path(__file__).resolve().parent / 'guests'
 
@@ -21,8 +17,7 @@ nodes:
     callbacks: [{name: heard, subscription: /chatter, deadline: 50ms}]
 """
 
-
-def make_workspace(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def make_workspace(folder, monkeypatch):
     """Make an ament package and modules; go there."""
     prefix = folder / 'ws'
     index = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declarations that several tests of the laboratory use."""
 
-from __future__ import annotations
-
 GRAPH = """\
 mddag: 1
 workers: 1

@@ -8,16 +8,13 @@ the phases and with times below the budgets; a necessary one that fails must mee
 drawn at random, and also brought to the border of what a test accepts, where a wrong one shows.
 """
 
-from __future__ import annotations
-
 import random
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS, Verdict
-from mddag_executor.simulate import Load, periodic_load, Settings, simulate
+from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS
+from mddag_executor.simulate import periodic_load, Settings, simulate
 import msg_graph
-from msg_graph import TaskSet
 
 from ..core.task_sets import examples
 
@@ -25,7 +22,7 @@ MS = 1_000_000
 HORIZON = 240 * MS
 
 
-def random_graph(seed: int, one_deadline: bool, dags: int, load: float) -> str:
+def random_graph(seed, one_deadline, dags, load):
     """
     Return a declaration: trees with joins, periods that divide the horizon.
 
@@ -60,7 +57,7 @@ def random_graph(seed: int, one_deadline: bool, dags: int, load: float) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def shifted(load: Load, phases: list[int]) -> Load:
+def shifted(load, phases):
     """Return the load with a phase for each DAG."""
     releases = sorted((time + phases[dag], dag, job)
                       for time, dag, job in zip(load.times, load.dags, load.jobs))
@@ -68,8 +65,7 @@ def shifted(load: Load, phases: list[int]) -> Load:
                          jobs=[r[2] for r in releases])
 
 
-def missed(task_set: TaskSet, times: list[list[int]], policy: str, preemptive: bool,
-           workers: int, phases: list[int]) -> bool:
+def missed(task_set, times, policy, preemptive, workers, phases):
     load = shifted(periodic_load(task_set, times, HORIZON), phases)
     run = simulate(task_set, load, Settings(
         policy=policy, workers=workers, duration_ns=HORIZON, preemptive=preemptive,
@@ -84,15 +80,15 @@ PROVEN = {
     'response time, RAD without preemption': [('rad', False)],
 }
 NAMES = tuple(PROVEN)
-held: dict[str, int] = dict.fromkeys(PROVEN, 0)
+held = dict.fromkeys(PROVEN, 0)
 
 
-def budgets_of(task_set: TaskSet) -> list[list[int]]:
+def budgets_of(task_set):
     return [[v.callback.execution_time.mean_ns for v in dag.vertices
              if v.callback.execution_time is not None] for dag in task_set.dags]
 
 
-def check_holds(task_set: TaskSet, verdict: Verdict, workers: int, rng: random.Random) -> None:
+def check_holds(task_set, verdict, workers, rng):
     """Try to find a miss where a sufficient test holds."""
     held[verdict.name] += 1
     budgets = budgets_of(task_set)
@@ -107,7 +103,7 @@ def check_holds(task_set: TaskSet, verdict: Verdict, workers: int, rng: random.R
 @examples(60)
 @given(seed=st.integers(0, 2 ** 32), one=st.booleans(), dags=st.integers(1, 4),
        workers=st.integers(1, 5), part=st.floats(0.05, 1.1))
-def check_random_set(seed: int, one: bool, dags: int, workers: int, part: float) -> None:
+def check_random_set(seed, one, dags, workers, part):
     task_set = msg_graph.loads(random_graph(seed, one, dags, part * workers / dags))
     rng = random.Random(seed)
     for verdict in analyse(task_set, workers).verdicts:
@@ -120,8 +116,7 @@ def check_random_set(seed: int, one: bool, dags: int, workers: int, part: float)
             check_holds(task_set, verdict, workers, rng)
 
 
-def at_the_border(seed: int, one: bool, dags: int, workers: int, name: str
-                  ) -> tuple[TaskSet, Verdict] | None:
+def at_the_border(seed, one, dags, workers, name):
     """Return a random set with nearly the most load for which a test holds."""
     low, high, found = 0.0, 1.2 * workers / dags, None
     for _ in range(8):
@@ -138,7 +133,7 @@ def at_the_border(seed: int, one: bool, dags: int, workers: int, name: str
 @examples(60)
 @given(seed=st.integers(0, 2 ** 32), dags=st.integers(1, 4), workers=st.integers(1, 4),
        name=st.sampled_from(NAMES), one=st.booleans())
-def check_border(seed: int, dags: int, workers: int, name: str, one: bool) -> None:
+def check_border(seed, dags, workers, name, one):
     found = at_the_border(
         seed, one, 1 if name == NAMES[0] else dags, workers, name)
     if found is None:

@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tests of the analysis, on figures worked out by hand."""
 
-from __future__ import annotations
-
-from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS, NOTHING, Verdict
+from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS, NOTHING
 from mddag_executor.laboratory.necessary import largest_demand
 from mddag_executor.laboratory.tasks import tasks_of
 from msg_graph import loads
@@ -23,8 +21,7 @@ nodes:
       - {name: y, subscription: /a, deadline: 50ms, execution_time: 40ms}
 """
 
-
-def timers(*callbacks: str) -> str:
+def timers(*callbacks):
     """Return a declaration of timers, each as `PERIOD DEADLINE COST`."""
     lines = ['mddag: 1', 'nodes:']
     for place, each in enumerate(callbacks):
@@ -34,7 +31,7 @@ def timers(*callbacks: str) -> str:
     return '\n'.join(lines)
 
 
-def verdicts(text: str, workers: int, budget: str = 'max') -> dict[str, Verdict]:
+def verdicts(text, workers, budget='max'):
     found = analyse(loads(text, 'g.yaml'), workers, budget).verdicts
     assert len({verdict.name for verdict in found}) == len(found)
     return {verdict.name: verdict for verdict in found}

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Deadlines by critical path and by search."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from mddag_executor.errors import UsageError
@@ -22,7 +20,7 @@ import pytest
 from .graphs import GRAPH, SHARED
 
 
-def experiment(**changes: object) -> Experiment:
+def experiment(**changes):
     return replace(Experiment(
         loads(GRAPH), ('rad',), workers=1, duration_ns=200_000_000), **changes)
 

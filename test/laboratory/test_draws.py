@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random execution times, shares of a load, and acceptance ratios."""
 
-from __future__ import annotations
-
 import io
 
 from hypothesis import example, given
@@ -29,7 +27,6 @@ nodes:
         execution_time: {quantiles_us: [100, 900], percent: [50, 100]}
 """
 
-
 @pytest.fixture
 def task_set():
     """Give two DAGs of two vertices each, which share the callback c."""
@@ -47,13 +44,13 @@ def test_a_run_is_drawn_by_its_number(task_set):
             time.draw(float(u)) for time, u in zip(times, uniform, strict=True)]
 
 
-def npz(**arrays: object) -> bytes:
+def npz(**arrays):
     file = io.BytesIO()
     np.savez(file, **arrays)
     return file.getvalue()
 
 
-def npy(array: object) -> bytes:
+def npy(array):
     file = io.BytesIO()
     np.save(file, np.asarray(array), allow_pickle=True)
     return file.getvalue()
@@ -143,7 +140,7 @@ def test_dirichlet_rescale_is_as_uniform_as_throwing_away(total):
     dice = Dice('uniform')
     count, limits = 4000, [1.0, 1.0, 1.0]
     stretched = sorted(max(dirichlet_rescale(dice, total, limits)) for _ in range(count))
-    discarded: list[float] = []
+    discarded = []
     while len(discarded) < count:
         first = total * (1 - dice.number() ** 0.5)      # UUniFast
         second = (total - first) * dice.number()

@@ -8,8 +8,6 @@ evaluation repository 2024_RTSS_WiP_Evaluation of Yano and Azumi): 5,000 runs, 7
 execution times drawn from the measured values.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 import logging
 import math
@@ -18,17 +16,12 @@ from pathlib import Path
 import signal
 
 from mddag_executor.errors import UsageError
-from mddag_executor.laboratory.acceptance import Evaluation, WIDE_BINS
+from mddag_executor.laboratory.acceptance import WIDE_BINS
 from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.evaluate import evaluate
 from mddag_executor.laboratory.experiment import Experiment
 from mddag_executor.laboratory.generate import generate, Options
-from mddag_executor.simulate import (
-    compiled,
-    periodic_load,
-    Settings,
-    simulate,
-)
+from mddag_executor.simulate import compiled, periodic_load, Settings, simulate
 from msg_graph import load, loads
 import numpy as np
 import pytest
@@ -57,7 +50,6 @@ nodes:
         deadline: 20ms
         execution_time: {quantiles_us: [10000, 10000, 16000, 16000], percent: [0, 50, 50.01, 100]}
 """
-
 
 @pytest.fixture(scope='module')
 def autoware():
@@ -150,7 +142,7 @@ def test_by_hand(small):
         (0.25 + lengths / 20_000_000).tolist())
 
 
-def same(first: Evaluation, second: Evaluation) -> bool:
+def same(first, second):
     return all((getattr(first, name) == getattr(second, name)).all()
                for name in ('done', 'accepted', 'possible', 'utilisation'))
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random task sets, and deadlines by critical path."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from hypothesis import given, settings
@@ -13,20 +11,20 @@ from mddag_executor.laboratory.assign_deadlines import proportional
 from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.laboratory.shapes import draw_shape, MOST_COPIES
 from mddag_executor.laboratory.shares import Dice
-from msg_graph import loads, TaskSet
+from msg_graph import loads
 from msg_graph.model import load_of
 import pytest
 
 from .graphs import GRAPH, SHARED
 
 
-def pairs(low: int, high: int) -> st.SearchStrategy[tuple[int, int]]:
+def pairs(low, high):
     return st.tuples(st.integers(low, high), st.integers(low, high)).map(
         lambda pair: (min(pair), max(pair)))
 
 
 @st.composite
-def any_options(draw: st.DrawFn) -> Options:
+def any_options(draw):
     dags, workers = draw(pairs(1, 5)), draw(st.integers(1, 8))
     vertices = draw(pairs(1, 12))
     most_per_dag = draw(st.floats(0.2, 3.0))
@@ -44,7 +42,7 @@ def any_options(draw: st.DrawFn) -> Options:
         seed=draw(st.integers(0, 2 ** 70)))
 
 
-def made(options: Options) -> tuple[str, TaskSet] | None:
+def made(options):
     """Return a task set; None if there is none, as the error says."""
     try:
         text = generate(options, 3)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which node runs in which process, and what a placement is predicted to do."""
 
-from __future__ import annotations
-
 from itertools import combinations, product
 
 from mddag_executor.core.tally import total
@@ -19,13 +17,13 @@ from mddag_executor.laboratory.prediction import (
     SEND_NS,
     TIMER_NS,
 )
-from msg_graph import loads, Process, TaskSet
+from msg_graph import loads, Process
 import pytest
 
 MS = 1_000_000
 
 
-def workload(*milliseconds: float, holds: str = '') -> TaskSet:
+def workload(*milliseconds, holds=''):
     """Return independent nodes /n0, /n1, … that compute so long of each 100 ms."""
     lines = ['mddag: 1', 'nodes:']
     for i, _ in enumerate(milliseconds):
@@ -34,7 +32,7 @@ def workload(*milliseconds: float, holds: str = '') -> TaskSet:
     return loads('\n'.join(lines))
 
 
-def placed(task_set: TaskSet, n: int, *milliseconds: float, **rules: object) -> list[set[str]]:
+def placed(task_set, n, *milliseconds, **rules):
     placing = Placing(task_set, n, [[round(ms * MS)] for ms in milliseconds],
                       **rules)
     return [set(process.nodes) for process in placing.processes(placing.place())]
@@ -91,7 +89,7 @@ ALL = (Process('all', ('/a', '/b')),)
 EACH = (Process('p1', ('/a',)), Process('p2', ('/b',)))
 
 
-def missed(text: str, processes: tuple[Process, ...], cpus: int | None, *ms: int) -> int:
+def missed(text, processes, cpus, *ms):
     predictor = Predictor(loads(text), 7, cpus, 'rad', 1000 * MS)
     tally = predictor.predict(processes, [[each * MS] for each in ms])
     return total(tally.result()['dags']).missed
@@ -114,7 +112,7 @@ def test_what_leaves_its_process_takes_longer():
     assert response(EACH) == response(ALL) + SEND_NS + RECEIVE_NS
 
 
-def several(*times: int) -> tuple[TaskSet, list[list[int]]]:
+def several(*times):
     """Return nodes that compute so many ms of each 100 ms; the first are urgent."""
     lines = [f'  - {{node: /n{i}, callbacks: [{{name: t, timer: 100ms, '
              f'deadline: {40 if i < 2 else 100}ms}}]}}' for i, _ in enumerate(times)]
@@ -128,7 +126,7 @@ def test_simulation_finds_what_loads_do_not_show():
     predictor = Predictor(task_set, 7, 2, 'rad', 1000 * MS)
     bad = {0: 0, 1: 0, 2: 1, 3: 1}
     assert predictor.predict(placing.processes(bad), times).missed
-    calls: list[int] = []
+    calls = []
     place, tried = improve(
         placing, bad, lambda processes: cost_of(predictor.predict(processes, times)), calls.append)
     assert not predictor.predict(placing.processes(place), times).missed

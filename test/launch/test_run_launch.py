@@ -6,11 +6,8 @@ The command line that the launch file makes.
 launch is not on the package index: `test_colcon.py` runs the file where it is installed.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
-from types import ModuleType
 
 from mddag_executor.cli import main as program
 import pytest
@@ -27,7 +24,7 @@ def launch_file():
     return module
 
 
-def command(launch_file: ModuleType, **given: str) -> list[str]:
+def command(launch_file, **given):
     assert set(given) <= set(launch_file.ARGUMENTS)
     return launch_file.command({**dict.fromkeys(launch_file.ARGUMENTS, ''), **given})
 

@@ -8,8 +8,6 @@ are found by trying everything until nothing new appears, cycles by transitive c
 connected components. Nothing is shared with `msg_graph`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
@@ -31,24 +29,24 @@ class Spec:
     dag: str | None = None
 
     @property
-    def key(self) -> str:
+    def key(self):
         """Return node and name."""
         return f'{self.node}:{self.name}'
 
     @property
-    def is_source(self) -> bool:
+    def is_source(self):
         """Tell whether a job starts here."""
         return self.start in ('timer', 'outside', 'service')
 
 
-def name_of_dag(source: Spec, specs: list[Spec]) -> str:
+def name_of_dag(source, specs):
     """Return the name of the DAG that a source starts."""
     alike = [spec for spec in specs
              if spec.is_source and spec.node == source.node and not spec.dag]
     return source.dag or (source.node if len(alike) == 1 else f'{source.node}/{source.name}')
 
 
-def violations(specs: list[Spec]) -> set[str]:
+def violations(specs):
     """Return which rules the declared callbacks break."""
     found = set()
     published = {topic for spec in specs for topic in spec.publishes}
@@ -81,7 +79,7 @@ def violations(specs: list[Spec]) -> set[str]:
     return found
 
 
-def all_violations(specs: list[Spec]) -> set[str]:
+def all_violations(specs):
     """Return which rules the declared callbacks or the vertices made of them break."""
     found = violations(specs)
     if found.isdisjoint({'in a cycle', 'no callback publishes', 'only a source has a period'}):
@@ -91,13 +89,13 @@ def all_violations(specs: list[Spec]) -> set[str]:
     return found
 
 
-def _starts(specs: list[Spec], a: int, b: int) -> bool:
+def _starts(specs, a, b):
     return not specs[b].is_source and bool(set(specs[a].publishes) & set(specs[b].topics))
 
 
-def expand(specs: list[Spec]) -> set[Vertex]:
+def expand(specs):
     """Return all vertices of a declaration that breaks none of the rules above."""
-    vertices: set[Vertex] = {(i, frozenset()) for i, s in enumerate(specs) if s.is_source}
+    vertices = {(i, frozenset()) for i, s in enumerate(specs) if s.is_source}
     while True:
         new = set(vertices)
         for i, spec in enumerate(specs):
@@ -114,9 +112,9 @@ def expand(specs: list[Spec]) -> set[Vertex]:
         vertices = new
 
 
-def components(vertices: set[Vertex]) -> list[set[Vertex]]:
+def components(vertices):
     """Return the weakly connected components."""
-    neighbours: dict[Vertex, set[Vertex]] = {v: set() for v in vertices}
+    neighbours = {v: set() for v in vertices}
     for vertex in vertices:
         for before in vertex[1]:
             neighbours[vertex].add(before)
@@ -133,16 +131,16 @@ def components(vertices: set[Vertex]) -> list[set[Vertex]]:
     return found
 
 
-def rank(vertex: Vertex) -> tuple[Any, ...]:
+def rank(vertex):
     """Return what vertices of one DAG are ordered by: callback, then what starts it."""
     return (vertex[0], sorted(rank(before) for before in vertex[1]))
 
 
-def as_yaml(specs: list[Spec]) -> dict[str, Any]:
+def as_yaml(specs):
     """Return the declaration as plain data; each callback has an entry of its node."""
     nodes = []
     for spec in specs:
-        callback: dict[str, Any] = {'name': spec.name}
+        callback = {'name': spec.name}
         if spec.start == 'timer':
             callback['timer'] = '10ms'
         elif spec.start == 'service':

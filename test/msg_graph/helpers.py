@@ -2,22 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Short ways to write declarations and to look at errors."""
 
-from __future__ import annotations
-
 import textwrap
 
-from msg_graph import GraphError, loads, TaskSet
+from msg_graph import GraphError, loads
 import pytest
 
 MARK = '# <-'
 
 
-def graph(text: str) -> TaskSet:
+def graph(text):
     """Derive a declaration whose head is left out."""
     return loads('mddag: 1\nnodes:\n' + textwrap.indent(textwrap.dedent(text), '  '), 'g.yaml')
 
 
-def error(text: str, line: int | None = None) -> GraphError:
+def error(text, line=None):
     """Return the error of a declaration; it must be in that line, or in that with MARK."""
     with pytest.raises(GraphError) as caught:
         loads(text, 'g.yaml')
@@ -32,13 +30,13 @@ def error(text: str, line: int | None = None) -> GraphError:
     return found
 
 
-def refusal(text: str, right: str, wrong: str) -> GraphError:
+def refusal(text, right, wrong):
     """Return the error of a declaration with a replacement; it must be in the line of that."""
     assert right in text
     return error(text.replace(right, wrong, 1), text[:text.index(right)].count('\n') + 1)
 
 
-def nodes_error(text: str, *says: str) -> GraphError:
+def nodes_error(text, *says):
     """Return the error of a declaration whose head is left out, which must say all of that."""
     found = error('mddag: 1\nnodes:\n' + textwrap.indent(textwrap.dedent(text), '  '))
     for part in says:

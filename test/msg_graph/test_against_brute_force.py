@@ -2,29 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random declarations, derived twice: by the package and by definition."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
-from msg_graph import Dag, GraphError, loads, TaskSet
+from msg_graph import GraphError, loads
 import yaml
 
-from .brute import all_violations, as_yaml, components, expand, name_of_dag, rank, Spec, Vertex
+from .brute import all_violations, as_yaml, components, expand, name_of_dag, rank, Spec
 
 TOPICS = [f'/t{i}' for i in range(4)]
 
 
 @st.composite
-def declarations(draw: st.DrawFn) -> list[Spec]:
+def declarations(draw):
     """
     Draw a declaration that is right more often than not.
 
     Callbacks subscribe to what those drawn before them publish and get deadlines where they
     belong; then a few entries may be spoilt, and the order of the file is shuffled.
     """
-    specs: list[Spec] = []
+    specs = []
     for i in range(draw(st.integers(1, 7))):
         published = sorted({topic for spec in specs for topic in spec.publishes})
         starts = ['timer', 'outside', 'service'] if i == 0 else ['timer', 'outside']
@@ -57,7 +55,7 @@ def declarations(draw: st.DrawFn) -> list[Spec]:
     return draw(st.permutations(specs))
 
 
-def _spoil(draw: st.DrawFn, spec: Spec) -> None:
+def _spoil(draw, spec):
     what = draw(st.sampled_from([
         'deadline', 'publish', 'loop', 'loop', 'subscribe', 'reads', 'silent', 'outside']))
     topic = draw(st.sampled_from(TOPICS))
@@ -77,9 +75,9 @@ def _spoil(draw: st.DrawFn, spec: Spec) -> None:
         spec.start = 'outside'
 
 
-def provenance(dag: Dag, places: dict[str, int]) -> list[Vertex]:
+def provenance(dag, places):
     """Return the DAG's vertices by index, each written as what it is."""
-    found: dict[int, Vertex] = {}
+    found = {}
 
     def write(index):
         if index not in found:
@@ -91,7 +89,7 @@ def provenance(dag: Dag, places: dict[str, int]) -> list[Vertex]:
     return [write(index) for index in range(len(dag.vertices))]
 
 
-def check_names(tasks: TaskSet) -> None:
+def check_names(tasks):
     """Names say the callback, the DAG where there is a choice, and a number where needed."""
     vertices = [v for dag in tasks.dags for v in dag.vertices]
     assert len({v.name for v in vertices}) == len(vertices)
@@ -109,7 +107,7 @@ def check_names(tasks: TaskSet) -> None:
             assert v.name == expected
 
 
-def check_same(tasks: TaskSet, specs: list[Spec]) -> None:
+def check_same(tasks, specs):
     vertices = expand(specs)
     parts = components(vertices)
     assert [c.key for c in tasks.callbacks] == [spec.key for spec in specs]

@@ -7,8 +7,6 @@ The facts are those of the public evaluation repository 2024_RTSS_WiP_Evaluation
 (RTSS 2024 work in progress).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 
@@ -95,7 +93,6 @@ class Facts(NamedTuple):
     edges: str
     times_ns: tuple[int, int, int, int]
     """Sums over the vertices of the least, median, 95 % and largest execution time."""
-
 
 LIDAR = '0-1 1-2 2-3 3-4 4-5'
 DAGS = {

@@ -2,13 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a system and its declaration disagree, and which entity is which declared callback."""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 from msg_graph import loads
 from msg_graph.binding import Binder, entities_of, Entity, entity_name, is_period, meant
-from msg_graph.drift import Drift, drift, Observed, Releases
+from msg_graph.drift import drift, Observed, Releases
 import pytest
 
 from .helpers import graph
@@ -30,7 +28,7 @@ nodes:
 """)
 
 
-def observed(jobs: int = 50, period: int = 10 * MS) -> Observed:
+def observed(jobs=50, period=10 * MS):
     """Return what a system does that is just as declared, for ``jobs`` jobs of the timer."""
     ys = jobs // 2
     counts = {'/a:t': jobs, '/a:y': ys, '/b:m': jobs, '/b:s': 2 * jobs, '/b:e': jobs, '/b:w': ys}
@@ -42,7 +40,7 @@ def observed(jobs: int = 50, period: int = 10 * MS) -> Observed:
         publishes={'/a:t': {'/x', '/rosout'}, '/a:y': {'/y'}, '/b:m': {'/z'}})
 
 
-def kinds(found: list[Drift]) -> list[tuple[str, str]]:
+def kinds(found):
     return [(each.kind, each.callback) for each in found]
 
 
@@ -159,7 +157,7 @@ BOUND = graph("""
 """)
 
 
-def key(callback: object) -> str | None:
+def key(callback):
     return None if callback is None else callback.key
 
 

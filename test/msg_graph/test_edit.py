@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes of the text of a declaration: deadlines and processes, where all else stays."""
 
-from __future__ import annotations
-
 from msg_graph import GraphError, loads, Process
 from msg_graph.edit import (
     deadlines_in_text,
@@ -34,7 +32,6 @@ nodes:
       deadline: 7ms
       timer: 20ms
 """
-
 
 def test_only_the_values_change():
     task_set = loads(TEXT)

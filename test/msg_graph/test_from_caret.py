@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declarations from CARET architecture files, made up here in CARET's format."""
 
-from __future__ import annotations
-
 import re
 
 from msg_graph import GraphError, loads
@@ -14,7 +12,7 @@ import pytest
 HEAD = 'executors: []\nnamed_paths: []\nnodes:\n'
 
 
-def node(name: str, *callbacks: str, extra: str = '') -> str:
+def node(name, *callbacks, extra=''):
     """Return a node; each callback as `timer NS`, `subscription TOPIC` or `service NAME`."""
     lines = [f'- node_name: {name}', '  callbacks:']
     keys = {'timer': 'period_ns', 'subscription': 'topic_name', 'service': 'service_name'}
@@ -27,7 +25,7 @@ def node(name: str, *callbacks: str, extra: str = '') -> str:
     return '\n'.join(lines) + '\n' + extra
 
 
-def publishes(topic: str, *names: str) -> str:
+def publishes(topic, *names):
     items = ''.join(f'    - {name}\n' for name in names)
     return f'  publishes:\n  - topic_name: {topic}\n    callback_names:\n{items}'
 
@@ -60,7 +58,7 @@ named_paths:
 """))
 
 
-def accepted(text: str) -> str:
+def accepted(text):
     """Return a declaration with all proposals accepted."""
     return re.sub(rf'^( +)# (\w+: .*# {MARK})', r'\1\2', text, flags=re.MULTILINE)
 
@@ -150,7 +148,6 @@ nodes:
   publishes:
   - {topic_name: /y, callback_name: timer_callback_0}
 """
-
 
 def test_a_file_of_2021():
     text = declaration_from_caret(OF_2021, 'arch.yaml')

@@ -2,11 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Damaged declarations give an error of one line; the work grows with what is declared."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 import sys
-from typing import Any
 
 from hypothesis import example, given, HealthCheck, settings
 from hypothesis import strategies as st
@@ -26,7 +22,7 @@ FRAGMENTS = [
 ]
 
 
-def outcome(text: str | bytes) -> TaskSet | None:
+def outcome(text):
     """Return the task set, or None after a look at the error."""
     try:
         tasks = loads(text, 'f.yaml')
@@ -43,7 +39,7 @@ def outcome(text: str | bytes) -> TaskSet | None:
 
 
 @st.composite
-def damaged(draw: st.DrawFn) -> str:
+def damaged(draw):
     """Draw a declaration with a few cuts, insertions, and lines gone or moved."""
     text = EVERYTHING
     for _ in range(draw(st.integers(1, 4))):
@@ -104,7 +100,7 @@ VALUES = st.recursive(
                      'release_from', 'on_late', 'max_active_jobs', 'dag']), VALUES)
 def test_any_value_at_any_key(top, value, key, inner):
     callback = {'name': 't', 'timer': '1ms', 'deadline': '1ms', key: inner}
-    data: dict[str, object] = {
+    data = {
         'mddag': 1, 'nodes': [{'node': '/n', 'callbacks': [callback]}]}
     outcome(yaml.safe_dump(data))
     data[top] = value
@@ -120,7 +116,7 @@ def test_every_truncation():
 HEAD = 'mddag: 1\nnodes:\n- node: /n\n  callbacks:\n'
 
 
-def many(size: int) -> str:
+def many(size):
     """Many small DAGs that share a callback, so that it has a vertex in each."""
     text = HEAD
     for i in range(size // 2):
@@ -128,7 +124,7 @@ def many(size: int) -> str:
     return text + '  - {name: s, subscription: /a, deadline: 1s}\n'
 
 
-def square(size: int) -> str:
+def square(size):
     """One topic with many publishers, with many sinks, and queue edges from one variable."""
     text = HEAD + '  - {name: t, timer: 10ms, publishes: [/a]}\n'
     for i in range(size // 2):
@@ -138,7 +134,7 @@ def square(size: int) -> str:
     return text + '  - {name: s, sync: [/a, /b], deadline: 1s}\n'
 
 
-def calls(work: Callable[[], Any]) -> int:
+def calls(work):
     """Return how many functions a piece of work calls, C functions included."""
     count = 0
 

@@ -2,15 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declarations that are put together from several files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 import re
 
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
-from msg_graph import GraphError, load, loads, Process, TaskSet
+from msg_graph import GraphError, load, loads, Process
 from msg_graph.edit import without_lines
 import pytest
 
@@ -95,8 +93,7 @@ paths:
   - {name: rear.way, callbacks: ['/rear/driver:read', '/rear/filter:crop']}
 """
 
-
-def write(folder: Path, **files: str) -> Path:
+def write(folder, **files):
     """Write files, named by their stems with `__` for a folder; return the path of `top`."""
     for name, text in files.items():
         path = folder / (name.replace('__', '/') + '.yaml')
@@ -105,7 +102,7 @@ def write(folder: Path, **files: str) -> Path:
     return folder / 'top.yaml'
 
 
-def plain(task_set: TaskSet) -> TaskSet:
+def plain(task_set):
     """Return the task set without what tells of files and lines."""
     return replace(without_lines(task_set), file='')
 

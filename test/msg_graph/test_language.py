@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The declaration language: what entries mean; parser and JSON Schema refuse the same."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import jsonschema
@@ -63,7 +61,6 @@ paths:
 processes: {eyes: ['/camera/driver'], rest: [/sink]}
 """
 
-
 def test_every_key():
     tasks = loads(EVERYTHING, 'all.yaml')
     assert (tasks.workers, tasks.file, tasks.text) == (7, 'all.yaml', EVERYTHING)
@@ -122,7 +119,7 @@ def test_quantiles_without_shares_are_evenly_spaced(count):
     assert (time.mean_ns, time.draw(0.99)) == (50_000, 99_000)
 
 
-def schema_errors(text: str) -> list[str]:
+def schema_errors(text):
     validator = jsonschema.Draft7Validator(language.schema())
     return [error.message for error in validator.iter_errors(yaml.safe_load(text))]
 

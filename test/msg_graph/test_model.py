@@ -2,28 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Execution times, durations, longest paths and load; look-ups by name."""
 
-from __future__ import annotations
-
 from itertools import permutations
 
 from hypothesis import given
 from hypothesis import strategies as st
-from msg_graph import (
-    Dag,
-    DurationError,
-    ExecutionTime,
-    format_duration,
-    loads,
-    model,
-    parse_duration,
-)
+from msg_graph import DurationError, ExecutionTime, format_duration, loads, model, parse_duration
 from msg_graph.duration import DAY, exact_duration
 import pytest
 
 from .helpers import graph
 
 
-def distribution(ns: list[int], percent: list[float]) -> ExecutionTime:
+def distribution(ns, percent):
     return ExecutionTime(tuple(ns), tuple(percent))
 
 
@@ -65,7 +55,7 @@ def test_unknown_where_an_execution_time_is_missing():
 
 
 @st.composite
-def weighted(draw: st.DrawFn) -> tuple[Dag, list[int]]:
+def weighted(draw):
     """Draw a DAG of up to seven vertices, in a random file order, with weights."""
     count = draw(st.integers(1, 7))
     order = draw(st.permutations(range(count)))

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rules of the model, one by one, and all errors of a declaration at once."""
 
-from __future__ import annotations
-
 import textwrap
 
 from msg_graph import GraphError, loads
@@ -92,7 +90,7 @@ def test_long_cycle_is_not_spelt_out():
     assert len(str(found)) < 400
 
 
-def doubling(levels: int) -> str:
+def doubling(levels):
     """Return a graph in which each level has twice the vertices of the one before."""
     text = 'mddag: 1\nnodes:\n- node: /n\n  callbacks:\n'
     text += '  - {name: t, timer: 10ms, publishes: [/t0]}\n'
@@ -154,8 +152,7 @@ paths:
   - {name: p, callbacks: ['/n:t', '/n:z']}
 """
 
-
-def found(text: str) -> GraphError:
+def found(text):
     with pytest.raises(GraphError) as caught:
         loads(text, 'g.yaml')
     assert all(error.errors == (error,) for error in caught.value.errors)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Text that is no YAML, no declaration, or meant to do harm."""
 
-from __future__ import annotations
-
 from msg_graph import GraphError, load, loads, yamltext
 import pytest
 import yaml
@@ -17,7 +15,6 @@ nodes:
     callbacks:
       - {name: t, timer: 10ms, deadline: 10ms}
 """
-
 
 @pytest.fixture(params=['CSafeLoader', 'SafeLoader'], autouse=True)
 def loader(request, monkeypatch):

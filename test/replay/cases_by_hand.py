@@ -2,18 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """CARET's definitions of response times, said once more and slowly, for comparison."""
 
-from __future__ import annotations
 
-from collections.abc import Iterable
-
-Responses = list[tuple[int, int]]
-
-
-def slow_cases(records: Iterable[tuple[int, int | None]]) -> dict[str, Responses]:
+def slow_cases(records):
     """Return each case's inputs and response times, found by searching all records."""
     rows = sorted((row for row in records if row[1] is None or row[1] >= row[0]),
                   key=lambda row: row[0])
-    ends: dict[int, int] = {}
+    ends = {}
     for start in {row[0] for row in rows}:
         own = [end for first, end in rows if first == start and end is not None]
         # what comes out of later inputs; of its own, too, where one of its flows arrived nowhere

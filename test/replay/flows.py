@@ -2,11 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The flows along a path, one by one."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
-from mddag_executor.replay.paths import leaves, Paths
+from mddag_executor.replay.paths import leaves
 
 
 class Flow(NamedTuple):
@@ -17,13 +15,13 @@ class Flow(NamedTuple):
     end: int | None
 
 
-def flows(paths: Paths) -> list[Flow]:
+def flows(paths):
     """Return the flows along the first path."""
     steps = paths.steps(0)
     last = len(paths.paths[0].callbacks) - 1
     found = []
     for leaf in leaves(steps, last).tolist():
-        columns: list[tuple[int | None, int | None]] = [(None, None)] * (last + 1)
+        columns = [(None, None)] * (last + 1)
         begin = end = None
         while leaf != -1:
             parent, position, is_run, time, ended = steps[leaf].item()

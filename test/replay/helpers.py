@@ -8,14 +8,10 @@ that arrive late or never, coroutines, drops, undeclared callbacks), and records
 records, in the order in which it does: what a thread ran only when it has run.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from pathlib import Path
 import random
-from typing import Any
 
 from hypothesis import strategies as st
 from mddag_executor.core import legs_of, Scheduler, Tables, Tally
@@ -67,14 +63,13 @@ paths:
   - {name: c, callbacks: ['/imu:tick', '/imu:use']}
 """
 
-
-def small() -> TaskSet:
+def small():
     """Return two DAGs with a fork, a join and three sinks."""
     return loads(SMALL, 'small.yaml')
 
 
 @st.composite
-def declarations(draw: st.DrawFn) -> str:
+def declarations(draw):
     """Return the text of a declaration: random DAGs, some of which share a callback."""
     n_dags = draw(st.integers(1, 3))
     shared = draw(st.booleans())
@@ -108,9 +103,9 @@ def declarations(draw: st.DrawFn) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def legs_to(task_set: TaskSet, tables: Tables) -> dict[int, list[tuple[int, int]]]:
+def legs_to(task_set, tables):
     """Return for each global vertex the vertices and legs that its messages start."""
-    found: dict[int, list[tuple[int, int]]] = {}
+    found = {}
     for dag in task_set.dags:
         first = tables.first_vertex[dag.index]
         for vertex in dag.vertices:
@@ -122,7 +117,7 @@ def legs_to(task_set: TaskSet, tables: Tables) -> dict[int, list[tuple[int, int]
     return found
 
 
-def begin_trace(path: Path, declaration: str, workers: int = 1) -> TraceFile:
+def begin_trace(path, declaration, workers=1):
     """Begin the trace of a run that goes by a declaration."""
     file = TraceFile(path)
     file.add('task_set', START_TIME, 1, 1, declaration, 'g.yaml', 'rad', workers, 100 * MS, 64,
@@ -130,17 +125,17 @@ def begin_trace(path: Path, declaration: str, workers: int = 1) -> TraceFile:
     return file
 
 
-def end_trace(file: TraceFile, time: int) -> None:
+def end_trace(file, time):
     """End a run, and its trace."""
     file.add('shutdown', time, 1, 1, time)
     file.finish()
 
 
 def add_execution(
-    file: TraceFile, start: int, end: int, dag: int, vertex: int, job: int, worker: int = 0, *,
-    ready: int | None = None, vpid: int = 1, thread: int = 10, address: int = 9,
-    computed: Sequence[Any] = (),
-) -> None:
+    file, start, end, dag, vertex, job, worker=0, *,
+    ready=None, vpid=1, thread=10, address=9,
+    computed=(),
+):
     """Record an execution that completes its vertex; without `ready` it has not waited."""
     file.add('dispatch', start, vpid, thread, address, dag, vertex, job, worker,
              start if ready is None else ready, 0)
@@ -192,7 +187,7 @@ class VirtualRun:
     finish_file: bool = True
     flush_every: int = 40
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         """Run."""
         self.random = random.Random(self.seed)
         self.tables = Tables.build(
@@ -200,17 +195,17 @@ class VirtualRun:
             expire_after=self.expire_after)
         self.scheduler = Scheduler(self.tables, self.workers, self.policy)
         self.tally = Tally(self.task_set, self.tables)
-        self.executions: dict[str, int] = {}
-        self.busy: dict[str, int] = {}
-        self.waited: dict[str, int] = {}
+        self.executions = {}
+        self.busy = {}
+        self.waited = {}
         self.undeclared_runs = 0
-        self.responses: list[int] = []
+        self.responses = []
         self.drops = 0
         self._targets = legs_to(self.task_set, self.tables)
-        self._queue: list[tuple[int, int, Callable[[int], None]]] = []
+        self._queue = []
         self._order = 0
-        self._waiting: dict[int, _Execution] = {}
-        self._aborted: set[tuple[int, int]] = set()
+        self._waiting = {}
+        self._aborted = set()
         self._jobs = [0] * self.tables.n_dags
         self._events = 0
         self.file = TraceFile(self.path, overwrite=True)
@@ -218,7 +213,7 @@ class VirtualRun:
 
     # --- the run ---------------------------------------------------------------------------------
 
-    def _run(self) -> None:
+    def _run(self):
         self.record('task_set', START_TIME, 1, self.task_set.text, self.task_set.file, self.policy,
                     self.workers, 100 * MS, self.max_active_jobs, False)
         end = START_TIME + self.duration
@@ -247,34 +242,34 @@ class VirtualRun:
 
     # --- what a test may change ------------------------------------------------------------------
 
-    def took(self, work: _Execution) -> int:
+    def took(self, work):
         """Return how long a piece takes."""
         return self.random.randrange(1, self.longest)
 
-    def way(self, work: _Execution) -> int:
+    def way(self, work):
         """Return how long a message takes from the end of the callback that published it."""
         return 100_000 + self.random.randrange(2 * MS)
 
-    def cpu(self, work: _Execution, took: int) -> tuple[int, bool]:
+    def cpu(self, work, took):
         """Return the CPU time of an execution, and whether it held the interpreter."""
         return -1, False
 
-    def lag(self, dag: int, job: int) -> int:
+    def lag(self, dag, job):
         """Return how long after its release a job is noticed."""
         return self.random.randrange(MS)
 
-    def _at(self, time: int, action: Callable[[int], None]) -> None:
+    def _at(self, time, action):
         self._order += 1
         heappush(self._queue, (time, self._order, action))
 
-    def record(self, event: str, timestamp: int, vtid: int, *fields: Any) -> None:
+    def record(self, event, timestamp, vtid, *fields):
         """Record an event; now and then a chunk is written."""
         self.file.add(event, timestamp, VPID, vtid, *fields)
         self._events += 1
         if self._events % self.flush_every == 0:
             self.file.flush()
 
-    def _release(self, dag: int, release: int) -> Callable[[int], None]:
+    def _release(self, dag, release):
         def action(now):
             job = self._jobs[dag]
             self._jobs[dag] += 1
@@ -289,14 +284,14 @@ class VirtualRun:
             self._ready(slot, dag, job, self.tables.source[dag], 0, now)
         return action
 
-    def _ready(self, slot: int, dag: int, job: int, vertex: int, leg: int, now: int) -> None:
+    def _ready(self, slot, dag, job, vertex, leg, now):
         x = self.scheduler.execution(slot, vertex, leg)
         self.scheduler.ready(x, now)
         self._waiting[x] = _Execution(x, vertex, leg, slot, dag, job, now)
         if self.random.random() < self.chances.dropped:
             self.drop(x, 'qos_depth', now)
 
-    def drop(self, x: int, reason: str, now: int) -> None:
+    def drop(self, x, reason, now):
         """Drop a waiting execution."""
         work = self._waiting.pop(x)
         self.scheduler.drop(x, now)
@@ -305,14 +300,12 @@ class VirtualRun:
         self.drops += 1
         self.decided(now)
 
-    def _undeclared(self, now: int) -> None:
+    def _undeclared(self, now):
         self.undeclared_runs += 1
         x = self.scheduler.ready_undeclared(self.undeclared_runs, -1, 0, now)
         self._waiting[x] = _Execution(x, -1, 0, -1, -1, -1, now)
 
-    def _message(
-        self, slot: int, dag: int, job: int, vertex: int, leg: int
-    ) -> Callable[[int], None]:
+    def _message(self, slot, dag, job, vertex, leg):
         def action(now):
             state = self.scheduler.state
             if (state.job_dag[slot] != dag or state.job_index[slot] != job
@@ -329,7 +322,7 @@ class VirtualRun:
                 self._ready(slot, dag, job, vertex, leg, now)
         return action
 
-    def _dispatch(self, now: int) -> None:
+    def _dispatch(self, now):
         workers = self.scheduler.state.worker_x
         while -1 in workers:
             worker = workers.index(-1)
@@ -339,7 +332,7 @@ class VirtualRun:
                 return
             self._start(self._waiting.pop(x), worker, now)
 
-    def _start(self, work: _Execution, worker: int, now: int) -> None:
+    def _start(self, work, worker, now):
         start = now + self.random.randrange(50_000)
         end = start + self.took(work)
         self._at(end + self.random.choice((0, 0, 1, 30_000)),
@@ -352,7 +345,7 @@ class VirtualRun:
                         else end + self.way(work)
                     self._at(arrival, self._message(work.slot, work.dag, work.job, vertex, leg))
 
-    def _end(self, work: _Execution, worker: int, start: int, end: int, now: int) -> None:
+    def _end(self, work, worker, start, end, now):
         vtid = 100 + worker
         declared = work.vertex >= 0
         address = self._address(work.vertex)
@@ -380,16 +373,16 @@ class VirtualRun:
                         work.leg, *self.cpu(work, end - start))
         self.decided(now)
 
-    def _resume(self, work: _Execution) -> None:
+    def _resume(self, work):
         work.pieces += 1
         self.scheduler.resume(work.x)
         self._waiting[work.x] = work
 
-    def _address(self, vertex: int) -> int:
+    def _address(self, vertex):
         return 5000 if vertex < 0 else 1000 + self.task_set.callbacks.index(
             self.task_set.vertices[vertex].callback)
 
-    def decided(self, now: int) -> None:
+    def decided(self, now):
         """Count and record what the core has decided, as the live executor does."""
         decisions = self.scheduler.decisions()
         self.tally.add(decisions)

@@ -2,15 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verdicts of a recording by the scheduler core itself, fed event by event."""
 
-from __future__ import annotations
-
 from mddag_executor.core import NEVER, Scheduler, Tables, Tally
 from mddag_executor.core import state as core
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.rules import complete
-from mddag_executor.core.state import Decision, IDLE, JOB_END, OPEN, SKIP
+from mddag_executor.core.state import IDLE, JOB_END, OPEN, SKIP
 from mddag_executor.core.tables import CONTINUE
-from mddag_executor.recording.tables import ABORTED, ALL_LEGS, EXPIRED, FAILED, Recording
+from mddag_executor.recording.tables import ABORTED, ALL_LEGS, EXPIRED, FAILED
 
 ENDS = {EXPIRED: core.EXPIRED, ABORTED: core.ABORTED, FAILED: core.FAILED}
 _KINDS = ('released', 'completed', 'ended', 'hosted', 'finished')
@@ -19,19 +17,19 @@ _KINDS = ('released', 'completed', 'ended', 'hosted', 'finished')
 class Oracle:
     """Feeds a core what a recording says, in order; its bounds are lifted."""
 
-    def __init__(self, recording: Recording, skip: int = 0) -> None:
+    def __init__(self, recording, skip=0):
         task_set = recording.task_set
         tables = Tables.build(task_set, legs=True, groups=False)
         n = tables.n_dags + 1
         self.tables = tables._replace(
             max_active_jobs=[NEVER] * n, expire_after=[NEVER] * n, on_late=[CONTINUE] * n)
         self.tally = Tally(task_set, self.tables)
-        self.decisions: list[Decision] = []
+        self.decisions = []
         self.scheduler = Scheduler(self.tables, 1)
         self.scheduler.state.scalars[SKIP] = skip
         if recording.judge_from > -NEVER:
             judge_from(self.scheduler.state, recording.judge_from)
-        self.slots: dict[tuple[int, int], int] = {}
+        self.slots = {}
         events = [(order, 0, (dag, job, release, noticed)) for _, dag, job, release, noticed, order
                   in recording.releases.tolist()]
         columns = ('order', 'dag', 'vertex', 'job', 'leg', 'end')
@@ -52,12 +50,12 @@ class Oracle:
             self.decisions += decided
         self.tally.add(self.decisions)
 
-    def released(self, dag: int, job: int, release: int, now: int) -> None:
+    def released(self, dag, job, release, now):
         slot = self.slots[dag, job] = self.scheduler.release(dag, job, release, now)
         if is_judged(self.scheduler.state, slot):
             self.tally.released(dag)
 
-    def completed(self, dag: int, vertex: int, job: int, leg: int, end: int) -> None:
+    def completed(self, dag, vertex, job, leg, end):
         state, tables = self.scheduler.state, self.tables
         legs = range(tables.n_legs[vertex]) if leg == ALL_LEGS else [leg]
         for each in legs:
@@ -69,7 +67,7 @@ class Oracle:
                 state.job_active[slot] += 1     # without ready queue, group and workers
                 complete(tables, state, self.scheduler.policy.key, x, end)
 
-    def ended(self, dag: int, job: int, time: int, reason: int) -> None:
+    def ended(self, dag, job, time, reason):
         slot = self.slots.get((dag, job))
         if slot is None:
             return
@@ -82,9 +80,9 @@ class Oracle:
             del decisions[before:]  # its end is not known
             del self.slots[dag, job]
 
-    def hosted(self, dag: int, here: frozenset[int]) -> None:
+    def hosted(self, dag, here):
         first, last = self.tables.first_vertex[dag:dag + 2]
         self.scheduler.expect(dag, [int(v in here) for v in range(first, last)])
 
-    def finished(self, now: int) -> None:
+    def finished(self, now):
         self.scheduler.finish(now)

@@ -2,12 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of rclcpp nodes made by hand, in the formats of the ROS distributions."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
-
 from mddag_executor.trace import EventType, TraceFile
 
 MS = 1_000_000
@@ -49,7 +43,6 @@ STYLES = ('caret', 'fastdds', 'humble_fastdds', 'jazzy', 'hook', 'tracing', 'cyc
 Humble on, from Jazzy on, and with Fast DDS in its first months; by ros2_tracing from Jazzy on, and
 before it with an instrumented Cyclone DDS; by CARET in rclpy."""
 
-
 class Recorded:
     """
     A recording: what happens is added in any order, times are ns since `BEGIN`.
@@ -57,16 +50,16 @@ class Recorded:
     Handles and callbacks are any numbers that the test picks; `pid` is 1 and threads are as given.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         self.path = path
-        self._events: list[tuple[int, int, int, str, tuple[Any, ...]]] = []
+        self._events = []
         self._next_message = 0x7000
 
-    def add(self, name: str, time: int, tid: int, *fields: Any, pid: int = 1) -> None:
+    def add(self, name, time, tid, *fields, pid=1):
         """Add an event by its full name."""
         self._events.append((BEGIN + time, pid, tid, name, fields))
 
-    def write(self, but: Sequence[int] = (), stop: int | None = None) -> Path:
+    def write(self, but=(), stop=None):
         """Write the file, without the events at these places in the order of time."""
         with TraceFile(self.path, overwrite=True) as file:
             file.define(_JAZZY)
@@ -82,34 +75,33 @@ class Recorded:
                     file.add(keys.get(name, name), time, pid, tid, *fields)
         return self.path
 
-    def names(self) -> list[str]:
+    def names(self):
         """Return the names of the events in the order of time."""
         return [event[3] for event in sorted(self._events, key=lambda event: event[0])]
 
-    def times(self) -> list[int]:
+    def times(self):
         """Return the times of the events, ns since `BEGIN`, in their order."""
         return sorted(event[0] - BEGIN for event in self._events)
 
     # --- who is who ------------------------------------------------------------------------------
 
-    def node(self, handle: int, name: str, time: int = 0, pid: int = 1) -> None:
+    def node(self, handle, name, time=0, pid=1):
         """Add a node, `name` with its namespace."""
         namespace, _, short = name.rpartition('/')
         self.add('ros2:rcl_node_init', time, 1, handle, handle, short, namespace or '/', pid=pid)
 
-    def publisher(self, handle: int, node: int, topic: str, time: int = 0, pid: int = 1) -> None:
+    def publisher(self, handle, node, topic, time=0, pid=1):
         """Add a publisher."""
         self.add('ros2:rcl_publisher_init', time, 1, handle, node, handle, topic, 10, pid=pid)
 
-    def timer(self, callback: int, node: int, period: int, time: int = 0, pid: int = 1) -> None:
+    def timer(self, callback, node, period, time=0, pid=1):
         """Add a timer; its handle is its callback's number and 10,000."""
         handle = callback + 10_000
         self.add('ros2:rcl_timer_init', time, 1, handle, period, pid=pid)
         self.add('ros2:rclcpp_timer_callback_added', time, 1, handle, callback, pid=pid)
         self.add('ros2:rclcpp_timer_link_node', time, 1, handle, node, pid=pid)
 
-    def subscription(self, callback: int, node: int, topic: str, time: int = 0, pid: int = 1,
-                     within: int | None = None) -> None:
+    def subscription(self, callback, node, topic, time=0, pid=1, within=None):
         """Add a subscription: its rmw handle is its callback's number and 30,000."""
         handle = callback + 10_000
         self.add('ros2:rcl_subscription_init', time, 1, handle, node, callback + 30_000, topic, 10,
@@ -120,7 +112,7 @@ class Recorded:
                 self.add('ros2:rclcpp_subscription_callback_added', time, 1, callback + 20_000,
                          each, pid=pid)
 
-    def group(self, address: int, kind: str, *callbacks: tuple[str, int], time: int = 0) -> None:
+    def group(self, address, kind, *callbacks, time=0):
         """Add a callback group of timers and subscriptions."""
         self.add('ros2_caret:add_callback_group', time, 1, 5, address, kind)
         for entity, callback in callbacks:
@@ -129,14 +121,12 @@ class Recorded:
 
     # --- what happens ----------------------------------------------------------------------------
 
-    def run(self, callback: int, tid: int, start: int, end: int, within: bool = False,
-            pid: int = 1) -> None:
+    def run(self, callback, tid, start, end, within=False, pid=1):
         """Add an execution."""
         self.add('ros2:callback_start', start, tid, callback, within, pid=pid)
         self.add('ros2:callback_end', end, tid, callback, pid=pid)
 
-    def publish(self, handle: int, tid: int, time: int, stamp: int | None = None,
-                style: str = 'caret', pid: int = 1) -> int:
+    def publish(self, handle, tid, time, stamp=None, style='caret', pid=1):
         """
         Add a publication and return its source timestamp (ns since `BEGIN`).
 
@@ -174,8 +164,7 @@ class Recorded:
             add(f'{provider}:dds_bind_addr_to_stamp', 20, address, BEGIN + stamp)
         return stamp
 
-    def receive(self, callback: int, tid: int, start: int, end: int, stamp: int,
-                style: str = 'caret', stated: int = 0, pid: int = 1) -> None:
+    def receive(self, callback, tid, start, end, stamp, style='caret', stated=0, pid=1):
         """Add an execution for a message, as `caret`, `august_2021` or `take` records it."""
         if style == 'caret':
             self.add('ros2:dispatch_subscription_callback', start - 4 * US, tid, 0x99, callback,
@@ -190,7 +179,7 @@ class Recorded:
         self.run(callback, tid, start, end, pid=pid)
 
 
-def four_jobs(path: Path) -> Path:
+def four_jobs(path):
     """Write a recording of /camera and /detect, which a message each 100 ms starts."""
     r = Recorded(path)
     r.node(1, '/camera')

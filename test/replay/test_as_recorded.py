@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """As recorded: the replayer counts what the executor counted."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import re
 import tempfile
@@ -77,8 +75,7 @@ def test_breakdowns_add_up_to_the_response_times(tmp_path):
     assert total == pytest.approx(sum(run.responses), rel=1e-6)
 
 
-def write(path: Path, *events: tuple[object, ...], text: str = SMALL, workers: int = 2,
-          policy: str = 'rad') -> Path:
+def write(path, *events, text=SMALL, workers=2, policy='rad'):
     with TraceFile(path, overwrite=True) as file:
         file.add('task_set', START_TIME, VPID, 1, text, 'small.yaml', policy, workers, 100 * MS,
                  64, False)
@@ -87,10 +84,7 @@ def write(path: Path, *events: tuple[object, ...], text: str = SMALL, workers: i
     return path
 
 
-def one_execution(
-    dag: int, vertex: int, job: int, ready: int, start: int, end: int, *, leg: int = 0,
-    whole: bool = True, vtid: int = 9,
-) -> list[tuple[object, ...]]:
+def one_execution(dag, vertex, job, ready, start, end, *, leg=0, whole=True, vtid=9):
     address = 100 * dag + vertex
     return [
         ('dispatch', start, vtid, address, dag, vertex, job, 0, START_TIME + ready * MS, 0),
@@ -99,7 +93,7 @@ def one_execution(
         ('complete', end, vtid, address, dag, vertex, job, whole, START_TIME + end * MS, leg)]
 
 
-def job_of_the_camera(job: int, at: int) -> list[tuple[object, ...]]:
+def job_of_the_camera(job, at):
     """Return the events of a whole job: vertices grab, detect, rectify, watch, join."""
     return [
         ('job_release', at + 1, 2, 0, job, START_TIME + at * MS),
@@ -196,7 +190,6 @@ nodes:
     callbacks:
       - {name: grab, timer: 20ms, publishes: [/info, /image], dag: video}
 """
-
 
 @pytest.mark.parametrize('seed', range(5))
 def test_vertices_are_found_by_name(tmp_path, seed):

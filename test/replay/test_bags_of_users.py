@@ -7,9 +7,6 @@ In those that rosbags cannot write, the definitions of the messages are the file
 installs, as the recorder stores them.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from contextlib import closing
 import json
 import os
@@ -17,7 +14,6 @@ from pathlib import Path
 import shutil
 import sqlite3
 import sys
-from typing import Any
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -29,24 +25,23 @@ from rosbags.typesys import get_typestore, Stores
 MS = 1_000_000
 BEGIN = 1_732_166_766_000_000_000
 STORE = get_typestore(Stores.ROS2_JAZZY)
-Messages = list[tuple[str, str, int, bytes]]
 
 
-def time_of(ns: int) -> Any:
+def time_of(ns):
     return STORE.types['builtin_interfaces/msg/Time'](*divmod(ns, 1_000_000_000))
 
 
-def header(ns: int) -> Any:
+def header(ns):
     return STORE.types['std_msgs/msg/Header'](time_of(ns), 'camera')
 
 
-def bytes_of(values: int) -> Any:
+def bytes_of(values):
     import numpy as np
     return np.arange(values, dtype=np.uint8)
 
 
 # By topic: the type, and how a message is made from its stamp.
-TOPICS: dict[str, tuple[str, Callable[[Any, int], Any]]] = {
+TOPICS = {
     '/parameter_events': ('rcl_interfaces/msg/ParameterEvent', lambda new, ns: new(
         time_of(ns), '/camera', [], [], [])),
     '/rosout': ('rcl_interfaces/msg/Log', lambda new, ns: new(
@@ -61,7 +56,7 @@ TOPICS: dict[str, tuple[str, Callable[[Any, int], Any]]] = {
 STAMPED = set(TOPICS) - {'/chatter'}
 
 
-def messages(begin: int, count: int) -> Messages:
+def messages(begin, count):
     """Make so many of each topic, 100 ms apart, each recorded 5 ms after its stamp."""
     found = []
     for i in range(begin, begin + count):
@@ -72,7 +67,7 @@ def messages(begin: int, count: int) -> Messages:
     return found
 
 
-def definition(kind: str) -> str:
+def definition(kind):
     prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
     package, folder, name = kind.split('/')
     for prefix in filter(None, prefixes):
@@ -82,9 +77,7 @@ def definition(kind: str) -> str:
     pytest.skip(f'ROS is not installed: no {package}/{folder}/{name}.msg')
 
 
-def with_rosbags(
-    storage: StoragePlugin, compression: CompressionMode = CompressionMode.NONE, version: int = 9
-) -> Callable[[Path, Messages], None]:
+def with_rosbags(storage, compression=CompressionMode.NONE, version=9):
     def write(path, given):
         writer = Writer(path, version=version, storage_plugin=storage)
         writer.set_compression(compression, CompressionFormat.ZSTD)
@@ -96,13 +89,13 @@ def with_rosbags(
     return write
 
 
-def without_definitions(path: Path, given: Messages) -> None:
+def without_definitions(path, given):
     with_rosbags(StoragePlugin.SQLITE3)(path, given)
     with closing(sqlite3.connect(path / f'{path.name}.db3')) as storage:
         storage.execute('DROP TABLE message_definitions')
 
 
-def with_mcap(**options: Any) -> Callable[[Path, Messages], None]:
+def with_mcap(**options):
     """Write as rosbag2_storage_mcap does with one of its presets, without metadata.yaml."""
     def write(path, given):
         path.mkdir()
@@ -121,7 +114,7 @@ def with_mcap(**options: Any) -> Callable[[Path, Messages], None]:
     return write
 
 
-BAGS: dict[str, Callable[[Path, Messages], None]] = {
+BAGS = {
     '-s mcap': with_rosbags(StoragePlugin.MCAP),
     '-s mcap of Iron': with_rosbags(StoragePlugin.MCAP, version=8),
     '-s mcap --compression-mode message': with_rosbags(
@@ -175,12 +168,12 @@ def test_each_kind_of_bag(tmp_path, graph, kind, split, call):
         f'd{i}': 20 for i in range(len(TOPICS))}
 
 
-def parted(path: Path, write: Callable[[Path, Messages], None], part: int) -> Path:
+def parted(path, write, part):
     write(path, messages(10 * part, 10))
     return path
 
 
-def join(bag: Path, parts: list[Path]) -> None:
+def join(bag, parts):
     """Make one bag of several, as the recorder splits it: drive_0, drive_1, …."""
     bag.mkdir()
     names = []

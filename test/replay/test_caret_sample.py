@@ -2,13 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real CARET recording, next to CARET's own results: equal to the nanosecond."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 import csv
 import os
 from pathlib import Path
-from typing import Any
 
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.paths import Paths
@@ -59,7 +55,6 @@ paths:
       - /actuator_dummy_node:callback_0
 """
 
-
 @pytest.fixture(scope='module')
 def trace(tmp_path_factory):
     path = tmp_path_factory.mktemp('caret') / 'sample.mcap'
@@ -73,7 +68,7 @@ def graph():
     return loads(GRAPH, 'sample.yaml')
 
 
-def rows(name: str) -> Iterator[tuple[int | None, ...]]:
+def rows(name):
     with open(CARET / name, encoding='utf-8') as stream:
         lines = csv.reader(stream)
         next(lines)
@@ -118,7 +113,7 @@ def test_the_replay_says_the_same(trace, graph):
 
 
 def test_without_a_graph(trace):
-    result: dict[str, Any] = replay(trace).result()
+    result = replay(trace).result()
     assert (result['dags'], result['paths'], result['warnings']) == ({}, {}, [])
     assert sum(use['executions'] for use in result['recorded_callbacks'].values()) == 480
     assert result['undeclared']['executions'] == 480

@@ -2,19 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts from tables are those of the scheduler core, and those of each part of a recording."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 import re
 import tempfile
-from typing import Any
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import DROP, JOB_END
-from mddag_executor.recording.tables import ABORTED, EXPIRED, FAILED, Recording, Table, WITHDRAWN
+from mddag_executor.recording.tables import ABORTED, EXPIRED, FAILED, WITHDRAWN
 from mddag_executor.replay import open_recording, Replay, replay, ReplayError, reschedule
 from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.replay.deadlines import Judged
@@ -29,7 +26,7 @@ from .test_ordinary_bags import GRAPH, write_bag
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 
 
-def check(recording: Recording, skip: int = 0) -> None:
+def check(recording, skip=0):
     judged, oracle = Judged(recording, skip), Oracle(recording, skip)
     assert judged.tally.result() == oracle.tally.result()
     expected = [each for each in oracle.decisions if each[0] not in (JOB_END, DROP)]
@@ -100,24 +97,24 @@ def test_verdicts_of_any_tables(seed, data):
 COLUMNS = ['kind', 'dag', 'sink', 'job', 'release', 'deadline', 'completed']
 
 
-def verdicts(replay: Replay) -> list[Any]:
+def verdicts(replay):
     return sorted(replay.judged.verdicts[COLUMNS].tolist())
 
 
-def links(table: Table, column: str, other: Table, *names: str) -> list[Any]:
+def links(table, column, other, *names):
     """Return the rows that a column refers to."""
     rows = table[column]
     return other[list(names)][rows[rows >= 0]].tolist()
 
 
-def chains_of(jobs: list[dict[str, Any]]) -> list[Any]:
+def chains_of(jobs):
     """Return of misses what does not depend on other jobs."""
     return sorted(
         (each['sink'], each['job'], list(dict.fromkeys(part['vertex'] for part in each['parts'])))
         for each in jobs)
 
 
-def check_parts(recording: Recording, borders: list[int]) -> None:
+def check_parts(recording, borders):
     """Compare the parts between borders with the whole."""
     whole = Replay(recording)
     start = recording.start or 0
@@ -136,7 +133,7 @@ def check_parts(recording: Recording, borders: list[int]) -> None:
     assert sorted(found) == verdicts(whole)
 
 
-def check_rows(whole: Recording, part: Recording, begin: int, end: int) -> None:
+def check_rows(whole, part, begin, end):
     """All that ran within the part is in it, and rows refer to what they did."""
     ran = whole.executions
     inside = ran[(ran['start'] >= begin) & (ran['end'] < end) & (ran['start'] >= 0)]

@@ -2,10 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The overheads measured in a recording, and that a reschedule has them again."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 from mddag_executor.replay import reschedule
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
@@ -14,7 +10,7 @@ import pytest
 from .helpers import add_execution, Chances, MS, SMALL, START_TIME, VirtualRun
 
 
-def record(path: Path, delay: int, wake: int, ready_early: int = 0) -> None:
+def record(path, delay, wake, ready_early=0):
     """Record three jobs of a chain of three, with these overheads, ns."""
     text = """\
 mddag: 1

@@ -2,10 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is estimated from a recording: dispatch times, waiting for groups, use of the pool."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.recording.entities import Entities
@@ -20,11 +16,9 @@ import pytest
 
 from .helpers import add_execution, MS, small, START_TIME
 
-Execution = tuple[int, 'int | None', int, int, int]
-"""Worker, group, when it was ready, its start and its end."""
 
-
-def late(n_workers: int, *executions: Execution, holding: Sequence[int] = ()) -> list[int]:
+def late(n_workers, *executions, holding=()):
+    """Return how late executions began: of each worker, group, when ready, start and end."""
     if not executions:
         return []
     worker, group, ready, start, end = (

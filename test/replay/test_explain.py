@@ -2,19 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs in which deadlines are missed for one known reason, and what is told of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 from hypothesis import example, given, HealthCheck, settings
 from hypothesis import strategies as st
 from mddag_executor.core.tally import total
 from mddag_executor.replay import open_recording, replay
 from mddag_executor.replay.causes import CAUSES, REMEDIES
-from msg_graph import loads, TaskSet
+from msg_graph import loads
 import pytest
 
 from .helpers import (
@@ -83,30 +79,30 @@ class Planned(VirtualRun):
     holds: bool = False
     computes: int = 0
 
-    def cpu(self, work: Any, took: int) -> tuple[int, bool]:
+    def cpu(self, work, took):
         return (min(took, self.computes), True) if self.computes else (-1, False)
 
-    def took(self, work: Any) -> int:
+    def took(self, work):
         usual, fifth = self.times.get(work.vertex, (MS // 2, MS // 2))
         took = fifth if work.job % 5 == 4 else usual
         if work.vertex == USE and work.leg < self.legs - 1:
             took = 10_000
         return self._shifted(self._now + took) - self._now
 
-    def _start(self, work: Any, worker: int, now: int) -> None:
+    def _start(self, work, worker, now):
         self._now = now
         super()._start(work, worker, now)
 
-    def lag(self, dag: int, job: int) -> int:
+    def lag(self, dag, job):
         return self.late if job % 5 == 4 and dag == 0 else 20_000
 
-    def way(self, work: Any) -> int:
+    def way(self, work):
         return self.slow if self.slow and work.job % 5 == 4 else 50_000
 
-    def _at(self, time: int, action: Any) -> None:
+    def _at(self, time, action):
         super()._at(self._shifted(time), action)
 
-    def _shifted(self, time: int) -> int:
+    def _shifted(self, time):
         """Return when something happens that would have happened in a stop."""
         if self.stops is None:
             return time
@@ -114,13 +110,13 @@ class Planned(VirtualRun):
         into = (time - START_TIME) % every
         return time + every - into if into >= every - length else time
 
-    def _ready(self, slot: int, dag: int, job: int, vertex: int, leg: int, now: int) -> None:
+    def _ready(self, slot, dag, job, vertex, leg, now):
         x = self.scheduler.execution(slot, vertex, leg)
         self.scheduler.state.x_group[x] = self.groups.get(vertex, -1)
         self.scheduler.state.x_holds[x] = int(self.holds)
         super()._ready(slot, dag, job, vertex, leg, now)
 
-    def _run(self) -> None:
+    def _run(self):
         for group in sorted(set(self.groups.values())):
             assert self.scheduler.new_group() == group
         if self.groups:
@@ -131,10 +127,10 @@ class Planned(VirtualRun):
                 self._at(end - 1, partial(self._note_stop, length))
         super()._run()
 
-    def _note_stop(self, length: int, now: int) -> None:
+    def _note_stop(self, length, now):
         self.record('stop', now, 3, now - length, now)
 
-    def _tell_groups(self) -> None:
+    def _tell_groups(self):
         for group in set(self.groups.values()):
             self.record('add_callback_group', START_TIME, 1, 1, 900 + group, 'mutually_exclusive')
         for vertex, group in self.groups.items():
@@ -145,7 +141,7 @@ class Planned(VirtualRun):
 
 
 BUSY = {FIRST: (30 * MS, 30 * MS), SECOND: (30 * MS, 30 * MS)}
-PLANS: dict[str, tuple[str, dict[str, Any]]] = {
+PLANS = {
     'ran long': (VICTIM, {'times': {USE: (2 * MS, 20 * MS)}}),
     # both heavy ones are released with every second job of the victim
     'waited': (HEAVY, {'times': BUSY, 'duration': 12_000 * MS}),
@@ -170,7 +166,7 @@ PLANS: dict[str, tuple[str, dict[str, Any]]] = {
     'failed': (VICTIM, {'chances': Chances(0, 0, 0, 0, 0, 0, 0.2)})}
 
 
-def explained(path: Path, task_set: TaskSet | None = None) -> dict[str, Any]:
+def explained(path, task_set=None):
     found = replay(path, task_set)
     result = found.explanation.result()
     assert len(result['jobs']) == result['missed'] == sum(result['causes'].values())
@@ -252,7 +248,6 @@ nodes:
   - node: /short
     callbacks: [{name: late, dag: short, timer: 1min, deadline: 10ms}]
 """
-
 
 @pytest.mark.parametrize('cause', ['waited', 'machine'])
 def test_misses_of_one_cause_have_it_however_long_the_run_is(cause, tmp_path, call):
@@ -351,9 +346,7 @@ def test_an_undeclared_callback_may_hold_the_interpreter(tmp_path, call):
         'replay', path, '--reschedule').stdout
 
 
-def test_a_release_that_was_skipped_before_an_abort_has_the_cause_of_that(
-    tmp_path, call
-):
+def test_a_release_that_was_skipped_before_an_abort_has_the_cause_of_that(tmp_path, call):
     path = tmp_path / 'run.mcap'
     with begin_trace(path, LENT.replace('50ms', '15ms'), workers=2) as file:
         for job in range(5):

@@ -12,9 +12,6 @@ often than there (unless whole chunks were doubled).  A chunk that was changed u
 says something else: of those only the first three are asked.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from itertools import chain
 import os
 from pathlib import Path
@@ -22,7 +19,6 @@ import random
 import resource
 import struct
 import time
-from typing import Any
 import zlib
 
 from mcap.opcode import Opcode
@@ -49,7 +45,7 @@ MEMORY = 400 << 20
 INTERESTING = (0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1)
 
 
-def rounds(seed: int) -> Iterator[int]:
+def rounds(seed):
     """Yield seeds: a fixed number of fixed ones, or fresh ones for as long as asked."""
     if not LONG_S:
         yield from range(seed * ROUNDS, (seed + 1) * ROUNDS)
@@ -62,7 +58,7 @@ def rounds(seed: int) -> Iterator[int]:
         first += 1
 
 
-def spans(data: bytes) -> list[tuple[int, int, int]]:
+def spans(data):
     """Return opcode, offset and end of the records of a sound file, and of its last bytes."""
     found = []
     position = len(records.MAGIC)
@@ -73,16 +69,16 @@ def spans(data: bytes) -> list[tuple[int, int, int]]:
     return found
 
 
-def flip(data: bytearray, rng: random.Random) -> None:
+def flip(data, rng):
     for _ in range(rng.choice((1, 1, 2, 8))):
         data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
 
 
-def cut(data: bytearray, rng: random.Random) -> None:
+def cut(data, rng):
     del data[rng.randrange(len(data)):]
 
 
-def stretch(data: bytearray, rng: random.Random) -> None:
+def stretch(data, rng):
     """Overwrite, take out, double or move a stretch."""
     first = rng.randrange(len(data))
     last = min(len(data), first + rng.choice((1, 2, 4, 8, 64, 1000)))
@@ -91,7 +87,7 @@ def stretch(data: bytearray, rng: random.Random) -> None:
         bytes(data[first:last]) * 2, bytes(data[last:last + 64] + data[first:last])))
 
 
-def length(data: bytearray, rng: random.Random) -> None:
+def length(data, rng):
     """Give a record, or a number at any place, a hostile value."""
     found = spans(bytes(data))
     _, start, end = rng.choice(found)
@@ -101,7 +97,7 @@ def length(data: bytearray, rng: random.Random) -> None:
         struct.pack_into('<Q', data, where, value % 2**64)
 
 
-def row(data: bytearray, rng: random.Random) -> None:
+def row(data, rng):
     """Take out, double, move or rename whole records."""
     found = spans(bytes(data))
     parts = [bytes(data[start:end]) for _, start, end in found]
@@ -118,18 +114,18 @@ def row(data: bytearray, rng: random.Random) -> None:
     data[:] = records.MAGIC + b''.join(parts) + records.MAGIC
 
 
-def summary(data: bytearray, rng: random.Random) -> None:
+def summary(data, rng):
     """Damage what follows the data: the summary and the footer."""
     start = next(start for opcode, start, _ in spans(bytes(data)) if opcode == Opcode.DATA_END)
     for _ in range(rng.choice((1, 3))):
         data[rng.randrange(start, len(data))] = rng.randrange(256)
 
 
-STRUCTURAL: tuple[Callable[[bytearray, random.Random], None], ...] = (
+STRUCTURAL = (
     flip, flip, cut, stretch, length, row, summary)
 
 
-def inside(data: bytearray, rng: random.Random) -> None:
+def inside(data, rng):
     """Change the records in a chunk, and give it the right size, CRC and compression again."""
     chunks = [span for span in spans(bytes(data)) if span[0] == Opcode.CHUNK]
     _, start, end = rng.choice(chunks)
@@ -146,7 +142,7 @@ def inside(data: bytearray, rng: random.Random) -> None:
     data[start:end] = written(chunk)
 
 
-def counts(result: dict[str, Any]) -> dict[str, int]:
+def counts(result):
     """Return what can only grow with a trace's length."""
     found = {}
     for name, dag in result['dags'].items():
@@ -163,7 +159,7 @@ def counts(result: dict[str, Any]) -> dict[str, int]:
     return found
 
 
-def never_above(result: dict[str, Any], whole: dict[str, Any]) -> None:
+def never_above(result, whole):
     ours, all_of_it = counts(result), counts(whole)
     assert {key: n for key, n in ours.items() if n > all_of_it[key]} == {}
 
@@ -176,7 +172,7 @@ def sound(tmp_path_factory):
     return path.read_bytes(), replay(path).result()
 
 
-def attempt(path: Path, read: Callable[[Path], Any], seed: int) -> Any:
+def attempt(path, read, seed):
     """Return what reading gives, None for an error of one line; a file that fails is kept."""
     begin = time.process_time()
     try:

@@ -2,17 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Jobs, verdicts and waits of imported recordings; a hand-made one that needs no CARET files."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
 import random
-from typing import Any
 
 from mddag_executor.errors import MddagError
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.trace import EventType, TraceFile, TraceReader
-from msg_graph import loads, TaskSet
+from msg_graph import loads
 import pytest
 
 from .recorded import BEGIN, MS, Recorded, US
@@ -85,7 +80,7 @@ def recorded(tmp_path):
     return r
 
 
-def result_of(path: Path, graph: TaskSet) -> tuple[dict[str, Any], list[str]]:
+def result_of(path, graph):
     outcome = replay(path, graph)
     return outcome.result(), [w.removeprefix(f'{path}: ') for w in outcome.warnings]
 
@@ -218,7 +213,6 @@ nodes:
       - {{name: s, subscription: /in, period: 100ms, deadline: 50ms, release_from: {}}}
 """
 
-
 @pytest.mark.parametrize('release_from, stated, response, said', [
     ('arrival', 0, 5 * MS + 4 * US, False), ('source_timestamp', 0, 15 * MS, False),
     ('header_stamp', 30 * MS, 75 * MS, False), ('header_stamp', 0, 15 * MS, True),
@@ -304,11 +298,11 @@ _VALUES = (0, 1, -1, 2 ** 63 - 1, -2 ** 63, 2 ** 64 - 1, 11, 12, 100, 30_012)
 _TEXTS = ('', '/', '/camera', 'x' * 5000, '\x1b[2J\n', '/camera\n')
 
 
-def mutated(source: Path, target: Path, seed: int) -> Path:
+def mutated(source, target, seed):
     """Write a recording with events left out, doubled, in other places, or with other values."""
     rng = random.Random(seed)
     reader = TraceReader(source)
-    events: list[tuple[Any, ...]] = list(reader.layout_events(None))
+    events = list(reader.layout_events(None))
     with TraceFile(target, overwrite=True) as file:
         for layout, time, pid, tid, *values in _shuffled(events, rng):
             kinds = []
@@ -332,7 +326,7 @@ def mutated(source: Path, target: Path, seed: int) -> Path:
     return target
 
 
-def _shuffled(events: list[tuple[Any, ...]], rng: random.Random) -> Iterator[tuple[Any, ...]]:
+def _shuffled(events, rng):
     for event in events:
         chance = rng.random()
         if chance < 0.02:

@@ -2,11 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The traces of several processes as one run."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.core.tally import counts
@@ -31,9 +27,9 @@ ADDRESS = 0x7F00_0000_0010
 class Trace:
     """The trace of a process that runs one vertex; its clock is late by some ns."""
 
-    def __init__(self, folder: Path, name: str, vertex: int, late: int = 0, graph: str = GRAPH,
-                 judges_from: int = 0, dag: int = 0, boot: str = '', begin: int = 0,
-                 pid: int | None = None) -> None:
+    def __init__(self, folder, name, vertex, late=0, graph=GRAPH,
+                 judges_from=0, dag=0, boot='', begin=0,
+                 pid=None):
         self.path = str(folder / f'run.{name}.mcap')
         self.file = TraceFile(self.path, overwrite=True)
         self.vertex, self.late, self.job = vertex, late, 0
@@ -47,11 +43,10 @@ class Trace:
         self.add('hosted', begin, dag, str(vertex))
         self.add('judge_from', begin, BASE + judges_from - late)
 
-    def add(self, name: str, at: int, *fields: Any) -> None:
+    def add(self, name, at, *fields):
         self.file.add(name, BASE + at - self.late, self.pid, self.pid, *fields)
 
-    def runs(self, release: int, start: int, took: int = MS, completes: bool = True,
-             ready: int | None = None, worker: int = 0, fails: bool = False) -> None:
+    def runs(self, release, start, took=MS, completes=True, ready=None, worker=0, fails=False):
         """Run its vertex for the next job; times in ns since the base."""
         t = BASE - self.late
         ready = start if ready is None else ready
@@ -68,24 +63,24 @@ class Trace:
                      took, True)
         self.job += 1
 
-    def knows(self, topic: str, handle: int) -> None:
+    def knows(self, topic, handle):
         """Publish a topic and subscribe to it."""
         for kind in ('publisher', 'subscription'):
             self.add(f'rcl_{kind}_init', 0, handle, 1, handle, topic, 10)
 
-    def sends(self, other: Trace, handle: int, sent: int, transport: int) -> None:
+    def sends(self, other, handle, sent, transport):
         """Send a message to another trace."""
         self.add('rclcpp_publish', sent, handle, 1, 0)
         other.add('rmw_take', sent + transport, handle, 1, BASE + sent - self.late, True)
 
-    def end(self, at: int | None) -> str:
+    def end(self, at):
         if at is not None:
             self.add('shutdown', at, BASE + at - self.late)
         self.file.finish()
         return self.path
 
 
-def sink(result: dict[str, Any]) -> dict[str, Any]:
+def sink(result):
     return result['dags']['chain']['sinks']['/b:take']
 
 
@@ -112,7 +107,7 @@ def test_a_job_goes_on_in_the_other_trace(tmp_path, late):
     assert result['recording']['shut_down'] and result['recording']['end_ns'] == BASE + 100 * MS
 
 
-def two_machines(folder: Path, late: int, back: bool = True, stranger: bool = False) -> list[str]:
+def two_machines(folder, late, back=True, stranger=False):
     """Return the traces of a run on two machines, the clock of the other is late."""
     up = Trace(folder, 'up', 0, graph=STAMPED, boot='one')
     down = Trace(folder, 'down', 1, late, STAMPED, boot='other')
@@ -225,7 +220,6 @@ nodes:
   - {node: /a, callbacks: [{name: t, timer: 12ms, deadline: 8ms}]}
   - {node: /b, callbacks: [{name: t, timer: 12ms, deadline: 8ms}]}
 """
-
 
 @pytest.fixture
 def two(tmp_path):

@@ -2,11 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Links of imported recordings, rule by rule, and lost events that never go unsaid."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
-from mddag_executor.recording.tables import Recording
 from mddag_executor.replay.drafting import System
 from mddag_executor.replay.run import open_recording
 import numpy as np
@@ -21,7 +16,7 @@ IMAGE = 100                     # publisher
 class Links:
     """The executions of a recording, what they ran for, and its publications; ns since `BEGIN`."""
 
-    def __init__(self, found: Recording) -> None:
+    def __init__(self, found):
         table, sent = found.executions, found.publications
         names = [found.who.name(number) for number in table['callback'].tolist()]
         start, end = ((table[name] - BEGIN).tolist() for name in ('start', 'end'))
@@ -37,7 +32,7 @@ class Links:
             for number, time in zip(sent['publisher'].tolist(), sent['time'].tolist())]
 
 
-def linked(path: Path) -> tuple[Links, list[str]]:
+def linked(path):
     """Return the links of a recording, and the warnings."""
     recording = open_recording(path)
     return Links(recording), [line.removeprefix(f'{path}: ') for line in recording.warnings]

@@ -2,22 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ordinary bags, written by rosbags, as releases: every storage and compression, and damage."""
 
-from __future__ import annotations
-
-from pathlib import Path
 import shutil
 import sqlite3
-from typing import Any
 
 from mddag_executor.errors import InputError
-from mddag_executor.replay import Reschedule
 from mddag_executor.replay.bags import Bag, BagError, is_ordinary
 from mddag_executor.replay.bags_reschedule import read_bag, reschedule_bag
 from mddag_executor.simulate import START
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
 import pytest
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
 MS = 1_000_000
@@ -40,17 +35,14 @@ nodes:
 BY_HEADER = GRAPH.replace('period: 100ms', 'period: 100ms, release_from: header_stamp')
 
 
-def header(stamp: int) -> bytes:
+def header(stamp):
     """Return a std_msgs/Header as CDR."""
     time = STORE.types['builtin_interfaces/msg/Time'](*divmod(stamp, 1_000_000_000))
     message = STORE.types['std_msgs/msg/Header'](time, 'lidar')
     return bytes(STORE.serialize_cdr(message, 'std_msgs/msg/Header'))
 
 
-def write_bag(
-    path: Path, storage: StoragePlugin = StoragePlugin.MCAP,
-    compression: CompressionMode | None = None, stamps: Any = None, topic: str = '/points',
-) -> Path:
+def write_bag(path, storage=StoragePlugin.MCAP, compression=None, stamps=None, topic='/points'):
     """Write a bag of ten scans, each 5 ms after its stamp, and a message of another topic."""
     writer = Writer(path, version=9, storage_plugin=storage)
     if compression is not None:
@@ -68,7 +60,7 @@ def write_bag(
     return path
 
 
-def responses(outcome: Reschedule, dag: str, sink: str) -> dict[str, int]:
+def responses(outcome, dag, sink):
     return outcome.result()['dags'][dag]['sinks'][sink]['response_ns']
 
 

@@ -2,10 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """End-to-end flows and response times: by hand, against slow ones, in traces of this executor."""
 
-from __future__ import annotations
-
-from typing import Any
-
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import quantile
@@ -46,26 +42,25 @@ paths:
     callbacks: ['/a:send', '/b:keep', '/b:use', '/c:take', '/d:end']
 """
 
-
 NONE = -1
 
 
 class Driver:
     """Makes a recording of what happens, by names; times are any, ascending."""
 
-    def __init__(self, text: str = GRAPH) -> None:
+    def __init__(self, text=GRAPH):
         self.task_set = loads(text, 'graph.yaml')
         self.places = self.task_set.places()
         vertices = self.task_set.places_of_vertices()
         self.vertex = {key: vertices.index(place) for key, place in self.places.items()}
         self.who = Entities()
-        self._subscriptions: dict[tuple[str, str], int] = {}
+        self._subscriptions = {}
         self._executions = Rows(
             tables.EXECUTIONS, 'callback', 'vertex', 'start', 'began', 'end', 'message')
         self._sent = Rows(tables.PUBLICATIONS, 'publisher', 'execution', 'vertex', 'time')
         self._took = Rows(tables.TAKES, 'execution', 'message')
 
-    def _callback(self, key: str, topic: str) -> int:
+    def _callback(self, key, topic):
         """Return the number of the subscription with which a callback takes a topic."""
         number = self._subscriptions.get((key, topic))
         if number is None:
@@ -81,34 +76,34 @@ class Driver:
                 self.who.note(f'ros2:{name}', {'_timestamp': 0, '_vpid': 0, **fields})
         return number
 
-    def run(self, key: str, start: int, message: int = NONE, topic: str = '') -> int:
+    def run(self, key, start, message=NONE, topic=''):
         """Begin an execution; return its number."""
         return self._executions.add(
             self._callback(key, topic), self.vertex[key], start, start, NONE, message)
 
-    def send(self, key: str | None, run: int, topic: str, time: int, node: str = '') -> int:
+    def send(self, key, run, topic, time, node=''):
         """Publish; return the message's number."""
         node = node or (key or '').partition(':')[0]
         number = len(self.who.every_publisher) + 1
         self.who.every_publisher[number] = Publisher(number, Node(0, node, 0), topic)
         return self._sent.add(number, run, NONE if key is None else self.vertex[key], time)
 
-    def end(self, key: str, run: int, time: int) -> None:
+    def end(self, key, run, time):
         """End an execution."""
         self._executions.columns['end'][run] = time
 
-    def took(self, key: str, run: int, message: int) -> None:
+    def took(self, key, run, message):
         """Let a running callback take a message."""
         self._took.add(run, message)
 
     @property
-    def paths(self) -> Paths:
+    def paths(self):
         return Paths(Recording(
             'by hand', Head(0, '', '', 'rad', 1, 0, 0, False), self.task_set, self.task_set,
             self.who, declared=False, executions=self._executions.table(), links=True,
             publications=self._sent.table(), takes=self._took.table()))
 
-    def starts(self) -> list[list[int | None]]:
+    def starts(self):
         """Return for each flow its first publication and the start of each later callback."""
         return [[flow.columns[0][0], *(c[1] for c in flow.columns[1:])]
                 for flow in flows(self.paths)]
@@ -191,14 +186,13 @@ def test_publications_outside_of_executions():
     assert d.starts() == [[3, 4, None]]
 
 
-Record = tuple[int, int | None]
 RECORDS = st.lists(st.tuples(
     st.integers(0, 15), st.one_of(st.none(), st.integers(0, 25))), max_size=14)
 LONG = st.lists(st.tuples(
     st.integers(0, 60), st.one_of(st.none(), st.integers(0, 80))), max_size=50)
 
 
-def statistics(times: list[int]) -> dict[str, Any] | None:
+def statistics(times):
     if not times:
         return None
     ordered = sorted(times)
@@ -207,7 +201,7 @@ def statistics(times: list[int]) -> dict[str, Any] | None:
             'p99': quantile(ordered, 0.99), 'max': ordered[-1]}
 
 
-def told(records: list[Record]) -> dict[str, Any]:
+def told(records):
     return figures(
         np.array([start for start, _ in records], dtype=np.int64),
         np.array([-1 if end is None else end for _, end in records], dtype=np.int64))

@@ -2,42 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rescheduled: the recorded load through the core, with the same and with other settings."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 from mddag_executor.core import PolicyError
 from mddag_executor.core.tally import counts
 from mddag_executor.errors import UsageError
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.run_writer import write_trace
-from mddag_executor.simulate import (
-    LogEntry,
-    periodic_load,
-    PREEMPT,
-    Settings,
-    simulate,
-    START,
-)
+from mddag_executor.simulate import periodic_load, PREEMPT, Settings, simulate, START
 from mddag_executor.simulate.load import Load
 from mddag_executor.trace import TraceFile
 from msg_graph import loads
 import pytest
 
-from ..replay.helpers import (
-    add_execution,
-    begin_trace,
-    end_trace,
-    MS,
-    START_TIME,
-    VPID,
-)
+from ..replay.helpers import add_execution, begin_trace, end_trace, MS, START_TIME, VPID
 from ..simulate.test_run import executions
 
 
-def starts(log: list[LogEntry]) -> list[tuple[int, int, int, int]]:
+def starts(log):
     """Return ms since the first one, worker, vertex and job of each start in a log."""
     return [((time - log[0][0]) // MS, worker, vertex, job)
             for time, kind, worker, _, vertex, job in log if kind == START]
@@ -52,8 +34,7 @@ nodes:
     callbacks: [{name: cb, timer: 10ms, deadline: 4ms}]
 """
 
-
-def write_two(path: Path) -> None:
+def write_two(path):
     """Record a run of 20 ms with a slow job from 0 to 12 and fast ones at 5 and 15 ms."""
     load = Load([0, 5 * MS, 15 * MS], [0, 1, 1], [0, 0, 1], [12 * MS, 2 * MS, 2 * MS], [0, 1],
                 [1, 1])
@@ -101,7 +82,7 @@ nodes:
     assert outcome.tables.group[:2] == [0, -1]
 
 
-def write_with_groups(path: Path, text: str, *shared: str) -> None:
+def write_with_groups(path, text, *shared):
     """Record two overlapping jobs of two callbacks, and the callback groups that they had."""
     kind = 'mutually_exclusive' if shared else 'reentrant'
     with TraceFile(path, overwrite=True) as file:
@@ -254,7 +235,7 @@ nodes:
     outcome = simulate(
         task_set, load, Settings(workers=1, duration_ns=200 * MS, preemptive=True), log=True)
     write_trace(tmp_path / 'a.mcap', task_set, load, outcome)
-    hows: list[tuple[dict[str, Any], bool]] = [
+    hows = [
         ({}, False), ({'preemptive': False}, True), ({'policy': 'ros2'}, True)]
     for how, late in hows:
         result = reschedule(tmp_path / 'a.mcap', **how).result()
@@ -262,7 +243,7 @@ nodes:
         assert result['preemptive'] != late
 
 
-def of_python(path: Path, jobs: list[tuple[int, int, int, int, bool]], cpus: int = 2) -> None:
+def of_python(path, jobs, cpus=2):
     """
     Record jobs of DAGs of one timer callback each, as they ran on a worker each.
 
@@ -272,7 +253,7 @@ def of_python(path: Path, jobs: list[tuple[int, int, int, int, bool]], cpus: int
         f'{{name: d{dag}, timer: 100ms, deadline: {deadline}ms, dag: d{dag}}}'
         for dag, deadline in enumerate((20, 50, 90)))
     text = f'mddag: 1\nnodes: [{{node: /n, callbacks: [{callbacks}]}}]'
-    seen: list[int] = []
+    seen = []
     ends = []
     for dag, start, end, cpu, held in jobs:
         ends.append((end, dag, seen.count(dag), start, cpu, held))
@@ -290,7 +271,7 @@ def of_python(path: Path, jobs: list[tuple[int, int, int, int, bool]], cpus: int
         file.add('shutdown', START_TIME + 200 * MS, 1, 1, START_TIME + 200 * MS)
 
 
-def responses(path: Path, **how: Any) -> list[float]:
+def responses(path, **how):
     """Return the response times of the DAGs, rescheduled, ms."""
     dags = reschedule(path, overheads=False, **how).result()['dags']
     return [sink['response_ns']['max'] / MS for dag in dags.values()

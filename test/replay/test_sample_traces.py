@@ -6,11 +6,8 @@ The sample traces in `bags/` and results that have been the same since version 1
 One is not: the first miss is that of the earliest deadline since 2.0.0.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
-from typing import Any
 
 from mddag_executor.cli import main as program
 from mddag_executor.core.tally import total
@@ -33,7 +30,7 @@ def test_every_trace_is_told_of_in_the_readme():
     assert 100_000 < DEMO.stat().st_size < 600_000
 
 
-def counted(result: dict[str, Any]) -> dict[str, Any]:
+def counted(result):
     """Return by DAG its jobs and how many of each sink completed."""
     return {name: (dag['jobs'], [sink['completed'] for sink in dag['sinks'].values()])
             for name, dag in result['dags'].items()}
@@ -104,7 +101,7 @@ def test_the_result_is_that_of_version_1(name, arguments):
         assert misses['missed'] == total(found['dags']).missed
 
 
-def _without_new(found: dict[str, Any]) -> None:
+def _without_new(found):
     """Remove what version 1 did not count."""
     for key in ('on_late', 'mddag', 'format', 'skipped_jobs'):
         found.pop(key, None)

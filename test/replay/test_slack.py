@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How much longer callbacks may take: by hand, against plain bisection, and what users see."""
 
-from __future__ import annotations
-
 import json
 import re
 
@@ -34,7 +32,6 @@ nodes:
   - node: /c
     callbacks: [{name: alone, timer: 100ms, deadline: 100ms, execution_time: 100us}]
 """
-
 
 @pytest.mark.parametrize('recorded', [False, True])
 def test_by_hand(recorded, tmp_path, call):

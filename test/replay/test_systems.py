@@ -2,10 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Systems from traces: who is who, what was measured, what drifted; on traces made here."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable
-from pathlib import Path
 import re
 
 from mddag_executor.errors import InputError
@@ -37,8 +33,7 @@ nodes:
   - {callback_name: /b/callback_2, callback_type: subscription_callback, topic_name: /never}
 """
 
-
-def head() -> list[tuple[object, ...]]:
+def head():
     """Return who is who: rclcpp makes a subscription's links in another order than rclpy."""
     return [
         ('rcl_node_init', 0, 1, 100, 0, 'a', '/'),
@@ -65,14 +60,13 @@ def head() -> list[tuple[object, ...]]:
     ]
 
 
-def run(callback: int, thread: int, start: int, length: int, *publishers: int
-        ) -> list[tuple[object, ...]]:
+def run(callback, thread, start, length, *publishers):
     return [('callback_start', start, thread, callback, False),
             *(('rcl_publish', start + 1, thread, each, 0) for each in publishers),
             ('callback_end', start + length, thread, callback)]
 
 
-def trace(path: Path, events: Iterable[tuple[object, ...]]) -> Path:
+def trace(path, events):
     with TraceFile(path) as file:
         file.extend(sorted(events, key=lambda event: event[1]), PID)
         assert file.rejected == 0, file.rejection
@@ -150,7 +144,7 @@ def test_names_periods_and_what_no_one_declares(tmp_path):
                4: 'std::_Bind<void (Node::*(Node*))()>'}
     lifecycle = ('change_state', 'get_state', 'get_available_states',
                  'get_available_transitions', 'get_transition_graph')
-    events: list[tuple[object, ...]] = [
+    events = [
         ('rcl_node_init', 0, 1, 100, 0, 'cam', '/'),
         ('rcl_publisher_init', 0, 1, 110, 100, 0, '/cam/transition_event', 10)]
     for n, period in ((1, 33_333_333), (2, 33_299_999), (3, 1_500), (4, 20 * MS)):

@@ -6,18 +6,15 @@ Damage of times and of files: what is left is right, and what is left out is sai
 The bounds are on jobs, decisions and steps of the schedule, never on wall time.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 import random
 import tempfile
-from typing import Any
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
-from mddag_executor.replay import open_recording, replay, Reschedule, reschedule
+from mddag_executor.replay import open_recording, replay, reschedule
 from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.trace import times, TraceFile, TraceReader
 from msg_graph import loads
@@ -36,8 +33,7 @@ PLACE = st.integers(0, N - 1)
 STORAGES = (StoragePlugin.MCAP, StoragePlugin.SQLITE3)
 
 
-def scans(path: Path, arrivals: list[int], storage: StoragePlugin = StoragePlugin.MCAP,
-          stamps: list[int] | None = None) -> Path:
+def scans(path, arrivals, storage=StoragePlugin.MCAP, stamps=None):
     """Write a bag of scans, in the order given."""
     writer = Writer(path, version=9, storage_plugin=storage)
     with writer:
@@ -47,11 +43,11 @@ def scans(path: Path, arrivals: list[int], storage: StoragePlugin = StoragePlugi
     return path
 
 
-def arrivals() -> list[int]:
+def arrivals():
     return [BEGIN + k * 25 * MS for k in range(N)]
 
 
-def rescheduled(path: Path, graph: str = GRAPH) -> Reschedule:
+def rescheduled(path, graph=GRAPH):
     """Reschedule a bag; there may not be more than each message warrants."""
     outcome = reschedule_bag(path, loads(graph, 'g.yaml'))
     jobs = [dag['jobs'] for dag in outcome.result()['dags'].values()]
@@ -94,7 +90,7 @@ def test_a_pause_has_no_jobs_of_timers(tmp_path):
     assert tick <= 2 * (N * 25 * MS // 2 // TIMER + 1)
 
 
-def changed(source: Path, target: Path, rng: random.Random) -> None:
+def changed(source, target, rng):
     """Write a trace once more, with one bit of one integer that is as large as a time flipped."""
     reader = TraceReader(source)
     events = [list(event) for event in reader.events()]
@@ -111,7 +107,7 @@ def changed(source: Path, target: Path, rng: random.Random) -> None:
             file.extend(((name, time, thread, *fields),), pid)
 
 
-def sizes(result: dict[str, Any]) -> list[int]:
+def sizes(result):
     """Return how many jobs there are, and what became of them."""
     return [dag['jobs'] for dag in result['dags'].values()]
 

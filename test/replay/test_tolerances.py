@@ -2,17 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tolerated misses, and JUnit XML."""
 
-from __future__ import annotations
-
 import json
-from typing import Any
 from xml.etree import ElementTree
 
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import Tables, Tally
 from mddag_executor.core.state import (
-    Decision,
     SINK_ABORTED,
     SINK_COMPLETED,
     SINK_EXPIRED,
@@ -37,12 +33,11 @@ nodes:
     callbacks: [{name: a, timer: 10ms, deadline: 8ms}]
 """
 
-
-def sink_of(missed: list[bool]) -> dict[str, Any]:
+def sink_of(missed):
     """Return the result of a sink whose jobs missed or not, in a tally that is told of them."""
     task_set = loads(GRAPH, 'g.yaml')
     tally = Tally(task_set, Tables.build(task_set))
-    decisions: list[Decision] = []
+    decisions = []
     for job, miss in enumerate(missed):
         deadline = job * 10 * MS + 8 * MS
         kind = SINK_IN_TIME

@@ -2,15 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Traces that were recorded without a declaration, judged by one that is given later."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 from mddag_executor.trace import EVENTS, TraceFile, TraceReader
 import pytest
 
-from ..conftest import Call
 from ..replay.helpers import begin_trace, end_trace, MS, START_TIME, US
 
 DEMO = Path(__file__).parents[2] / 'bags' / 'demo_short.mcap'
@@ -32,7 +28,7 @@ _OF_JOBS = {f'mddag:{name}' for name in (
 class Run:
     """The trace of a run of three nodes; times are ns since the start."""
 
-    def __init__(self, folder: Path, call: Call) -> None:
+    def __init__(self, folder, call):
         self._call = call
         self.path = folder / 'run.mcap'
         self.graph = folder / 'graph.yaml'
@@ -49,11 +45,10 @@ class Run:
         self.add('rclcpp_subscription_init', 0, 1, 30, 30)
         self.add('rclcpp_subscription_callback_added', 0, 1, 30, RUN)
 
-    def add(self, name: str, time: int, thread: int, *fields: Any) -> None:
+    def add(self, name, time, thread, *fields):
         self.file.add(name, START_TIME + time, 1, thread, *fields)
 
-    def runs(self, callback: int, ready: int, start: int, end: int, *published: int,
-             thread: int = 0) -> None:
+    def runs(self, callback, ready, start, end, *published, thread=0):
         """Run a callback, which publishes at some times."""
         thread = thread or callback
         self.add('dispatch', start, thread, callback, -1, -1, -1, 0, START_TIME + ready, 0)
@@ -64,16 +59,16 @@ class Run:
             self.add('rcl_publish', time, thread, publisher, 0)
         self.add('callback_end', end, thread, callback)
 
-    def takes(self, stamp: int, time: int) -> None:
+    def takes(self, stamp, time):
         """Take a message for /detect."""
         self.add('rmw_take', time, 1, 30, 0, START_TIME + stamp, True)
 
-    def detects(self, stamp: int, taken: int, took: int = 5 * MS) -> None:
+    def detects(self, stamp, taken, took=5 * MS):
         """Take a message and run /detect for it."""
         self.takes(stamp, taken)
         self.runs(RUN, taken + US, taken + 2 * US, taken + 2 * US + took)
 
-    def result(self, until: int | None = None) -> Any:
+    def result(self, until=None):
         """End the run and return what `mddag replay --json` says of it."""
         if until is None:
             self.file.finish()
@@ -87,7 +82,7 @@ def run(tmp_path, call):
     return Run(tmp_path, call)
 
 
-def undeclared(source: Path, target: Path) -> str:
+def undeclared(source, target):
     """Write a trace as if it had been recorded without its declaration, and return that."""
     text = ''
     with TraceFile(target) as file:

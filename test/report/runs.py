@@ -2,24 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs for the tests of reports: a small trace written by hand, and simulated ones."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from mddag_executor.simulate import (
     draw_execution_times,
-    Load,
     periodic_load,
     scale_execution_times,
     Settings,
     simulate,
-    SimulatedRun,
 )
 from mddag_executor.trace import TraceFile
 import msg_graph
-from msg_graph import TaskSet
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 START = 1_732_166_766_000_000_000
@@ -39,11 +32,7 @@ paths:
   - {name: whole, callbacks: ['/driver:tick', '/filter:run']}
 """
 
-
-def by_hand(
-    path: Path, hostile: bool = False, finished: bool = True, undeclared: bool = True,
-    extra_ms: int = 0, took: Sequence[int] = (1, 2, 6),
-) -> Path:
+def by_hand(path, hostile=False, finished=True, undeclared=True, extra_ms=0, took=(1, 2, 6)):
     """
     Write a trace of three jobs; the third is 2 ms late; then an undeclared callback runs.
 
@@ -81,14 +70,11 @@ def by_hand(
     return path
 
 
-def autoware(name: str = 'autoware_multi') -> TaskSet:
+def autoware(name='autoware_multi'):
     return msg_graph.load(CONFIG / f'{name}.yaml')
 
 
-def simulated(
-    task_set: TaskSet, *, utilisation: float = 0.95, workers: int = 5, ms: int = 300,
-    seed: int = 0, **settings: Any,
-) -> tuple[Load, SimulatedRun]:
+def simulated(task_set, *, utilisation=0.95, workers=5, ms=300, seed=0, **settings):
     """Simulate with a log."""
     times = scale_execution_times(
         task_set, draw_execution_times(task_set, seed), workers, utilisation)

@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exports: rows for spreadsheets and data frames, and traces for Perfetto, read back."""
 
-from __future__ import annotations
-
 from collections import Counter
 import csv
 import io
-from pathlib import Path
 
 from mddag_executor.replay import replay
 from mddag_executor.report.export import _harmless, write
@@ -18,13 +15,13 @@ from . import runs
 DEMO = runs.CONFIG.parent / 'bags' / 'demo_short.mcap'
 
 
-def exported(path: Path, form: str, jobs: bool = False) -> bytes:
+def exported(path, form, jobs=False):
     file = io.BytesIO()
     write(form, file, replay(path), 'jobs' if jobs else 'executions')
     return file.getvalue()
 
 
-def read_csv(data: bytes) -> list[dict[str, str]]:
+def read_csv(data):
     return list(csv.DictReader(io.StringIO(data.decode(), newline='')))
 
 

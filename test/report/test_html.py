@@ -2,14 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The HTML report: figures, tables, hostile names; and what is worse in a second run."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 import io
 import json
 from pathlib import Path
 import re
-from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -36,33 +33,33 @@ pytest.importorskip('bokeh', reason='Bokeh is not installed')
 class Page(HTMLParser):
     """Collects elements with their attributes, and text that is shown."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.texts: list[str] = []
-        self.scripts: dict[str | None, str] = {}
-        self._script: str | None = None
+        self.elements = []
+        self.texts = []
+        self.scripts = {}
+        self._script = None
         self._in_script = self._in_style = False
         self.feed(text)
         self.close()
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         attributes = dict(attrs)
         self.elements.append((tag, attributes))
         self._in_script, self._in_style = tag == 'script', tag == 'style'
         self._script = attributes.get('id')
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         self._in_script = self._in_style = False
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if self._in_script:
             self.scripts[self._script] = self.scripts.get(self._script, '') + data
         elif not self._in_style:
             self.texts.append(data)
 
 
-def report(path: Path) -> Page:
+def report(path):
     file = io.BytesIO()
     html.write(file, html.of_outcome(replay(path)))
     return Page(file.getvalue().decode())
@@ -133,7 +130,7 @@ def result(tmp_path):
     return replay(runs.by_hand(tmp_path / 'run.mcap')).result()
 
 
-def changed(result: dict[str, Any], **sink: Any) -> dict[str, Any]:
+def changed(result, **sink):
     before = result['dags']['/driver']['sinks']['/filter:run']
     return {**result, 'dags': {'/driver': {'sinks': {'/filter:run': {**before, **sink}}}}}
 

@@ -2,14 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """HTML reports in headless Chromium: they open without an error, and a miss can be found."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 import os
-from pathlib import Path
 import shutil
 import time
-from typing import Any
 
 from mddag_executor.replay import replay
 from mddag_executor.report import html
@@ -50,7 +45,7 @@ def browser(tmp_path_factory):
     driver.quit()
 
 
-def wait_for(condition: Callable[[], Any]) -> Any:
+def wait_for(condition):
     end = time.monotonic() + PATIENCE_S
     while True:
         value = condition()
@@ -60,7 +55,7 @@ def wait_for(condition: Callable[[], Any]) -> Any:
         time.sleep(0.02)
 
 
-def opened(browser: Any, path: Path) -> Any:
+def opened(browser, path):
     """Open a report and wait until it is drawn."""
     browser.get(path.as_uri())
     wait_for(lambda: browser.execute_script(
@@ -70,24 +65,24 @@ def opened(browser: Any, path: Path) -> Any:
     return browser
 
 
-def complaints(browser: Any) -> list[str]:
+def complaints(browser):
     return [entry['message'] for entry in browser.get_log('browser')
             if entry['level'] not in ('INFO', 'DEBUG')]
 
 
-def status(browser: Any) -> str:
+def status(browser):
     text = browser.execute_script('return document.getElementById("mddag-status")?.textContent')
     assert isinstance(text, str)
     return text
 
 
-def bars(browser: Any, column: str) -> list[Any]:
+def bars(browser, column):
     values = browser.execute_script(f'return Array.from(mddag.bars.data.{column})')
     assert isinstance(values, list)
     return values
 
 
-def write(path: Path, data: html.ReportData) -> Path:
+def write(path, data):
     with path.open('wb') as file:
         html.write(file, data)
     return path
@@ -132,7 +127,7 @@ def test_names_cannot_become_markup(browser, small):
     assert complaints(browser) == []
 
 
-def point_at(browser: Any, name: str, x: float, y: float) -> None:
+def point_at(browser, name, x, y):
     """Move the mouse to a place of a picture, given as its axes have it."""
     from selenium.webdriver.common.action_chains import ActionChains
     from selenium.webdriver.common.actions.action_builder import ActionBuilder
@@ -151,7 +146,7 @@ def point_at(browser: Any, name: str, x: float, y: float) -> None:
     ActionChains(browser).pause(0.05).perform()
 
 
-def shown_tip(browser: Any) -> str:
+def shown_tip(browser):
     """Return the text of the tool tip that is shown."""
     text = browser.execute_script("""
         const found = [];
@@ -204,7 +199,7 @@ def test_many_sinks_are_shown_on_demand_and_found(browser, tmp_path):
     report = write(tmp_path / 'report.html', html.of_run(task_set, load, run))
     opened(browser, report)
 
-    def shown() -> list[str]:
+    def shown():
         names = browser.execute_script("""
             return [...document.querySelectorAll('#mddag-sinks tbody tr')].filter(
               (row) => row.offsetHeight > 0).map((row) => row.cells[0].textContent);""")

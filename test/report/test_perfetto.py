@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Traces for Perfetto, read back with Perfetto's own messages, in the order of its viewer."""
 
-from __future__ import annotations
-
 from collections import Counter
 import io
-from pathlib import Path
 from typing import NamedTuple
 
 from mddag_executor.replay import replay
@@ -40,7 +37,7 @@ class Trace:
     :ivar flows: names of the slices at both ends of each arrow, and their starts.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         file = io.BytesIO()
         write_perfetto(file, replay(path))
         trace = messages.Trace()
@@ -49,10 +46,10 @@ class Trace:
                  for each in packet.interned_data.event_names}
         tracks = {packet.track_descriptor.uuid: packet.track_descriptor
                   for packet in trace.packet if packet.HasField('track_descriptor')}
-        open_slices: dict[int, tuple[str, int]] = {}
-        sent: dict[int, tuple[str, int]] = {}
-        self.slices: list[Slice] = []
-        self.flows: list[tuple[tuple[str, int], tuple[str, int]]] = []
+        open_slices = {}
+        sent = {}
+        self.slices = []
+        self.flows = []
         # the viewer sorts by time, and leaves what is at the same time in the order of the file
         for packet in sorted((packet for packet in trace.packet if packet.HasField('track_event')),
                              key=lambda packet: packet.timestamp):

@@ -6,8 +6,6 @@ Pictures of task sets: what is in them, and that no name can break out of its la
 ``cli/test_golden.py`` has the DOT and Mermaid texts of ``GRAPH``.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 import json
 from pathlib import Path
@@ -18,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.report import dot, mermaid
 from mddag_executor.report.dot import to_dot
-from mddag_executor.report.picture import Picture, picture
+from mddag_executor.report.picture import picture
 from mddag_executor.report.text import printable
 import msg_graph
 import pytest
@@ -42,11 +40,11 @@ HOSTILE = ('a"b', 'back\\slash', 'n\\N\\G', '<b>bold</b>', 'line\nbreak', '"]; e
            '%% comment', 'end', '--> x', '&quot;', '#35;', '\x1b[31m', '\u202e', '"', '\\')
 
 
-def drawn(text: str = GRAPH) -> Picture:
+def drawn(text=GRAPH):
     return picture(msg_graph.loads(text, name='g.yaml'))
 
 
-def laid_out(text: str) -> dict[str, list[float]]:
+def laid_out(text):
     """Return where Graphviz puts each DAG: left, low, right and high."""
     done = subprocess.run(['dot', '-Tjson0'], input=text, text=True, check=True,
                           stdout=subprocess.PIPE, timeout=60)

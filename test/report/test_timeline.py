@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Timelines: what is shown of a schedule is what its trace says, and no more than asked for."""
 
-from __future__ import annotations
-
-from mddag_executor.recording.tables import Recording
 from mddag_executor.replay import open_recording, replay, reschedule
 from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.replay.computed import ComputedRun
@@ -20,7 +17,7 @@ from ..replay.test_ordinary_bags import BY_HEADER, write_bag
 from ..report import runs
 
 
-def same_tables(ours: Recording, theirs: Recording, times: int = 1) -> None:
+def same_tables(ours, theirs, times=1):
     """Compare recordings, the jobs of the first of which have other numbers."""
     for name in ('releases', 'executions', 'job_ends'):
         both = [getattr(each, name).copy() for each in (ours, theirs)]

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording to run nodes again from, and the declaration that goes with it."""
 
-from __future__ import annotations
-
 import pytest
 from std_msgs.msg import Header
 

@@ -2,14 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag, a graph for it, and a node that notes what it sees."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any
 
 from mcap.writer import Writer
-from mddag_executor.rerun import rerun, Result
+from mddag_executor.rerun import rerun
 from mddag_executor.rerun.message_types import definition, type_name
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -35,13 +31,12 @@ nodes:
          deadline: 50ms}
 """
 
-
-def write_bag(path: Path, messages: Iterable[tuple[int, str, Any]]) -> str:
+def write_bag(path, messages):
     """Write messages (ns after `START`, topic, message or its bytes) as rosbag2 does."""
     with open(path, 'wb') as file:
-        writer: Any = Writer(file)
+        writer = Writer(file)
         writer.start(profile='ros2')
-        channels: dict[str, int] = {}
+        channels = {}
         for time, topic, message in messages:
             kind, data = message if isinstance(message, tuple) else (
                 type(message), serialize_message(message))
@@ -60,26 +55,23 @@ Seen = list[tuple[float, Any]]
 class Filter(Node):
     """The declared node; what it does with each message is given."""
 
-    def __init__(self, take: Callable[[Filter, int], Any], **more: Any) -> None:
+    def __init__(self, take, **more):
         super().__init__('filter', **more)
         self.group = ReentrantCallbackGroup()
-        self.seen: Seen = []
+        self.seen = []
         self.create_subscription(
             Header, '/points', lambda message: take(self, int(message.frame_id)), 10,
             callback_group=self.group)
 
-    def note(self, what: Any) -> None:
+    def note(self, what):
         """Note something with the virtual time, ms after the start."""
         self.seen.append(((self.get_clock().now().nanoseconds - START) / MS, what))
 
 
 def run_filter(
-    bag: str, graph: Path, take: Callable[[Filter, int], Any] = lambda node, number: None,
-    *others: Any,
-    fill: Callable[[Filter], Any] = lambda node: None, **more: Any,
-) -> tuple[Seen, Result]:
+        bag, graph, take=lambda node, number: None, *others, fill=lambda node: None, **more):
     """Rerun the node; return what it noted."""
-    nodes: list[Filter] = []
+    nodes = []
 
     def make():
         node = Filter(take)

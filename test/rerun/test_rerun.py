@@ -2,29 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes run again from a bag: what they see, what they publish, and when."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import partial
 import os
 import random
 import threading
-from typing import Any
 
 from builtin_interfaces.msg import Time
 from mddag_executor import open_recording
 from mddag_executor.core import Tables
 from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.replay import replay
-from mddag_executor.rerun import (
-    assert_same,
-    CallbackFailed,
-    compare,
-    programs,
-    rerun,
-    RerunError,
-    Result,
-)
+from mddag_executor.rerun import assert_same, CallbackFailed, compare, programs, rerun, RerunError
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.inputs import MessageBag, open_input
 from mddag_executor.rerun.run import Rerun, Settings
@@ -51,28 +39,28 @@ GAIN = 2.0
 class Filter(Node):
     """Passes on what comes, with the time at which it came."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__('filter')
         self.publisher = self.create_publisher(Header, '/filtered', 10)
         self.create_subscription(Header, '/points', self.take, 10)
 
-    def take(self, message: Header) -> None:
+    def take(self, message):
         now = self.get_clock().now()
         self.publisher.publish(Header(stamp=now.to_msg(), frame_id=message.frame_id))
 
 
 class Sink(Node):
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__('sink')
         self.publisher = self.create_publisher(Float64, '/out', 10)
         self.create_subscription(Header, '/filtered', self.take, 10)
 
-    def take(self, message: Header) -> None:
+    def take(self, message):
         self.publisher.publish(Float64(data=GAIN * int(message.frame_id)))
 
 
-def published(result: Result, topic: str) -> list[tuple[float, Any]]:
+def published(result, topic):
     """Return what was published on a topic: when (ms after the start), and the message."""
     return [((each.time - START) / MS, deserialize_message(each.data, each.kind))
             for each in result.outputs if each.topic == topic]
@@ -128,7 +116,6 @@ nodes:
       - {name: refused, subscription: /others, period: 140ms, dag: refused, importance: low,
          execution_time: 70ms, deadline: 140ms, on_late: demote}
 """
-
 
 def test_refused_work_runs_when_what_it_waits_for_does_not_come(tmp_path, graph):
     """The worker is reserved for a job that must start by 610 ms; its message is lost."""
@@ -194,7 +181,7 @@ def test_messages_leave_at_the_end_and_take_their_recorded_time(bag, graph, dela
     assert [time for time, _ in published(result, '/out')][:2] == [out_ms, 100 + out_ms]
 
 
-def make_node(declared: dict[str, Any]) -> Node:
+def make_node(declared):
     """Return a node whose callbacks only publish what they declare."""
     node = rclpy.create_node(declared['node'][1:])
     for callback in declared['callbacks']:
@@ -257,7 +244,7 @@ def test_timers_fire_at_their_virtual_times(bag, graph):
         (time, 'second') for time in (920, 1220, 1520, 1820)]
 
 
-def seeded(function: Callable[[], None]) -> float:
+def seeded(function):
     function()
     return random.random()
 
@@ -270,7 +257,7 @@ def seeded(function: Callable[[], None]) -> float:
     lambda: numpy.random.RandomState().random_sample(),
 ])
 def test_random_numbers_are_those_of_the_seed(bag, graph, draw):
-    seen: list[float] = []
+    seen = []
     for seed in (1, 1, 2):
         run_filter(bag, graph, lambda node, number: seen.append(draw()), seed=seed)
     assert len({*seen[:20]}) == 20
@@ -305,7 +292,7 @@ def test_nothing_happens_in_a_pause_of_the_recording(tmp_path, graph):
 
 def test_a_message_is_as_it_was_published(bag, graph):
     """Who publishes may change a message afterwards, and who receives it has one of his own."""
-    received: list[str] = []
+    received = []
 
     def fill(node):
         node.names = node.create_publisher(String, '/names', 10)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What waits, and what asks others: services, parameters, rates, sleeps, threads, programs."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 import inspect
@@ -13,7 +11,6 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Any
 
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
@@ -24,7 +21,6 @@ from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header, String
@@ -34,7 +30,7 @@ from test_msgs.action import Fibonacci
 from .helpers import Filter, GRAPH, MS, run_filter, write_bag
 
 
-def server(answers_after_ms: float | None = None) -> Node:
+def server(answers_after_ms=None):
     """Return a node with a service, which takes its time with a rate."""
     node = rclpy.create_node('server')
 
@@ -73,7 +69,7 @@ def test_a_synchronous_call_lends_its_worker(bag, graph):
 
 
 def test_ros_arguments(bag, graph):
-    seen: list[Any] = []
+    seen = []
 
     def main():
         rclpy.init()
@@ -143,7 +139,7 @@ def test_threads_of_nodes_are_in_virtual_time_too(bag, graph):
 
 # --- actions -------------------------------------------------------------------------------------
 
-def fibonacci(**more: Any) -> Node:
+def fibonacci(**more):
     """Return a node with an action that feeds back each 10 ms, and may be cancelled."""
     node = rclpy.create_node('fibonacci')
 
@@ -211,7 +207,7 @@ def test_results_of_actions_expire(bag, graph):
 # --- programs ------------------------------------------------------------------------------------
 
 def test_a_program_with_a_loop_of_its_own(bag, graph):
-    seen: list[Any] = []
+    seen = []
 
     def main():
         rclpy.init()
@@ -272,7 +268,7 @@ def test_simulated_time_is_that_of_the_recording(tmp_path, graph):
         *((i * 20 * MS, '/clock', Clock(clock=Time(sec=5, nanosec=i * 10 * MS)))
           for i in range(48))], key=lambda each: each[0])
     bag = write_bag(tmp_path / 'in.mcap', messages)
-    seen: list[float] = []
+    seen = []
 
     def make():
         def take(node, number):
@@ -312,7 +308,7 @@ def test_who_is_there_is_known_at_once(bag, graph):
 # --- what blocks ---------------------------------------------------------------------------------
 
 
-def read_for_ever() -> None:
+def read_for_ever():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         device.bind(('127.0.0.1', 0))
         device.settimeout(0.01)
@@ -321,7 +317,7 @@ def read_for_ever() -> None:
                 device.recv(1)  # the line that is named
 
 
-def pass_on_for_ever() -> None:
+def pass_on_for_ever():
     numbers = queue.Queue[int](maxsize=1)
     threading.Thread(target=lambda: list(iter(numbers.get, None))).start()
     while True:
@@ -329,7 +325,7 @@ def pass_on_for_ever() -> None:
         numbers.put(1)
 
 
-def compute_for_ever() -> None:
+def compute_for_ever():
     any(number for number in iter(int, 1))  # the line that is named
 
 

@@ -2,19 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's workload through the core: 11 DAGs, 86 vertices, at the nanosecond."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 
 from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
-from mddag_executor.simulate import (
-    draw_execution_times,
-    periodic_load,
-    Settings,
-    simulate,
-)
-from msg_graph import load, TaskSet
+from mddag_executor.simulate import draw_execution_times, periodic_load, Settings, simulate
+from msg_graph import load
 import pytest
 
 AUTOWARE = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
@@ -23,14 +16,14 @@ WORKERS = 7
 
 
 @cache
-def autoware() -> TaskSet:
+def autoware():
     return load(AUTOWARE)
 
 
 # What the paper's own program (github.com/atsushi421/2024_RTSS_WiP_Evaluation) gave on 2026-11-22
 # for draws of this project, by seed and policy: when the first late sink completed, and the worst
 # response time of each sink until then, DAG by DAG, us.
-PAPER: dict[tuple[int, str], tuple[int | None, list[int]]] = {
+PAPER = {
     (2, 'rad'): (None, [
         5998, 5967, 1995, 2216, 34988, 250, 251, 4401, 140938, 231479, 122722, 212577, 188155, 669,
         2889, 79032, 316, 314]),
@@ -78,7 +71,7 @@ def test_the_paper_s_program_gives_the_same(seed, policy):
     run = simulate(task_set, periodic_load(task_set, times, DURATION_NS), Settings(
         policy=policy, workers=WORKERS, duration_ns=DURATION_NS, preemptive=None,
         judge='completions', stop_at_first_miss=True))
-    worst: dict[int, int] = {}
+    worst = {}
     first_miss = None
     for kind, dag, vertex, job, _, time in run.decisions:
         if kind in SINK_COMPLETED and first_miss is None:

@@ -6,8 +6,6 @@ The compiled core against the plain one: the same starts, ends and decisions.
 Both are the same source; what this finds is where compiled arithmetic, lists or heaps differ.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import accumulate
 import os
@@ -38,7 +36,7 @@ MS = 1_000_000
 EVERY_RULE = cases(overheads=True, importance=True)
 
 
-def settings_of(case: Case, horizon: int, judge: str, stop: bool) -> Settings:
+def settings_of(case, horizon, judge, stop):
     return Settings(
         policy=case.policy, workers=case.workers, duration_ns=horizon * TICK,
         preemptive=case.preemptive, judge=judge, stop_at_first_miss=stop,
@@ -46,7 +44,7 @@ def settings_of(case: Case, horizon: int, judge: str, stop: bool) -> Settings:
         switch_overhead_ns=case.switch_overhead * TICK)
 
 
-def compare(case: Case, horizon: int, judge: str = 'horizon', stop: bool = False) -> int:
+def compare(case, horizon, judge='horizon', stop=False):
     """Run a case both ways; return how many decisions there were."""
     settings = settings_of(case, horizon, judge, stop)
     load_ = case.load(horizon)
@@ -77,8 +75,7 @@ def test_everything_at_once(case, horizon, judge, stop):
 SLOW = 400
 """Times so many times as long are some switch intervals and slices of a machine."""
 
-
-def slowed(tables: Tables, processes: int, chances: random.Random) -> Tables:
+def slowed(tables, processes, chances):
     """Return tables with longer times, and vertices in any of the processes."""
     columns = {name: [time * SLOW if time >= 0 else time for time in getattr(tables, name)]
                for name in ('period', 'dag_deadline', 'rad_offset', 'sink_deadline')}
@@ -86,7 +83,7 @@ def slowed(tables: Tables, processes: int, chances: random.Random) -> Tables:
         **columns, process=[chances.randint(1, processes) for _ in tables.process])
 
 
-def with_everything(load_: Load, tables: Tables, chances: random.Random) -> Load:
+def with_everything(load_, tables, chances):
     """Return a load, slowed, that is different for each job, with all that it may tell."""
     jobs = [load_.dags.count(dag) for dag in range(tables.n_dags)]
     sizes = [tables.n_region[dag] for dag in range(tables.n_dags)]
@@ -184,7 +181,7 @@ def test_autoware(policy):
     assert compare(case, 400_000) > 200
 
 
-def python(*lines: str, **environment: str) -> str:
+def python(*lines, **environment):
     done = subprocess.run(
         [sys.executable, '-c', '\n'.join(lines)], env={**os.environ, **environment},
         capture_output=True, text=True, check=True, timeout=300)

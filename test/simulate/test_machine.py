@@ -2,11 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """CPUs and the interpreter in virtual time: by hand, and against a model that goes by ticks."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -49,10 +45,7 @@ class Job:
     end: int = -1
 
 
-def times(
-    jobs: Sequence[Job], workers: int, cpus: int | None = None, python: bool = False,
-    preemptive: bool = False, divided: bool = False,
-) -> list[tuple[int, int]]:
+def times(jobs, workers, cpus=None, python=False, preemptive=False, divided=False):
     """Return when each job starts first, and when it ends."""
     task_set = declaration([
         single(f'd{n}', 10 ** 9, job.deadline) for n, job in enumerate(jobs)])
@@ -78,14 +71,14 @@ def times(
     return found
 
 
-def of_ms(*jobs: Job) -> list[Job]:
+def of_ms(*jobs):
     for job in jobs:
         job.release, job.deadline, job.cost = job.release * MS, job.deadline * MS, job.cost * MS
         job.cpu = None if job.cpu is None else job.cpu * MS
     return list(jobs)
 
 
-def in_ms(found: Sequence[tuple[int, int]]) -> list[tuple[float, float]]:
+def in_ms(found):
     return [(start / MS, end / MS) for start, end in found]
 
 
@@ -115,7 +108,6 @@ nodes:
       - {name: b, timer: 20ms, deadline: 20ms, dag: b, execution_time: 6ms, holds_interpreter: H}
 """
 
-
 def test_declared_holders_in_the_simulator():
     worst = []
     for holds, cpus in (('false', None), ('true', None), ('false', 1)):
@@ -143,7 +135,7 @@ class Lock:
     queue: list[Job] = field(default_factory=list)
     left: int = 0
 
-    def pass_on(self, wanted: list[Job], now: int) -> None:
+    def pass_on(self, wanted, now):
         goes_on = [job for job in wanted if job.start == now]
         if self.queue and self.queue[0].end == now and goes_on:
             self.queue[0] = goes_on[0]
@@ -173,7 +165,7 @@ class Ticks:
     computing: list[Job] = field(default_factory=list)
     slice_left: int | None = None
 
-    def times(self) -> list[tuple[int, int]]:
+    def times(self):
         self.on = [None] * self.workers * (1 + self.divided)
         now = 0
         while any(job.end < 0 for job in self.jobs):
@@ -181,14 +173,14 @@ class Ticks:
             now += 1
         return [(job.start, job.end) for job in self.jobs]
 
-    def _instant(self, now: int) -> None:
+    def _instant(self, now):
         for worker, job in enumerate(self.on):
             if job is not None and job.left == 0:
                 job.end, self.on[worker] = now, None
         self.waiting += [job for job in self.jobs if job.release == now]
         while self._start_one(now):
             pass
-        wanted: dict[str, list[Job]] = {LOCK: [], CPU: [], NOTHING: []}
+        wanted = {LOCK: [], CPU: [], NOTHING: []}
         for job in filter(None, self.on):
             wanted[self._needs(job)].append(job)
         having = []
@@ -201,7 +193,7 @@ class Ticks:
             job.left -= 1
         self.slice_left = None if self.slice_left is None else self.slice_left - 1
 
-    def _start_one(self, now: int) -> bool:
+    def _start_one(self, now):
         waiting = sorted(self.waiting, key=lambda j: j.release + j.deadline)
         for job in waiting:
             idle = [w for w, other in enumerate(self.on) if other is None and (
@@ -219,11 +211,11 @@ class Ticks:
                 return True
         return False
 
-    def _holders(self, job: Job) -> list[Job]:
+    def _holders(self, job):
         return [other for other in self.on if other is not None and other.holds
                 and other.interpreter == job.interpreter]
 
-    def _overtaking_pays(self, first: Job, now: int) -> bool:
+    def _overtaking_pays(self, first, now):
         """Tell whether twice the wait for who began last is longer than the deadline."""
         holders = self._holders(first) if first.holds else []
         if not holders:
@@ -233,7 +225,7 @@ class Ticks:
         left = last.cost - held if held < 3 * last.cost + LONG else held
         return left >= TURN and 2 * left >= first.deadline
 
-    def _needs(self, job: Job) -> str:
+    def _needs(self, job):
         cpu = job.cost if job.cpu is None else job.cpu
         waits = job.cost - cpu
         if job.holds:
@@ -249,7 +241,7 @@ class Ticks:
             parts = [LOCK] * (cpu // 4) + [NOTHING] * waits + [LOCK] * (cpu - cpu // 4)
         return parts[job.cost - job.left]
 
-    def _pass_cpus(self, wanted: list[Job]) -> None:
+    def _pass_cpus(self, wanted):
         had = self.computing[:self.cpus]
         old = [job for job in self.computing if job in wanted]
         self.computing = [job for job in wanted if job not in old] + old
@@ -263,8 +255,8 @@ class Ticks:
 
 
 @st.composite
-def some_jobs(draw: st.DrawFn) -> list[Job]:
-    jobs: list[Job] = []
+def some_jobs(draw):
+    jobs = []
     n = draw(st.integers(1, 6))
     urgencies = draw(st.permutations(range(40, 40 + n)))
     for urgency in urgencies:
@@ -283,5 +275,5 @@ def test_as_the_model_that_goes_by_ticks(jobs, workers, cpus, python, divided):
             patch.setattr(machine, name, ticks)
         for name, ticks in (('TURN_NS', TURN), ('LONG_NS', LONG)):
             patch.setattr(queues, name, ticks)
-        found: Any = times(jobs, workers, cpus, python, divided=divided)
+        found = times(jobs, workers, cpus, python, divided=divided)
     assert found == Ticks(jobs, workers, cpus, python, divided).times()

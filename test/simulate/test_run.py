@@ -2,14 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated runs: loads and settings, and that a recorded one is replayed as it was."""
 
-from __future__ import annotations
-
 from collections import Counter
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 import tempfile
-from typing import Any
 
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
@@ -20,16 +16,14 @@ from mddag_executor.simulate import (
     draw_execution_times,
     END,
     Load,
-    LogEntry,
     periodic_load,
     scale_execution_times,
     Settings,
     simulate,
-    SimulatedRun,
     START,
     utilisation,
 )
-from msg_graph import load, loads, TaskSet
+from msg_graph import load, loads
 import pytest
 
 from ..core.task_sets import Case, cases, declaration, examples
@@ -37,7 +31,7 @@ from ..core.task_sets import Case, cases, declaration, examples
 US = 1_000
 
 
-def two_dags(**more: Any) -> TaskSet:
+def two_dags(**more):
     return declaration([
         {'node': '/n', 'name': 's', 'timer': '10us', 'publishes': ['/s'], 'dag': 'a',
          'execution_time': '2us', **more},
@@ -166,7 +160,7 @@ def trace():
         yield Path(folder, 'run.mcap')
 
 
-def record(case: Case, horizon: int, trace: Path, **how: Any) -> SimulatedRun:
+def record(case, horizon, trace, **how):
     run = case.run(horizon, **how)
     trace.unlink(missing_ok=True)
     write_trace(trace, case.task_set, case.load(how.get('last_release') or horizon), run)
@@ -199,9 +193,9 @@ def test_the_replayer_counts_the_same(trace, case, horizon, stop):
         assert replay(trace).result()['duration_ns'] <= stopped.ended_ns
 
 
-def executions(log: Sequence[LogEntry]) -> Iterator[tuple[int, LogEntry]]:
+def executions(log):
     """Yield the start of each stretch in which a callback ran, and the entry of its end."""
-    since: dict[int, int] = {}
+    since = {}
     for entry in log:
         time, kind, worker, *_ = entry
         if kind == START:

@@ -2,12 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A small CTF 1.8 writer: sessions as LTTng records them, for the importer's tests."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 import struct
-from typing import Any
 
 CLOCK_OFFSET = 1_732_000_000_000_000_000
 MAGIC = 0xC1FC1FC1
@@ -38,13 +33,9 @@ TYPES = {
 }
 CONTEXT = f'{TYPES["i32"][0]} _vpid; {TYPES["i32"][0]} _vtid; string _procname;'
 
-Kind = tuple[str, Sequence[tuple[str, str]]]
 
 
-def session(
-    folder: Path, kinds: Sequence[Kind], events: Sequence[tuple[Any, ...]], *,
-    context: bool = True, discarded: int = 0, environment: Mapping[str, str] | None = None,
-) -> Path:
+def session(folder, kinds, events, *, context=True, discarded=0, environment=None):
     """
     Write a trace into a new folder and return it.
 
@@ -71,7 +62,7 @@ def session(
     return folder
 
 
-def _declared(name: str, kind: str) -> str:
+def _declared(name, kind):
     if kind == 'str':
         return f'string _{name};'
     base, bracket, length = kind.partition('[')
@@ -82,7 +73,7 @@ def _declared(name: str, kind: str) -> str:
     return f'{TYPES[base][0]} _{name}[{length};'
 
 
-def _packed(kind: str, value: Any) -> bytes:
+def _packed(kind, value):
     if kind == 'str':
         return value.encode() + b'\0'
     base, bracket, length = kind.partition('[')
@@ -93,8 +84,7 @@ def _packed(kind: str, value: Any) -> bytes:
     return head + struct.pack(f'<{len(value)}{code}', *value)
 
 
-def _packet(kinds: Sequence[Kind], events: Sequence[tuple[Any, ...]], context: bool,
-            discarded: int) -> bytes:
+def _packet(kinds, events, context, discarded):
     body = b''
     for kind, time, pid, tid, procname, *values in events:
         body += struct.pack('<IQ', kind, time)

@@ -2,16 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Events, files and child processes that the trace tests share."""
 
-from __future__ import annotations
-
-from pathlib import Path
 import struct
 import subprocess
 import sys
 from typing import Any
 
 from hypothesis import strategies as st
-from mddag_executor.trace import EVENTS, EventType, TraceFile, TraceReader
+from mddag_executor.trace import EVENTS, TraceFile, TraceReader
 from mddag_executor.trace.cdr import FieldType
 
 VPID = 4321
@@ -26,7 +23,7 @@ _RANGES = {
 }
 
 
-def values(kind: FieldType) -> st.SearchStrategy[Any]:
+def values(kind):
     """Return a strategy for values of a type, ends of the ranges included."""
     one: st.SearchStrategy[Any]
     if kind.base == 'string':
@@ -44,14 +41,14 @@ def values(kind: FieldType) -> st.SearchStrategy[Any]:
     return st.lists(one, min_size=max(kind.count, 0), max_size=size).map(tuple)
 
 
-def entries(event: EventType) -> st.SearchStrategy[tuple[Any, ...]]:
+def entries(event):
     """Return a strategy for recordings of an event: name, timestamp, thread id, fields."""
     return st.tuples(st.just(event.key), st.integers(0, 2**63 - 1),
                      st.integers(-2**31, 2**31 - 1),
                      *(values(FieldType.parse(kind)) for _, kind in event.fields))
 
 
-def sample(event: EventType, number: int) -> tuple[Any, ...]:
+def sample(event, number):
     """Return one recording of an event, different for each number."""
     def value(kind, place):
         if kind == 'string':
@@ -63,19 +60,19 @@ def sample(event: EventType, number: int) -> tuple[Any, ...]:
             *(value(kind, place) for place, (_, kind) in enumerate(event.fields)))
 
 
-def mixture(count: int, first: int = 0) -> list[tuple[Any, ...]]:
+def mixture(count, first=0):
     """Return recordings of all events of the table, one by one, in the order of time."""
     events = list(EVENTS.values())
     return [sample(events[number % len(events)], number)
             for number in range(first, first + count)]
 
 
-def read_back(recorded: list[tuple[Any, ...]], vpid: int = VPID) -> list[tuple[Any, ...]]:
+def read_back(recorded, vpid=VPID):
     """Return recordings as the reader gives them."""
     return [(name, timestamp, vpid, *rest) for name, timestamp, *rest in recorded]
 
 
-def write_chunks(path: Path, chunks: list[list[tuple[Any, ...]]], finish: bool = True) -> None:
+def write_chunks(path, chunks, finish=True):
     """Write a file with the given recordings in each chunk."""
     file = TraceFile(path, overwrite=True)
     for chunk in chunks:
@@ -88,14 +85,14 @@ def write_chunks(path: Path, chunks: list[list[tuple[Any, ...]]], finish: bool =
         file.abandon()
 
 
-def read(path: Path, in_time_order: bool = False) -> tuple[list[tuple[Any, ...]], list[str]]:
+def read(path, in_time_order=False):
     """Return the events of a file and the warnings."""
     reader = TraceReader(path)
     events = list(reader.events(sorted=in_time_order))
     return events, reader.warnings
 
 
-def records_of(data: bytes) -> list[tuple[int, int, int]]:
+def records_of(data):
     """Return opcode, offset and end of the records of a sound file."""
     found = []
     position = 8
@@ -106,7 +103,7 @@ def records_of(data: bytes) -> list[tuple[int, int, int]]:
     return found
 
 
-def run_child(script: str, *arguments: object, timeout: float = 60) -> str:
+def run_child(script, *arguments, timeout=60):
     """Run a script in a Python process of its own and return what it prints."""
     done = subprocess.run([sys.executable, '-c', script, *map(str, arguments)], text=True,
                           capture_output=True, timeout=timeout, check=False)

@@ -2,13 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Importing CTF sessions: every event with every field, and damage said in one line."""
 
-from __future__ import annotations
-
-from pathlib import Path
 import pickle
 import struct
 import sys
-from typing import NoReturn
 
 from mddag_executor.trace import ctf, import_ctf, read_events, TraceError, TraceReader
 import pytest
@@ -25,7 +21,7 @@ UNREADABLE = r's: (cannot be read|babeltrace2 gave up) \('
 bt2 = pytest.mark.needs('babeltrace2')
 
 
-def imported(folder: Path, tmp_path: Path) -> Path:
+def imported(folder, tmp_path):
     import_ctf(folder, tmp_path / 'out.mcap')
     return tmp_path / 'out.mcap'
 
@@ -167,7 +163,7 @@ def test_a_helper_that_fails(rows, then, what, tmp_path, monkeypatch):
 class Plain(pickle.Unpickler):
     """Reads pickles of plain values only."""
 
-    def find_class(self, module: str, name: str) -> NoReturn:
+    def find_class(self, module, name):
         raise pickle.UnpicklingError(f'{module}.{name}')
 
 

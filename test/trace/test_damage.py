@@ -7,14 +7,9 @@ The sample has several chunks, each with a definition that the ones before do no
 way to lose or to mistake one shows.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 import os
-from pathlib import Path
 import random
 import struct
-from typing import Any
 import zlib
 
 import lz4.frame
@@ -49,7 +44,7 @@ def sample(tmp_path_factory):
     return path.read_bytes(), [read_back(chunk) for chunk in chunks]
 
 
-def check(path: Path, data: bytes, chunks: list[list[Any]]) -> int:
+def check(path, data, chunks):
     """Check that a changed file gives a prefix in both orders, and return of how many chunks."""
     path.write_bytes(data)
     results = []
@@ -63,7 +58,7 @@ def check(path: Path, data: bytes, chunks: list[list[Any]]) -> int:
         assert len(warnings) <= 1
         for text in warnings:
             assert text.startswith(f'{path}: ') and '\n' not in text
-        prefix: list[Any] = []
+        prefix = []
         whole = 0
         while len(prefix) < len(events):
             prefix += chunks[whole]
@@ -119,7 +114,7 @@ def test_warnings_have_counts(tmp_path, sample):
                              'the data, 4 chunks with 14 messages']
 
 
-def flips(data: bytes, count: int, seed: int) -> Iterator[tuple[int, bytes]]:
+def flips(data, count, seed):
     """Yield positions and the data with one bit flipped there, every position at least once."""
     generator = random.Random(seed)
     for number in range(count):
@@ -180,7 +175,7 @@ def test_a_folder_says_what_is_in_it(tmp_path, files, says):
     assert str(error.value) == f'{tmp_path}: {says.format(tmp_path)}'
 
 
-def spans(data: bytes) -> list[tuple[int, int]]:
+def spans(data):
     """Return where each chunk with its indexes begins and ends."""
     starts = [start for opcode, start, _ in records_of(data)
               if opcode in (Opcode.CHUNK, Opcode.DATA_END)]
@@ -220,12 +215,12 @@ def test_a_file_that_goes_away_or_shrinks(tmp_path, sample):
     assert list(reader.events()) == [event for chunk in chunks for event in chunk]     # it is open
 
 
-def prefixed(data: bytes) -> bytes:
+def prefixed(data):
     """Return bytes with their length in front."""
     return records.UINT32.pack(len(data)) + data
 
 
-def chunk(content: bytes, **changes: Any) -> bytes:
+def chunk(content, **changes):
     """Return a chunk record around packed content, with some of its head changed."""
     head = {'size': 100, 'crc': 0, 'compression': 'zstd', 'length': len(content), **changes}
     return records.record(
@@ -234,24 +229,24 @@ def chunk(content: bytes, **changes: Any) -> bytes:
         + prefixed(head['compression'].encode()) + struct.pack('<Q', head['length']) + content)
 
 
-def definitions(text: str = EVENTS['ros2:callback_end'].text) -> bytes:
+def definitions(text=EVENTS['ros2:callback_end'].text):
     """Return the records that make channel 1 one of callback_end."""
     schema = Schema(1, text.encode(), 'ros2msg', 'a')
     return written(schema) + channel('/trace/ros2/callback_end')
 
 
-def channel(topic: str) -> bytes:
+def channel(topic):
     """Return the record that makes channel 1 one of a topic."""
     return written(Channel(1, topic, 'cdr', {}, 1))
 
 
-def message(fields: bytes) -> bytes:
+def message(fields):
     """Return a message record on channel 1."""
     return records.record(Opcode.MESSAGE, records.MESSAGE_HEAD.pack(1, 0, 1, 1)
                           + b'\0\1\0\0' + struct.pack('<qii', 1, 2, 3) + fields)
 
 
-def hostile() -> dict[str, bytes]:
+def hostile():
     """Return data sections that claim more than there is, or hold more than they say."""
     zeros = bytes(1 << 20)
     bomb = zstandard.ZstdCompressor().compress(zeros * 300)
@@ -338,7 +333,6 @@ for path in sys.argv[1:]:
         assert str(error).startswith(path)
 print(round(mddag_executor.memory.peak_memory_mb()))
 """
-
 
 @pytest.mark.parametrize('finished', [False, True])
 def test_hostile_lengths(tmp_path, finished):

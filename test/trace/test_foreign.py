@@ -2,32 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files by other writers, and the order of time."""
 
-from __future__ import annotations
-
-from pathlib import Path
 import random
 import struct
-from typing import Any
 
 from mcap.writer import CompressionType, IndexType, Writer
-from mddag_executor.trace import (
-    EVENTS,
-    read_events,
-    TraceReader,
-    TraceWarning,
-)
+from mddag_executor.trace import EVENTS, read_events, TraceReader, TraceWarning
 from mddag_executor.trace.cdr import ENCAPSULATION, encode
 import pytest
 
 from .helpers import mixture, read, read_back, VPID, write_chunks
 
 
-def message(entry: tuple[Any, ...]) -> bytes:
+def message(entry):
     name, timestamp, *rest = entry
     return ENCAPSULATION + encode(EVENTS[name].types, (timestamp, VPID, *rest))
 
 
-def write_with_mcap(path: Path, recorded: list[tuple[Any, ...]], **options: Any) -> None:
+def write_with_mcap(path, recorded, **options):
     """Write with the mcap package: other schema ids, other names, channels in another order."""
     with open(path, 'wb') as stream:
         writer = Writer(stream, **options)
@@ -69,8 +60,8 @@ def test_files_by_the_mcap_package(tmp_path, options, in_time_order):
     assert read(path, in_time_order) == (read_back(recorded), [])
 
 
-def write_one(path: Path, schema: str, data: bytes, topic: str = '/trace/ros2/callback_end',
-              schema_encoding: str = 'ros2msg', encoding: str = 'cdr', repeat: int = 1) -> None:
+def write_one(path, schema, data, topic='/trace/ros2/callback_end',
+              schema_encoding='ros2msg', encoding='cdr', repeat=1):
     with open(path, 'wb') as stream:
         writer = Writer(stream)
         writer.start(profile='ros2')

@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is written is what this reader, the mcap package and rosbags read."""
 
-from __future__ import annotations
-
 import struct
-from typing import Any
 
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
@@ -216,7 +213,7 @@ def test_optional_fields_of_older_files(tmp_path):
     path = tmp_path / 'a.mcap'
     now = EVENTS['mddag:complete']
     before = EventType(now.provider, now.name, now.fields[:7])
-    cases: list[tuple[Any, ...]] = [
+    cases = [
         (before, (), -1, False), (now, (), -1, False), (now, (700, True), 700, True)]
     for event, fields, cpu_time, held in cases:
         with TraceFile(path, overwrite=True) as file:
@@ -292,7 +289,7 @@ TYPES = PRIMITIVES + [base + array for base in PRIMITIVES for array in ('[]', '[
 
 
 @st.composite
-def messages(draw: Any) -> tuple[list[str], list[Any]]:
+def messages(draw):
     names = draw(st.lists(st.sampled_from(TYPES), min_size=1, max_size=8))
     return names, [draw(values(FieldType.parse(name))) for name in names]
 

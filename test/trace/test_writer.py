@@ -2,17 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live writer: many threads, kills, full buffers, full disks."""
 
-from __future__ import annotations
-
 import errno
 import os
-from pathlib import Path
 import signal
 import subprocess
 import sys
 import threading
 import time
-from typing import Any
 
 from mddag_executor.trace import TraceError, TraceWriter
 import pytest
@@ -22,7 +18,7 @@ from .helpers import mixture, read, read_back, run_child, START
 FAST = 0.01     # flush interval of tests that need not wait
 
 
-def wait_for_file(path: Path, size: int) -> None:
+def wait_for_file(path, size):
     """Wait until the writer thread has written more than some bytes."""
     deadline = time.monotonic() + 10
     while path.stat().st_size <= size:
@@ -84,7 +80,7 @@ def test_every_event_is_in_the_file_or_counted(tmp_path):
 
 def test_what_cannot_be_written_costs_nothing_else(tmp_path, caplog):
     path = tmp_path / 'a.mcap'
-    bad: list[tuple[Any, ...]] = [
+    bad = [
         ('nonsense', START, 1, 2), ('callback_end', START, 1), ('callback_end', START, 1, -1),
         ('callback_end', START, 1, 'text'), ('callback_end', -START, 1, 2), (), ([], START, 1),
         ('callback_end', START, 1, object()), ('callback_end', None, 1, 2),
@@ -134,7 +130,6 @@ while True:
     if number % 100 == 0:
         print(number, flush=True)
 """
-
 
 @pytest.mark.parametrize('seconds', [1.1])
 def test_a_killed_process_loses_at_most_the_last_second(tmp_path, seconds):

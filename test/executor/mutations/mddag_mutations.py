@@ -9,8 +9,6 @@ test begins, and one for each phase of it that fails and for the end of its call
 never ended shows as well: it has only begun.
 """
 
-from __future__ import annotations
-
 from importlib.machinery import SourceFileLoader
 import json
 import os

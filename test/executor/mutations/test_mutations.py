@@ -8,8 +8,6 @@ tests of this project.  One of them has to fail.  That a run hangs until its tim
 to find a mistake: it does not count, and is told apart.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 from dataclasses import dataclass, field
@@ -36,7 +34,6 @@ IN_PARALLEL = 3
 """So many runs at a time: their tests mostly wait."""
 AT_ONCE_S = 4.0
 """A test that has failed sooner has not waited for one of its own time-outs, which are 5 s."""
-
 
 @dataclass(frozen=True)
 class Case:
