@@ -227,6 +227,12 @@ def reschedule(
         warnings.append(
             f'{run.name}: CPU times are not recorded in it, so with --cpus each '
             'execution computes all the time')
+    pieces = run.executions[run.executions['piece'] > 0]
+    waited = sorted({run.task_set.vertices[v].callback.key for v in set(
+        pieces['vertex'].tolist()) if v >= 0})
+    if waited and not head.preemptive:
+        warnings.append(
+            f'{run.name}: the time in which coroutines waited is left out: {listed(waited)}')
     settings = Settings(
         policy, workers, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
         judge_from=judge_from, processes=max(1, len(placed)), on_late=on_late)

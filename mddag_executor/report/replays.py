@@ -139,7 +139,7 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
         return
     undeclared = result['undeclared']
     if undeclared['executions']:
-        yield (f'{counted(undeclared["executions"], "run")} of undeclared callbacks, '
+        yield (f'{counted(undeclared["executions"], "run")} of undeclared callbacks and tasks, '
                f'{format_ns(undeclared["busy_ns"], 3)} altogether')
     dropped = result['dropped']
     if dropped:

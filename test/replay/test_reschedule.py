@@ -199,6 +199,8 @@ nodes:
                                  'waiting_ns': 0, 'longest_wait_ns': 0, 'waiting_group_ns': 0}
     breakdown = replay(path).result()['dags']['a']['sinks']['/n:b']['breakdown']['worst']
     assert (breakdown['suspended_ns'], breakdown['executing_ns']) == (18 * MS, 5 * MS + 6 * MS)
+    assert reschedule(path).warnings == [
+        f'{path}: the time in which coroutines waited is left out: /n:a']
 
 
 def test_settings_that_can_not_be(tmp_path):
