@@ -51,11 +51,9 @@ class PublisherProcess:
         orders.close()
 
     def __enter__(self) -> PublisherProcess:
-        """Return itself."""
         return self
 
     def __exit__(self, *args: object) -> None:
-        """End the process."""
         self._process.kill()
         self._process.join()
 

@@ -50,11 +50,7 @@ def parse_declaration(
 
 
 def read_processes(top: Entry, nodes: Iterable[str]) -> tuple[Process, ...]:
-    """
-    Return the processes that the entry of a file declares.
-
-    :param nodes: the declared ones, in file order.
-    """
+    """Return the processes that the entry of a file declares for its nodes."""
     declared: Entry = top.get('processes')
     nodes = list(dict.fromkeys(nodes))
     process_of: dict[str, str] = {}

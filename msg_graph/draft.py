@@ -134,11 +134,7 @@ class Draft:
 def leave_out_sources(
     draft: Draft, which: Callable[[DraftCallback], bool], reason: str
 ) -> None:
-    """
-    Leave out sources, and callbacks that become sources because their topics lose the publisher.
-
-    :param which: returns whether a source is left out.
-    """
+    """Leave out some sources, and callbacks whose topics lose all publishers by that."""
     while True:
         published = {topic for callback in draft.callbacks()
                      for topic in callback.publishes + callback.maybe}

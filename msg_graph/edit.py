@@ -66,12 +66,7 @@ def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, list[
 
 
 def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Table[str, int]) -> str:
-    """
-    Return a declaration with other deadlines; comments, order and everything else stay.
-
-    :param task_set: the task set of the text.
-    :param deadlines: by the callback's key, ns.
-    """
+    """Return a declaration with other deadlines (by key, ns); comments and order stay."""
     try:
         result = _with_deadlines(text, deadlines)
     except KeyError:  # the declaration has several files
@@ -117,11 +112,7 @@ def _with_deadlines(text: str, deadlines: Table[str, int]) -> str:
 
 
 def with_deadlines(task_set: TaskSet, deadlines: Table[str, int]) -> TaskSet:
-    """
-    Return a task set with other deadlines.
-
-    :param deadlines: by the callback's key, ns; of sinks only.
-    """
+    """Return a task set with other deadlines of sinks, by the callback's key, ns."""
     return task_set.with_callbacks({key: {'deadline_ns': ns} for key, ns in deadlines.items()})
 
 

@@ -52,12 +52,7 @@ class GraphError(Exception):
 
 
 class ValueProblem(ValueError):
-    """
-    A text that is not a valid value; ``str()`` is one line.
-
-    :ivar problem: what is wrong with it.
-    :ivar remedy: what to write instead.
-    """
+    """A text that is not a valid value; ``str()`` is one line: its problem and the remedy."""
 
     def __init__(self, problem: str, remedy: str) -> None:
         super().__init__(problem, remedy)

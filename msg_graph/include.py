@@ -238,11 +238,7 @@ def _changed(tree: Tree, change: Callable[[Scalar], str]) -> Tree:
 
 
 def _renamed(entry: Entry, inner: Mapping) -> Mapping:
-    """
-    Return an included file with its names as the including one uses them (rule 3).
-
-    :param entry: of ``include:``.
-    """
+    """Return an included file with its names as an entry of ``include:`` has them (rule 3)."""
     space: str = entry.get('namespace') or ''
     remapped: Entry = entry.get('remap')
     remap: dict[str, str] = {old: remapped.get(old) for old in remapped}

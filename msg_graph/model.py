@@ -80,7 +80,6 @@ class WeaklyHard:
     of: int
 
     def __str__(self) -> str:
-        """Return its text in a declaration."""
         return f'{self.misses} of {self.of}'
 
 
@@ -265,7 +264,6 @@ class TaskSet:
     _callback: dict[str, Callback] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Build the indices for look-ups by name."""
         every = tuple(vertex for dag in self.dags for vertex in dag.vertices)
         object.__setattr__(self, 'vertices', every)
         object.__setattr__(self, '_vertex', {vertex.name: vertex for vertex in every})

@@ -143,11 +143,7 @@ def _stdin() -> BinaryIO:
 
 
 def check_files(args: argparse.Namespace) -> None:
-    """
-    Find out whether the files of a command line can be written, before the work starts.
-
-    What an output may replace says `output_rules`.
-    """
+    """Check that the files of a command line can be written (see `output_rules`)."""
     for kind, stream in ((Input, 'input'), (Output, 'output')):
         same = sorted(name for name, each in _files(args)
                       if isinstance(each, kind) and each == '-')
@@ -173,12 +169,7 @@ def _files(args: argparse.Namespace) -> Iterator[tuple[str, Input | Output]]:
 
 
 def check_output(path: str | None, recording: bool = False, overwrite: bool = False) -> None:
-    """
-    Find out whether a file can be written.
-
-    :param path: as given on the command line; None and `-` are always fine
-    :param recording: whether it will be a recording; `overwrite`: whether it may replace one
-    """
+    """Check that a file can be written: `-` always; a recording may need `overwrite`."""
     if path is None or path == '-':
         return
     target = Path(path)
@@ -207,11 +198,7 @@ def _is_special(path: Path) -> bool:
 
 @contextmanager
 def output_file(path: str) -> Iterator[BinaryIO]:
-    """
-    Give a binary file that becomes `path` when the block ends well, and vanishes otherwise.
-
-    :param path: the target; `-` is standard output
-    """
+    """Give a binary file that becomes `path` (`-`: standard output) if the block ends well."""
     if path == '-':
         sys.stdout.flush()
         yield cast(BinaryIO, sys.stdout.buffer)
@@ -321,11 +308,7 @@ def write_report(path: str, data: ReportData) -> None:
 
 
 def write_result(args: argparse.Namespace, result: Any) -> bool:
-    """
-    Write a result to the file of `--json`; return whether tables are to be shown as well.
-
-    :param result: gets the version of the program and of the results' format
-    """
+    """Write a result and its versions to the file of `--json`; return whether to show tables."""
     if args.json is not None:
         head = {'mddag': __version__, 'format': FORMAT}
         write_json(args.json, {**head, **result} if isinstance(result, Mapping) else result)

@@ -40,7 +40,6 @@ class DemoError(MddagError):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     add('--duration', type=options.duration, default=20 * 10 ** 9, metavar='TIME',
         help="how long to measure this executor (default: 20s), and half of it rclpy's")
@@ -52,7 +51,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Do the steps, and show what each prints."""
     output = Path(args.output)
     output.mkdir(parents=True, exist_ok=True)
     graph, trace = str(find('config/autoware.yaml')), str(output / 'demo.mcap')

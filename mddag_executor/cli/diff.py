@@ -33,7 +33,6 @@ exit status: 0 compared; 1 with --fail-on-worse when a sink got worse; 2 bad inp
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     add('first', metavar='A.mcap', type=options.Input,
         help="the run to compare with: a trace, also an imported one ('-': standard input), or a "
@@ -54,7 +53,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Compare two runs."""
     from mddag_executor.report import diff
     task_set = None if args.graph is None else common.load_graph(args.graph)
     first, second = (

@@ -40,7 +40,6 @@ _EXIT_INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     add('graph', metavar='GRAPH', nargs='+', type=options.Input,
         help="declaration ('-': standard input), or several, or a folder of them (*.yaml)")
@@ -69,7 +68,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Evaluate a declaration and print the acceptance ratios."""
     policies = options.policies(args.policies)
     if args.plot is not None:
         from mddag_executor.laboratory.plot import check_plot

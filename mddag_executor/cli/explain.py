@@ -29,7 +29,6 @@ MOST_SHOWN = 20
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     options.add_recording(parser, "a recorded run, an MCAP file ('-': standard input)")
     add('--sink', metavar='S',
@@ -40,7 +39,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Explain the misses of a trace."""
     common.recording_and_graph(args)
     source = recorded.source_of(args)
     if source.task_set is None:

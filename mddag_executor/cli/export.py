@@ -29,7 +29,6 @@ _TABLES = 'tables'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     options.add_recording(
         parser, "a recorded run, an MCAP file ('-': standard input)")
@@ -44,7 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Export a recording."""
     from mddag_executor.recording.frames import FILES, write_tables
     from mddag_executor.report.export import check_available, write
     common.recording_and_graph(args)

@@ -27,7 +27,6 @@ _MOST_SETS = 100_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     def add(
         name: str, kind: Callable[[str], Any], metavar: str, what: str, dest: str = ''
     ) -> None:
@@ -74,7 +73,6 @@ def _pair(kind: Callable[[str], Any]) -> Callable[[str], Any]:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Make task sets."""
     from mddag_executor.laboratory.generate import generate
     every = list(_every(args))
     for each in (every[0], every[-1]):

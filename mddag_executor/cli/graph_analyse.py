@@ -30,7 +30,6 @@ _HEADER = ('test', 'kind', 'verdict', 'figure')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     parser.add_argument(
         '--budget', choices=defaults.BUDGETS, default='max',
         help='what of each execution time counts: its maximum (default), 99 %% quantile or mean')
@@ -41,7 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Analyse."""
     from mddag_executor.laboratory.analyse import analyse, HOLDS
     task_set = common.load_graph(args.graph)
     with Progress('analysing') as line:

@@ -30,7 +30,6 @@ is measured and reported; after a search with other draws of execution times."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     options.add(parser, 'graph', '--output', '--workers', '--duration', '--json')
     add('--target', type=options.positive_float, metavar='RATIO',
@@ -45,7 +44,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Assign deadlines."""
     from msg_graph.edit import deadlines_in_text, load_with_or_without_deadlines
     name, text = common.read_text(args.graph)
     task_set, _ = load_with_or_without_deadlines(text, name)

@@ -39,12 +39,10 @@ _BACKLOG_LOAD = 0.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     options.add(parser, 'graph', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
-    """Check."""
     task_set = common.load_graph(args.graph)
     result = check_result(task_set)
     warn(*_warnings(task_set, result))

@@ -34,7 +34,6 @@ _ENDINGS = (*_BY_GRAPHVIZ, '.dot', '.mmd')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     options.add(parser, 'graph')
     parser.add_argument(
         '-o', '--output', metavar='OUT', type=options.Output, required=True,
@@ -42,7 +41,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Draw."""
     ending = Path(args.output).suffix.lower()
     if ending not in _ENDINGS:
         raise UsageError(

@@ -29,7 +29,6 @@ are filled in."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     parser.add_argument('architecture', metavar='ARCHITECTURE.yaml', type=options.Input,
                         help="the architecture file ('-': standard input)")
     parser.add_argument('--trace', metavar='TRACE', type=options.Input,
@@ -40,7 +39,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Write the declaration."""
     from mddag_executor.cli.systems import recorded_system, write_declaration
     from msg_graph.caret import declaration_from_caret
     name, text = common.read_text(args.architecture)

@@ -25,7 +25,6 @@ out."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     parser.add_argument(
         '--timeout', type=_seconds, default=5.0, metavar='TIME',
         help='how long to listen and to measure rates, for instance 10s (default: 5s)')
@@ -38,7 +37,6 @@ def _seconds(text: str) -> float:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Write the declaration."""
     from mddag_executor.cli.systems import write_declaration
     from mddag_executor.hosting.graph_probe import draft_of, probe
     from msg_graph.draft import declaration_of

@@ -27,7 +27,6 @@ declaration names the latter."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     parser.add_argument('trace', metavar='TRACE', type=options.Input,
                         help="a trace (MCAP; '-': standard input), or the folder of a session "
                         'that LTTng recorded (needs python3-bt2)')
@@ -40,7 +39,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Write the declaration."""
     from mddag_executor.cli.systems import recorded_system, write_declaration
     from msg_graph import loads
     from msg_graph.draft import accept, declaration_of

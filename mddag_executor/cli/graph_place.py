@@ -31,7 +31,6 @@ one callback at a time, and all share the CPUs. The result is the declaration wi
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     add('--processes', type=options.positive_int, required=True, metavar='N',
         help='how many processes')
@@ -55,7 +54,6 @@ def _nodes(text: str) -> list[str]:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Place nodes."""
     from mddag_executor.cli.simulate import execution_times
     from mddag_executor.laboratory.placement import Placing
     from mddag_executor.laboratory.prediction import cost_of, improve, Predictor, PUBLISH_NS

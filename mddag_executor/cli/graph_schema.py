@@ -18,13 +18,11 @@ and check a declaration that begins with the line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     parser.add_argument('-o', '--output', metavar='OUT', type=options.Output, default='-',
                         help="the file ('-': standard output)")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print the schema."""
     from msg_graph.language import schema
     common.write_json(args.output, schema())
     return 0

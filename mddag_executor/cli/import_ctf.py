@@ -20,7 +20,6 @@ mddag replay drive.mcap graph.yaml"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     parser.add_argument(
         'session', metavar='SESSION', nargs='+',
         help='the folder that was recorded to; of a run on several computers the folder of each')
@@ -30,7 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Import a session and say what was in it."""
     from mddag_executor.trace import import_ctf
     with common.output_trace(args.output) as path, Progress('importing') as line:
         imported = import_ctf(

@@ -98,12 +98,7 @@ def overview(family: str = '') -> str:
 
 
 def find_verb(argv: Sequence[str]) -> tuple[Parser, Sequence[str]]:
-    """
-    Find the verb that a command line names.
-
-    :returns: its parser and its arguments
-    :raises mddag_executor.errors.UsageError: when there is no such verb
-    """
+    """Return the parser and the arguments of the verb that a command line names."""
     family = argv[0] if argv and argv[0] in _FAMILIES else ''
     prog = f'mddag {family}'.rstrip()
     count = 2 if family else 1
@@ -127,11 +122,7 @@ def find_verb(argv: Sequence[str]) -> tuple[Parser, Sequence[str]]:
 
 
 def run(argv: Sequence[str]) -> int:
-    """
-    Parse and do what a command line says.
-
-    :returns: the verb's exit status
-    """
+    """Parse and do what a command line says; return the verb's exit status."""
     parser, rest = find_verb(argv)
     args = parser.parse(rest)
     set_quiet(args.quiet)

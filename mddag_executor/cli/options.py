@@ -272,11 +272,7 @@ def refuse(args: argparse.Namespace, names: Iterable[str], why: str) -> None:
 
 
 def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
-    """
-    Declare the arguments `TRACE… [GRAPH]`; see `common.recording_and_graph`.
-
-    :param what: the help of TRACE
-    """
+    """Declare `TRACE… [GRAPH]` (see `common.recording_and_graph`); `what`: TRACE's help."""
     parser.add_argument(
         'trace', metavar='TRACE', nargs='+', type=Input,
         help=f'{what}; for one run of several processes the traces of all')

@@ -29,7 +29,6 @@ mddag replay run.mcap --fail-on-miss --junit junit.xml"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     options.add_recording(
         parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
@@ -45,7 +44,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Replay a trace and print the verdicts about its deadlines."""
     from mddag_executor.replay import Replay
     common.recording_and_graph(args)
     recorded.check(args)

@@ -35,7 +35,6 @@ _MODULE = 'mddag_executor/__main__.py'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     add('recording', metavar='BAG|TRACE', type=options.Input,
         help="a bag with the messages that the nodes take, or a trace of mddag run ('-': standard "
@@ -65,7 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the nodes, and say what came of it."""
     if args.expect is not None:
         os.stat(args.expect)  # now, not after the run
     args.ros_args = args.ros_args or []

@@ -66,7 +66,6 @@ _MEET_S, _ALONE_S = 10.0, 4.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
@@ -115,7 +114,6 @@ def _or_off(text: str) -> int:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run nodes until the run ends, and print the verdicts about the deadlines."""
     _check_arguments(args)
     if args.part is not None:
         return part(args)

@@ -35,12 +35,7 @@ _PROBE_TIMEOUT_S = 120.0
 
 
 def with_declared(args: argparse.Namespace, task_set: TaskSet) -> TaskSet:
-    """
-    Return the task set with the processes that `--processes FILE` or the declaration says.
-
-    :raises msg_graph.GraphError: when the file is wrong
-    :raises mddag_executor.errors.UsageError: when nothing says where nodes run
-    """
+    """Return the task set with the processes of `--processes FILE`, else of the declaration."""
     if args.processes is None:
         return task_set
     if args.processes.isdecimal():
@@ -51,12 +46,7 @@ def with_declared(args: argparse.Namespace, task_set: TaskSet) -> TaskSet:
 
 
 def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
-    """
-    Run nodes in several processes until the run ends, and print what came of the deadlines.
-
-    :raises msg_graph.GraphError: when the declaration is wrong
-    :raises mddag_executor.errors.MddagError: when anything else cannot be used
-    """
+    """Run nodes in several processes until the run ends, and print what came of the deadlines."""
     from mddag_executor.hosting.measure import ExecutionPlan
     from mddag_executor.hosting.processes import left, Part, Run, Supervisor, together
     plan = None

@@ -27,7 +27,6 @@ mddag simulate graph.yaml --execution-times times.json --json - --fail-on-miss""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     add('--judge', choices=('horizon', 'completions'), default='horizon',
         help='a job that is overdue at the end is late (horizon, the default), or only completed '
@@ -42,7 +41,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Simulate and print the verdicts about the deadlines."""
     from mddag_executor.simulate import periodic_load, Settings, simulate, utilisation
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)

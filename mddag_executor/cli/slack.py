@@ -32,7 +32,6 @@ _ONLY_GRAPH = ('duration', 'execution_times', 'seed', 'utilisation')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     options.add_recording(
         parser, "a recorded run, an MCAP file ('-': standard input), or a declaration alone, a "
@@ -55,7 +54,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Find the slack and print it."""
     from mddag_executor.core.tolerances import NOTHING_DUE
     from mddag_executor.replay.slack import find_slack, slack_result
     from mddag_executor.report.slack import lines, page

@@ -17,11 +17,7 @@ if TYPE_CHECKING:
 
 
 def recorded_system(given: str) -> System:
-    """
-    Return the system that was recorded to a trace, or to a session of LTTng (a folder).
-
-    :param given: as on the command line; `-` is standard input.
-    """
+    """Return the system in a trace (`-`: standard input), or in a session of LTTng (a folder)."""
     from mddag_executor.replay.drafting import System
     with Progress('reading the trace') as line:
         if given != '-' and Path(given).is_dir():

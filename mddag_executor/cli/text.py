@@ -62,7 +62,8 @@ class Progress:
     One line on a terminal for work that takes longer than two seconds, and silence otherwise.
 
     It is a context manager; the line is wiped when the work ends. Nothing is written when the
-    stream is no terminal.
+    stream (standard error by default) is no terminal. It shows ``what`` is going on, for instance
+    `simulating`, and how much of the ``total`` is done, if that is known.
     """
 
     PATIENCE_S = 2.0
@@ -71,14 +72,6 @@ class Progress:
     def __init__(self, what: str, total: int | float | None = None, *,
                  stream: TextIO | None = None,
                  clock: Callable[[], float] = time.monotonic) -> None:
-        """
-        Start to measure.
-
-        :param what: what is going on, for instance `simulating`
-        :param total: how much there is to do; None when that is not known
-        :param stream: where to write, standard error by default
-        :param clock: gives seconds; tests bring their own
-        """
         self._what = one_line(what)
         self._total = total
         self._stream = sys.stderr if stream is None else stream
@@ -99,12 +92,7 @@ class Progress:
             self._stream.flush()
 
     def update(self, done: int | float, note: str = '') -> None:
-        """
-        Show how much is done so far; cheap enough for an inner loop.
-
-        :param done: in the unit of the total
-        :param note: something to add to the line
-        """
+        """Show how much of the total is done, and a note; cheap enough for an inner loop."""
         if self._next == float('inf') or self._clock() < self._next:
             return
         if self._total:
@@ -133,12 +121,7 @@ def run_program(
     command: Sequence[str], what: str, seconds: float | None = None, given: bytes | None = None,
     environment: Mapping[str, str] | None = None,
 ) -> subprocess.CompletedProcess[bytes]:
-    """
-    Run a program, with progress on a terminal meanwhile.
-
-    :param seconds: how long it will take, if that is known.
-    :param given: its standard input.
-    """
+    """Run a program on the given input; show progress, of `seconds` if that is known."""
     import subprocess
     begin = time.monotonic()
     with Progress(what, seconds) as line, subprocess.Popen(

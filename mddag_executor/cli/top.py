@@ -40,7 +40,6 @@ class NothingHeard(MddagError):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
     add = parser.add_argument
     add('--once', action='store_true', help='print the state once, as soon as it has arrived')
     add('--duration', type=options.duration, metavar='TIME',
@@ -51,7 +50,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Listen and show."""
     board, wanted = Board(), common.wants_tables(args)
     live = sys.stdout.isatty() and not args.once and wanted
     # Ctrl-C is how one leaves it

@@ -19,11 +19,7 @@ _NEVER_DUE = ('give a declaration whose nodes, topics and namespaces are those t
 
 
 def judge(args: argparse.Namespace, result: dict[str, Any]) -> int:
-    """
-    Say and write what is not tolerated, and return the exit status.
-
-    :param result: of ``replay --json``.
-    """
+    """Print and write what is not tolerated in a result; return the exit status."""
     broken = not_tolerated(result['dags'])
     if args.junit is not None:
         from mddag_executor.report.ci import junit

@@ -141,11 +141,7 @@ class PolicyError(MddagError):
 
 
 def policy(name: str) -> Policy:
-    """
-    Return the policy with this name.
-
-    :raises PolicyError: when there is none.
-    """
+    """Return the policy with this name, or raise PolicyError."""
     try:
         return POLICIES[name]
     except (KeyError, TypeError):  # a list, for example

@@ -302,11 +302,7 @@ def processes_of(task_set: TaskSet) -> list[int]:
 
 
 def legs_of(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int, int]]:
-    """
-    Return the messages that start a vertex, its legs: topic index and publishing vertex.
-
-    :param vertices: those of its DAG.
-    """
+    """Return the messages that start a vertex, its legs: topic index and publishing vertex."""
     topics = vertex.callback.topics
     if len(topics) <= 1:
         return [(0, before) for before in vertex.predecessors]

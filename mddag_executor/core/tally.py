@@ -175,18 +175,15 @@ class Latest:
             self.append(2 ** 63 - 1 if value > 0 else -2 ** 63)
 
     def __len__(self) -> int:
-        """Return the number of stored values."""
         return len(self._values)
 
     def __getitem__(self, index: int) -> int:
-        """Return a value; 0 is the oldest, -1 the last."""
         length = len(self._values)
         if not -length <= index < length:
             raise IndexError(index)
         return self._values[(self._next + index) % length]
 
     def __iter__(self) -> Iterator[int]:
-        """Yield the values from the oldest to the last."""
         return iter(self._values[self._next:] + self._values[:self._next])
 
 

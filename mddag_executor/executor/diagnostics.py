@@ -238,12 +238,7 @@ class PoolWatch:
 
 
 class Diagnostics:
-    """
-    Publishes the state of an executor, from a separate thread.
-
-    :param period_ns: the period, ns.
-    :param process: the declared process that this is.
-    """
+    """Publishes the state of an executor, from a separate thread."""
 
     def __init__(
         self, context: Context, task_set: TaskSet | None, pool: WorkerPool, registry: Registry,

@@ -765,11 +765,7 @@ class Engine:
         return len(self._state.job_dag) + len(self._state.x_state)
 
     def validate(self) -> None:
-        """
-        Check the invariants that hold between two calls.
-
-        :raises InvariantError: when one is violated.
-        """
+        """Raise InvariantError if an invariant that holds between two calls is violated."""
         broken = [
             *broken_invariants(self.tables, self._state), *self.deadlines.broken_invariants(),
             *self._broken_invariants()]

@@ -468,11 +468,7 @@ class MultiDeadlineExecutor(BareExecutor):
             time.sleep(0.001)
 
     def _was_ended(self) -> bool:
-        """
-        Return whether a callback has ended the context.
-
-        :raises ExternalShutdownException: when anything else has.
-        """
+        """Return whether a callback ended the context, or raise ExternalShutdownException."""
         if not is_over(self.context):
             return False
         with suppress(InvalidHandle):

@@ -93,11 +93,7 @@ def new_eventfd() -> int:
 
 
 class NextCall:
-    """
-    The time of a timer's next call by rcl, on the timer's clock.
-
-    :param address: of the rcl timer.
-    """
+    """The time of the next call of the rcl timer at an address, on the timer's clock."""
 
     __slots__ = ('_address', '_value', '_reference')
 

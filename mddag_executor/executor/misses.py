@@ -40,12 +40,7 @@ MOST_WAITING = 256
 
 
 class MissNotifier:
-    """
-    Calls a handler with each miss, in the order in which they were found.
-
-    :param handler: the user's ``on_deadline_miss``.
-    :param fail: receives the handler's exceptions.
-    """
+    """Calls the user's handler with each miss, in order; ``fail`` receives its exceptions."""
 
     def __init__(
         self, handler: Callable[[DeadlineMiss], None], fail: Callable[[BaseException], None],

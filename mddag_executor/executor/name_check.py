@@ -34,11 +34,7 @@ LEAST_S = 1.0
 
 
 class NameCheck:
-    """
-    Compares the names of the nodes with those of the declaration, once.
-
-    :param process: the declared process that this is.
-    """
+    """Compares the names of the nodes with those of the declaration, once."""
 
     def __init__(
         self, task_set: TaskSet | None, registry: Registry, process: str | None

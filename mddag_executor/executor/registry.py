@@ -106,12 +106,7 @@ class Registry:
         return self._task_set.callbacks if self._task_set is not None else ()
 
     def refresh(self, found: EntitySet) -> tuple[list[Entity], list[Entity]]:
-        """
-        Update the entities of the nodes.
-
-        :param found: the entities that the nodes have now.
-        :return: new entities, and removed ones.
-        """
+        """Update the entities to those that the nodes have now; return new and removed ones."""
         present: dict[int, Entity] = {}
         new: list[tuple[str, Any, str]] = []
         for node, lists in found.items():

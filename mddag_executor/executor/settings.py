@@ -43,11 +43,7 @@ def whole_number(name: str, value: Any, most: int, unit: str = '') -> int:
 
 
 def check_context(context: Context | None) -> None:
-    """
-    Check the context of an executor, None for the default one.
-
-    :raises NotInitializedException: when it has not been initialised.
-    """
+    """Check that a context (None: the default) is initialised; raise NotInitializedException."""
     if (get_default_context() if context is None else context).handle is None:
         raise NotInitializedException('an executor needs a context: call rclpy.init() before')
 
@@ -84,7 +80,6 @@ class Thresholds:
     name: str = 'mddag'
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for field in ('warn_ratio', 'error_ratio'):
             value = getattr(self, field)
             if not isinstance(value, (int, float)) or not 0.0 < value <= 1.0:
@@ -104,11 +99,7 @@ def _nanoseconds(name: str, time: Any) -> Any:
 
 
 def diagnostics_period_ns(period: int | str | Duration | None) -> int | None:
-    """
-    Return the period of the diagnostics in ns, None: no diagnostics.
-
-    :param period: ns, text such as ``1s``, or a ``Duration``; None or 0: no diagnostics.
-    """
+    """Return the period of the diagnostics in ns; None, also for 0: no diagnostics."""
     period = _nanoseconds('diagnostics_period', period)
     if period is None or period == 0:
         return None
@@ -148,11 +139,7 @@ def resolve(
 
 
 def check_on_late(on_late: object) -> None:
-    """
-    Check the treatment of late jobs.
-
-    :raises UsageError: when it is unknown.
-    """
+    """Check that the treatment of late jobs is known."""
     if on_late not in [*ON_LATE]:
         raise UsageError(
             f"on_late: '{on_late}' is unknown: give one of {', '.join(ON_LATE)}")

@@ -44,11 +44,7 @@ class EntitySource(ChannelSource):
         self.handle: Any = entity.rclpy.handle
 
     def listen(self) -> None:
-        """
-        Let the middleware announce arrivals.
-
-        :raises InvalidHandle: when the entity has been destroyed.
-        """
+        """Let the middleware announce arrivals; raise InvalidHandle if the entity is destroyed."""
         with self.handle:
             set_listener(self.entity.kind, self.handle.pointer, self.fd)
 

@@ -65,11 +65,7 @@ def statistics(
 
 
 class Watch:
-    """
-    Watches an executor from now on.
-
-    :param task_set: the declaration of the executor.
-    """
+    """Watches an executor from now on."""
 
     def __init__(self, executor: MultiDeadlineExecutor, task_set: TaskSet) -> None:
         self._executor = executor

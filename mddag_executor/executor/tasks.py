@@ -87,11 +87,7 @@ class Unclaimed:
         self._tasks: deque[weakref.ref[ObservedTask]] = deque()
 
     def ended(self, task: ObservedTask) -> None:
-        """
-        Note that a task has ended.
-
-        :raises BaseException: its exception, if that cannot be handled.
-        """
+        """Note that a task has ended; raise its exception if that cannot be handled."""
         error = task.unclaimed()
         if error is None:
             task.maker = None

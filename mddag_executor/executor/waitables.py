@@ -105,12 +105,7 @@ class WaitableSource(ChannelSource):
             self._timers.append(NextCall(address))
 
     def listen(self) -> None:
-        """
-        Let the middleware announce arrivals.
-
-        :raises ListenerError: when it cannot.
-        :raises InvalidHandle: when one of them has been destroyed.
-        """
+        """Let the middleware announce arrivals, or raise ListenerError or InvalidHandle."""
         with self._lock:  # announcements meanwhile must not fill the wait set, too
             self._set.parts(self._set.waitables,
                             lambda kind, address: set_listener(kind, address, self.fd))

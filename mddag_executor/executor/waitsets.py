@@ -63,11 +63,7 @@ class FilledSet:
                 context.handle)
 
     def held(self) -> AbstractContextManager[None]:
-        """
-        Protect all of them from being destroyed while entered.
-
-        :raises InvalidHandle: when one of them has been destroyed.
-        """
+        """Protect all of them from being destroyed while entered, or raise InvalidHandle."""
         return _held(self._held)
 
     def parts(self, waitables: Iterable[Waitable], call: Callable[[str, int], None]) -> None:

@@ -177,11 +177,7 @@ def decides_itself(group: Any) -> bool:
 
 
 class Gate:
-    """
-    The user-defined callback group of an entity.
-
-    :param passed: called with an execution that may run, before it does.
-    """
+    """The user-defined callback group of an entity; ``passed`` gets executions before they run."""
 
     def __init__(self, group: Any, entity: Any, passed: Callable[[Work], None]) -> None:
         self._group = group
@@ -189,11 +185,7 @@ class Gate:
         self._passed = passed
 
     def step(self, work: Work, must_check: bool = True) -> Any:
-        """
-        Run a step of an execution as ``Work.step`` does, if the group lets it.
-
-        :raises Refused: if the group does not.
-        """
+        """Run a step of an execution as ``Work.step`` does, or raise Refused."""
         group, entity = self._group, self._entity
         if work.coroutine is None:
             if not (group.can_execute(entity) and group.beginning_execution(entity)):

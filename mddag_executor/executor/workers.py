@@ -219,11 +219,7 @@ class WorkerPool:
                 self.engine.timer_missed(work.entity, due, period, missed, self.now)
 
     def report(self, event: Callable[..., None], *args: Any) -> None:
-        """
-        Report an event to the engine, and wake a thread for the ready executions.
-
-        :param event: a method of the engine, called with the arguments and the time.
-        """
+        """Report an event to a method of the engine, and wake a thread for ready executions."""
         if self.is_inside():
             self._defer(partial(self.report, event, *args))
             return
@@ -453,11 +449,7 @@ class WorkerPool:
     # --- a turn ----------------------------------------------------------------------------------
 
     def _receive(self, me: WorkerThread, events: Events) -> bool:
-        """
-        Handle events, and find the next execution if the thread has none: ``me.work``.
-
-        :return: as ``_go_on``.
-        """
+        """Handle events, and find the thread's next execution if it has none; see ``_go_on``."""
         arrived, asking, is_due = self.loop.sources(events)
         if asking:
             self._collect(asking)

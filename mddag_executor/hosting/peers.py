@@ -41,11 +41,7 @@ class UnfinishedSession(Session):
             time.sleep(0.05)
 
     def check(self, measured: bool) -> None:
-        """
-        Check that a run was measured to its end.
-
-        :raises BaseException: the exception that has ended it.
-        """
+        """Check that a run was measured to its end, or raise the exception that has ended it."""
         if self.error is not None:
             raise self.error
         if not measured:

@@ -65,12 +65,10 @@ class Session:
         self._thread = threading.Thread(target=self._run, name='mddag-spin', daemon=True)
 
     def __enter__(self) -> Session:
-        """Begin to spin."""
         self._thread.start()
         return self
 
     def __exit__(self, *args: object) -> None:
-        """Shut the executor down."""
         self.end()
 
     def _run(self) -> None:

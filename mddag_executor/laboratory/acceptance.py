@@ -29,11 +29,7 @@ Z_95 = 1.959963984540054
 def bins_of(
     utilisation: npt.NDArray[np.float64], bins: Sequence[float] = BINS
 ) -> npt.NDArray[np.int64]:
-    """
-    Return for each utilisation the number of its bin.
-
-    :param bins: their centres.
-    """
+    """Return for each utilisation the index of its bin, the one with the nearest centre."""
     edges = np.array([round(centre + 0.025, 3) for centre in bins[:-1]])
     return np.searchsorted(edges, utilisation, side='right').astype(np.int64)
 
@@ -108,7 +104,6 @@ class Evaluation:
     done: Bools = field(init=False)
 
     def __post_init__(self) -> None:
-        """Allocate the arrays."""
         asked = self.asked
         self.utilisation = np.zeros(asked)
         self.possible = np.zeros(asked, dtype=np.bool_)

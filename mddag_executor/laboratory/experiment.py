@@ -119,12 +119,7 @@ def judge_of(task_set: TaskSet, duration_ns: int, compiled: bool) -> Judge:
 
 
 class Evaluator:
-    """
-    Evaluates chunks of experiments; threads may share it, and processes get a copy.
-
-    :param runs: of each experiment.
-    :param first_run: number of the first one.
-    """
+    """Evaluates chunks of experiments; threads may share it, and processes get a copy."""
 
     def __init__(
         self, experiments: Sequence[Experiment], runs: int, first_run: int, compiled: bool

@@ -74,11 +74,7 @@ class Options:
     seed: int = 0
 
     def check(self) -> None:
-        """
-        Check that there can be such a task set.
-
-        :raises UsageError: there cannot.
-        """
+        """Check that there can be such a task set, or raise UsageError."""
         for name, (option, least, most) in _RANGES.items():
             value = getattr(self, name)
             values = value if isinstance(value, tuple) else (value,)
@@ -112,11 +108,7 @@ class _Dag(NamedTuple):
 
 
 def generate(options: Options, number: int = 0) -> str:
-    """
-    Return the declaration of a random task set.
-
-    :param number: which of the task sets of this seed.
-    """
+    """Return the declaration of a random task set, that of this number for the seed."""
     options.check()
     dice = Dice(f'mddag {options.seed} {number}')
     drawn = [

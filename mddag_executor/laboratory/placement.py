@@ -118,11 +118,7 @@ class Placing:
         return loads
 
     def place(self) -> dict[int, int]:
-        """
-        Return the process of each block (rule 3).
-
-        :raises UsageError: when too many nodes are to run apart.
-        """
+        """Return the process of each block (rule 3); UsageError: too many are to run apart."""
         torn = Counter(block for block, _ in self._apart)
         order = sorted(self._blocks, key=lambda b: (-torn[b], -self._own[b], b))
         place = self._kept_apart({}, order[:len(torn)])

@@ -45,11 +45,7 @@ def check_plot(path: str) -> None:
 
 
 def draw(evaluation: Evaluation, file: BinaryIO, path: str) -> None:
-    """
-    Draw the figure of an evaluation into a file.
-
-    :param path: its name, whose ending says the kind.
-    """
+    """Draw the figure of an evaluation into a file; the ending of its path selects the format."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
     kind = os.path.splitext(path)[1].lower()[1:]

@@ -202,5 +202,4 @@ class _Blocking:
             self._sums.append(self._sums[-1] + cost - dropped)
 
     def __call__(self, above: int) -> int:
-        """Return the sum."""
         return self._sums[bisect_left(self._minus_rad, -above)]

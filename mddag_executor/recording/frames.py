@@ -36,12 +36,7 @@ _INNER = {'order'}
 
 
 def arrow_table(recording: Recording, name: str) -> Any:
-    """
-    Return a table of a recording as an Arrow table.
-
-    :param name: one of ``TABLES``.
-    :raises KeyError: for another name.
-    """
+    """Return a table of a recording, one of ``TABLES`` (else KeyError), as an Arrow table."""
     if name not in TABLES:
         raise KeyError(f'there is no table {name!r}: the tables are {", ".join(TABLES)}')
     import pyarrow

@@ -121,11 +121,7 @@ class Growing:
 
 
 class Rows:
-    """
-    Rows of a table while it grows.
-
-    :param names: names of the filled columns, in the order of the values of ``add``.
-    """
+    """Rows of a table while it grows; ``add`` gets the values of the named columns in order."""
 
     def __init__(self, kind: np.dtype[Any], *names: str) -> None:
         self._kind, self._names = kind, names
@@ -133,7 +129,6 @@ class Rows:
         self._add = [column.append for column in self.columns.values()]
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return len(self.columns[self._names[0]])
 
     def add(self, *values: int) -> int:
@@ -262,11 +257,7 @@ class Recording:
         return self._callbacks
 
     def vertices_of_callbacks(self, which: Any = slice(None)) -> Ints:
-        """
-        Return by index of a callback the vertex that it ran as last; -1: none.
-
-        :param which: the executions to consider.
-        """
+        """Return by index of a callback the vertex it ran as last (in ``which``); -1: none."""
         numbers, index = self.callbacks()
         vertex, index = self.executions['vertex'][which], index[which]
         found = np.full(len(numbers), UNKNOWN)
@@ -306,11 +297,7 @@ class Recording:
 
 
 class JobNumbers:
-    """
-    Numbers jobs over all DAGs; the last number is for rows without job.
-
-    :param released: the releases of the jobs.
-    """
+    """Numbers jobs over all DAGs; the last number is for rows without job."""
 
     def __init__(self, released: Table) -> None:
         self._released = released
@@ -332,11 +319,7 @@ class JobNumbers:
 
 
 class RowNumbers:
-    """
-    New row numbers after some rows were dropped.
-
-    :param kept: the rows that are not dropped.
-    """
+    """New row numbers after all rows but the kept ones were dropped."""
 
     def __init__(self, kept: Mask) -> None:
         self._new = np.append(np.where(kept, np.cumsum(kept) - 1, UNKNOWN), UNKNOWN)

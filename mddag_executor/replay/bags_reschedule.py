@@ -137,11 +137,7 @@ class _Releases:
 def read_bag(
     path: str | os.PathLike[str], task_set: TaskSet, name: str | None = None
 ) -> Recording:
-    """
-    Return the recording of an ordinary bag: the releases of its sources.
-
-    :param path: a bag's folder, or one of its files.
-    """
+    """Return the recording of an ordinary bag: the releases of its sources."""
     sources = (dag.vertices[dag.source].callback for dag in task_set.dags)
     topics = {topic for source in sources if source.kind != 'timer' for topic in source.topics}
     bag = Bag(path, topics, name)

@@ -81,11 +81,7 @@ class ComputedRun(NamedTuple):
         return cls(task_set, load, run.log, run.decisions, horizon, run.ended_ns, judged)
 
     def recording(self, workers: int = 0) -> Recording:
-        """
-        Return the schedule as a recording.
-
-        :param workers: number of workers.
-        """
+        """Return the schedule as a recording."""
         return _Player(self).recording(workers)
 
 

@@ -236,12 +236,7 @@ class Explanation:
                         'misses': self._in_stops[begin, end]} for begin, end in self.stops]}
 
     def result(self, sink: int | None = None, job: int | None = None) -> dict[str, Any]:
-        """
-        Return the result format of ``explain --json``.
-
-        :param sink: global vertex of the only sink to report.
-        :param job: the only job to report.
-        """
+        """Return the result format of ``explain --json``, of one (global) sink or job only."""
         return {**self.summary(), 'jobs': list(self._jobs(sink, job))}
 
     def _jobs(self, sink: int | None, job: int | None) -> Iterator[dict[str, Any]]:
@@ -346,11 +341,7 @@ class Explanation:
 
 
 def medians(numbers: Any, times: Ints, count: int) -> Ints:
-    """
-    Return the median time of each number, exact to 3 %; 0 without times.
-
-    :param count: how many numbers there are.
-    """
+    """Return the median time of each of ``count`` numbers, exact to 3 %; 0 without times."""
     counts = np.zeros((count, 64 * _STEPS), dtype=np.int64)
     steps = (np.log2(np.maximum(times, 1)) * _STEPS).astype(np.int64)
     np.add.at(counts, (numbers, steps), 1)

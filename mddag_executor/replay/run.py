@@ -33,7 +33,6 @@ class Traces:
     offsets: Mapping[str, int] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        """Return the name that messages use."""
         return ', '.join(self.paths)
 
 
@@ -93,11 +92,7 @@ def _bag(path: str, task_set: TaskSet | None, name: str | None) -> Recording:
 
 
 def check_declared(path: Given, name: str) -> None:
-    """
-    Check that a recording declares deadlines.
-
-    :raises ReplayError: if it does not.
-    """
+    """Check that a recording declares deadlines, or raise ReplayError."""
     if isinstance(path, (str, os.PathLike, TraceReader)):
         reader = path if isinstance(path, TraceReader) else None
         path = os.fspath(path) if not isinstance(path, TraceReader) else path.path

@@ -112,11 +112,7 @@ class PoolUse:
 
 
 class Usage:
-    """
-    The time that callbacks and workers used in a recording.
-
-    :param waited: see ``group_waits``.
-    """
+    """The time that callbacks and workers used in a recording; ``waited``: ``group_waits``."""
 
     def __init__(self, recording: Recording, waited: Ints) -> None:
         task_set = recording.task_set

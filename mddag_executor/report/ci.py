@@ -24,12 +24,7 @@ Sinks = Mapping[tuple[str, str], str]
 
 
 def junit(result: Mapping[str, Any], broken: Sinks, name: str) -> bytes:
-    """
-    Return JUnit XML.
-
-    :param result: a result of ``replay --json``.
-    :param name: name of the replayed recording.
-    """
+    """Return JUnit XML of a result of ``replay --json``; ``name`` is that of the recording."""
     cases = []
     skipped = 0
     for dag_name, dag in result['dags'].items():
@@ -73,12 +68,7 @@ def _text(text: str) -> str:
 
 
 def annotation_lines(dags: Mapping[str, Any], broken: Sinks, file: str | None) -> Iterator[str]:
-    """
-    Yield output lines that a workflow of GitHub Actions shows in its summary.
-
-    :param dags: of a result of ``replay --json``.
-    :param file: the declaration.
-    """
+    """Yield the lines that GitHub Actions shows in its summary; ``file`` is the declaration."""
     for dag_name, dag in dags.items():
         for sink_name, sink in dag['sinks'].items():
             why = broken.get((dag_name, sink_name))

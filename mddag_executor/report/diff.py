@@ -116,11 +116,7 @@ def _callback(use: Mapping[str, int] | None) -> dict[str, Any] | None:
 
 
 def sinks_table(dags: Mapping[str, Any]) -> str:
-    """
-    Return the table of sinks of both runs; the sinks that are worse in run B come first.
-
-    :param dags: of the difference.
-    """
+    """Return the table of a difference's sinks; those that are worse in run B come first."""
     sinks = [(name, sink) for dag in dags.values() for name, sink in dag['sinks'].items()]
     short = short_names(name for name, _ in sinks)
     sinks.sort(key=lambda item: _order(item[1]))

@@ -34,8 +34,6 @@ from mddag_executor.replay.usage import ran
 from mddag_executor.report.text import printable
 import numpy as np
 
-ROWS = ('executions', 'jobs')
-"""Kinds of rows."""
 _BATCH = 65_536
 
 
@@ -59,11 +57,7 @@ def columns_of(replay: Replay, rows: str) -> list[Column]:
 
 
 def executions(replay: Replay, rows: Ints | None = None) -> tuple[list[Column], Ints]:
-    """
-    Return the columns of executions, and their rows of the table.
-
-    :param rows: only these rows.
-    """
+    """Return the columns of executions (all, or these rows), and their rows of the table."""
     recording, judged = replay.recording, replay.judged
     rows = ran(recording.executions) if rows is None else rows
     release, known = _releases(replay, rows)
@@ -193,12 +187,7 @@ def check_available(form: str) -> None:
 
 
 def write(form: str, file: BinaryIO, replay: Replay, rows: str) -> None:
-    """
-    Write a recording.
-
-    :param form: ``csv``, ``parquet`` or ``pftrace``.
-    :param rows: one of ``ROWS``, for the first two.
-    """
+    """Write a recording's executions or jobs (``rows``) as csv or parquet, or all as pftrace."""
     if form == 'pftrace':
         from mddag_executor.report.perfetto import write_perfetto
         write_perfetto(file, replay)

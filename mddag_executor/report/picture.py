@@ -52,11 +52,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class DagFrame:
-    """
-    A DAG: its title with name and period.
-
-    :ivar depth: the number of boxes of its longest path.
-    """
+    """A DAG: its title with name and period, and the number of boxes of its longest path."""
 
     mark: str
     title: str

@@ -41,11 +41,7 @@ def _last_parts(name: str, parts: int) -> str:
 
 
 class Sink(NamedTuple):
-    """
-    A sink in a table.
-
-    :ivar shown_name: its name in the table.
-    """
+    """A sink in a table, where it has its ``shown_name``."""
 
     dag: str
     name: str
@@ -157,11 +153,7 @@ def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:
 
 
 def run_lines(result: Mapping[str, Any], more: str = '') -> Iterator[str]:
-    """
-    Yield the lines about a whole run, below a table of its sinks.
-
-    :param more: after the settings of the run.
-    """
+    """Yield the lines about a run, below a table of its sinks; ``more`` about its settings."""
     yield verdicts_line(result['dags'])
     yield from never_due_lines(result['dags'])
     yield (f'{pool_text(result)}, {format_ns(result["duration_ns"])}, '
@@ -189,11 +181,7 @@ def ratio(value: float | None) -> str:
 
 
 def drift_lines(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """
-    Yield a line for each difference between a run and its declaration.
-
-    :param found: ``drift`` of a JSON result.
-    """
+    """Yield a line for each difference between a run and its declaration (``drift``)."""
     if not found:
         return
     yield f'{counted(len(found), "difference")} between the run and the declaration:'

@@ -51,11 +51,7 @@ Header = tuple[Any, int]
 
 
 class Requests:
-    """
-    Carries what clients and servers of services and actions send.
-
-    :param executor: runs the callbacks of futures.
-    """
+    """Carries what clients and servers of services and actions send."""
 
     def __init__(self, loop: Loop, executor: Any) -> None:
         self._loop = loop

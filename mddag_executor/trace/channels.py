@@ -86,20 +86,12 @@ class Channels:
         self._decoders: dict[int, Decoder | str] = {}       # or the reason why there is none
 
     def add_schema(self, content: bytes) -> None:
-        """
-        Add the content of a schema record.
-
-        :raises ValueError: if it is malformed, or redefines a known schema
-        """
+        """Add the content of a schema record; ValueError: malformed, or redefines a known one."""
         schema = Schema.read(Content(content))
         self._keep(self._schemas, schema, content)
 
     def add_channel(self, content: bytes) -> None:
-        """
-        Add the content of a channel record.
-
-        :raises ValueError: if it is malformed, or redefines a known channel
-        """
+        """Add the content of a channel record; ValueError: malformed, or redefines a known one."""
         channel = Channel.read(Content(content))
         self._keep(self._channels, channel, content)
         number = channel.id

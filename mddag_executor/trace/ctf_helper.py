@@ -161,7 +161,6 @@ class Session:
     """The events of a session, as rows."""
 
     def __init__(self, bt2: Any, add: Callable[..., None]) -> None:
-        """Pass each row to `add`."""
         self._bt2 = bt2
         self._add = add
         native = self._native = import_module('bt2.native_bt')

@@ -73,7 +73,6 @@ class Batch:
         self.columns, self._others = columns, others
 
     def __len__(self) -> int:
-        """Return the number of events."""
         return sum(len(column.at) for column in self.columns) + len(self._others)
 
     def table(self, column: Column) -> Table:

@@ -77,7 +77,6 @@ class TraceReader:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Check that there is a trace."""
         self.path = os.fspath(path)
         self.warnings: list[str] = []
         self.fields: dict[str, tuple[str, ...]] = {}

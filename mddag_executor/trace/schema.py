@@ -36,7 +36,6 @@ class EventType:
     optional: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the names and the types."""
         names = [name for name, _ in PREAMBLE + self.fields]
         for name in (self.provider, self.name, *names):
             if not _NAME.fullmatch(name):

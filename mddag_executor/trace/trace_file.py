@@ -289,11 +289,7 @@ class TraceFile:
         channel.undefined = 0
 
     def flush(self) -> None:
-        """
-        Write the collected events as a chunk to the operating system.
-
-        :raises TraceError: if writing fails
-        """
+        """Write the collected events as a chunk to the operating system, or raise TraceError."""
         if not self._records:
             return
         used = [channel for channel in self._in_order if channel.index]
@@ -381,7 +377,6 @@ class TraceFile:
         self._stream.close()
 
     def __enter__(self) -> TraceFile:
-        """Return the file itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,

@@ -195,7 +195,6 @@ class TraceWriter:
         _LOGGER.error('%s', error)
 
     def __enter__(self) -> TraceWriter:
-        """Return the writer itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
