@@ -18,18 +18,6 @@ def trace(tmp_path):
     return by_hand(tmp_path / 'run.mcap', undeclared=False)
 
 
-def test_a_given_graph_judges(trace, tmp_path, call):
-    graph = tmp_path / 'strict.yaml'
-    graph.write_text(GRAPH.replace('8ms', '5ms'))
-    status, out, err = call('replay', trace, graph, '--fail-on-miss')
-    assert (status, err) == (1, '')
-    assert '3 results due, 1 in time (33.33 %), 2 late, 0 expired' in out
-    graph.write_text(GRAPH.replace('8ms', '10ms'))
-    status, out, err = call('replay', trace, graph, '--fail-on-miss')
-    assert (status, err) == (0, '')
-    assert 'first miss' not in out
-
-
 def test_overheads(trace, call):
     # the second callback was dispatched 1 ms after it was ready, though its worker was free
     for options, longest in (([], 10 * MS), (['--overheads', 'recorded'], 10 * MS),
@@ -38,23 +26,6 @@ def test_overheads(trace, call):
         sink = result['dags']['/driver']['sinks']['/filter:run']
         assert sink['response_ns']['max'] == longest
         assert result['overheads']['dispatch_median_ns'] == 0
-
-
-def test_a_run_without_jobs_proves_nothing(tmp_path, call):
-    # only an undeclared callback ran, 1.5 s after the recording began
-    trace, report = tmp_path / 'run.mcap', tmp_path / 'report.html'
-    with TraceFile(trace) as file:
-        file.add('task_set', START, 1, 9, GRAPH, 'graph.yaml', 'rad', 2, 100 * MS, 64, False)
-        now = START + 1_500 * MS
-        file.add('dispatch', now, 1, 9, 77, -1, -1, -1, 0, now, 0)
-        file.add('callback_start', now, 1, 9, 77, False)
-        file.add('callback_end', now + MS, 1, 9, 77)
-        file.add('shutdown', now + MS, 1, 9, now + MS)
-    status, out, _ = call('replay', trace, '--report', report)
-    assert status == 0 and ', 1.501 s, utilisation 0.000 ' in out
-    page = report.read_text()
-    assert 'No deadline was missed' not in page
-    assert 'No job was due at any sink: nothing is proven.' in page
 
 
 def test_a_truncated_trace_gives_what_is_there(trace, tmp_path, call):

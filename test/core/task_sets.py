@@ -90,6 +90,12 @@ def declaration(callbacks):
     return loads(json.dumps({'mddag': 1, 'nodes': nodes}), 'random.yaml')
 
 
+def single(name, period, deadline=None, **more):
+    """Declare a DAG of one callback; times in ticks."""
+    return {'node': '/n', 'name': name, 'timer': f'{period}us',
+            'deadline': f'{deadline or period}us', 'dag': name, **more}
+
+
 def _ticks(draw, least, most):
     return f'{draw(st.integers(least, most))}us'
 

@@ -13,7 +13,7 @@ from msg_graph import ExecutionTime
 import pytest
 
 from .live_helpers import J, live, start_job, US
-from .task_sets import Case, cases, declaration, examples, TICK
+from .task_sets import Case, cases, declaration, examples, single, TICK
 
 
 def with_times(case, on_late=None, **more):
@@ -97,11 +97,6 @@ def test_messages_of_each_topic_of_a_sync_keep_their_order(steps):
 def _until(case, run, end):
     """Return the events before a time: what is released later may be too much for the workers."""
     return [event for event in case.events(run) if event[0] < end]
-
-
-def single(name, period, deadline, **more):
-    return {'node': '/n', 'name': name, 'timer': f'{period}us', 'deadline': f'{deadline}us',
-            'dag': name, **more}
 
 
 def results(callbacks, ticks, horizon, preemptive=False):

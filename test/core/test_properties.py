@@ -82,29 +82,6 @@ def test_until_all_is_done(case, last_release):
 US = 1_000
 
 
-def two_dags():
-    return declaration([
-        {'node': '/a', 'name': 's', 'timer': '10us', 'publishes': ['/s', '/all'], 'dag': 'first',
-         'max_active_jobs': 4, 'on_late': 'abort', 'group': 'g'},
-        {'node': '/a', 'name': 'late', 'subscription': '/s', 'deadline': '30us', 'group': 'g'},
-        {'node': '/b', 'name': 't', 'timer': '20us', 'publishes': ['/t', '/all'],
-         'dag': 'second', 'group': 'g'},
-        {'node': '/a', 'name': 'mid', 'subscription': '/s', 'publishes': ['/mid']},
-        {'node': '/a', 'name': 'both', 'sync': ['/mid', '/s'], 'deadline': '25us'},
-        {'node': '/b', 'name': 'shared', 'subscription': '/all', 'deadline': '40us',
-         'group': 'g'},
-    ])
-
-
-def test_a_sync_has_a_leg_for_each_topic():
-    plain, legs = Tables.build(two_dags()), Tables.build(two_dags(), legs=True)
-    assert plain.n_legs == [1] * 8
-    assert plain.n_region == [5, 2, 1]
-    assert legs.n_legs == [1, 1, 1, 2, 1, 1, 1, 1]
-    assert legs.n_region == [6, 2, 1]
-    assert legs.region_offset == [0, 1, 2, 3, 5, 0, 1, 0]
-
-
 def test_a_sync_has_a_leg_for_each_publisher_of_a_topic():
     tables = Tables.build(declaration([
         {'node': '/n', 'name': 's', 'timer': '10us', 'publishes': ['/s', '/x'], 'dag': 'd'},

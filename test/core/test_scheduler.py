@@ -7,7 +7,7 @@ import random
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.core import PolicyError, rules, Scheduler, Tables
+from mddag_executor.core import rules, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.queues import SWEEP_AT
 from mddag_executor.core.state import (
@@ -24,13 +24,9 @@ from mddag_executor.core.state import (
     WAITING,
 )
 from mddag_executor.core.tables import NEVER
-from mddag_executor.errors import UsageError
-from mddag_executor.simulate import Settings, simulate
-import pytest
 
 from .live_helpers import J, live, run_one, start_job, undeclared, US, X
-from .task_sets import declaration, examples
-from .test_by_hand import case, single
+from .task_sets import declaration, examples, single
 
 
 def test_a_job_fails_with_what_fails_of_it():
@@ -76,11 +72,6 @@ def test_a_blocked_callback_does_not_abort_its_job():
     scheduler.complete(busy, 11 * US)
     assert scheduler.take(1, 11 * US) == -1
     assert scheduler.decisions()[-1][0] == DROP
-
-
-def test_an_unknown_policy_is_refused_with_the_list():
-    with pytest.raises(PolicyError, match=r"policy 'edf': .*: choose one of rad, rm, wc, fifo"):
-        live(policy_name='edf')
 
 
 # --- workers -------------------------------------------------------------------------------------
@@ -169,10 +160,6 @@ def test_each_overdue_sink_is_found_once_and_in_time(steps, gaps):
             assert now <= deadlines.next <= min(later, default=NEVER)
 
 
-def ros2(callbacks, ticks, **more):
-    return case(callbacks, ticks, policy='ros2', **more)
-
-
 # --- the core by itself --------------------------------------------------------------------------
 
 
@@ -201,18 +188,6 @@ def test_dropped_ones_leave_the_queues():
     core.complete(kept, 3)
     assert core.take(0, 4) == -1
     assert core.queue_length == 0
-
-
-def test_no_preemption():
-    task_set = declaration([single('a', 10)])
-    of = ros2([single('a', 10)], {'a': 1})
-    settings = Settings(policy='ros2', workers=1, preemptive=True, duration_ns=10)
-    with pytest.raises(PolicyError, match="policy 'ros2': .* preempts no callback: run it"):
-        simulate(task_set, of.load(10), settings)
-    assert not simulate(
-        task_set, of.load(10), Settings(policy='ros2', preemptive=None)).settings.preempts
-    with pytest.raises(UsageError, match='workers'):
-        simulate(task_set, of.load(10), Settings(policy='ros2', workers=0))
 
 
 URGENT = 0
@@ -261,17 +236,6 @@ class Driver:
     def complete(self, x):
         self.now += 1
         self.core.complete(x, self.now)
-
-
-def test_one_that_turns_out_to_wait_gives_the_interpreter_back():
-    drive = Driver(computing(7))
-    holder, held_back = drive.ready(URGENT, holds=True), drive.ready(URGENT, holds=True)
-    assert drive.go() == [holder]
-    drive.core.stop_holding(holder)
-    assert drive.go() == [held_back]
-    drive.complete(holder)
-    drive.complete(held_back)
-    assert drive.core.state.worker_x.count(-1) == 7
 
 
 def may_start(core, x):

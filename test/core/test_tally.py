@@ -10,17 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import quantile, Tables, Tally
 from mddag_executor.core.state import (
-    ABORTED,
-    COMPLETED,
-    DROP,
-    EXPIRED,
-    JOB_END,
-    LATE,
-    SINK_ABORTED,
-    SINK_EXPIRED,
     SINK_IN_TIME,
     SINK_LATE,
-    SINK_MISSED,
 )
 from mddag_executor.core.stops import KEEP_MISSES, KEEP_STOPS, Stops
 from mddag_executor.core.tally import Latest
@@ -45,41 +36,6 @@ def done(vertex, job, response):
     release = 100 * US * job
     deadline, time = release + 10 * US * vertex, release + response
     return (SINK_LATE if time > deadline else SINK_IN_TIME, 0, vertex, job, deadline, time)
-
-
-def test_a_tally_of_everything():
-    counts = tally()
-    for _ in range(5):
-        counts.released(0)
-    counts.released(1)  # the undeclared DAG's jobs are not judged
-    counts.add([done(1, 0, 10 * US), done(2, 0, 3 * US), (JOB_END, 0, -1, 0, COMPLETED, 1)])
-    assert not counts.missed
-    counts.add([done(1, 2, 5 * US), (SINK_EXPIRED, 0, 2, 2, 220 * US, -1),
-                (JOB_END, 0, -1, 2, EXPIRED, 1)])
-    counts.add([done(1, 1, 10 * US + 1), done(2, 1, 20 * US), (JOB_END, 0, -1, 1, LATE, 1)])
-    counts.add([(SINK_ABORTED, 0, 1, 3, 310 * US, -1), (SINK_ABORTED, 0, 2, 3, 320 * US, -1),
-                (JOB_END, 0, -1, 3, ABORTED, 1), (DROP, 0, 2, 3, 17, 1)])
-    counts.add([(SINK_MISSED, 0, 1, 4, 410 * US, -1)])
-    assert counts.dropped == 1
-    assert counts.result() == {
-        'deadline_missed': True, 'never_due': [],
-        'first_miss': {'dag': 'd', 'vertex': '/n:x', 'job': 1, 'deadline_ns': 110 * US,
-                       'completed_ns': 110 * US + 1},
-        'dags': {'d': {
-            'jobs': 5,
-            'ends': {'completed': 1, 'late': 1, 'aborted': 1, 'expired': 1, 'failed': 0,
-                     'dropped': 0},
-            'sinks': {
-                '/n:x': {'relative_deadline_ns': 10 * US, 'completed': 3, 'late': 2,
-                         'overdue': 1, 'expired': 0, 'failed': 0, 'aborted': 1,
-                         'dropped': 0,
-                         'response_ns': {'min': 5 * US, 'median': 10 * US, 'p99': 10 * US + 1,
-                                         'max': 10 * US + 1}},
-                '/n:y': {'relative_deadline_ns': 20 * US, 'completed': 2, 'late': 0,
-                         'overdue': 0, 'expired': 1, 'failed': 0, 'aborted': 1,
-                         'dropped': 0,
-                         'response_ns': {'min': 3 * US, 'median': 3 * US, 'p99': 20 * US,
-                                         'max': 20 * US}}}}}}
 
 
 def test_a_bounded_tally_keeps_the_extremes_and_the_last():

@@ -41,6 +41,23 @@ class Spinning:
         assert not self._thread.is_alive(), 'spin did not end'
 
 
+class Stepping(Spinning):
+    """Spins by a loop of ``spin_once``."""
+
+    def _run(self):
+        try:
+            while not self.executor._is_shutdown:
+                self.executor.spin_once()
+        except BaseException as error:
+            self.error = error
+
+
+@pytest.fixture(params=[Spinning, Stepping], ids=['spin', 'spin_once'])
+def spinning(request):
+    """Give the ways of spinning."""
+    return request.param
+
+
 def wait_for(condition, seconds=15.0):
     """Wait until something is true; return whether it became so."""
     end = time.monotonic() + seconds

@@ -90,32 +90,6 @@ def test_rclpy_spin_until_future_complete_as_the_global_executor(as_global, make
 # --- several at once -----------------------------------------------------------------------------
 
 
-def test_several_executors_in_one_context(make_executor, make_node):
-    """Each runs its own nodes, they talk to each other, and one may go."""
-    executors = [make_executor(num_workers=2) for _ in range(3)]
-    nodes = [make_node(f'node_{number}') for number in range(3)]
-    calls = [counting(node) for node in nodes]
-    for executor, node in zip(executors, nodes):
-        executor.add_node(node)
-    nodes[0].create_service(
-        Trigger, '/ask', lambda request, response: response,
-        callback_group=ReentrantCallbackGroup())
-    client = nodes[1].create_client(Trigger, '/ask', callback_group=ReentrantCallbackGroup())
-    with Spinning(executors[0]), Spinning(executors[1]) as second:
-        with Spinning(executors[2]):
-            assert all(goes_on(some) for some in calls)
-            assert client.wait_for_service(5.0)
-            task = executors[1].create_task(client.call, Trigger.Request(), 5.0)
-            assert wait_for(task.done) and task.result() is not None
-        count = len(calls[2])
-        assert goes_on(calls[0]) and goes_on(calls[1])
-        assert len(calls[2]) == count
-        executors[1].add_node(nodes[2])  # it goes to another one
-        assert goes_on(calls[2])
-    assert second.error is None
-    assert not set(calls[0]) & set(calls[1])
-
-
 def test_several_contexts_in_one_process(make_executor, make_node, ros_context):
     """One is shut down, the other goes on; what signals do is not touched."""
     handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)

@@ -88,15 +88,15 @@ def one_by_one(make, call):
 
 @pytest.mark.parametrize('start', [
     of_tasks, of_coroutines, of_subscriptions, of_services, of_guards, of_waitables])
-def test_each_of_many_runs_once(make_executor, make_node, start):
+def test_each_of_many_runs_once(make_executor, make_node, spinning, start):
     node = make_node()
     executor = make_executor(nodes=[node])
     calls = []
-    with Spinning(executor) as spinning:
+    with spinning(executor) as spun:
         start(executor, node, calls.append)
         wait_for(lambda: len(calls) >= MANY, 6.0)
     assert sorted(calls) == list(range(MANY))
-    assert spinning.error is None
+    assert spun.error is None
 
 
 def test_each_time_that_a_timer_is_due_counts(make_executor, make_node):

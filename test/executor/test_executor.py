@@ -155,22 +155,6 @@ def stays(calls):
     return len(calls) == before
 
 
-def test_entities_created_and_destroyed_while_it_spins(make_executor, make_node):
-    """What is destroyed meanwhile neither runs nor fails (rclpy#1206)."""
-    node, calls = make_node(), []
-    executor = make_executor(nodes=[node])
-    publisher = node.create_publisher(Header, '/topic', 10)
-    with Spinning(executor) as spinning:
-        for _ in range(8):
-            calls.clear()
-            subscription = node.create_subscription(Header, '/topic', calls.append, 10)
-            assert wait_for(lambda: publisher.get_subscription_count() == 1)
-            assert wait_for(lambda: publisher.publish(Header()) or calls)
-            node.destroy_subscription(subscription)
-            assert wait_for(lambda: publisher.get_subscription_count() == 0)
-    assert spinning.error is None
-
-
 def test_a_node_destroyed_while_it_spins_and_one_made_instead(make_executor, make_node):
     executor = make_executor()
     total = 0

@@ -31,23 +31,6 @@ nodes:
         deadline: 1s
 """
 
-class Stepping(Spinning):
-    """Spins by a loop of ``spin_once``."""
-
-    def _run(self):
-        try:
-            while not self.executor._is_shutdown:
-                self.executor.spin_once()
-        except BaseException as error:
-            self.error = error
-
-
-@pytest.fixture(params=[Spinning, Stepping], ids=['spin', 'spin_once'])
-def spinning(request):
-    """Give the ways of spinning."""
-    return request.param
-
-
 def waits_for_no_timer(executor):
     """Tell whether the executor knows of all timers, and none is to become due."""
     with executor._pool.lock:

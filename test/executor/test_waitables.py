@@ -12,7 +12,6 @@ import pytest
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import EventHandler, PublisherEventCallbacks
-from rclpy.guard_condition import GuardCondition
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 from test_msgs.action import Fibonacci
@@ -192,64 +191,7 @@ def test_the_middleware_writes_to_no_file_after_the_executor_has_ended(
     assert sizes == [0] * 200
 
 
-# --- guard conditions, and waitables of a user's own ---------------------------------------------
-
-
-def wait_set_threads():
-    return sum(thread.name == 'mddag-wait-set' for thread in threading.enumerate())
-
-
-class Counted(Pulse):
-    """Counts its executions."""
-
-    def __init__(self, node):
-        super().__init__(node, node.default_callback_group)
-        self.guard.destroy()  # its node had it for a moment
-        self.guard = GuardCondition(None, None, node.context)
-        self.executed = 0
-
-    async def execute(self, taken_data):
-        self.executed += 1
-
-
-@pytest.mark.parametrize('stepwise', [False, True])
-def test_each_trigger_of_a_guard_condition_is_noticed(make_executor, make_node, stepwise):
-    """While it spins guard conditions come and go."""
-    node = make_node()
-    executor = make_executor(nodes=[node])
-
-    def triggered(guard, done):
-        guard.trigger()
-        if stepwise:
-            end = time.monotonic() + 15.0
-            while not done() and time.monotonic() < end:
-                executor.spin_once(5.0)
-        assert wait_for(done)
-
-    def rounds():
-        for _ in range(5):
-            calls = []
-            guard = node.create_guard_condition(lambda calls=calls: calls.append(1))
-            for number in range(1, 21):
-                triggered(guard, lambda c=calls, n=number: len(c) == n)
-            waitable = Counted(node)
-            node.add_waitable(waitable)
-            for number in range(1, 21):
-                triggered(waitable.guard, lambda w=waitable, n=number: w.executed == n)
-            node.destroy_guard_condition(guard)
-            node.remove_waitable(waitable)
-            waitable.guard.destroy()
-
-    if stepwise:
-        rounds()
-    else:
-        with Spinning(executor) as spinning:
-            rounds()
-        assert spinning.error is None
-        assert wait_set_threads() == 0
-
-
-# --- timers --------------------------------------------------------------------------------------
+# --- timers, and a waitable of a user's own ------------------------------------------------------
 
 
 @pytest.mark.skipif(compat.TimerInfo is None, reason='this rclpy has no TimerInfo')

@@ -205,9 +205,11 @@ def test_where_nothing_was_due_nothing_is_proven(trace, tmp_path, mode, call):
     graph = tmp_path / 'g.yaml'
     graph.write_text(GRAPH.replace('8ms}', '8ms, execution_time: 1ms}'))
     arguments = 'replay', empty, graph, *mode
-    status, said, err = call(*arguments, '--fail-on-miss', '--junit', out)
+    page = tmp_path / 'page.html'
+    status, said, err = call(*arguments, '--fail-on-miss', '--junit', out, '--report', page)
     assert status == 1 and err.count(f'error: {empty}: no job was due at any sink') == 1
     assert 'never due, so not judged: 1 sink: /n:a' in said
+    assert 'No job was due at any sink: nothing is proven.' in page.read_text()
     failure = ElementTree.parse(out).getroot().find('testsuite/testcase/failure')
     assert failure is not None and 'no job was due' in failure.attrib['message']
     assert json.loads(call(*arguments, '--json', '-').stdout)['never_due'] == ['/n:a']

@@ -23,8 +23,7 @@ from mddag_executor.simulate import (
 from msg_graph import loads
 import pytest
 
-from ..core.task_sets import declaration, examples
-from ..core.test_by_hand import single
+from ..core.task_sets import declaration, examples, single
 
 MS = 1_000_000
 LOCK, CPU, NOTHING = 'lock', 'cpu', 'nothing'

@@ -78,6 +78,7 @@ def test_a_bound_for_all_dags_and_one_of_its_own():
     ({'duration_ns': 0}, 'duration: 0 ns is too short'),
     ({'judge': 'me'}, "judge 'me': .*: choose one of horizon, completions"),
     ({'policy': 'edf'}, "policy 'edf': .*: choose one of rad, rm"),
+    ({'policy': 'ros2', 'preemptive': True}, "policy 'ros2': .* preempts no callback: run it"),
     ({'dispatch_overhead_ns': -1}, 'overhead'), ({'switch_overhead_ns': -1}, 'overhead'),
 ])
 def test_settings_that_make_no_sense(setting, says):

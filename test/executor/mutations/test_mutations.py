@@ -70,7 +70,7 @@ def step(self, must_check: bool = True) -> Any:
         if self.coroutine is None and self.entity.ran % 20 == 19:
             return None""")], of(
         'test_each_runs.py', 'test_each_time_that_a_timer_is_due_counts', *(
-            f'test_each_of_many_runs_once[of_{kind}]' for kind in (
+            f'test_each_of_many_runs_once[spin-of_{kind}]' for kind in (
                 'tasks', 'subscriptions', 'services', 'guards', 'waitables'))), every=True),
     Case('create_task_does_not_wake_spin_once', [
         ('executor/executor.py', 'self._pool.report(self._engine.ready, work)', UNNOTICED),
@@ -106,10 +106,10 @@ may not check
 client.completed = getattr(client, 'completed', 0) + 1
     if client.completed % 20:
         future.set_result(response)""")], of(
-        'test_each_runs.py', 'test_each_of_many_runs_once[of_services]')),
+        'test_each_runs.py', 'test_each_of_many_runs_once[spin-of_services]')),
     Case('coroutines_not_resumed', [(
         'executor/engine.py', 'self._core().resume(work.x)', 'pass')], [
-        *of('test_each_runs.py', 'test_each_of_many_runs_once[of_coroutines]'),
+        *of('test_each_runs.py', 'test_each_of_many_runs_once[spin-of_coroutines]'),
         *of('test_like_rclpy.py',
             'test_a_coroutine_goes_on_in_the_step_after_its_future_is_done')], every=True),
     Case('what_bypasses_the_core_stays_unknown', [(
