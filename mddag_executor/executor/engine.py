@@ -287,13 +287,6 @@ class Engine:
             self.other_processes.note(name, job)
         return job._replace(vertex=vertex)
 
-    def reference_deadline(self, work: Work) -> int | None:
-        """Return the reference absolute deadline of an open job's execution; None for others."""
-        release = None if work.origin is None else self.open_release(work.origin)
-        if release is None or work.origin is None:
-            return None
-        return release + self.tables.rad_offset[work.origin.vertex]
-
     def open_release(self, origin: Origin) -> int | None:
         """Return the release of an open job, None if the job has ended."""
         state, slot = self._state, origin.slot

@@ -123,8 +123,8 @@ class Session:
                 return
             if time.monotonic() > end:
                 raise SessionError(
-                    f'{topics[0]}: its publishers and subscriptions have not met within '
-                    f'{patience_s:.0f} s ({counted(len(topics), "topic")} in all): check '
+                    f'{topics[0]}: publishers and subscriptions have not discovered each other '
+                    f'within {patience_s:.0f} s ({counted(len(topics), "topic")} in all): check '
                     'ROS_DOMAIN_ID and the network')
 
     def end(self) -> None:

@@ -103,8 +103,9 @@ def tables(statuses: list[Status], width: int | None = None) -> str:
     :param width: of a terminal: only the columns that fit, and the messages below; None: all.
     """
     dags = sorted((s for s in statuses if not s.is_pool), key=lambda s: (s.name, s.process))
-    parts = [_table(_DAG_COLUMNS, dags, width),
-             _table(_POOL_COLUMNS, [s for s in statuses if s.is_pool], width)]
+    pools = [s for s in statuses if s.is_pool]
+    parts = [_table(columns, rows, width) for columns, rows in (
+        (_DAG_COLUMNS, dags), (_POOL_COLUMNS, pools)) if rows]
     if width is not None:
         parts.append(''.join(
             printable(f'{s.level} {s.name}: {s.message}')[:width] + '\n'

@@ -83,7 +83,7 @@ class TraceReader:
         self.topics: dict[int, Topic] = {}
         self.times = array('Q')
         stream = self._stream = _opened(self.path)
-        self._closing = weakref.finalize(self, stream.close)
+        weakref.finalize(self, stream.close)
         try:
             size = self._size = os.fstat(stream.fileno()).st_size
             self._start, library = open_data(stream, self.path)

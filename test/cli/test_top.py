@@ -59,6 +59,12 @@ def test_names_cannot_command_the_terminal():
         assert '\\x1b]0;owned' in text
 
 
+def test_without_declaration_there_is_no_table_of_dags():
+    board = Board()
+    board.take(array(('a/1', 'mddag: workers', 0, POOL)))
+    assert tables(board.statuses(), 120).split()[0] == 'workers'
+
+
 def board_of_autoware(*processes):
     """Return what a run of Autoware's workload reports."""
     values = {

@@ -105,6 +105,8 @@ def _without_new(found):
     """Remove what version 1 did not count."""
     for key in ('on_late', 'mddag', 'format', 'skipped_jobs'):
         found.pop(key, None)
+    if found.get('rescheduled'):    # version 1 did not warn of it
+        found['warnings'] = [each for each in found['warnings'] if 'coroutines' not in each]
     recorded = found.get('recorded')
     if recorded is not None and 'dags' in recorded:
         _without_new(recorded)
