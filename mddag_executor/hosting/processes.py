@@ -46,7 +46,7 @@ from mddag_executor.core.tally import of_processes
 from mddag_executor.errors import MddagError
 from mddag_executor.executor.entity import add_counts
 from mddag_executor.hosting.child import signal_at_end_of
-from mddag_executor.hosting.session import Session
+from mddag_executor.hosting.session import MATCH_TIMEOUT_S, Session
 from msg_graph import TaskSet
 from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
@@ -272,7 +272,7 @@ class Part:
 
     def start_together(
         self, name: str, names: Sequence[str], session: Session,
-        unmatched: Callable[[], list[str]],
+        unmatched: Callable[[], list[str]], patience_s: float = MATCH_TIMEOUT_S,
     ) -> int:
         """
         Wait for the common start of all processes, and return it (monotonic ns).
@@ -280,11 +280,12 @@ class Part:
         Returns early if the run is to end.
 
         :param unmatched: returns the topics on which publishers and subscriptions have not
-            discovered each other.
+            discovered each other; ``patience_s``: how long to wait for progress.
         :raises mddag_executor.hosting.session.SessionError: when discovery fails.
         """
         self._come_to('made', name, names, session)
-        session.wait_until_matched(lambda: [] if self._is_left_alone() else unmatched())
+        session.wait_until_matched(
+            lambda: [] if self._is_left_alone() else unmatched(), patience_s)
         at = self._come_to('ready', name, names, session) + LEAD_NS
         session.wait(max(0, at - time.monotonic_ns()) / 1e9)
         return at

@@ -119,7 +119,11 @@ def _name(recording: Recording, column: str, number: int) -> str:
 
 def pandas_frame(recording: Recording, name: str) -> Any:
     """Return a table of a recording as a pandas data frame; see ``arrow_table``."""
-    return arrow_table(recording, name).to_pandas()
+    import pandas
+    import pyarrow
+    # pandas' own choice, floats where a value is missing, would round times to 256 ns
+    return arrow_table(recording, name).to_pandas(
+        types_mapper={pyarrow.int64(): pandas.Int64Dtype()}.get)
 
 
 def write_tables(recording: Recording, folder: Path) -> list[str]:

@@ -129,7 +129,7 @@ class Beside:
             self.waited = seconds
         return False
 
-    def wait_until_matched(self, unmatched):
+    def wait_until_matched(self, unmatched, patience_s):
         while unmatched():
             self.wait(0.02)
 

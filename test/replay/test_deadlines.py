@@ -194,6 +194,9 @@ def test_a_recording_in_a_program(tmp_path):
         r'<Recording .*demo_short\.mcap: 1\.4\d\d s, \d+ jobs, \d+ executions>', repr(recording))
     with pytest.raises(KeyError, match="no table 'nope': the tables are releases, executions, "):
         recording.to_pandas('nope')
+    recording.executions['end'][0] = -1     # a missing value rounds no other
+    ends = recording.to_pandas('executions').end
+    assert ends.isna()[0] and ends[1:].tolist() == recording.executions['end'][1:].tolist()
 
 
 def test_an_ordinary_bag_has_releases(tmp_path):
