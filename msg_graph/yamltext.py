@@ -124,7 +124,7 @@ def parse_yaml(text: str, file: str) -> Tree | None:
         what = error.problem or error.context or 'it cannot be parsed'
         raise GraphError(
             file, None if mark is None else mark.line + 1, f'not YAML: {what}',
-            'check indentation, brackets and quotes') from None
+            'check indentation (by blanks, not tabs), brackets and quotes') from None
     except yaml.YAMLError as error:
         raise GraphError(file, None, f'not YAML: {error}', 'give a YAML file') from None
 

@@ -40,6 +40,7 @@ import threading
 import time
 from typing import Any
 
+from mddag_executor.core import legs_of
 from mddag_executor.executor.jobs import header_stamp
 from mddag_executor.executor.listeners import NextCall
 from mddag_executor.executor.quiet_nodes import quiet_node
@@ -101,17 +102,19 @@ class Role:
     A callback as one vertex, and its actions for a message of that DAG.
 
     :ivar senders: the ``frame_id`` of the messages that it waits for.
-    :ivar waiting: of a sync the incomplete joins: the received messages, by release.
+    :ivar waiting: of a sync the incomplete joins: the received messages (topic and sender), by
+        release; ``n_legs`` are needed.
     :param sender: the ``frame_id`` of the messages that it publishes.
     """
 
     def __init__(
-        self, vertex: Vertex, senders: list[str], sender: str, execution_ns: int,
+        self, vertex: Vertex, senders: list[str], n_legs: int, sender: str, execution_ns: int,
         publishers: list[Publisher], emulate: Emulate, ledger: Ledger,
     ) -> None:
         self.vertex = vertex
         self.senders = senders
-        self.waiting: dict[int, set[str]] = {}
+        self.waiting: dict[int, set[tuple[str, str]]] = {}
+        self._n_legs = n_legs
         self._ledger = ledger
         self._sender = sender
         self._execution_ns = execution_ns
@@ -121,12 +124,12 @@ class Role:
         self._completions = ledger.completions.get(vertex.name)
         self._lock = threading.Lock()
 
-    def is_whole(self, release: int, sender: str) -> bool:
+    def is_whole(self, release: int, leg: tuple[str, str]) -> bool:
         """Note a message of a sync; return whether it was the last one of its job."""
         with self._lock:
             seen = self.waiting.setdefault(release, set())
-            seen.add(sender)
-            if len(seen) == len(self.senders):
+            seen.add(leg)
+            if len(seen) == self._n_legs:
                 del self.waiting[release]
                 return True
             if len(self.waiting) > JOIN_LIMIT:
@@ -177,7 +180,7 @@ class Grid:
 
 
 def callback_of(
-    roles: list[Role], ledger: Ledger, current_job: CurrentJob
+    topic: str, roles: list[Role], ledger: Ledger, current_job: CurrentJob
 ) -> Callable[[Header], None]:
     """
     Make the callback of a subscription: the sender of a message selects the vertex.
@@ -192,7 +195,7 @@ def callback_of(
         if role is None:
             return  # published from outside of the declaration
         release = header_stamp(message)
-        if is_sync and not role.is_whole(release, message.frame_id):
+        if is_sync and not role.is_whole(release, (topic, message.frame_id)):
             return
         if current_job is not no_job:
             release = attributed(role, release, ledger, current_job)
@@ -419,8 +422,8 @@ class SyntheticWorkload:
             elif callback.kind == 'service':
                 self._add_service(node, group, callback, roles[0])
             else:
-                on_message = callback_of(roles, self.ledger, self._current_job)
                 for topic in callback.topics:
+                    on_message = callback_of(topic, roles, self.ledger, self._current_job)
                     node.create_subscription(Header, topic, on_message, QOS, callback_group=group)
         return node
 
@@ -439,6 +442,7 @@ class SyntheticWorkload:
         senders = [f'{name}#{index}' for index in vertex.predecessors]
         return Role(
             vertex, senders or [SENSOR + topic for topic in vertex.callback.topics],
+            len(legs_of(vertex, self.task_set.dags[vertex.dag].vertices)),
             f'{name}#{vertex.index}', self.plan.execution_ns(vertex),
             publishers, self._emulate[self.plan.body(vertex)], self.ledger)
 

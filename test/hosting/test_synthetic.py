@@ -168,6 +168,27 @@ def test_every_release_reaches_every_sink(task_set, ros_context):
     workload.destroy()
 
 
+def test_a_sync_of_two_topics_of_one_publisher_executes_once_for_each_job(ros_context):
+    task_set = loads("""
+mddag: 1
+nodes:
+  - node: /a
+    callbacks: [{name: tick, timer: 20ms, publishes: [/x, /y]}]
+  - node: /b
+    callbacks: [{name: both, sync: [/x, /y], deadline: 20ms}]
+""", 'graph.yaml')
+    executor = MultiDeadlineExecutor(task_set, context=ros_context)
+    workload = SyntheticWorkload(
+        task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
+    for node in workload.nodes:
+        executor.add_node(node)
+    with Session(executor) as session:
+        assert workload.run(session, 0.2, warm_up_s=0.1)
+    ran, joined = (len(workload.ledger.durations[name]) for name in ('/a:tick', '/b:both'))
+    assert ran - 2 <= joined <= ran
+    workload.destroy()
+
+
 def test_the_ledger_of_a_long_run_is_bounded(task_set, ros_context, monkeypatch):
     monkeypatch.setattr('mddag_executor.hosting.synthetic.MOST_MEASURED_S', 0.4)
     executor = MultiDeadlineExecutor(task_set, context=ros_context)
