@@ -162,8 +162,8 @@ def record(cause: str, trace: Path, misses: int, scale: float = 1.0) -> None:
 
 def causes(trace: Path) -> dict[str, int]:
     """Return how many misses of each cause are named."""
-    told = replay(trace).explanation.summary()['causes']
-    return {cause: n for cause, n in told.items() if n}
+    found = replay(trace).explanation.summary()['causes']
+    return {cause: n for cause, n in found.items() if n}
 
 
 def measure(misses: int, scale: float, wanted: list[str]) -> None:
@@ -173,9 +173,9 @@ def measure(misses: int, scale: float, wanted: list[str]) -> None:
         with tempfile.TemporaryDirectory() as folder:
             trace = Path(folder) / 'run.mcap'
             record(cause, trace, misses, scale)
-            told = causes(trace)
-        total, right = sum(told.values()), told.pop(cause, 0)
-        instead = ', '.join(f'{n} {other}' for other, n in told.items()) or '-'
+            reported = causes(trace)
+        total, right = sum(reported.values()), reported.pop(cause, 0)
+        instead = ', '.join(f'{n} {other}' for other, n in reported.items()) or '-'
         print(f'{cause:<15}{total:>8}{right / max(1, total):>11.1%}   {instead}', flush=True)
 
 
@@ -196,7 +196,7 @@ def main(parse: Callable[[], argparse.Namespace]) -> None:
 
 
 def _parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description='What explain tells of live runs.')
+    parser = argparse.ArgumentParser(description='What explain reports of live runs.')
     parser.add_argument('cause', nargs='*', choices=[*PERIODS, []], help='default: all of them')
     parser.add_argument('--misses', type=int, default=100, help='about so many of each cause')
     parser.add_argument('--scale', type=float, default=1.0, help='of all times')

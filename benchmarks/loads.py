@@ -28,7 +28,7 @@ from typing import Any, cast
 from benchmarks.campaign import DECLARED, OURS, ROBOT, Spec
 from benchmarks.executors import make_executor, noting, spin_of, Start, within
 from benchmarks.publisher import PublisherProcess
-from mddag_executor.core.tally import quantiles_us
+from mddag_executor.core import quantile
 from mddag_executor.executor import current_job
 from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.hosting.child import ChildError
@@ -63,6 +63,16 @@ MIDDLEWARE = 'dds.'
 PROGRAM = 'examples/robot/robot.py'
 
 Log = list[tuple[int, int]]
+
+
+def quantiles_us(values: list[int]) -> dict[str, float] | None:
+    """Return p50, p99 and max in us of values in ns; None when there are none."""
+    if not values:
+        return None
+    ordered = sorted(values)
+    return {
+        'p50': quantile(ordered, 0.5) / 1000, 'p99': quantile(ordered, 0.99) / 1000,
+        'max': ordered[-1] / 1000}
 
 
 def run(spec: Spec) -> dict[str, Any]:

@@ -49,10 +49,10 @@ def stage(name: str, takes_s: float, topic: str, to: str | None, depth: int) -> 
 
 def run(depth: int) -> None:
     """Run for two seconds, with so many images waiting at most."""
-    told: Counter[str] = Counter()
+    reported: Counter[str] = Counter()
 
     def missed(miss: DeadlineMiss) -> None:
-        told[f'{miss.dag} {miss.kind}'] += 1
+        reported[f'{miss.dag} {miss.kind}'] += 1
 
     executor = MultiDeadlineExecutor(
         str(Path(__file__).with_name('graph.yaml')), on_deadline_miss=missed)
@@ -68,7 +68,7 @@ def run(depth: int) -> None:
     for name, dag in executor.statistics()['dags'].items():
         ends = ', '.join(f'{count} {end}' for end, count in dag['ends'].items())
         print(f"  {name}: {dag['jobs']} jobs: {ends}")
-    print('  misses:', ', '.join(f'{count} {what}' for what, count in sorted(told.items())))
+    print('  misses:', ', '.join(f'{count} {what}' for what, count in sorted(reported.items())))
 
 
 def main() -> None:

@@ -50,7 +50,7 @@ class Stage(Node):
         self._to = self.create_publisher(Header, to, 10) if to else None
 
     def work(self, first: Header, *others: Header) -> None:
-        """Stand for what takes time outside of Python: a camera, a GPU, a library."""
+        """Wait, as for a camera, a GPU or a library outside of Python."""
         time.sleep(self._takes_s)
         if self._to is not None:
             self._to.publish(Header(stamp=first.stamp, frame_id=self.get_name()))

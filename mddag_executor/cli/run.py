@@ -359,7 +359,7 @@ def _run_synthetic(
 
 
 def _begin(args: argparse.Namespace, task_set: TaskSet) -> Callable[..., int | None]:
-    """Return what waits until publishers and subscriptions have met, and for other processes."""
+    """Return what waits until endpoints have discovered each other, and for other processes."""
     from mddag_executor.hosting.processes import Part
     from mddag_executor.hosting.session import Session
     if args.part is None:

@@ -52,16 +52,6 @@ def quantile(ordered: Sequence[int], q: float) -> int:
     return ordered[min(len(ordered) - 1, max(0, -int(-q * len(ordered) // 1) - 1))]
 
 
-def quantiles_us(values: list[int]) -> dict[str, float] | None:
-    """Return p50, p99 and max in us of values in ns; None when there are none."""
-    if not values:
-        return None
-    ordered = sorted(values)
-    return {
-        'p50': quantile(ordered, 0.5) / 1000, 'p99': quantile(ordered, 0.99) / 1000,
-        'max': ordered[-1] / 1000}
-
-
 class Counts(NamedTuple):
     """
     Verdicts about the jobs of one or several sinks; ``late`` includes the overdue.

@@ -139,7 +139,7 @@ class PublisherNumbers:
 
 new_address: Callable[[], int] = count(secrets.randbits(46) << 16).__next__
 """
-Returns a number that stands for an address in a trace.
+Returns a number that is an address in a trace.
 
 Unlike an address, it is never used again, nor by another process.
 """

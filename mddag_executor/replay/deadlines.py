@@ -418,10 +418,10 @@ class Judged:
         missed, before = self.missed, self._recording.misses
         columns = ('dag', 'sink', 'job', 'deadline', 'completed')
         found = Counter(zip(*(missed[name].tolist() for name in columns)))
-        told = Counter(zip(*(before[name].tolist() for name in before.dtype.names or ())))
-        if found == told:
+        recorded = Counter(zip(*(before[name].tolist() for name in before.dtype.names or ())))
+        if found == recorded:
             return None
-        more, less = found - told, told - found
+        more, less = found - recorded, recorded - found
         example = min([*more, *less], key=lambda miss: miss[3])
         name = 'an undeclared vertex' if example[1] < 0 else self.tally.vertex_name(example[1])
         recorded_misses = counted(len(before), 'recorded miss', 'recorded misses')
