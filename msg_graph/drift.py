@@ -34,7 +34,7 @@ from typing import Any
 from msg_graph.binding import Entity, is_background, meant
 from msg_graph.duration import format_duration
 from msg_graph.errors import printable
-from msg_graph.model import Callback, Dag, TaskSet, topological_order
+from msg_graph.model import Callback, Dag, legs_of, TaskSet, topological_order
 
 TOLERANCE = 0.2
 LEAST = 10
@@ -198,14 +198,13 @@ def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift |
 
 def _due_by_runs(callback: Callback, dags: list[Dag], observed: Observed) -> int | None:
     """Return the number of runs of the callbacks that publish to this one; None: unknown."""
-    before = {dag.vertices[i].callback.key: dag.vertices[i].callback for dag in dags
+    before = {dag.vertices[i].callback.key: (dag.vertices[i], dag.vertices) for dag in dags
               for vertex in dag.vertices if vertex.callback.key == callback.key
               for i in vertex.predecessors}
     if not before or not before.keys() <= observed.ran.keys():
         return None
-    # a sync runs once for each topic, and publishes once
-    return sum(observed.ran[key] // (len(each.topics) if each.kind == 'sync' else 1)
-               for key, each in before.items())
+    # a sync runs once for each leg, and publishes once
+    return sum(observed.ran[key] // max(1, len(legs_of(*each))) for key, each in before.items())
 
 
 def _message_rate(callback: Callback, dags: list[Dag], observed: Observed) -> Drift | None:

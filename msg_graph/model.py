@@ -318,6 +318,16 @@ def topological_order(dag: Dag) -> list[int]:
     return order
 
 
+def legs_of(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int, int]]:
+    """Return the messages that start a vertex, its legs: topic index and publishing vertex."""
+    topics = vertex.callback.topics
+    if len(topics) <= 1:
+        return [(0, before) for before in vertex.predecessors]
+    return [
+        (place, before) for place, topic in enumerate(topics) for before in vertex.predecessors
+        if topic in vertices[before].callback.publishes]
+
+
 def path_lengths(dag: Dag, weights: Sequence[int]) -> list[int]:
     """
     Return for each vertex the length of the longest path from the source through it.

@@ -7,7 +7,6 @@ from mddag_executor.core.scheduler import Scheduler
 from mddag_executor.core.tables import (
     DEFAULT_DEADLINE_NS,
     EXPIRE_AFTER_NS,
-    legs_of,
     MAX_ACTIVE_JOBS,
     NEVER,
     processes_of,
@@ -15,6 +14,7 @@ from mddag_executor.core.tables import (
     Tables,
 )
 from mddag_executor.core.tally import quantile, Tally
+from msg_graph.model import legs_of
 
 __all__ = [
     'DEFAULT_DEADLINE_NS', 'EXPIRE_AFTER_NS', 'MAX_ACTIVE_JOBS', 'NEVER', 'POLICIES', 'Policy',

@@ -52,7 +52,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from msg_graph import Callback, Dag, TaskSet, Vertex
-from msg_graph.model import path_lengths, topological_order
+from msg_graph.model import legs_of, path_lengths, topological_order
 
 NEVER = 2 ** 62
 """A time that is never reached, ns: larger than any clock, small enough to add to."""
@@ -299,16 +299,6 @@ def processes_of(task_set: TaskSet) -> list[int]:
     place = {node: number for number, process in enumerate(task_set.processes, 1)
              for node in process.nodes}
     return [place.get(vertex.callback.node, 1) for vertex in task_set.vertices]
-
-
-def legs_of(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int, int]]:
-    """Return the messages that start a vertex, its legs: topic index and publishing vertex."""
-    topics = vertex.callback.topics
-    if len(topics) <= 1:
-        return [(0, before) for before in vertex.predecessors]
-    return [
-        (place, before) for place, topic in enumerate(topics) for before in vertex.predecessors
-        if topic in vertices[before].callback.publishes]
 
 
 def rad_offsets(dag: Dag) -> list[int]:

@@ -121,6 +121,25 @@ def test_a_sync_that_never_got_one_of_its_topics():
         "/b:s never got a message of /z in 0.500 s: did you mean the topic '/zz'?")
 
 
+def test_a_sync_publishes_once_for_all_messages_of_a_job():
+    """Two publishers of one topic make three legs of two topics."""
+    task_set = loads("""\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: t, timer: 10ms, publishes: [/i]}
+      - {name: one, subscription: /i, publishes: [/x]}
+      - {name: two, subscription: /i, publishes: [/x]}
+      - {name: three, subscription: /i, publishes: [/y]}
+      - {name: s, sync: [/x, /y], publishes: [/z]}
+      - {name: e, subscription: /z, deadline: 9ms}
+""")
+    ran = {callback.key: 50 for callback in task_set.callbacks} | {'/a:s': 150}
+    seen = Observed(500 * MS, {'/a:t': Releases(50, 0, 490 * MS)}, ran, ran)
+    assert drift(task_set, seen) == []
+
+
 def test_a_short_run_says_nothing_of_what_never_ran():
     seen = Observed(duration_ns=24 * MS)
     assert drift(TASKS, seen) == []
