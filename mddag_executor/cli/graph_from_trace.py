@@ -21,7 +21,7 @@ services, callback groups, what each callback published, and the quantiles of it
 (0, 50, 90, 99, 100 %). What it cannot show (deadlines, periods of what comes from outside, queue
 edges) is in comments marked 'FILL IN', with a proposal from the recorded rates; remove the
 first '# ' of such a line once its value is right. If the run was recorded with a declaration, its
-names, deadlines and queue edges are kept. Services that every node has, such as those for
+names, deadlines, queue edges and paths are kept. Services that every node has, such as those for
 parameters, are left out, and so are services and subscriptions from outside that never ran; the
 declaration names the latter."""
 

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 import os
 
 from mddag_executor.core import quantile
@@ -37,7 +38,7 @@ from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
 from msg_graph import ExecutionTime, NO_GRAPH, TaskSet
 from msg_graph.binding import function_of, is_background
-from msg_graph.draft import Draft, DraftCallback, DraftNode, leave_out_sources
+from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath, leave_out_sources
 from msg_graph.duration import DAY
 from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
 import numpy as np
@@ -140,7 +141,8 @@ class System:
             if unseen:
                 for callback in nodes[name].callbacks.values() if name in nodes else ():
                     callback.maybe.extend(t for t in unseen if t not in callback.publishes)
-        draft = Draft(f'the trace {self.name}', self._ordered(nodes), workers=self.workers)
+        draft = Draft(
+            f'the trace {self.name}', self._ordered(nodes), self._paths(nodes), self.workers)
         declared = {callback.key for callback in self._declared.values()}
         leave_out_sources(draft, lambda callback: (
             callback.runs == 0 and callback.kind != 'timer' and callback.key not in declared),
@@ -164,6 +166,16 @@ class System:
                 found.append(DraftNode(callback.node))  # a node may have several entries
             found[-1].callbacks[callback.name] = callback
         return found
+
+    def _paths(self, nodes: dict[str, DraftNode]) -> list[DraftPath]:
+        """Return the declared paths, as far as each step was recorded."""
+        every = {c.key: c for node in nodes.values() for c in node.callbacks.values()}
+        return [
+            DraftPath(path.name, [], list(path.callbacks))
+            for path in (self.task_set or NO_GRAPH).paths
+            if every.keys() >= set(path.callbacks) and all(
+                not {*before.publishes, before.name}.isdisjoint(after.starts + after.reads)
+                for before, after in pairwise(every[key] for key in path.callbacks))]
 
     def _callback(self, entity: Callback, node: DraftNode) -> DraftCallback:
         declared = self._declared.get(entity.number)
