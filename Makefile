@@ -85,7 +85,7 @@ check-fresh:
 
 nightly: mutations soak stress fuzz
 	@MDDAG_THOROUGH=20 HARDENING_EXAMPLES=1000 $(BIN)/python -m pytest $(PYTEST_ARGS) -q \
-		test/core test/msg_graph test/hardening test/laboratory test/simulate
+		test/core test/msg_graph test/hardening test/laboratory test/replay test/simulate test/trace
 
 mutations: env
 	@$(BIN)/python -m pytest -q -m nightly test/executor/mutations

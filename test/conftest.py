@@ -233,6 +233,44 @@ def ros_context(no_thread_leak):
     context.try_shutdown()
 
 
+def examples(count):
+    """Return settings for that many examples; MDDAG_THOROUGH=20 in the environment: 20 fold."""
+    check = hypothesis.HealthCheck
+    return hypothesis.settings(
+        max_examples=count * int(os.environ.get('MDDAG_THOROUGH', '1')), suppress_health_check=[
+            check.too_slow, check.data_too_large, check.function_scoped_fixture])
+
+
+def run_program(program, *arguments, send=None):
+    """
+    Run a program in a process of its own; return its output and errors.
+
+    :param send: the signal that it gets when it has printed ``ready``.
+    """
+    process = subprocess.Popen(
+        [sys.executable, '-c', program, *map(str, arguments)], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True)
+    try:
+        if send is not None:
+            assert process.stdout.readline() == 'ready\n', process.communicate()[1]
+            process.send_signal(send)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 0, err
+    return out, err
+
+
+def wait_for_run(process, condition):
+    """Wait until something is true of a process that goes on."""
+    end = time.monotonic() + 60
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 class Done(NamedTuple):
     """How a command ended, and what it printed."""
 
@@ -247,6 +285,12 @@ class Done(NamedTuple):
         return json.loads(self.stdout)
 
 
+@pytest.fixture
+def graph(tmp_path, request):
+    """Give the declaration `GRAPH` of the test's module as a file, graph.yaml."""
+    path = tmp_path / 'graph.yaml'
+    path.write_text(request.module.GRAPH)
+    return path
 
 
 @pytest.fixture

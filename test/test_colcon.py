@@ -96,6 +96,7 @@ nodes:
     callbacks: [{name: tick, timer: 20ms, deadline: DEADLINE, execution_time: 5ms}]
 """
 
+
 @needs_ros2
 @pytest.mark.parametrize(('deadline', 'status'), [
     ('20s, tolerate: 999 of 1000', 0), ('1ms', 1)])

@@ -13,8 +13,6 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def graph(folder, request):
-    """Give the declaration `GRAPH` of the test's module, graph.yaml in the working directory."""
-    path = folder / 'graph.yaml'
-    path.write_text(request.module.GRAPH)
-    return path
+def graph(folder, graph):
+    """Give the same in the working directory."""
+    return graph

@@ -28,6 +28,7 @@ nodes:
         execution_time: {quantiles_us: [10000, 10000, 14000, 14000], percent: [0, 50, 50.01, 100]}
 """
 
+
 @pytest.mark.parametrize(('ending', 'start'), [
     ('png', b'\x89PNG'), ('svg', b'<?xml'), ('pdf', b'%PDF')])
 def test_figure(graph, tmp_path, call, ending, start):

@@ -4,8 +4,6 @@
 
 import os
 from pathlib import Path
-import subprocess
-import sys
 
 from mddag_executor.recording.tables import TABLES
 from mddag_executor.replay import open_recording
@@ -20,6 +18,7 @@ nodes:
       - {name: t, timer: 10ms, publishes: [/a], execution_time: 2ms}
       - {name: s, subscription: /a, deadline: 5ms, execution_time: %s}
 """
+
 
 @pytest.fixture
 def graph(tmp_path):
@@ -114,14 +113,12 @@ def test_a_folder_replaces_an_earlier_export_only(tmp_path, call):
 
 @pytest.mark.parametrize('command', [
     'export g.mcap -o out.parquet', 'export run.mcap other.yaml -o out.parquet --rows jobs'])
-def test_a_parquet_export_that_fails_is_one_line(trace, tmp_path, command):
+def test_a_parquet_export_that_fails_is_one_line(trace, tmp_path, mddag, command):
     """In a process of its own: pyarrow complains when its writer is collected."""
     pytest.importorskip('pyarrow', reason='pyarrow is not installed')
     (tmp_path / 'g.mcap').write_text('no recording')
     (tmp_path / 'other.yaml').write_text(GRAPH.replace('/n', '/other') % '1ms')
-    done = subprocess.run(
-        [sys.executable, '-m', 'mddag_executor', *command.split()], cwd=tmp_path, text=True,
-        capture_output=True, check=False)
+    done = mddag(*command.split(), cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr.startswith('error: ') and done.stderr.count('\n') == 1
     assert not (tmp_path / 'out.parquet').exists()

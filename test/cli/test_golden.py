@@ -64,6 +64,7 @@ paths:
   - {name: seen, callbacks: ['/camera:grab', '/detect:detect']}
 """
 
+
 @pytest.fixture
 def files(folder):
     """Give a working directory with declarations and recordings."""

@@ -23,6 +23,7 @@ nodes:
     callbacks: [{name: t, timer: 100ms, deadline: 100ms, execution_time: 10ms}]
 """
 
+
 def test_standard_input_and_output(call, monkeypatch):
     monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)
     text = msg_graph.load(CONFIG / 'autoware_multi.yaml').text

@@ -67,6 +67,7 @@ executor.shutdown()
 print(node.asked)
 """
 
+
 def test_from_trace(call, tmp_path):
     done = call('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, 'no blanks to fill in\n', '')

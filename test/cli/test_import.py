@@ -17,6 +17,7 @@ for row in rows:
     print(json.dumps(row))
 """
 
+
 @pytest.fixture
 def recording(tmp_path, monkeypatch):
     """Give a folder that looks like a session, read by a stand-in for babeltrace2."""
@@ -41,21 +42,6 @@ def test_what_was_there_stays_when_the_import_fails(recording, call):
     assert errors.count('\n') == 1
     assert out.read_text() == 'precious'
     assert sorted(recording.parent.iterdir()) == before
-
-
-@pytest.mark.parametrize('name, what', [
-    ('missing', 'there is no such folder'), ('file', 'is no folder'),
-    ('empty', 'holds no CTF recording'), ('cache', 'holds only what CARET converted'),
-])
-def test_bad_sessions(name, what, tmp_path, call):
-    (tmp_path / 'file').touch()
-    (tmp_path / 'empty').mkdir()
-    (tmp_path / 'cache').mkdir()
-    (tmp_path / 'cache' / 'caret_converted').touch()
-    status, text, errors = call('import', 'ctf', tmp_path / name, '-o', tmp_path / 'out.mcap')
-    assert (status, text, errors.count('\n')) == (2, '', 1)
-    assert errors.startswith(f'error: {tmp_path / name}: {what}')
-    assert not list(tmp_path.glob('*.mcap')) + list(tmp_path.glob('.*'))
 
 
 def of_session(folder, name, made, host='robot', callback=1):

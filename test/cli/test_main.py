@@ -89,27 +89,6 @@ def test_an_interrupt_is_quiet(verb, capsys):
     assert capsys.readouterr() == ('', '')
 
 
-@pytest.mark.parametrize(('words', 'says'), [
-    ('', 'mddag: a verb is missing'),
-    ('graph', 'mddag graph: a verb is missing'),
-    ('rplay run.mcap --json -', "mddag: there is no verb 'rplay': did you mean 'replay'?"),
-    ('graph chek g --json -', "mddag graph: there is no verb 'chek': did you mean 'check'?"),
-    ('grph check g', "mddag: there is no verb 'grph': did you mean 'graph'?"),
-    ('-q replay run.mcap', 'mddag: -q: options of a verb follow it'),
-    ('graph --json - check g', 'mddag graph: --json: options of a verb follow it'),
-    ('replay t --reshedule', "mddag replay: there is no option '--reshedule': did you mean '--r"),
-    ('replay --reshedule', "mddag replay: there is no option '--reshedule': did you mean '--r"),
-    ('graph check g --jsn=-', "mddag graph check: there is no option '--jsn': did you mean '--js"),
-    ('replay -z run.mcap', "mddag replay: there is no option '-z': see 'mddag replay --help'"),
-    ('replay --\x1b[2J\n', "mddag replay: there is no option '--\\x1b[2J\\n'"),
-])
-def test_the_wrong_word_is_blamed_and_the_right_one_suggested(capsys, words, says):
-    assert program.main(words.split(' ') if words else []) == 2
-    out, err = capsys.readouterr()
-    assert out == '' and err.count('\n') == 1 and '\x1b' not in err
-    assert err.startswith(f'error: {says}')
-
-
 @pytest.mark.parametrize('words', [
     'a b --number 3 c', '--number 3 a b c', 'a --number=3 b c', 'a b c --number 3',
     '--number 3 -- a b c'])
@@ -118,14 +97,6 @@ def test_options_and_files_come_in_any_order(verb, words):
     verb(lambda args: found.append(args) or 0)
     assert program.main(['probe', *words.split()]) == 0
     assert (found[0].files, found[0].number) == (['a', 'b', 'c'], 3)
-
-
-@pytest.mark.parametrize('words', [
-    'replay a.mcap --reschedule gone.yaml', 'slack a.mcap --workers 2 gone.yaml',
-    'diff a.mcap b.mcap --callbacks gone.yaml'])
-def test_a_declaration_may_follow_an_option(folder, capsys, words):
-    assert program.main(words.split()) == 2
-    assert capsys.readouterr().err.startswith('error: gone.yaml: no such file or directory')
 
 
 @pytest.mark.parametrize('verb', sorted(program.VERBS))
@@ -305,6 +276,7 @@ mddag: 1
 nodes:
   - {node: /n, callbacks: [{name: tick, timer: 10ms, deadline: 10ms, execution_time: 1ms}]}
 """
+
 
 @pytest.fixture
 def ros2(monkeypatch):

@@ -23,6 +23,7 @@ nodes:
       - {name: s, subscription: /a, deadline: 5ms, execution_time: 4ms}
 """
 
+
 @pytest.fixture
 def run(graph, call):
     """Give a recorded run, run.mcap in the working directory."""

@@ -75,23 +75,6 @@ def test_diff(files, arguments, medians, due, call):
                for mark, line in zip('ab', lines[-3:-1]))
 
 
-@pytest.mark.parametrize(('arguments', 'problem'), [
-    (['export', 'imported.mcap', '--rows', 'jobs', '-o', 'out.csv'], 'it was imported'),
-    (['export', 'imported.mcap', 'other.yaml', '-o', 'out.csv'], 'none of the callbacks'),
-    (['export', 'bag', '-o', 'out.csv'], 'give a GRAPH and --reschedule'),
-    (['export', 'bag', 'graph.yaml', '-o', 'out.csv'], 'give a GRAPH and --reschedule'),
-    (['diff', 'imported.mcap', 'imported.mcap'], 'it was imported'),
-    (['diff', 'bag', 'own.mcap'], 'give a GRAPH and --reschedule'),
-    (['diff', 'own.mcap', 'bag', 'graph.yaml'], 'give a GRAPH and --reschedule'),
-    (['diff', 'own.mcap', 'imported.mcap', 'other.yaml'], 'none of the callbacks')])
-def test_what_can_not_be(files, arguments, problem, tmp_path, monkeypatch, call):
-    monkeypatch.chdir(tmp_path)
-    status, out, errors = call(*(files.get(word, word) for word in arguments))
-    assert (status, out, errors.count('\n')) == (2, '', 1), errors
-    assert errors.startswith('error: ') and problem in errors
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_part_by_time(files, tmp_path, call):
     """Ten jobs, one each 100 ms: that at `--from` is in the part, that at `--to` is not."""
     part = '--from', '200ms', '--to', '500ms'

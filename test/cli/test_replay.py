@@ -5,11 +5,10 @@
 import json
 from pathlib import Path
 
-from mddag_executor.trace import TraceFile
 import pytest
 
 from ..replay.recorded import MS
-from ..report.runs import by_hand, GRAPH, START
+from ..report.runs import by_hand, GRAPH
 
 
 @pytest.fixture
@@ -53,42 +52,6 @@ def test_standard_input(trace, call):
         2, '', 'error: <stdin>: is no MCAP file: give a trace written by this program or another '
         'MCAP recording\n')
     assert call('replay', trace, '-', stdin=GRAPH)[::2] == (0, '')
-
-
-def nothing_recorded(path):
-    with TraceFile(path) as file:
-        file.add('caret_init', START, 1, 1, 5, 'jazzy')
-
-
-def no_declaration(path):
-    with TraceFile(path) as file:
-        file.add('task_set', START, 1, 1, '', '', 'rad', 7, 0, 0, False)
-
-
-@pytest.mark.parametrize(('content', 'says'), [
-    (None, 'no such file or directory: check the path'),
-    (b'', 'is empty: give a trace'),
-    (b'8 bytes!', 'is no MCAP file: give a trace'),
-    (b'\x89MCAP0\r\n', 'ends or is damaged before its first event: give a trace'),
-    (b'PK\x03\x04' * 100, 'is no MCAP file: give a trace'),
-    (nothing_recorded, 'no run of this executor is recorded in it (it has no event '
-     'mddag:task_set): record a run with mddag run'),
-    (no_declaration,
-     'it was recorded without a declaration, so there are no jobs: give the GRAPH'),
-])
-@pytest.mark.parametrize('options', [[], ['--reschedule']])
-def test_what_is_no_trace_is_one_line(content, says, options, tmp_path, call):
-    path = tmp_path / 'bad.mcap'
-    if callable(content):
-        content(path)
-    elif content is not None:
-        path.write_bytes(content)
-    result = tmp_path / 'result.json'
-    status, out, err = call('replay', path, '--json', result, *options)
-    assert (status, out) == (2, '')
-    assert err.startswith(f'error: {path}: {says}')
-    assert err.count('\n') == 1
-    assert not result.exists()
 
 
 def test_a_sink_is_named_as_tables_do_or_by_a_unique_end(call, folder):

@@ -16,6 +16,7 @@ from mddag_executor.trace import read_events, TraceError, TraceReader
 from msg_graph import load
 import pytest
 
+from ..conftest import wait_for_run
 from . import golden
 
 GRAPH = """\
@@ -31,16 +32,6 @@ nodes:
     callbacks:
       - {name: cb, subscription: /data, deadline: 10ms, execution_time: 15ms}
 """
-
-
-# --- bad input -----------------------------------------------------------------------------------
-
-
-def test_the_declaration_comes_from_standard_input(graph, mddag):
-    process = mddag(
-        'run', '-', '--synthetic', 'sleep', '--duration', '0.2s', '--json', '-', input=GRAPH)
-    assert process.returncode == 0, process.stderr
-    assert json.loads(process.stdout)['file'] == '<stdin>'
 
 
 # --- runs ----------------------------------------------------------------------------------------
@@ -138,19 +129,20 @@ def test_three_commands_from_a_robot_to_a_verdict(folder, mddag):
     assert sink['completed'] == ran > 0  # on a busy machine the last one may not get to run
 
 
-@pytest.mark.parametrize(('tolerate', 'status'), [('1 of 1000', 1), ('999 of 1000', 0)])
-@pytest.mark.parametrize('processes', ['1', '2'])
+@pytest.mark.parametrize(('tolerate', 'status', 'processes'), [
+    ('1 of 1000', 1, '1'), ('1 of 1000', 1, '2'), ('999 of 1000', 0, '2')])
 def test_fail_on_miss_judges_by_what_the_declaration_tolerates(
-        graph, mddag, tolerate, status, processes):
+        folder, mddag, tolerate, status, processes):
     """The slow sink misses every deadline; the other one may miss what a busy machine costs."""
-    text = graph.read_text().replace('500ms,', '500ms, tolerate: 999 of 1000,')
-    graph.write_text(text.replace('10ms,', f'10ms, tolerate: {tolerate},'))
-    done = mddag('run', 'graph.yaml', '--synthetic', 'sleep', '--duration', '300ms',
-                 '--processes', processes, '--fail-on-miss', '--json', 'out.json')
+    text = GRAPH.replace('500ms,', '500ms, tolerate: 999 of 1000,')
+    done = mddag('run', '-', '--synthetic', 'sleep', '--duration', '300ms', '--processes',
+                 processes, '--fail-on-miss', '--json', 'out.json',
+                 input=text.replace('10ms,', f'10ms, tolerate: {tolerate},'))
     assert done.returncode == status, done.stderr
     assert re.search(r'in time +late .* tolerates +worst\n', done.stdout)
-    dags = json.loads(Path('out.json').read_text())['dags']
-    found = dags['main']['sinks']['/slow:cb']
+    result = json.loads(Path('out.json').read_text())
+    assert result['file'] == '<stdin>'
+    found = result['dags']['main']['sinks']['/slow:cb']
     assert found['tolerate']['worst'] == counts(found).missed > 1
 
 
@@ -168,15 +160,6 @@ def started(graph):
             process.kill()
 
 
-def wait_for(process, condition):
-    """Wait until something is true of a run."""
-    end = time.monotonic() + 60
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def releases():
     """Return when the jobs were due of which /slow:cb was late, as far as the trace has them."""
     with suppress(OSError, TraceError):
@@ -192,12 +175,11 @@ def recorded_ns():
     return found[-1] - found[0] if found else 0
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_synthetic_run(graph, number):
+def test_a_signal_ends_a_synthetic_run(graph):
     with started(graph) as process:
         # The window begins after the warm-up of 1 s.
-        wait_for(process, lambda: recorded_ns() > 2 * 10 ** 9)
-        process.send_signal(number)
+        wait_for_run(process, lambda: recorded_ns() > 2 * 10 ** 9)
+        process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 0
     assert 'Traceback' not in err
@@ -210,7 +192,7 @@ def test_a_signal_ends_a_synthetic_run(graph, number):
 def test_a_signal_that_comes_twice_is_one(graph):
     """Who ends a process group sends one, and `ros2 launch` sends its own, too."""
     with started(graph) as process:
-        wait_for(process, lambda: bool(releases()))
+        wait_for_run(process, lambda: bool(releases()))
         begin = time.monotonic()
         while process.poll() is None and time.monotonic() < begin + 0.3:  # on to its very end
             process.send_signal(signal.SIGINT)
@@ -223,13 +205,13 @@ def test_a_signal_that_comes_twice_is_one(graph):
 
 def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph):
     with started(graph) as process:
-        wait_for(process, lambda: bool(releases()))
+        wait_for_run(process, lambda: bool(releases()))
         process.send_signal(signal.SIGSTOP)
         time.sleep(0.3)
         process.send_signal(signal.SIGCONT)
         # It ends when what was due meanwhile has been taken in.
         after = time.time_ns()
-        wait_for(process, lambda: releases()[-1] > after)
+        wait_for_run(process, lambda: releases()[-1] > after)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
@@ -312,9 +294,9 @@ nodes:
 """
 
 
-@pytest.mark.parametrize('spec', [
-    'bad:Calibrated', 'bad:Uncalibrated', 'bad:main', 'bad_module:main'])
-@pytest.mark.parametrize('verb', ['run', 'rerun'])
+@pytest.mark.parametrize(('verb', 'spec'), [
+    ('run', 'bad:Calibrated'), ('run', 'bad:Uncalibrated'), ('run', 'bad:main'),
+    ('run', 'bad_module:main'), ('rerun', 'bad:Calibrated'), ('rerun', 'bad:main')])
 def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(folder, mddag, verb, spec):
     Path('n.yaml').write_text(ONE_TIMER)
     Path('bad.py').write_text(BAD_NODES)

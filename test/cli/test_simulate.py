@@ -6,8 +6,6 @@ import errno
 import json
 import os
 import resource
-import subprocess
-import sys
 
 import pytest
 
@@ -90,11 +88,10 @@ def test_what_is_asked_for_is_done(result_of, graph):
     assert stopped['deadline_missed'] is True
 
 
-def test_a_disk_that_gets_full_leaves_nothing_and_promises_nothing(graph):
-    done = subprocess.run(
-        [sys.executable, '-m', 'mddag_executor', 'simulate', str(graph), '--duration', '20s',
-         '--trace', 'out.mcap'], cwd=graph.parent, text=True, capture_output=True, check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000)))
+def test_a_disk_that_gets_full_leaves_nothing_and_promises_nothing(graph, mddag):
+    done = mddag(
+        'simulate', graph, '--duration', '20s', '--trace', 'out.mcap', preexec_fn=lambda:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000)))
     assert done.returncode == 2
     assert done.stderr == (
         f'error: out.mcap: writing failed ({os.strerror(errno.EFBIG)}): free space, then try '
@@ -104,15 +101,13 @@ def test_a_disk_that_gets_full_leaves_nothing_and_promises_nothing(graph):
 
 @pytest.mark.parametrize('command', [
     'export run.mcap -o tables/', 'export run.mcap -o out.csv', 'generate --sets 3 -o sets'])
-def test_a_disk_that_gets_full_is_one_line(graph, call, command):
+def test_a_disk_that_gets_full_is_one_line(graph, call, mddag, command):
     if 'tables' in command:
         pytest.importorskip('pyarrow', reason='pyarrow is not installed')
     assert call('simulate', graph, '--duration', '2s', '--trace', 'run.mcap').returncode == 0
     before = sorted(graph.parent.iterdir())
-    done = subprocess.run(
-        [sys.executable, '-m', 'mddag_executor', *command.split()], cwd=graph.parent, text=True,
-        capture_output=True, check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, 1_000)))
+    done = mddag(*command.split(), preexec_fn=lambda: resource.setrlimit(
+        resource.RLIMIT_FSIZE, (1_000, 1_000)))
     assert done.returncode == 2
     assert done.stderr.startswith(f'error: {command.split()[-1]}: ')
     assert done.stderr.count('\n') == 1 and 'ile too large' in done.stderr

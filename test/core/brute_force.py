@@ -50,6 +50,7 @@ from .dag_paths import laxity, reachable_sinks, ways_to
 Event = tuple[int, str, int, int, int, int]
 """(tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job)."""
 
+
 @dataclass(eq=False)
 class Job:
     """A job with its sinks' verdicts."""

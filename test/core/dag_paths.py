@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What follows from the graph of a DAG, by going through all its paths: for the slow simulator."""
 
+
 def reachable_sinks(dag, index):
     """Return the sinks that a vertex leads to, itself included."""
     vertex = dag.vertices[index]

@@ -9,9 +9,7 @@ task set is a whole number of ticks, so that a slow simulator can go tick by tic
 
 from dataclasses import dataclass
 import json
-import os
 
-from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from mddag_executor.core import POLICIES
 from mddag_executor.simulate import END, periodic_load, PREEMPT, Settings, simulate, START
@@ -22,15 +20,6 @@ KINDS = {START: 'start', END: 'end', PREEMPT: 'preempt'}
 
 Event = tuple[int, str, int, int, int, int]
 """(tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job)."""
-
-_FACTOR = int(os.environ.get('MDDAG_THOROUGH', '1'))
-
-
-def examples(count):
-    """Return settings for that many examples; MDDAG_THOROUGH=20 in the environment: 20 fold."""
-    return settings(
-        max_examples=count * _FACTOR, deadline=None,
-        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 
 
 @dataclass(frozen=True)

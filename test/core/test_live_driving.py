@@ -30,8 +30,9 @@ from mddag_executor.core.state import (
     SINK_EXPIRED,
 )
 
+from ..conftest import examples
 from .live_helpers import undeclared
-from .task_sets import examples, task_sets, TICK
+from .task_sets import task_sets, TICK
 
 WAITING, RUNNING, SUSPENDED, DONE, DROPPED = 'waiting', 'running', 'suspended', 'done', 'dropped'
 REFUSED = 'refused'

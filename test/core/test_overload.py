@@ -12,8 +12,9 @@ from mddag_executor.simulate import Settings, simulate
 from msg_graph import ExecutionTime
 import pytest
 
+from ..conftest import examples
 from .live_helpers import J, live, start_job, US
-from .task_sets import Case, cases, declaration, examples, single, TICK
+from .task_sets import Case, cases, declaration, single, TICK
 
 
 def with_times(case, on_late=None, **more):

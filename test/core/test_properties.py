@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from mddag_executor.core import POLICIES, policy, rad_offsets, Tables
 import pytest
 
+from ..conftest import examples
 from .brute_force import BruteForce
-from .task_sets import cases, declaration, examples, task_sets, TICK
+from .task_sets import cases, declaration, task_sets, TICK
 
 
 def paths_to_sinks(dag, index):

@@ -25,8 +25,9 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import NEVER
 
+from ..conftest import examples
 from .live_helpers import J, live, run_one, start_job, undeclared, US, X
-from .task_sets import declaration, examples, single
+from .task_sets import declaration, single
 
 
 def test_a_job_fails_with_what_fails_of_it():

@@ -18,7 +18,8 @@ from mddag_executor.core.tally import Latest
 from mddag_executor.core.weakly_hard import MissWindow
 import pytest
 
-from .task_sets import declaration, examples
+from ..conftest import examples
+from .task_sets import declaration
 
 US = 1_000
 

@@ -54,6 +54,7 @@ _KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 URDF = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">
 <parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>"""
 
+
 @dataclass(frozen=True)
 class Program:
     """

@@ -69,6 +69,7 @@ while True:
         print(time.time_ns(), flush=True)
 """
 
+
 class StallWatch:
     """Notes when a process that only sleeps was woken late, ns since the epoch."""
 

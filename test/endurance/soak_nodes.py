@@ -14,6 +14,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 class SoakFault(Exception):
     """What a callback raises on purpose."""
 
+
 class SoakNodes:
     """
     The nodes of a declaration; each can be destroyed and made again.

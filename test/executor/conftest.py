@@ -3,8 +3,6 @@
 """What the tests of the executor share: executors that spin in a thread of their own."""
 
 import contextlib
-import subprocess
-import sys
 import threading
 import time
 
@@ -72,28 +70,6 @@ def is_idle(executor):
     """Tell whether nothing runs or waits."""
     statistics = executor.statistics()
     return bool(not statistics['queue'] and statistics['idle_workers'] == statistics['workers'])
-
-
-def run_program(program, *arguments, send=None, after=0.0):
-    """
-    Run a program in a process of its own; return its output and errors.
-
-    :param send: the signal that it gets ``after`` seconds when it has printed ``ready``.
-    """
-    process = subprocess.Popen(
-        [sys.executable, '-c', program, *arguments], stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True)
-    try:
-        if send is not None:
-            assert process.stdout.readline() == 'ready\n', process.communicate()[1]
-            time.sleep(after)
-            process.send_signal(send)
-        out, err = process.communicate(timeout=60)
-    finally:
-        process.kill()
-        process.wait()
-    assert process.returncode == 0, err
-    return out, err
 
 
 @pytest.fixture

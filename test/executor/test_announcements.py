@@ -42,6 +42,7 @@ nodes:
     callbacks: [{name: sink, subscription: /end, deadline: 60s}]
 """
 
+
 def split(make_executor, make_node, **processes):
     """Run JOBS jobs or more over several executors; return nodes and executors by process."""
     text = GRAPH + 'processes:\n' + ''.join(

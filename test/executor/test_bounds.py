@@ -12,7 +12,8 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import is_idle, run_program, Spinning, wait_for
+from ..conftest import run_program
+from .conftest import is_idle, Spinning, wait_for
 
 # --- descriptors ---------------------------------------------------------------------------------
 
@@ -64,6 +65,7 @@ executor.shutdown()
 thread.join()
 rclpy.shutdown()
 """
+
 
 def test_many_subscriptions_share_few_descriptors():
     """300 of them, and no more than 256 files."""

@@ -31,6 +31,7 @@ nodes:
     callbacks: [{name: last, subscription: /b, deadline: 50ms}]
 """
 
+
 def sinks(executor):
     found = {}
     for dag in executor.statistics()['dags'].values():

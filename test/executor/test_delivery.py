@@ -93,6 +93,7 @@ publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=10))
 rclpy.shutdown()
 """
 
+
 def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
         make_executor, make_node):
     node, got = make_node('here'), []

@@ -14,6 +14,7 @@ from .pulse import Pulse
 MANY = 60
 """More than twice twenty: every twentieth that is lost shows."""
 
+
 def of_tasks(executor, node, call):
     for number in range(MANY):
         executor.create_task(call, number)

@@ -24,7 +24,7 @@ from rclpy.executors import (
 from rclpy.node import Node
 from std_msgs.msg import Empty
 
-from .conftest import run_program
+from ..conftest import run_program
 
 ENDS = {
     'shutdown': Context.try_shutdown, 'destroy': Context.destroy,
@@ -175,6 +175,9 @@ print('end', flush=True)
 
 SPIN = 'executor.spin()'
 STEPS = 'while rclpy.ok(): executor.spin_once(timeout_sec=0.005)'
+# threads of a spin are parked then
+SPUN_BEFORE = """executor.spin_until_future_complete(rclpy.Future(), 0.1)
+    while True: executor.spin_once(0.3)"""
 
 
 def run(**parts):
@@ -186,7 +189,7 @@ def run(**parts):
     assert noise == []
 
 
-@pytest.mark.parametrize('spin', [SPIN, STEPS])
+@pytest.mark.parametrize('spin', [SPIN, STEPS, SPUN_BEFORE], ids=range(3))
 def test_a_program_may_end_while_a_daemon_thread_spins(spin):
     run(spin=spin)
 
@@ -211,35 +214,6 @@ def test_a_forked_child_ends_without_what_the_parent_has():
         '        os._exit(3)\n'
         'assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3')
     run(spin=SPIN, callback='ran.set', end=end)
-
-
-PROGRAM_SIGNALS = """
-import sys, threading, time
-import rclpy
-from rclpy.executors import ExternalShutdownException
-from mddag_executor import MultiDeadlineExecutor
-
-rclpy.init()
-node = rclpy.create_node('node')
-node.create_timer(0.01, lambda: time.sleep(0.005))
-executor = MultiDeadlineExecutor()
-executor.add_node(node)
-print('ready', flush=True)
-try:
-    {spin}
-except (KeyboardInterrupt, ExternalShutdownException) as end:
-    print(type(end).__name__)
-executor.shutdown()
-print([t.name for t in threading.enumerate() if t.name.startswith('mddag')])
-"""
-
-@pytest.mark.parametrize(('number', 'spin'), [
-    (signal.SIGTERM, 'executor.spin()'), (signal.SIGINT, 'rclpy.spin(node, executor)')])
-def test_a_signal_ends_spin(number, spin):
-    out, err = run_program(PROGRAM_SIGNALS.format(spin=spin), send=number, after=0.5)
-    assert out.splitlines()[0] in ('KeyboardInterrupt', 'ExternalShutdownException')
-    assert out.splitlines()[1] == '[]'
-    assert 'Traceback' not in err
 
 
 PUBLISHES = """
@@ -329,30 +303,3 @@ def test_a_callback_of_spin_once_may_shut_down(make_executor, make_node):
             if done:
                 break
     assert done == [True]
-
-
-STEPS = """
-import threading, time
-import rclpy
-from mddag_executor import MultiDeadlineExecutor
-
-rclpy.init()
-node = rclpy.create_node('node')
-executor = MultiDeadlineExecutor(num_workers=2)
-executor.add_node(node)
-future = rclpy.Future()
-node.create_timer(0.02, lambda: future.done() or future.set_result(None))
-executor.spin_until_future_complete(future)
-
-def step():
-    while True:
-        executor.spin_once(0.3)
-
-threading.Thread(target=step, daemon=True).start()
-time.sleep(0.3)
-print('ends')
-"""
-
-
-def test_a_program_ends_while_a_daemon_thread_steps():
-    assert run_program(STEPS)[0] == 'ends\n'

@@ -15,7 +15,8 @@ from mddag_executor.executor.work import Work
 from msg_graph import loads
 import pytest
 
-from ..core.task_sets import Case, cases, examples, TICK
+from ..conftest import examples
+from ..core.task_sets import Case, cases, TICK
 from .conftest import Spinning, wait_for
 
 HORIZON = 60
@@ -204,6 +205,7 @@ nodes:
   - node: /n
     callbacks: [{name: tick, timer: 10ms, deadline: 10ms}]
 """
+
 
 class Twin:
     """An engine with entities of several kinds, each work of which has a number."""

@@ -15,6 +15,7 @@ from .test_deadlines import CHAIN, sinks
 class Wrong(Exception):
     """What the callbacks of these tests raise."""
 
+
 def odd_jobs_raise():
     job = current_job()
     if job.job % 2:

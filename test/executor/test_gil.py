@@ -148,6 +148,7 @@ nodes:
          holds_interpreter: true}
 """
 
+
 class Computing:
     """
     Three callbacks, one of which computes for long.

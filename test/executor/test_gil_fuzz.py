@@ -25,7 +25,6 @@ ROUNDS = int(os.environ.get('FUZZ_ROUNDS', '25'))
 PATIENCE_S = 60.0
 
 
-
 def scripts(seed):
     """
     Return what each callback does in a round.

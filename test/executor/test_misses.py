@@ -37,6 +37,7 @@ LATE = 'mddag: 1\nnodes:\n  - node: /late\n    callbacks:\n' + ''.join(
 class Wrong(Exception):
     """What a handler of these tests raises."""
 
+
 class Handler:
     """Takes note of each miss, then does one of the things that users do."""
 

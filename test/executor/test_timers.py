@@ -31,6 +31,7 @@ nodes:
         deadline: 1s
 """
 
+
 def waits_for_no_timer(executor):
     """Tell whether the executor knows of all timers, and none is to become due."""
     with executor._pool.lock:

@@ -113,6 +113,7 @@ nodes:
     callbacks: [{name: detect, subscription: /image, deadline: 50ms}]
 """
 
+
 @pytest.mark.parametrize(('node', 'topic', 'expected'), [
     ('camera', 'image', None),
     ('kamera', 'image', '1 declared callback was found in no node: /camera:capture '

@@ -53,6 +53,7 @@ paths:
   - {name: whole, callbacks: ['/n:tick', '/n:left', '/m:both']}
 """
 
+
 @pytest.fixture(scope='module')
 def runs(tmp_path_factory):
     """Give the events of a small run and the first ones of a recorded run, entities and all."""

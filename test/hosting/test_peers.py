@@ -19,6 +19,7 @@ nodes:
   - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 500ms, execution_time: 1ms}]}
 """
 
+
 def test_nodes_run_under_rclpys_executor(tmp_path):
     graph = tmp_path / 'graph.yaml'
     graph.write_text(GRAPH)

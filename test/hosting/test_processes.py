@@ -9,7 +9,6 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
-import time
 
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
@@ -18,6 +17,8 @@ from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
+
+from ..conftest import wait_for_run
 
 GUESTS = Path(__file__).resolve().parent / 'guests'
 CHAIN = """\
@@ -65,13 +66,6 @@ class Running:
             if '--process' in words:
                 found[words[words.index('--process') + 1]] = int(pid)
         return found
-
-    def wait_for(self, condition):
-        end = time.monotonic() + 60
-        while not condition():
-            assert self.process.poll() is None, self.process.communicate()
-            assert time.monotonic() < end
-            time.sleep(0.01)
 
     def end(self):
         """Wait for its end; return the result, and what it printed."""
@@ -173,7 +167,7 @@ def test_what_is_lost_until_processes_have_met_is_of_no_job(world):
 
 def test_programs_run_in_the_process_of_their_nodes(world):
     with running('graph.yaml', *NODES, '--trace', '.') as run:
-        run.wait_for((world / 'enough').exists)
+        wait_for_run(run.process, (world / 'enough').exists)
         run.process.send_signal(signal.SIGINT)
         result, _, errors = run.end()
     assert run.process.returncode == 0, errors
@@ -189,9 +183,9 @@ def test_programs_run_in_the_process_of_their_nodes(world):
 
 def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
     with running('graph.yaml', *NODES, '--on-exit', 'continue', '--trace', 'out.mcap') as run:
-        run.wait_for((world / 'enough').exists)
+        wait_for_run(run.process, (world / 'enough').exists)
         os.kill(run.pids()['up'], signal.SIGKILL)
-        run.wait_for(lambda: 'up' not in run.pids())
+        wait_for_run(run.process, lambda: 'up' not in run.pids())
         run.process.send_signal(signal.SIGTERM)
         result, out, errors = run.end()
     assert run.process.returncode == 70

@@ -25,6 +25,7 @@ end.wait(60)
 print('ends')
 """
 
+
 class Case:
     """A supervisor of programs by name."""
 

@@ -54,6 +54,7 @@ nodes:
       - {name: cb, service: /gate/reset, period: 80ms, dag: gate, deadline: 400ms}
 """
 
+
 @pytest.fixture
 def task_set():
     return loads(GRAPH, 'graph.yaml')

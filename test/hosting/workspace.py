@@ -17,6 +17,7 @@ nodes:
     callbacks: [{name: heard, subscription: /chatter, deadline: 50ms}]
 """
 
+
 def make_workspace(folder, monkeypatch):
     """Make an ament package and modules; go there."""
     prefix = folder / 'ws'

@@ -16,7 +16,7 @@ from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS
 from mddag_executor.simulate import periodic_load, Settings, simulate
 import msg_graph
 
-from ..core.task_sets import examples
+from ..conftest import examples
 
 MS = 1_000_000
 HORIZON = 240 * MS

@@ -21,6 +21,7 @@ nodes:
       - {name: y, subscription: /a, deadline: 50ms, execution_time: 40ms}
 """
 
+
 def timers(*callbacks):
     """Return a declaration of timers, each as `PERIOD DEADLINE COST`."""
     lines = ['mddag: 1', 'nodes:']

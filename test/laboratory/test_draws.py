@@ -27,6 +27,7 @@ nodes:
         execution_time: {quantiles_us: [100, 900], percent: [50, 100]}
 """
 
+
 @pytest.fixture
 def task_set():
     """Give two DAGs of two vertices each, which share the callback c."""

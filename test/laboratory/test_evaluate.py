@@ -51,6 +51,7 @@ nodes:
         execution_time: {quantiles_us: [10000, 10000, 16000, 16000], percent: [0, 50, 50.01, 100]}
 """
 
+
 @pytest.fixture(scope='module')
 def autoware():
     """Give the paper's workload."""

@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from hypothesis import given, settings
+from hypothesis import given
 import hypothesis.strategies as st
 from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.assign_deadlines import proportional
@@ -15,6 +15,7 @@ from msg_graph import loads
 from msg_graph.model import load_of
 import pytest
 
+from ..conftest import examples
 from .graphs import GRAPH, SHARED
 
 
@@ -52,7 +53,7 @@ def made(options):
     return text, loads(text, 'random.yaml')
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(options=any_options())
 def test_every_task_set_is_what_was_asked_for(options):
     found = made(options)
@@ -81,7 +82,7 @@ def test_every_task_set_is_what_was_asked_for(options):
             assert low - off <= deadline <= high + off or deadline == 1000
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(count=st.integers(1, 40), part=st.floats(0, 1), edges=st.floats(0, 1), ors=st.floats(0, 1),
        seed=st.integers(0, 10 ** 6))
 def test_shapes(count, part, edges, ors, seed):

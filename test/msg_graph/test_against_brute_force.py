@@ -4,11 +4,12 @@
 
 from collections import Counter
 
-from hypothesis import given, HealthCheck, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msg_graph import GraphError, loads
 import yaml
 
+from ..conftest import examples
 from .brute import all_violations, as_yaml, components, expand, name_of_dag, rank, Spec
 
 TOPICS = [f'/t{i}' for i in range(4)]
@@ -145,7 +146,7 @@ def check_same(tasks, specs):
     check_names(tasks)
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
+@examples(300)
 @given(declarations())
 def test_same_as_by_definition(specs):
     text = yaml.safe_dump(as_yaml(specs))

@@ -94,6 +94,7 @@ class Facts(NamedTuple):
     times_ns: tuple[int, int, int, int]
     """Sums over the vertices of the least, median, 95 % and largest execution time."""
 
+
 LIDAR = '0-1 1-2 2-3 3-4 4-5'
 DAGS = {
     'control': Facts(

@@ -33,6 +33,7 @@ nodes:
       timer: 20ms
 """
 
+
 def test_only_the_values_change():
     task_set = loads(TEXT)
     new = {'/n:x': 1_234_000, '/n:y': 2_000_000_000, '/n:z': 3_141}

@@ -149,6 +149,7 @@ nodes:
   - {topic_name: /y, callback_name: timer_callback_0}
 """
 
+
 def test_a_file_of_2021():
     text = declaration_from_caret(OF_2021, 'arch.yaml')
     assert (f'# {MARK}: path lost: which callbacks? /a:timer_callback_0 -> /b:gone'

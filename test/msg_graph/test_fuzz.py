@@ -4,12 +4,13 @@
 
 import sys
 
-from hypothesis import example, given, HealthCheck, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from msg_graph import GraphError, loads, TaskSet
 import pytest
 import yaml
 
+from ..conftest import examples
 from .test_language import EVERYTHING
 
 FRAGMENTS = [
@@ -64,13 +65,13 @@ def damaged(draw):
     return text
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
+@examples(300)
 @given(damaged())
 def test_damaged_declarations(text):
     outcome(text)
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(st.text() | st.binary())
 @example('mddag: 1\nnodes: {a: &b {c: *b}}')
 @example('? ? ? a')
@@ -93,7 +94,7 @@ VALUES = st.recursive(
     max_leaves=12)
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+@examples(150)
 @given(
     st.sampled_from(['workers', 'nodes', 'paths', 'mddag']), VALUES,
     st.sampled_from(['name', 'timer', 'deadline', 'publishes', 'reads', 'execution_time', 'group',

@@ -6,12 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 import re
 
-from hypothesis import given, HealthCheck, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msg_graph import GraphError, load, loads, Process
 from msg_graph.edit import without_lines
 import pytest
 
+from ..conftest import examples
 from .test_language import EVERYTHING, schema_errors
 
 TWO = """\
@@ -92,6 +93,7 @@ paths:
   - {name: front.left.way, callbacks: ['/front/left/driver:read', '/front/left/filter:crop']}
   - {name: rear.way, callbacks: ['/rear/driver:read', '/rear/filter:crop']}
 """
+
 
 def write(folder, **files):
     """Write files, named by their stems with `__` for a folder; return the path of `top`."""
@@ -221,7 +223,7 @@ def test_values_do_not_explode(tmp_path):
         load(write(tmp_path, top='mddag: 1\ninclude: [{file: f0.yaml, set: {a: abc}}]\n', **files))
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(150)
 @given(data=st.data())
 def test_damaged_files_give_errors_and_nothing_else(tmp_path, data):
     texts = []

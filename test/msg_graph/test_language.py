@@ -61,6 +61,7 @@ paths:
 processes: {eyes: ['/camera/driver'], rest: [/sink]}
 """
 
+
 def test_every_key():
     tasks = loads(EVERYTHING, 'all.yaml')
     assert (tasks.workers, tasks.file, tasks.text) == (7, 'all.yaml', EVERYTHING)

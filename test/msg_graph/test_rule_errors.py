@@ -152,6 +152,7 @@ paths:
   - {name: p, callbacks: ['/n:t', '/n:z']}
 """
 
+
 def found(text):
     with pytest.raises(GraphError) as caught:
         loads(text, 'g.yaml')

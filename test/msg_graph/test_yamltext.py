@@ -16,6 +16,7 @@ nodes:
       - {name: t, timer: 10ms, deadline: 10ms}
 """
 
+
 @pytest.fixture(params=['CSafeLoader', 'SafeLoader'], autouse=True)
 def loader(request, monkeypatch):
     """Run every test with libyaml and without."""

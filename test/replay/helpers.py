@@ -63,6 +63,7 @@ paths:
   - {name: c, callbacks: ['/imu:tick', '/imu:use']}
 """
 
+
 def small():
     """Return two DAGs with a fork, a join and three sinks."""
     return loads(SMALL, 'small.yaml')

@@ -43,6 +43,7 @@ STYLES = ('caret', 'fastdds', 'humble_fastdds', 'jazzy', 'hook', 'tracing', 'cyc
 Humble on, from Jazzy on, and with Fast DDS in its first months; by ros2_tracing from Jazzy on, and
 before it with an instrumented Cyclone DDS; by CARET in rclpy."""
 
+
 class Recorded:
     """
     A recording: what happens is added in any order, times are ns since `BEGIN`.

@@ -6,7 +6,7 @@ from pathlib import Path
 import re
 import tempfile
 
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.recording.head import declared, Head
@@ -16,6 +16,7 @@ from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
+from ..conftest import examples
 from ..replay.helpers import (
     begin_trace,
     declarations,
@@ -31,7 +32,7 @@ from ..replay.helpers import (
 
 @given(declarations(), st.integers(0, 2**32), st.integers(1, 4),
        st.sampled_from(['rad', 'fifo', 'rm']), st.integers(1, 25))
-@settings(max_examples=150)
+@examples(80)
 @example(SMALL, 1, 2, 'rad', 8)
 def test_replay_counts_what_the_driver_counted(text, seed, workers, policy, longest):
     with tempfile.TemporaryDirectory() as folder:
@@ -190,6 +191,7 @@ nodes:
     callbacks:
       - {name: grab, timer: 20ms, publishes: [/info, /image], dag: video}
 """
+
 
 @pytest.mark.parametrize('seed', range(5))
 def test_vertices_are_found_by_name(tmp_path, seed):

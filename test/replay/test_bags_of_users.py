@@ -140,13 +140,6 @@ GRAPH = 'mddag: 1\nnodes:\n  - node: /all\n    callbacks:\n' + ''.join(
     f'execution_time: 1ms, dag: d{i}}}\n' for i, topic in enumerate(TOPICS))
 
 
-@pytest.fixture
-def graph(tmp_path):
-    path = tmp_path / 'graph.yaml'
-    path.write_text(GRAPH)
-    return path
-
-
 @pytest.mark.parametrize('split', [False, True], ids=['one file', '-b'])
 @pytest.mark.parametrize('kind', BAGS)
 def test_each_kind_of_bag(tmp_path, graph, kind, split, call):

@@ -55,6 +55,7 @@ paths:
       - /actuator_dummy_node:callback_0
 """
 
+
 @pytest.fixture(scope='module')
 def trace(tmp_path_factory):
     path = tmp_path_factory.mktemp('caret') / 'sample.mcap'

@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 import tempfile
 
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import DROP, JOB_END
@@ -19,6 +19,7 @@ from msg_graph import loads
 import numpy as np
 import pytest
 
+from ..conftest import examples
 from .helpers import Chances, declarations, MS, PATHS, SMALL, VirtualRun
 from .oracle import Oracle
 from .test_ordinary_bags import GRAPH, write_bag
@@ -36,7 +37,7 @@ def check(recording, skip=0):
 
 @given(declarations(), st.integers(0, 2**32), st.integers(1, 4), st.integers(1, 25),
        st.sampled_from([0, 70 * MS]))
-@settings(max_examples=100)
+@examples(60)
 @example(SMALL, 1, 2, 8, 0)
 def test_verdicts_of_any_run(text, seed, workers, longest, skip):
     with tempfile.TemporaryDirectory() as folder:
@@ -57,7 +58,7 @@ def test_verdicts_of_a_bag():
 
 
 @given(st.integers(0, 2**32), st.data())
-@settings(max_examples=100)
+@examples(60)
 def test_verdicts_of_any_tables(seed, data):
     """Tables that no executor records: ends and completions in any order, twice, or of no job."""
     with tempfile.TemporaryDirectory() as folder:
@@ -152,7 +153,7 @@ def check_rows(whole, part, begin, end):
 
 @given(declarations(), st.integers(0, 2**32), st.integers(1, 4), st.integers(1, 25),
        st.lists(st.integers(1, 150), max_size=3, unique=True))
-@settings(max_examples=60)
+@examples(40)
 @example(SMALL + PATHS, 1, 2, 20, [40, 90])
 def test_parts_of_any_run(text, seed, workers, longest, borders):
     with tempfile.TemporaryDirectory() as folder:

@@ -5,7 +5,7 @@
 from dataclasses import dataclass, field
 from functools import partial
 
-from hypothesis import example, given, HealthCheck, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.core.tally import total
 from mddag_executor.replay import open_recording, replay
@@ -13,6 +13,7 @@ from mddag_executor.replay.causes import CAUSES, REMEDIES
 from msg_graph import loads
 import pytest
 
+from ..conftest import examples
 from .helpers import (
     add_execution,
     begin_trace,
@@ -199,8 +200,7 @@ def test_the_right_cause_is_told(cause, tmp_path):
         assert behind and behind <= {'/heavy:first', '/heavy:second'}
 
 
-@settings(max_examples=8, deadline=None,
-          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(8)
 @example(903, 2)    # the release after that of a job that failed was skipped
 @given(st.integers(0, 10 ** 6), st.sampled_from([1, 2, 4]))
 def test_all_misses_of_any_run_are_explained(tmp_path, seed, workers):
@@ -229,8 +229,6 @@ def test_what_people_see(tmp_path, call):
     assert out.startswith('Job 9 of victim:use: late by ')
     assert 'heavy:first' in out
     assert call('explain', path, '--job', '8').stdout == 'no such job missed its deadline\n'
-    refused = call('explain', path, '--sink', '/victim:uze')
-    assert refused.returncode == 2 and "did you mean '/victim:use'" in refused.stderr
     result = call('explain', path, '--job', '9', '--json', '-').result
     assert [job['job'] for job in result['jobs']] == [9]
     assert result['missed'] == 119
@@ -248,6 +246,7 @@ nodes:
   - node: /short
     callbacks: [{name: late, dag: short, timer: 1min, deadline: 10ms}]
 """
+
 
 @pytest.mark.parametrize('cause', ['waited', 'machine'])
 def test_misses_of_one_cause_have_it_however_long_the_run_is(cause, tmp_path, call):

@@ -160,7 +160,7 @@ def test_whatever_event_is_lost_no_job_is_late_or_expired(recorded, graph):
         recorded.run(77, tid, 3002 * MS, 3003 * MS, pid=2 if tid == 9 else 1)
     before, _ = result_of(recorded.write(), graph)
     first = recorded.names().index('ros2:callback_start')
-    for lost in range(first, len(recorded.names())):
+    for lost in range(first, len(recorded.names()), 2):     # of each job the other ones
         result, _ = result_of(recorded.write(but=[lost]), graph)
         for name, dag in result['dags'].items():
             whole = before['dags'][name]
@@ -212,6 +212,7 @@ nodes:
     callbacks:
       - {{name: s, subscription: /in, period: 100ms, deadline: 50ms, release_from: {}}}
 """
+
 
 @pytest.mark.parametrize('release_from, stated, response, said', [
     ('arrival', 0, 5 * MS + 4 * US, False), ('source_timestamp', 0, 15 * MS, False),

@@ -163,20 +163,6 @@ def test_one_machine_has_one_clock_whatever_it_was_set_to(tmp_path):
     assert outcome.warnings == [] and counts(sink(outcome.result())).in_time == 1
 
 
-@pytest.mark.parametrize(('offsets', 'message'), [
-    (['down'], 'is not NAME=TIME'),
-    (['down=3'], 'has no unit'),
-    (['across=1ms'], 'there is no trace of across: name one of up, down'),
-    (['up=1ms'], "up is on the first trace's machine"),
-])
-def test_offsets_that_cannot_be_are_one_line(tmp_path, call, offsets, message):
-    paths = two_machines(tmp_path, 0)
-    run = call('replay', *paths, *(f'--offset={each}' for each in offsets))
-    assert run.returncode == 2 and message in run.stderr and run.stderr.count('\n') == 1
-    one = call('replay', paths[0], '--offset', 'up=1ms')
-    assert one.returncode == 2 and 'one trace has one clock' in one.stderr
-
-
 def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(tmp_path):
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
     for i in range(4):
@@ -220,6 +206,7 @@ nodes:
   - {node: /a, callbacks: [{name: t, timer: 12ms, deadline: 8ms}]}
   - {node: /b, callbacks: [{name: t, timer: 12ms, deadline: 8ms}]}
 """
+
 
 @pytest.fixture
 def two(tmp_path):
@@ -283,20 +270,6 @@ def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path, call):
     path = trace.end(100 * MS)
     assert ' 0 late' not in call('replay', path, '--reschedule').stdout
     assert ' 0 late' in call('replay', path, '--reschedule', '--processes', '2').stdout
-
-
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['--processes', '2'], 'add --reschedule'),
-    (['--reschedule', '--processes', '0'], 'give 1 or more'),
-    (['--reschedule', '--processes', '3'], 'only 2 nodes, or groups'),
-    (['--reschedule', '--processes', 'none.yaml'], 'none.yaml'),
-    (['--reschedule', '--policy', 'ros2'], 'polling is known of one process only'),
-    (['--reschedule', '--preemptive'], 'preemption is known of one process only'),
-])
-def test_bad_placements_are_one_line(two, call, arguments, message):
-    run = call('replay', *two, *arguments)
-    assert (run.returncode, run.stdout) == (2, '')
-    assert message in run.stderr and run.stderr.count('\n') == 1
 
 
 def test_traces_of_different_runs_are_refused(tmp_path):

@@ -210,13 +210,6 @@ def test_on_the_command_line(tmp_path, call):
                           '--fail-on-miss')
     assert status == 1
     assert '9 late' in out     # the last one is open at the end
-    for arguments, says in (
-            ([path], 'no run of this executor is recorded in it, so there are no jobs: to take'),
-            ([path, graph], 'no run of this executor is recorded in it'),
-            ([path, '--reschedule', '--execution-times', times], 'give a GRAPH')):
-        status, out, err = call('replay', *arguments)
-        assert (status, out) == (2, '')
-        assert err.startswith('error: ') and says in err and err.count('\n') == 1
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])

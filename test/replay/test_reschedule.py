@@ -34,6 +34,7 @@ nodes:
     callbacks: [{name: cb, timer: 10ms, deadline: 4ms}]
 """
 
+
 def write_two(path):
     """Record a run of 20 ms with a slow job from 0 to 12 and fast ones at 5 and 15 ms."""
     load = Load([0, 5 * MS, 15 * MS], [0, 1, 1], [0, 0, 1], [12 * MS, 2 * MS, 2 * MS], [0, 1],

@@ -33,6 +33,7 @@ nodes:
   - {callback_name: /b/callback_2, callback_type: subscription_callback, topic_name: /never}
 """
 
+
 def head():
     """Return who is who: rclcpp makes a subscription's links in another order than rclpy."""
     return [

@@ -10,7 +10,7 @@ from pathlib import Path
 import random
 import tempfile
 
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
@@ -21,6 +21,7 @@ from msg_graph import loads
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from ..conftest import examples
 from .helpers import MS, SMALL, small, START_TIME, VirtualRun
 from .recorded import CAMERA, four_jobs
 from .test_ordinary_bags import BEGIN, GRAPH, header, STORE
@@ -73,7 +74,7 @@ def test_a_message_at_a_time_that_cannot_be(tmp_path, storage, odd):
 
 @given(PLACE, BITS, st.sampled_from(STORAGES))
 @example(N - 1, 45, StoragePlugin.MCAP)
-@settings(max_examples=60, deadline=None)
+@examples(40)
 def test_any_bit_of_a_bag(place, bit, storage):
     flipped = arrivals()
     flipped[place] = (flipped[place] ^ 1 << bit) & 2**63 - 1
@@ -122,7 +123,7 @@ def test_any_bit_of_a_trace(tmp_path, kind):
         four_jobs(sound)
         graph = loads(CAMERA, 'g.yaml')
     whole = reschedule(sound, graph, policy='rad', workers=2)
-    for seed in range(150):
+    for seed in range(70):
         changed(sound, odd, random.Random(seed))
         try:
             found = replay(odd, graph).result()

@@ -33,6 +33,7 @@ nodes:
     callbacks: [{name: a, timer: 10ms, deadline: 8ms}]
 """
 
+
 def sink_of(missed):
     """Return the result of a sink whose jobs missed or not, in a tally that is told of them."""
     task_set = loads(GRAPH, 'g.yaml')
@@ -226,12 +227,3 @@ def test_a_run_in_which_nothing_was_due_is_no_better(trace, tmp_path, call):
     assert status == 1 and (
         f'error: {empty} and {empty}: no sink was due in both, so nothing was compared: ' in err)
     assert call('diff', empty, empty).returncode == 0
-
-
-@pytest.mark.parametrize(('options', 'says'), [
-    (['--junit', '/gone/out.xml'], 'there is no directory /gone'),
-    (['--junit', '-', '--json', '-'], 'can be only one of json and junit'),
-])
-def test_wrong_options(trace, options, says, call):
-    status, out, err = call('replay', trace, *options)
-    assert (status, out, err.count('\n')) == (2, '', 1) and says in err

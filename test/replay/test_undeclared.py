@@ -251,14 +251,3 @@ def test_a_job_that_is_open_at_the_end_is_judged_by_that(run):
     sink = result['dags']['/camera']['sinks']['/detect:run@/camera']
     assert (sink['completed'], sink['late'], sink['overdue']) == (0, 1, 1)
     assert result['dropped'] == {'qos_depth': 1}
-
-
-def test_without_a_graph_it_says_how_to_get_a_verdict(run, call):
-    run.result(10 * MS)
-    for verb in ('replay', 'explain', 'slack'):
-        status, _, errors = call(verb, run.path)
-        assert (status, errors.count('\n')) == (2, 1)
-        assert 'give the GRAPH that judges it' in errors
-    status, _, errors = call('replay', run.path, run.path, run.graph)
-    assert (status, errors.count('\n')) == (2, 1)
-    assert 'replay it by itself, with a GRAPH' in errors

@@ -32,6 +32,7 @@ paths:
   - {name: whole, callbacks: ['/driver:tick', '/filter:run']}
 """
 
+
 def by_hand(path, hostile=False, finished=True, undeclared=True, extra_ms=0, took=(1, 2, 6)):
     """
     Write a trace of three jobs; the third is 2 ms late; then an undeclared callback runs.

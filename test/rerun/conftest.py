@@ -5,17 +5,10 @@
 import pytest
 from std_msgs.msg import Header
 
-from .helpers import GRAPH, MS, write_bag
+from .helpers import MS, write_bag
 
 
 @pytest.fixture
 def bag(tmp_path):
     return write_bag(tmp_path / 'in.mcap', [
         (i * 100 * MS, '/points', Header(frame_id=str(i))) for i in range(20)])
-
-
-@pytest.fixture
-def graph(tmp_path):
-    path = tmp_path / 'graph.yaml'
-    path.write_text(GRAPH)
-    return path

@@ -31,6 +31,7 @@ nodes:
          deadline: 50ms}
 """
 
+
 def write_bag(path, messages):
     """Write messages (ns after `START`, topic, message or its bytes) as rosbag2 does."""
     with open(path, 'wb') as file:

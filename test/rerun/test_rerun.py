@@ -117,6 +117,7 @@ nodes:
          execution_time: 70ms, deadline: 140ms, on_late: demote}
 """
 
+
 def test_refused_work_runs_when_what_it_waits_for_does_not_come(tmp_path, graph):
     """The worker is reserved for a job that must start by 610 ms; its message is lost."""
     graph.write_text(RESERVED)

@@ -25,7 +25,8 @@ from msg_graph import load
 import numpy as np
 import pytest
 
-from ..core.task_sets import Case, cases, declaration, examples, TICK
+from ..conftest import examples
+from ..core.task_sets import Case, cases, declaration, TICK
 
 pytestmark = [
     pytest.mark.skipif(not compiled.available(), reason='numba is not there'),
@@ -74,6 +75,7 @@ def test_everything_at_once(case, horizon, judge, stop):
 
 SLOW = 400
 """Times so many times as long are some switch intervals and slices of a machine."""
+
 
 def slowed(tables, processes, chances):
     """Return tables with longer times, and vertices in any of the processes."""

@@ -23,7 +23,8 @@ from mddag_executor.simulate import (
 from msg_graph import loads
 import pytest
 
-from ..core.task_sets import declaration, examples, single
+from ..conftest import examples
+from ..core.task_sets import declaration, single
 
 MS = 1_000_000
 LOCK, CPU, NOTHING = 'lock', 'cpu', 'nothing'
@@ -106,6 +107,7 @@ nodes:
       - {name: a, timer: 20ms, deadline: 20ms, dag: a, execution_time: 6ms, holds_interpreter: H}
       - {name: b, timer: 20ms, deadline: 20ms, dag: b, execution_time: 6ms, holds_interpreter: H}
 """
+
 
 def test_declared_holders_in_the_simulator():
     worst = []

@@ -26,7 +26,8 @@ from mddag_executor.simulate import (
 from msg_graph import load, loads
 import pytest
 
-from ..core.task_sets import Case, cases, declaration, examples
+from ..conftest import examples
+from ..core.task_sets import Case, cases, declaration
 
 US = 1_000
 

@@ -34,7 +34,6 @@ TYPES = {
 CONTEXT = f'{TYPES["i32"][0]} _vpid; {TYPES["i32"][0]} _vtid; string _procname;'
 
 
-
 def session(folder, kinds, events, *, context=True, discarded=0, environment=None):
     """
     Write a trace into a new folder and return it.

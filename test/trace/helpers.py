@@ -3,8 +3,6 @@
 """Events, files and child processes that the trace tests share."""
 
 import struct
-import subprocess
-import sys
 from typing import Any
 
 from hypothesis import strategies as st
@@ -101,11 +99,3 @@ def records_of(data):
         found.append((opcode, position, position + 9 + length))
         position += 9 + length
     return found
-
-
-def run_child(script, *arguments, timeout=60):
-    """Run a script in a Python process of its own and return what it prints."""
-    done = subprocess.run([sys.executable, '-c', script, *map(str, arguments)], text=True,
-                          capture_output=True, timeout=timeout, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout

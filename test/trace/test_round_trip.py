@@ -4,7 +4,7 @@
 
 import struct
 
-from hypothesis import given, HealthCheck, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader, NonSeekingReader
 from mddag_executor.trace import (
@@ -24,6 +24,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
+from ..conftest import examples
 from .helpers import (
     entries,
     mixture,
@@ -39,8 +40,7 @@ from .helpers import (
 ANY_EVENTS = st.lists(st.sampled_from(list(EVENTS.values())).flatmap(entries), max_size=30)
 
 
-@settings(max_examples=150, deadline=None,
-          suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@examples(150)
 @given(recorded=ANY_EVENTS)
 def test_every_value_comes_back(tmp_path, recorded):
     path = tmp_path / 'a.mcap'
@@ -294,7 +294,7 @@ def messages(draw):
     return names, [draw(values(FieldType.parse(name))) for name in names]
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(messages())
 def test_any_flat_message_is_as_rosbags_encodes_it(message):
     names, fields = message

@@ -13,7 +13,8 @@ import time
 from mddag_executor.trace import TraceError, TraceWriter
 import pytest
 
-from .helpers import mixture, read, read_back, run_child, START
+from ..conftest import run_program
+from .helpers import mixture, read, read_back, START
 
 FAST = 0.01     # flush interval of tests that need not wait
 
@@ -131,6 +132,7 @@ while True:
         print(number, flush=True)
 """
 
+
 @pytest.mark.parametrize('seconds', [1.1])
 def test_a_killed_process_loses_at_most_the_last_second(tmp_path, seconds):
     path = tmp_path / 'a.mcap'
@@ -178,7 +180,7 @@ print(number + 10, writer.dropped)
 
 def test_a_disk_that_gets_full(tmp_path):
     path = tmp_path / 'a.mcap'
-    output = run_child(LIMITED, path).splitlines()
+    output = run_program(LIMITED, path)[0].splitlines()
     assert output[0] == (f'{path}: writing failed ({os.strerror(errno.EFBIG)}): what was written '
                          'before is there; free space, then try again')
     recorded, dropped = map(int, output[1].split())
@@ -215,12 +217,12 @@ writer.close()
 
 
 def test_a_forgotten_writer_completes_its_file_at_exit(tmp_path):
-    run_child(FORGOTTEN, tmp_path / 'a.mcap')
+    run_program(FORGOTTEN, tmp_path / 'a.mcap')
     events, warnings = read(tmp_path / 'a.mcap')
     assert len(events) == 1 and not warnings
 
 
 def test_a_forked_child_leaves_the_file_alone(tmp_path):
-    run_child(FORKED, tmp_path / 'a.mcap')
+    run_program(FORKED, tmp_path / 'a.mcap')
     events, warnings = read(tmp_path / 'a.mcap')
     assert [event[1] for event in events] == [1, 3] and not warnings

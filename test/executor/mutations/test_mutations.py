@@ -35,6 +35,7 @@ IN_PARALLEL = 3
 AT_ONCE_S = 4.0
 """A test that has failed sooner has not waited for one of its own time-outs, which are 5 s."""
 
+
 @dataclass(frozen=True)
 class Case:
     """
