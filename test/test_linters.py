@@ -46,6 +46,7 @@ THIRD_PARTY = {
     'nav_msgs': ('nav_msgs', None),
     'numba': (None, 'numba'),  # of the extra `batch`
     'numpy': ('python3-numpy', 'numpy'),
+    'pandas': (None, 'pandas'),  # `to_pandas` only
     'pyarrow': (None, 'pyarrow'),  # of the extra `export`
     'rcl_interfaces': ('rcl_interfaces', None),
     'rclpy': ('rclpy', None),
