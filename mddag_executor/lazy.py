@@ -13,11 +13,7 @@ from typing import Any
 def on_first_use(
     package: str, modules: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """
-    Return a package's `__getattr__` and `__dir__` (PEP 562).
-
-    :param modules: by public name the module that has it.
-    """
+    """Return a package's `__getattr__` and `__dir__` (PEP 562), for modules by public name."""
     def find(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f'module {package!r} has no attribute {name!r}')

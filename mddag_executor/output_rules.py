@@ -30,12 +30,7 @@ _ENDINGS = ('.mcap', '.db3')
 
 
 def check_replaced(path: str, *, recording: bool, overwrite: bool = False) -> None:
-    """
-    Find out whether an output may take the place of what is there (rule 1).
-
-    :param recording: whether the output is a recording
-    :raises mddag_executor.errors.InputError: when it may not
-    """
+    """Raise InputError if an output may not take the place of what is there (rule 1)."""
     if overwrite or not holds_data(path):
         return
     if recording:
@@ -45,11 +40,7 @@ def check_replaced(path: str, *, recording: bool, overwrite: bool = False) -> No
 
 
 def create_recording(path: str, overwrite: bool = False) -> BinaryIO:
-    """
-    Open a new recording for writing, unbuffered (rule 1).
-
-    :raises FileExistsError: when a file is there and must not be replaced
-    """
+    """Open a new recording for writing, unbuffered, or raise FileExistsError (rule 1)."""
     try:
         return cast(BinaryIO, open(path, 'xb', buffering=0))
     except FileExistsError:
@@ -59,12 +50,7 @@ def create_recording(path: str, overwrite: bool = False) -> BinaryIO:
 
 
 def check_results(folder: Path, names: Collection[str]) -> None:
-    """
-    Find out whether a folder of results may take the place of what is there (rule 5).
-
-    :param names: of the files that such a folder holds
-    :raises mddag_executor.errors.InputError: when it may not
-    """
+    """Raise InputError if a folder of results may not replace what is there (rule 5)."""
     if not os.path.lexists(folder):
         return
     if not folder.is_dir():
@@ -86,12 +72,7 @@ def remove_results(folder: Path, names: Collection[str]) -> None:
 
 
 def check_distinct(inputs: Sequence[tuple[str, str]], outputs: Sequence[tuple[str, str]]) -> None:
-    """
-    Find out whether every output is a file of its own (rule 2).
-
-    :param inputs: name of the argument, and path; outputs likewise
-    :raises mddag_executor.errors.UsageError: when one is an input or another output, too
-    """
+    """Raise UsageError unless each output (name, path) is a file of its own (rule 2)."""
     for i, (name, path) in enumerate(outputs):
         for other, there in (*inputs, *outputs[:i]):
             if _same_file(path, there):

@@ -42,12 +42,7 @@ def roots() -> Iterator[Path]:
 
 
 def find(name: str) -> Path:
-    """
-    Return the path of a shipped file.
-
-    :param name: relative to the top of the project, for instance `config/autoware.yaml`
-    :raises mddag_executor.errors.InputError: when no installation on this machine has it
-    """
+    """Return the path of a shipped file (its name is from the top), or raise InputError."""
     for root in roots():
         path = root / name
         if path.exists():

@@ -164,11 +164,7 @@ def _same_below(name: str, other: str) -> bool:
 
 
 def function_of(symbol: str) -> str | None:
-    """
-    Return the function's name in a recorded symbol, None if it has none.
-
-    :param symbol: `package.module.Class.function`, or a symbol of rclcpp.
-    """
+    """Return the function's name in a symbol of Python or rclcpp; None: it has none."""
     found = _PYTHON.fullmatch(symbol) or _CPP.fullmatch(symbol)
     return None if found is None else found[1]
 

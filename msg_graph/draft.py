@@ -165,11 +165,7 @@ def accept(draft: Draft) -> None:
 
 
 def declaration_of(draft: Draft, accepted: bool = False) -> str:
-    """
-    Return the text of a declaration.
-
-    :param accepted: proposals for periods and deadlines become entries, else marked blanks.
-    """
+    """Return the text of a declaration; proposals are entries if accepted, else blanks."""
     return '\n'.join(_Writer(draft, accepted).lines()) + '\n'
 
 

@@ -156,11 +156,7 @@ class GilHabit:
 
 
 class Measurement:
-    """
-    The CPU times during an execution.
-
-    :param habit: it is updated at the end, unless it rests.
-    """
+    """The CPU times during an execution; they update the ``habit`` at the end, unless it rests."""
 
     __slots__ = ('_habit', '_process', '_preempted', '_own')
 

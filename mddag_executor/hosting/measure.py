@@ -221,11 +221,7 @@ def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> di
 def judge_sink(
     deadline: int, due: Sequence[int], completed: Mapping[int, int]
 ) -> dict[str, Any]:
-    """
-    Return the verdicts about a sink.
-
-    :param due: the releases of its jobs; ``completed``: their completions, by release.
-    """
+    """Return the verdicts about a sink: ``due`` releases, and completions by release."""
     tally = SinkTally(deadline, None)
     for release in due:
         if release in completed:

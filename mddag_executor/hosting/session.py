@@ -82,11 +82,7 @@ class Session:
             self.stop()
 
     def stop(self, hurried: bool = False) -> None:
-        """
-        End the run; from any thread, also from a signal handler.
-
-        :param hurried: shorten the wait for callbacks that do not end.
-        """
+        """End the run, also from a signal handler; ``hurried``: wait less for callbacks."""
         if hurried:
             self._patience_s = HURRIED_END_TIMEOUT_S
         self.stopped = True

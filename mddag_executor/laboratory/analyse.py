@@ -89,12 +89,7 @@ def analyse(
     task_set: TaskSet, workers: int, budget: str = 'max',
     progress: Callable[[int], None] | None = None,
 ) -> Analysis:
-    """
-    Analyse a task set.
-
-    :param budget: which value of each execution time counts: ``max``, ``p99`` or ``mean``.
-    :param progress: gets how many tests are done.
-    """
+    """Analyse a task set for a budget (see ``tasks_of``); ``progress`` gets the tests done."""
     if workers < 1:
         raise UsageError(f'workers: {workers} is too few: give at least 1')
     tasks = tasks_of(task_set, budget)

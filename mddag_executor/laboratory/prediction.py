@@ -112,12 +112,7 @@ def improve(
     placing: Placing, place: dict[int, int], cost: Callable[[tuple[Process, ...]], Cost],
     report: Callable[[int], None] = lambda tried: None, most: int = MOST_TRIES,
 ) -> tuple[dict[int, int], int]:
-    """
-    Return a placement at least as good, and how many were simulated.
-
-    :param cost: simulates one.
-    :param report: called now and then with how many have been tried.
-    """
+    """Return a placement that costs no more, and how many have been simulated."""
     best, tried = cost(placing.processes(place)), 1
     seen = {tuple(sorted(place.items()))}
     candidates = _next(placing, place, seen)

@@ -49,12 +49,7 @@ class Shape:
 def draw_shape(
     dice: Dice, count: int, sinks: int, edge_probability: float, or_share: float
 ) -> Shape:
-    """
-    Return a random graph.
-
-    :param count: number of callbacks.
-    :param sinks: number of sinks, fewer than callbacks unless there is one of each.
-    """
+    """Return a random graph; there are fewer sinks than callbacks, unless there is one of each."""
     inner = count - sinks if count > 1 else 1
     before: list[set[int]] = [set() for _ in range(count)]
     for after in range(1, count):

@@ -49,11 +49,7 @@ class Task:
 
 
 def tasks_of(task_set: TaskSet, budget: str = 'max') -> list[Task]:
-    """
-    Return the tasks of a task set.
-
-    :param budget: which value of each execution time counts: ``max``, ``p99`` or ``mean``.
-    """
+    """Return the tasks of a task set, with one of ``BUDGETS`` of each execution time."""
     if budget not in defaults.BUDGETS:
         raise UsageError(f"budget '{budget}': there is no such budget: choose one of "
                          f'{", ".join(defaults.BUDGETS)}')

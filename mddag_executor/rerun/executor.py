@@ -19,11 +19,7 @@ from rclpy.task import Task
 
 
 class NodeHolder(BareExecutor):
-    """
-    The executor of the nodes of a run.
-
-    :ivar task_entity: what the run keeps for tasks.
-    """
+    """The executor of the nodes of a run; ``task_entity`` is what the run keeps for tasks."""
 
     def __init__(self, context: Any, loop: Loop) -> None:
         super().__init__(context=context)

@@ -110,11 +110,7 @@ def _is_latched(qos: Any) -> bool:
 
 
 class Messages:
-    """
-    Carries messages.
-
-    :ivar offered: the topics on which nodes of the run publish, each with its publishers.
-    """
+    """Carries messages; ``offered`` has by topic the publishers of nodes of the run."""
 
     def __init__(
         self, loop: Loop, recording: MessageBag, times: Durations, outputs: Outputs,
