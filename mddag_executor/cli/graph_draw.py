@@ -27,7 +27,8 @@ leads to; red is the most urgent. DAGs are in the order of the file, many of the
 The ending of OUT selects the format: .svg, .png and .pdf need Graphviz (Debian, Ubuntu:
 'sudo apt install graphviz'); .dot (Graphviz's language) and .mmd (Mermaid) need nothing.
 Mermaid viewers limit the size: raise maxEdges and maxTextSize there for large graphs.
-Graphs of more than 1000 vertices get straight lines, and a PNG at most 16000 dots in a row."""
+Graphs of more than 1000 vertices, or of ten arrows for each, get straight lines, and a PNG at most
+16000 dots in a row."""
 
 _BY_GRAPHVIZ = ('.svg', '.png', '.pdf')
 _ENDINGS = (*_BY_GRAPHVIZ, '.dot', '.mmd')
@@ -75,7 +76,10 @@ def _find_dot(output: str) -> str:
 
 def _render(program: str, text: str, kind: str, output: str) -> bytes:
     """Let Graphviz lay a picture out."""
-    done = run_program([program, f'-T{kind}'], 'drawing', given=text.encode())
+    done = run_program(
+        [program, f'-T{kind}'], 'drawing', given=text.encode(),
+        slow=f'{output}: Graphviz takes long, perhaps hours if arrows cross many others: wait, or '
+        'end it with Ctrl-C and write OUT.dot or OUT.mmd instead')
     if done.returncode != 0:
         said = one_line(done.stderr.decode('utf-8', 'replace')) or f'status {done.returncode}'
         raise InputError(output, f'Graphviz failed ({said})',

@@ -26,6 +26,7 @@ def one_line(text: str) -> str:
     return printable(' '.join(text.split()))
 
 
+SLOW_S = 10.0
 _quiet = False
 
 
@@ -87,9 +88,14 @@ class Progress:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         progress.LISTENERS.remove(self._note)
+        self.wipe()
+
+    def wipe(self) -> None:
+        """Remove the line, for other output."""
         if self._shown:
             self._stream.write('\r' + ' ' * self._shown + '\r')
             self._stream.flush()
+            self._shown = 0
 
     def update(self, done: int | float, note: str = '') -> None:
         """Show how much of the total is done, and a note; cheap enough for an inner loop."""
@@ -119,9 +125,13 @@ class Progress:
 
 def run_program(
     command: Sequence[str], what: str, seconds: float | None = None, given: bytes | None = None,
-    environment: Mapping[str, str] | None = None,
+    environment: Mapping[str, str] | None = None, slow: str = '',
 ) -> subprocess.CompletedProcess[bytes]:
-    """Run a program on the given input; show progress, of `seconds` if that is known."""
+    """
+    Run a program on the given input; show progress, of `seconds` if that is known.
+
+    :param slow: a warning if it takes longer than ``SLOW_S``.
+    """
     import subprocess
     begin = time.monotonic()
     with Progress(what, seconds) as line, subprocess.Popen(
@@ -134,7 +144,12 @@ def run_program(
                     return subprocess.CompletedProcess(command, process.returncode, out, errors)
                 except subprocess.TimeoutExpired:
                     given = None
-                    line.update(round(time.monotonic() - begin, 1), 's')
+                    passed = time.monotonic() - begin
+                    if slow and passed > SLOW_S:
+                        line.wipe()
+                        warn(slow)
+                        slow = ''
+                    line.update(round(passed, 1), 's')
         except BaseException:
             process.terminate()
             raise

@@ -16,8 +16,8 @@ Theory of operation
    topics are tool tips. Graphviz lays out each DAG separately and packs them into a grid, in the
    order of the file, with as many columns as give about the proportions of a screen. (Version 2.43
    drops the labels of edges when it packs.)
-5. ``dot`` takes minutes for thousands of boxes. For more than ``_MANY`` it spends less time on the
-   order of boxes, and lines are straight.
+5. ``dot`` takes minutes for thousands of boxes, or for long arrows that cross many others. In a
+   large or dense graph it spends less time on the order of boxes, and lines are straight.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ _MOST_WRITERS = 3
 _QUEUE = 'style=dotted, color="#2244bb", penwidth=1.6, arrowhead=open'
 _STUB = 'shape=plaintext, fontsize=9, fontcolor="#2244bb", margin="0.02,0.02"'
 _PIECES = re.compile(r'[^/_]*[/_]?')
-_MANY = 1_000
+_MANY, _DENSE = 1_000, 10
+"""Boxes, and arrows for each, above which a graph is large or dense."""
 _QUICK = 'splines=line, nslimit=0.1, nslimit1=0.1, mclimit=0.1, size="166,166",'
 """166 inches are 16,000 dots, the maximum width of PNG viewers."""
 _BOX_WIDTH, _BOX_HEIGHT = 150, 70
@@ -81,7 +82,7 @@ def _lines(picture: Picture) -> Iterator[str]:
     columns = 1 if labelled else _columns(picture)
     if not labelled:
         yield f'    pack=36, packmode="array_cutr{columns}",'
-    if len(picture.boxes) > _MANY:
+    if len(picture.boxes) > _MANY or len(picture.arrows) > _DENSE * len(picture.boxes):
         yield f'    {_QUICK}'
     yield '    fontname="Helvetica", labelloc=t, labeljust=l, fontsize=12,'
     yield f'    label={_legend(picture)}]'

@@ -143,6 +143,20 @@ def test_a_large_graph(call, tmp_path):
     assert text.count('class="edge"') == 60 * 20
 
 
+def test_a_dense_graph_is_drawn_quickly(call, tmp_path):
+    """Graphviz would need minutes for 30 boxes, each of which starts all later ones."""
+    lines = ['mddag: 1', 'nodes:',
+             '  - {node: /n0, callbacks: [{name: c, timer: 1s, publishes: [/t0]}]}']
+    for i in range(1, 30):
+        topics = [f'/t{j}' for j in range(i)]
+        starts = f'sync: [{", ".join(topics)}]' if i > 1 else 'subscription: /t0'
+        ends = f'publishes: [/t{i}]' if i < 29 else 'deadline: 1s'
+        lines.append(f'  - {{node: /n{i}, callbacks: [{{name: c, {starts}, {ends}}}]}}')
+    done = call('graph', 'draw', '-', '-o', 'o.dot', cwd=tmp_path, stdin='\n'.join(lines))
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    assert 'nslimit' in (tmp_path / 'o.dot').read_text()
+
+
 def test_without_graphviz(call, tmp_path, monkeypatch):
     monkeypatch.setenv('PATH', str(Path(sys.executable).parent))
     if shutil.which('dot') is not None:
@@ -163,6 +177,18 @@ def test_graphviz_that_fails(call, tmp_path, monkeypatch):
     assert done.returncode == 2
     assert done.stderr.startswith('error: o.svg: Graphviz failed (no fonts): ')
     assert not (tmp_path / 'o.svg').exists()
+
+
+def test_a_slow_graphviz_is_reported(call, tmp_path, monkeypatch):
+    program = tmp_path / 'dot'
+    program.write_text('#!/bin/sh\nsleep 0.7\ncat\n')
+    program.chmod(0o755)
+    monkeypatch.setenv('PATH', f'{tmp_path}:/usr/bin:/bin')
+    monkeypatch.setattr('mddag_executor.cli.text.SLOW_S', 0.0)
+    done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
+    assert done.returncode == 0 and (tmp_path / 'o.svg').exists()
+    assert done.stderr.startswith('warning: o.svg: Graphviz takes long')
+    assert done.stderr.count('\n') == 1
 
 
 def test_schema(call, tmp_path):
