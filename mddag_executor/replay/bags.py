@@ -33,10 +33,11 @@ from mddag_executor.errors import InputError
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.channels import Topic
-from mddag_executor.trace.errors import renamed
+from mddag_executor.trace.errors import renamed, unreadable
 from mddag_executor.trace.times import joined, NEVER, stretches
 import zstandard
 
+_METADATA = 'metadata.yaml'
 _METADATA_LIMIT = 4 * 1024 * 1024
 _MCAP, _SQLITE, _ZSTD = b'\x89MCAP0\r\n', b'SQLite format 3\0', b'\x28\xb5\x2f\xfd'
 _REMEDY = 'give a folder with metadata.yaml that ros2 bag record wrote, or one of its files'
@@ -106,12 +107,12 @@ class Bag:
 
     def _files(self) -> list[Path]:
         path = Path(self.path)
-        if not path.is_dir():
+        if not os.path.isdir(path):
             return [path]
-        metadata = path / 'metadata.yaml'
-        if metadata.is_file():
-            return [path / name for name in _named_files(metadata)]
-        found = sorted(p for p in path.iterdir() if _BAG_FILE.fullmatch(p.name))
+        names = _names_in(self.path)
+        if _METADATA in names:
+            return [path / name for name in _named_files(path / _METADATA)]
+        found = sorted(path / name for name in names if _BAG_FILE.fullmatch(name))
         if not found:
             raise BagError(self.name, 'there is neither metadata.yaml nor a bag file', _REMEDY)
         self.warnings.append(
@@ -209,29 +210,44 @@ class Bag:
 
 
 def is_ordinary(path: str) -> bool:
-    """Return whether a path is a bag without traced events, so without jobs."""
-    files, has_metadata = [path], False
+    """
+    Return whether a path is a bag without traced events, so without jobs.
+
+    :raises mddag_executor.trace.TraceError: if a folder cannot be read.
+    """
+    files, is_bag = [path], False
     if os.path.isdir(path):
-        names = os.listdir(path)
+        names = _names_in(path)
         files = [os.path.join(path, name) for name in names if _BAG_FILE.fullmatch(name)]
-        has_metadata = 'metadata.yaml' in names     # a bag, even if its files are damaged or gone
-    return (has_metadata or any(map(_is_bag, files))) and all(
-        opened_trace(file) is None for file in files)
+        is_bag = _METADATA in names     # even if its files are damaged or gone
+    for file in files:
+        found = _trace_or_bag(file)
+        if isinstance(found, TraceReader):
+            return False
+        is_bag = is_bag or found
+    return is_bag
+
+
+def _names_in(folder: str) -> list[str]:
+    try:
+        return os.listdir(folder)
+    except OSError as error:
+        raise unreadable(folder, error) from None
 
 
 def opened_trace(path: str) -> TraceReader | None:
     """Return the trace in a file; None for other files, and for damage."""
+    found = _trace_or_bag(path)
+    return found if isinstance(found, TraceReader) else None
+
+
+def _trace_or_bag(path: str) -> TraceReader | bool:
+    """Return the trace in a file, else whether it is a bag; what is left of a trace is none."""
     try:
+        if _kind(Path(path)) != _MCAP:
+            return True
         reader = TraceReader(path)
-        return reader if reader.written_here or reader.has_events() else None
-    except InputError:
-        return None
-
-
-def _is_bag(path: str) -> bool:
-    """Return whether a file is a bag; what is left of a trace is none."""
-    try:
-        return _kind(Path(path)) != _MCAP or not TraceReader(path).written_here
+        return reader if reader.written_here or reader.has_events() else True
     except InputError:
         return False
 

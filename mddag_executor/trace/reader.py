@@ -20,13 +20,12 @@ import weakref
 from mddag_executor.text import counted
 from mddag_executor.trace.blocks import open_data, read_summary, Summary
 from mddag_executor.trace.channels import Channels, Topic
-from mddag_executor.trace.errors import TraceError, TraceWarning
+from mddag_executor.trace.errors import TraceError, TraceWarning, unreadable
 from mddag_executor.trace.events import Batch, Event
 from mddag_executor.trace.reading import Message, Reading
 from mddag_executor.trace.records import LIBRARY
 from mddag_executor.trace.schema import PROCESS
 
-_REMEDY = 'check its name, that you may read it, and the disk it is on'
 _T = TypeVar('_T')
 _Way = Callable[[Reading], Iterator[_T]]
 
@@ -42,13 +41,7 @@ def _opened(path: str) -> BinaryIO:
             raise TraceError(path, 'is no file', 'give the .mcap file itself')
         return open(path, 'rb')
     except OSError as error:
-        raise _unreadable(path, error) from None
-
-
-def _unreadable(path: str, error: OSError) -> TraceError:
-    if isinstance(error, FileNotFoundError):
-        return TraceError(path, 'no such file or directory', 'check the path')
-    return TraceError(path, f'cannot be read ({error.strerror})', _REMEDY)
+        raise unreadable(path, error) from None
 
 
 def no_trace(folder: str) -> TraceError:
@@ -97,7 +90,7 @@ class TraceReader:
             except (ValueError, struct.error):
                 self._finished = False
         except OSError as error:
-            raise _unreadable(self.path, error) from None
+            raise unreadable(self.path, error) from None
 
     @property
     def message_count(self) -> int | None:
@@ -166,7 +159,7 @@ class TraceReader:
             reading = Reading(self.path, channels, self._stream, self._start, self._size)
             yield from way(reading)
         except OSError as error:
-            raise _unreadable(self.path, error) from None
+            raise unreadable(self.path, error) from None
         for text in (self._missing(reading), reading.undecoded(), reading.impossible_times()):
             if text and text not in self.warnings:
                 self.warnings.append(text)

@@ -2,14 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ordinary bags, written by rosbags, as releases: every storage and compression, and damage."""
 
+import os
 import shutil
 import sqlite3
 
+from mddag_executor import open_recording
 from mddag_executor.errors import InputError
 from mddag_executor.replay.bags import Bag, BagError, is_ordinary
 from mddag_executor.replay.bags_reschedule import read_bag, reschedule_bag
 from mddag_executor.simulate import START
-from mddag_executor.trace import TraceFile
+from mddag_executor.trace import TraceError, TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 from rosbags.rosbag2 import CompressionFormat, StoragePlugin, Writer
@@ -237,3 +239,34 @@ def test_a_folder_says_what_is_in_it(tmp_path):
     for size in (len(data) // 2, 60, 45):
         (tmp_path / 'run' / 'a.mcap').write_bytes(data[:size])
         assert not is_ordinary(str(tmp_path / 'run' / 'a.mcap'))
+
+
+def test_a_folder_is_looked_through_once(tmp_path, monkeypatch):
+    path = write_bag(tmp_path / 'bag', StoragePlugin.MCAP)
+    (path / 'metadata.yaml').unlink()
+    opened = []
+
+    class Counted(TraceReader):
+
+        def __init__(self, path):
+            opened.append(path)
+            super().__init__(path)
+
+    monkeypatch.setattr('mddag_executor.replay.bags.TraceReader', Counted)
+    assert is_ordinary(str(path)) and opened == [str(path / 'bag.mcap')]
+
+
+@pytest.mark.parametrize('mode', [0, 0o444])
+def test_a_folder_that_may_not_be_read(tmp_path, monkeypatch, mode):
+    path = write_bag(tmp_path / 'bag')
+    monkeypatch.chdir(tmp_path)
+    tmp_path.chmod(0o755)
+    path.chmod(mode)
+    user = os.geteuid()
+    os.seteuid(user or 65534)       # root may read everything
+    try:
+        with pytest.raises((TraceError, BagError), match='bag.*Permission denied'):
+            open_recording('bag', loads(GRAPH))
+    finally:
+        os.seteuid(user)
+        path.chmod(0o755)
