@@ -255,10 +255,11 @@ class SyntheticWorkload:
         self.ledger = Ledger(task_set)
         if process is not None:
             self.ledger.tolerance_ns = _CLOCKS_NS
+        self._process = process
         self._current_job = current_job
         self._context = context
         self._emulate: dict[Body, Emulate] = {}
-        bodies = {plan.body(vertex) for vertex in task_set.vertices}
+        bodies = {plan.body(v) for v in task_set.vertices if self._is_here(v.callback.node)}
         if 'sleep' in bodies:
             self.ledger.busy_below_ns = typical_oversleep_ns()  # takes 30 ms
             self._emulate['sleep'] = sleeper(self.ledger.busy_below_ns)
@@ -271,7 +272,6 @@ class SyntheticWorkload:
         self._nodes: dict[str, Node] = {}
         self._sensor_node: Node | None = None
         self._publishers: dict[tuple[str, str], Publisher] = {}
-        self._process = process
         self._n_subscribers = Counter(t for c in task_set.callbacks for t in c.topics)
         self._n_publishers = Counter(
             t for _, t in {(c.node, t) for c in task_set.callbacks for t in c.publishes})

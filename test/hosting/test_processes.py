@@ -109,6 +109,19 @@ def test_synthetic_nodes_in_two_processes_are_one_run(world, mddag):
     assert '1 declared callback' not in run.stdout
 
 
+def test_a_process_by_itself_does_not_judge_the_jobs_of_others(world, mddag):
+    (world / 'two.yaml').write_text(
+        'mddag: 1\nnodes:\n'
+        '  - {node: /a, callbacks: [{name: t, timer: 9ms, deadline: 9ms, execution_time: 1ms}]}\n'
+        '  - {node: /b, callbacks: [{name: t, timer: 9ms, deadline: 9ms, execution_time: 1ms}]}\n'
+        'processes: {one: [/a], two: [/b]}\n')
+    run = mddag('run', 'two.yaml', '--synthetic', 'sleep', '--process', 'one', '--duration',
+                '100ms', '--json', 'result.json')
+    assert run.returncode == 0, run.stderr
+    result = json.loads(Path('result.json').read_text())
+    assert result['callbacks']['/a:t']['ran'] > 0 and result['measured'] is None
+
+
 class Beside:
     """A session in which, at each wait, the next thing happens in the other process."""
 

@@ -135,6 +135,19 @@ def test_nodes_have_exactly_what_is_declared(task_set, ros_context):
     workload.destroy()
 
 
+def test_a_process_prepares_only_what_it_runs(ros_context, monkeypatch):
+    task_set = loads(
+        'mddag: 1\nnodes:\n'
+        '  - {node: /a, callbacks: [{name: t, timer: 9ms, deadline: 9ms, execution_time: 1ms}]}\n'
+        '  - {node: /b, callbacks: [{name: t, timer: 9ms, deadline: 9ms, execution_time: 1ms}]}\n'
+        'processes: {one: [/a], two: [/b]}\n')
+    plan = next(plan for seed in range(99) if [
+        (plan := ExecutionPlan(task_set, seed, mode='mixed')).body(vertex)
+        for vertex in task_set.vertices] == ['spin', 'native'])
+    monkeypatch.delattr('mddag_executor.hosting.synthetic.native')  # its speed takes time
+    SyntheticWorkload(task_set, plan, context=ros_context, process='one').destroy()
+
+
 def test_every_release_reaches_every_sink(task_set, ros_context):
     executor = MultiDeadlineExecutor(task_set, context=ros_context)
     workload = SyntheticWorkload(
