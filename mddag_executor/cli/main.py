@@ -17,19 +17,25 @@ declaration are one line each. The exit status is
 | 70 | a defect of this program or of a node, with its traceback (EX_SOFTWARE) |
 | 130 | interrupted with Ctrl-C |
 | 141 | the reader of the output went away |
+| 128 + N | ended by signal N, SIGTERM or SIGHUP, in the same order as with Ctrl-C |
 
 `MDDAG_DEBUG=1` in the environment shows the traceback of every error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 import errno
 from importlib import import_module
 import io
+import math
 import os
+import signal
 import sys
-from types import ModuleType
+import threading
+import time
+from types import FrameType, ModuleType
 from typing import Any
 
 from mddag_executor import __version__
@@ -41,6 +47,10 @@ EXIT_BAD_INPUT = 2
 EXIT_DEFECT = 70
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
+EXIT_SIGNAL = 128
+"""A shell adds the number of the signal."""
+# Signals within this time are one: `timeout` sends one to the process, and one to its group.
+SAME_SIGNAL_S = 1.0
 
 
 # Each verb and its one-line help, by task. `graph check` is the module `graph_check`.
@@ -148,17 +158,54 @@ def main(
     if '_ARGCOMPLETE' in os.environ:
         from mddag_executor.cli.completion import complete
         complete()
+    with _ending_signals() as received:
+        status = _status_of(run, sys.argv[1:] if argv is None else argv)
+    return EXIT_SIGNAL + received[0] if received else status
+
+
+@contextmanager
+def _ending_signals() -> Iterator[list[int]]:
+    """
+    Let SIGTERM and SIGHUP end a command as Ctrl-C does, so no incomplete file is left behind.
+
+    An ignored signal (`nohup`) stays ignored.  Yields a list that gets the number of the signal.
+    """
+    received: list[int] = []
+    last = -math.inf
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal last
+        if (now := time.monotonic()) - last >= SAME_SIGNAL_S:
+            last, received[:] = now, [number]
+            raise KeyboardInterrupt
+
+    numbers = [number for number in (signal.SIGTERM, signal.SIGHUP)
+               if signal.getsignal(number) == signal.SIG_DFL
+               and threading.current_thread() is threading.main_thread()]
+    for number in numbers:
+        signal.signal(number, interrupt)
+    try:
+        yield received
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _status_of(run: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
+    """Do what the arguments say; report an error and return the exit status."""
     try:
         # A name that the terminal's encoding lacks is escaped; it must not end the program.
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors='backslashreplace')
-        return run(sys.argv[1:] if argv is None else argv)
+        return run(argv)
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         _silence_stdout()
         return EXIT_BROKEN_PIPE
-    except Exception as error:
+    except SystemExit:
+        raise
+    except BaseException as error:      # an asyncio.CancelledError is no Exception
         if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
             _silence_stdout()
         line = user_line(error)

@@ -4,9 +4,9 @@
 The verb `run`: real nodes, or nodes made from the declaration, under the executor.
 
 The whole command line is checked before a node starts: the declaration, the names of policy and
-nodes, whether trace and result can be written.  A run ends after `--duration`, with Ctrl-C (or
-SIGTERM), when a callback calls `rclpy.shutdown`, or when all programs have ended; its summary is
-always printed.
+nodes, whether trace and result can be written.  A run ends after `--duration`, with Ctrl-C,
+SIGTERM or SIGHUP, when a callback calls `rclpy.shutdown`, or when all programs have ended; its
+summary is always printed.
 
 A run of several processes (`run_processes`) starts this verb once for each of them, with `--part`.
 """
@@ -32,6 +32,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options, verdicts
+from mddag_executor.cli.main import SAME_SIGNAL_S
 from mddag_executor.cli.text import Progress, warn
 from mddag_executor.errors import MddagError, UsageError, UserCodeError
 from mddag_executor.report.live_runs import live_lines
@@ -52,9 +53,6 @@ mddag run graph.yaml --node my_package/driver --node my_package.filter:main --tr
 mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20s
 mddag run --node my_package/driver --node my_package/filter --trace run.mcap"""
 
-# SIGINTs within this time are one: Ctrl-C sends one to all processes of the group, and `ros2
-# launch` without a terminal another one to those that it started.
-_SAME_INTERRUPT_S = 1.0
 # An end that takes longer than this writes the stack of each thread: well above the duration of an
 # end with slow callbacks, middleware and disk.
 STUCK_S = 30.0
@@ -164,6 +162,7 @@ def run_here(
         of these), and what a node raised.
     """
     common.check_output(args.trace, recording=True, overwrite=args.overwrite)
+    trace = None if args.trace is None else Path(args.trace).absolute()  # nodes may change folders
     workers = defaults.workers(args.workers, task_set)
     plan = None
     host: Host | None = None
@@ -192,8 +191,8 @@ def run_here(
             with redirect_stdout(output):
                 return _run(args, task_set, executor, host, programs, plan, signals)
         except MddagError:
-            if args.trace is not None:  # nothing ran: leave no empty trace behind
-                Path(args.trace).unlink(missing_ok=True)
+            if trace is not None:  # nothing ran: leave no empty trace behind
+                trace.unlink(missing_ok=True)
             raise
 
 
@@ -325,7 +324,7 @@ def _with_place(
     error: BaseException | None, result: dict[str, Any], guests: Sequence[Guest],
 ) -> BaseException | None:
     """Return what a node raised, with the callbacks or the program that raised it."""
-    if not isinstance(error, Exception):
+    if error is None or isinstance(error, (KeyboardInterrupt, SystemExit)):
         return error
     from mddag_executor.hosting.loading import describe
     places = [name for name, each in result['callbacks'].items() if each['failed']] or [
@@ -350,7 +349,8 @@ def _run_synthetic(
         with session:
             measured = workload.run(
                 session, seconds, progress.update, begin=_begin(args, task_set))
-            return workload.ledger if measured else None
+            # The jobs of one process of several begin or end in others.
+            return workload.ledger if measured and args.process is None else None
     finally:
         # Processes that destroy hundreds of entities while their peers do, too, may wait for each
         # other within the middleware; a process of several ends without that.
@@ -404,7 +404,7 @@ def _run_programs(
 
 class Signals:
     """
-    Let SIGINT and SIGTERM end the run, and its report be written; a context manager.
+    Let SIGINT, SIGTERM and SIGHUP end the run, and its report be written; a context manager.
 
     A SIGINT that comes a while after the first interrupts the program itself.
     """
@@ -421,21 +421,22 @@ class Signals:
         """From now on they end this session."""
         self._session = session
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._handle)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+                    self._before[number] = signal.signal(number, self._handle)
 
     def __exit__(self, *args: object) -> None:
         for number, before in self._before.items():
             signal.signal(number, before)
-        if self._first is not None and signal.SIGINT in self._before:
+        for number in self._before if self._first is not None else ():
             # The process is about to end by itself; it is not to look as if it was killed.
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            signal.signal(number, signal.SIG_IGN)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         now = time.monotonic()
         if self._first is None:
             self._first = now
-        elif number == signal.SIGINT and now - self._first > _SAME_INTERRUPT_S:
+        elif number == signal.SIGINT and now - self._first > SAME_SIGNAL_S:
             signal.default_int_handler(number, frame)
         if self._session is not None:
             self._session.stop(hurried=True)

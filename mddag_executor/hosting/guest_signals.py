@@ -8,6 +8,7 @@ Theory of operation
 Python runs handlers in the main thread, and only the main thread may set them.  So this module
 sets a common handler for the signals that programs use, and stores the handlers of programs.  When
 a signal arrives, first its earlier handler runs (SIGINT ends the run), then those of the programs.
+SIGHUP ends the run only if no program handles it, which usually means to read settings again.
 An exception of a program's handler is raised in the program's own thread, as soon as that runs
 Python.
 """
@@ -78,7 +79,8 @@ class GuestSignals:
     def _handle(self, number: int, frame: Any) -> None:
         before, handlers = self._before[number], self._handlers[number]
         if callable(before):
-            before(number, frame)
+            if number != signal.SIGHUP or not handlers:
+                before(number, frame)
         elif before == signal.SIG_DFL and not handlers:
             self._set(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)

@@ -19,6 +19,8 @@ Theory of operation
    ``signal.signal``, ``getsignal``   keep a handler for each program: see ``guest_signals``
    =================================  ============================================================
 
+   Afterwards the working directory is the earlier one, too: paths of results may be relative.
+
 3. A program that spins passes its nodes to the host's executor and waits until the run or the
    program ends.  A program ends by ``rclpy.shutdown`` or when it returns.  Its nodes are then
    removed, unless it has returned them.  The run ends with the last program.
@@ -36,6 +38,7 @@ from collections.abc import Callable, Iterable
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from importlib import import_module
+import os
 import sys
 import threading
 import time
@@ -107,6 +110,7 @@ class Host:
     def __enter__(self) -> Host:
         context = self.context = rclpy.utilities.get_default_context()
         replace = self._replacements.replace
+        self._replacements.callback(os.chdir, os.getcwd())
         self._replacements.callback(self._signals.uninstall)
         self._signals.install(replace)
         for name, function in (('init', self._init), ('ok', self._ok),
@@ -190,7 +194,7 @@ class Host:
         if isinstance(guest.error, LoadingError):
             raise guest.error
         if guest.error is not None:
-            failure = ProgramFailed if isinstance(guest.error, Exception) else LoadingError
+            failure = LoadingError if isinstance(guest.error, SystemExit) else ProgramFailed
             raise failure(
                 spec, f'it failed while starting ({describe(guest.error)})',
                 'correct it, or see how it runs by itself') from guest.error

@@ -197,7 +197,8 @@ def _script(spec: str, path: Path) -> Program:
 
 def describe(error: BaseException) -> str:
     """Return an exception on one line, with the place where it was raised."""
-    text = ' '.join(str(error).split())
+    # str(error) may raise, too
+    text = ' '.join(str(traceback.TracebackException.from_exception(error)).split())
     name = type(error).__name__
     frames = traceback.extract_tb(error.__traceback__)
     own = [f for f in frames if not f.filename.startswith('<') and f.filename != __file__]

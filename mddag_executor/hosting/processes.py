@@ -91,8 +91,9 @@ class Run:
     @property
     def died(self) -> bool:
         """Return whether it ended by an exception, a signal or an error."""
-        # SIGTERM during its start: before its handler was installed, or its nodes could not start
-        as_asked = self.asked and self.status in (-signal.SIGTERM, _BAD_INPUT)
+        # SIGTERM during its start: before `main`, before the run, or its nodes could not start
+        as_asked = self.asked and self.status in (
+            -signal.SIGTERM, 128 + signal.SIGTERM, _BAD_INPUT)
         return self.status not in (None, 0) and not as_asked
 
     @property

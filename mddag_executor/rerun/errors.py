@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from mddag_executor.errors import MddagError, UserCodeError
+from mddag_executor.hosting.loading import describe
 
 
 class RerunError(MddagError):
@@ -19,7 +20,7 @@ class CallbackFailed(RerunError, UserCodeError):
     """
 
     def __init__(self, name: str, error: BaseException, at_ns: int) -> None:
-        what = ' '.join(f'{type(error).__name__}: {error}'.split())
         super().__init__(
-            f'{name}: it raised {what} at {at_ns / 1e9:.6f} s: correct it, or see its traceback')
+            f'{name}: it raised {describe(error)} at {at_ns / 1e9:.6f} s: correct it, or see its '
+            'traceback')
         self.at_ns = at_ns

@@ -3,6 +3,7 @@
 """The program as a whole: verbs, exit status, one line of error, text for people, `ros2 mddag`."""
 
 import argparse
+from asyncio import CancelledError
 from contextlib import nullcontext
 from importlib.metadata import distribution
 from importlib.util import find_spec
@@ -11,8 +12,10 @@ import json
 import os
 from pathlib import Path
 import re
+import signal
 import subprocess
 import sys
+import time
 from types import ModuleType, SimpleNamespace
 
 from hypothesis import given, strategies
@@ -74,7 +77,7 @@ def test_bad_input_is_one_line(verb, capsys, error, line):
 
 
 @pytest.mark.parametrize('error', [
-    ZeroDivisionError('a defect'), OSError('a defect'),
+    ZeroDivisionError('a defect'), OSError('a defect'), CancelledError('a defect'),
     ModuleNotFoundError('a defect', name='somebodys_module')])
 def test_a_defect_keeps_its_traceback(verb, capsys, error):
     verb(fail_with(error))
@@ -87,6 +90,25 @@ def test_an_interrupt_is_quiet(verb, capsys):
     verb(fail_with(KeyboardInterrupt()))
     assert program.main(['probe']) == 130
     assert capsys.readouterr() == ('', '')
+
+
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_no_incomplete_file(folder, number):
+    (folder / 'g.yaml').write_text(GRAPH)
+    with subprocess.Popen(
+            [sys.executable, '-m', 'mddag_executor', 'simulate', 'g.yaml', '--duration', '1000s',
+             '--trace', 'run.mcap'], stderr=subprocess.PIPE) as process:
+        try:
+            while not list(folder.glob('.run.mcap.*.part')):
+                assert process.poll() is None
+                time.sleep(0.01)
+            process.send_signal(number)
+            process.send_signal(number)     # as `timeout` does: to the process, and to its group
+            err = process.communicate(timeout=60)[1]
+        finally:
+            process.kill()
+    assert (process.returncode, err) == (128 + number, b'')
+    assert os.listdir(folder) == ['g.yaml']
 
 
 @pytest.mark.parametrize('words', [

@@ -3,6 +3,7 @@
 
 from contextlib import contextmanager, suppress
 import json
+import os
 from pathlib import Path
 import re
 import signal
@@ -175,11 +176,12 @@ def recorded_ns():
     return found[-1] - found[0] if found else 0
 
 
-def test_a_signal_ends_a_synthetic_run(graph):
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_synthetic_run(graph, number):
     with started(graph) as process:
         # The window begins after the warm-up of 1 s.
         wait_for_run(process, lambda: recorded_ns() > 2 * 10 ** 9)
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(number)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 0
     assert 'Traceback' not in err
@@ -314,6 +316,48 @@ def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(folder, mddag,
                for line, after in zip(lines, lines[1:]))
     place = '/n:tick: it raised' if spec == 'bad:Calibrated' else f'--node {spec}:'
     assert lines[-1].startswith(f'error: {place} ') and 'FileNotFoundError' in lines[-1]
+
+
+ODD_NODES = """\
+import os
+from rclpy.node import Node
+
+
+class Odd(BaseException):
+
+    def __str__(self):
+        raise ValueError('it has no text')
+
+
+class Talker(Node):
+
+    def __init__(self):
+        super().__init__('n')
+        os.chdir('elsewhere')
+        self.create_timer(0.02, self.tick)
+
+    def tick(self):
+        raise Odd
+
+
+def main():
+    os.chdir('elsewhere')
+    raise Odd
+"""
+
+
+@pytest.mark.parametrize('spec', ['odd:Talker', 'odd:main'])
+def test_nodes_that_change_the_folder_and_raise_what_has_no_text(folder, mddag, spec):
+    Path('n.yaml').write_text(ONE_TIMER)
+    Path('odd.py').write_text(ODD_NODES)
+    Path('elsewhere').mkdir()
+    Path('elsewhere', 'out.mcap').touch()
+    done = mddag('run', 'n.yaml', '--node', spec, '--trace', 'out.mcap', '--json', 'result.json')
+    ran = spec == 'odd:Talker'
+    assert done.returncode == 70, done.stderr
+    assert 'Odd: <' in done.stderr.splitlines()[-1]
+    assert os.listdir('elsewhere') == ['out.mcap']
+    assert [Path(name).exists() for name in ('out.mcap', 'result.json')] == [ran, ran]
 
 
 STUCK = """\

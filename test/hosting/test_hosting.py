@@ -79,7 +79,7 @@ def heard(result):
     ('chat:own_executor', 'own executor ended'),
     ('chat:events_executor', ''),
     ('chat:spins_once_for_ever', 'no longer ok'),
-    ('chat:catches_signals', ''),
+    ('chat:catches_signals', 'read the settings again'),
 ])
 def test_unmodified_programs_run_on_our_executor(world, listener, said):
     result, output = run('chat_nodes/talker', listener, until=has_heard)

@@ -114,9 +114,12 @@ def shuts_down_in_a_callback():
 
 
 def catches_signals():
+    import os
     import signal
     rclpy.init()
     signal.signal(signal.SIGTERM, lambda *_: None)
+    signal.signal(signal.SIGHUP, lambda *_: print('read the settings again'))
+    os.kill(os.getpid(), signal.SIGHUP)
     rclpy.spin(Listener())
 
 
