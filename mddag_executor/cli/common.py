@@ -225,8 +225,8 @@ def output_file(path: str) -> Iterator[BinaryIO]:
         part.replace(target)
     except BaseException as error:
         part.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename is None:
-            error.filename = path  # a full disk
+        if isinstance(error, OSError) and error.filename in (None, str(part)):
+            error.filename = path  # a full disk, or the folder
         raise
 
 

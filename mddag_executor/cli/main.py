@@ -236,11 +236,12 @@ def user_line(error: BaseException) -> str | None:
     """Return the line that reports an error to the user, or None when it is a defect."""
     if isinstance(error, known_errors()):
         return one_line(str(error))
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
-        error.filename = 'standard output'
+    if isinstance(error, OSError) and error.filename is None and error.errno in _PLACES:
+        error.filename = _PLACES[error.errno]
     if isinstance(error, OSError) and error.filename is not None:
         reason = error.strerror or type(error).__name__
-        remedy = _REMEDIES.get(type(error), 'check the path and what it lies on')
+        remedy = _REMEDIES.get(error.errno) or _REMEDIES.get(
+            type(error), 'check the path and what it lies on')
         name = error.filename if error.filename2 is None else error.filename2
         place = name if isinstance(name, int) else os.fsdecode(name)
         return one_line(f'{place}: {reason[:1].lower()}{reason[1:]}: {remedy}')
@@ -250,11 +251,17 @@ def user_line(error: BaseException) -> str | None:
     return None
 
 
-_REMEDIES: dict[type[BaseException], str] = {
+_PLACES = {errno.ENOSPC: 'standard output', errno.ENOENT: 'working directory',
+           errno.EMFILE: 'this process'}
+"""The places of errors without a file name."""
+_REMEDIES: dict[type[BaseException] | int | None, str] = {
     FileNotFoundError: 'check the path',
     IsADirectoryError: 'name a file',
     NotADirectoryError: 'check the path',
     PermissionError: 'change its permissions or name another file',
+    errno.ENOSPC: 'free space, or name another file',
+    errno.EDQUOT: 'free space, or name another file',
+    errno.EMFILE: "allow more with 'ulimit -n'",
 }
 
 

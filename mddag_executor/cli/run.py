@@ -251,7 +251,8 @@ def _rclpy(ros_args: Sequence[str]) -> Iterator[None]:
     except Exception as error:
         reason = re.sub(r', at /\S+:\d+', '', str(error).split('\n')[0])
         raise UsageError(
-            f'--ros-args {" ".join(ros_args)}: {reason}: correct it, or leave it out'
+            f'--ros-args {" ".join(ros_args)}: {reason}: correct it, or leave it out' if ros_args
+            else f'rclpy: {reason}: correct the environment, for instance HOME or ROS_LOG_DIR'
         ) from error
     try:
         yield

@@ -64,8 +64,9 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
     for trace in (result['trace'], *(p['trace'] for p in result.get('processes', ()))):
         if trace is not None:
             lost = trace['lost']
+            why = 'the disk was too slow' if trace['error'] is None else 'writing failed'
             yield (f'trace: {printable(str(Path(trace["path"]).absolute()))}'
-                   + (f' ({counted(lost, "event")} lost: the disk was too slow)' if lost else ''))
+                   + (f' ({counted(lost, "event")} lost: {why})' if lost else ''))
     if not result['dags'] and result['trace'] is not None:
         path = printable(result['trace']['path'])
         yield (f'to judge it: mddag graph from-trace {path} --accept -o graph.yaml, then '
