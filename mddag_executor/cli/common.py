@@ -214,7 +214,8 @@ def output_file(path: str) -> Iterator[BinaryIO]:
             raise
         return
     target = Path(os.path.realpath(path))  # a symbolic link stays one
-    part = target.with_name(f'.{target.name}.{os.getpid()}.part')
+    begin = os.fsdecode(os.fsencode(target.name)[:200])     # a name may have 255 bytes
+    part = target.with_name(f'.{begin}.{os.getpid()}.part')
     try:
         with part.open('xb') as file:
             yield file

@@ -76,7 +76,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         def ended(run: Run) -> None:
             Part.ended(folder, run.name)
             if run.died:
-                warn(f'process {run.name} {run.how}: {run.said}')
+                warn(f'process {run.name} {run.how}: {run.said or "it said nothing"}')
 
         supervisor = Supervisor(command, args.on_exit == 'continue', out, sys.stderr, ended)
         signals.end_of(supervisor)

@@ -190,6 +190,12 @@ def test_an_output_keeps_links_and_permissions(tmp_path):
     assert stat.S_IMODE(target.stat().st_mode) == 0o640
 
 
+def test_the_name_of_an_output_may_be_as_long_as_a_name_may_be(tmp_path):
+    path = tmp_path / ('é' * 127)
+    common.write_text(str(path), 'x')
+    assert os.listdir(tmp_path) == [path.name]
+
+
 def test_an_output_may_be_a_pipe(tmp_path):
     pipe = tmp_path / 'pipe'
     os.mkfifo(pipe)
