@@ -17,7 +17,7 @@ declaration are one line each. The exit status is
 | 70 | a defect of this program or of a node, with its traceback (EX_SOFTWARE) |
 | 130 | interrupted with Ctrl-C |
 | 141 | the reader of the output went away |
-| 128 + N | ended by signal N, SIGTERM or SIGHUP, in the same order as with Ctrl-C |
+| 128 + N | ended by signal N (SIGTERM or SIGHUP), as with Ctrl-C |
 
 `MDDAG_DEBUG=1` in the environment shows the traceback of every error.
 """
