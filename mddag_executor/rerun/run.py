@@ -281,7 +281,11 @@ class Rerun:
         if all(guest.is_complete for guest in self._host.guests) and not self._hosted:
             raise RerunError(self._none_hosted())
         name, pauses = self._recording.name, self._recording.pauses
-        known = {*self._recording.topics, *self._messages.offered, CLOCK}
+        here = {n.get_fully_qualified_name() for guest in self._host.guests for n in guest.nodes}
+        # a lifecycle node makes its publishers later
+        known = {*self._recording.topics, *self._messages.offered, CLOCK, *(
+            topic for each in self._task_set.callbacks if each.node in here
+            for topic in each.publishes)}
         for callback in self._task_set.callbacks:
             for topic in callback.topics:
                 if callback.key in self._hosted and topic not in known:

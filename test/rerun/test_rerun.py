@@ -85,6 +85,22 @@ def test_the_same_again_and_with_other_workers(bag, graph):
     assert rerun(bag, graph, [Filter, Sink], workers=7).digest == first.digest
 
 
+def test_publishers_may_be_made_later(bag, graph):
+    """As those of lifecycle nodes, which are configured by a request."""
+    class Late(Node):
+
+        def __init__(self):
+            super().__init__('filter')
+            self.create_subscription(Header, '/points', self.take, 10)
+
+        def take(self, message):
+            if not hasattr(self, 'publisher'):
+                self.publisher = self.create_publisher(Header, '/filtered', 10)
+            self.publisher.publish(message)
+
+    assert len(published(rerun(bag, graph, [Late, Sink]), '/out')) == 20
+
+
 def test_processes_share_one_interpreter(bag, graph):
     """A node that computes in Python waits for others, also if declared for another process."""
     text = GRAPH.replace('execution_time: 10ms', 'execution_time: 90ms, holds_interpreter: true')
