@@ -39,7 +39,6 @@ from mddag_executor.core.tables import Tables
 
 TURN_NS = 1_000_000
 """No overtaking if the holder needs less time than this: Python switches threads no sooner."""
-LONGER, LONG_NS = 3, 5_000_000
 PATIENCE = 2
 """Overtaking pays if the wait for the interpreter, times this, reaches RAD minus release."""
 SWEEP_AT = 64
@@ -184,8 +183,8 @@ def overtaking_pays(
     :param held: how long the holder has held the interpreter; ``usual``: its usual duration, ns.
     :param preempts: whether the holder would be paused instead.
     """
-    # Nothing is known about a holder that takes much longer than usual; it may take twice as long.
-    left = usual - held if held < LONGER * usual + LONG_NS else held
+    # A holder that takes longer than usual is expected to go on for as long as it is over that.
+    left = abs(usual - held)
     if left < TURN_NS or preempts:
         return left >= TURN_NS
     first = first_waiting(t, s, process)
@@ -196,7 +195,7 @@ def overtaking_pays_from(t: Tables, s: State, process: int, usual: int) -> int:
     """Return after which time of holding the interpreter overtaking pays again, ns."""
     first = first_waiting(t, s, process)
     wait = 0 if first < 0 else -(-t.rad_offset[s.x_vertex[first]] // PATIENCE)
-    return max(LONGER * usual + LONG_NS, TURN_NS, wait)
+    return usual + max(TURN_NS, wait)
 
 
 def wait_for_poll(t: Tables, s: State, entry: QueueEntry) -> None:

@@ -119,7 +119,7 @@ class DueTimes:
             first = min(first, muting.until - offset)
         if self._engine.holders and self._engine.has_waiting:
             self._watch_holder(now)
-            first = min(first, check.at or NEVER)
+            first = min(first, self._next_check(now))
         elif check.at:
             check.end()
         if first == NEVER:
@@ -144,11 +144,18 @@ class DueTimes:
         self._watch_holder(now, is_late)
         if is_late:
             self._check_gil(now)  # the first reading, with which the next one is compared
-        self._arm_by(self._gil_check.at)
+        self._arm_by(self._next_check(now))
+
+    def _next_check(self, now: int) -> int:
+        """Return when to check whether the first waiting execution may start; NEVER: no need."""
+        if not self._engine.holders:
+            return NEVER
+        at = self._engine.overtaking_at() - self._offset
+        return min(at if at > now else NEVER, self._gil_check.at or NEVER)
 
     def _arm_by(self, at: int) -> None:
-        """Set the timerfd to a time, unless that is 0, or it expires sooner."""
-        if at and not 0 < self._timer.at <= at:
+        """Set the timerfd to a time, unless it expires sooner."""
+        if at < NEVER and not 0 < self._timer.at <= at:
             self.may_expire_early = True
             self._timer.arm(at)
 

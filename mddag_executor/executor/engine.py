@@ -118,7 +118,6 @@ class Engine:
         self._finished = False
         # executions that hold the GIL, in the order in which they began; read-only outside
         self.holders: list[Work] = []
-        self._holds_since = 0
         self._keys_are_deadlines = policy in ('rad', 'gedf')
         self._default_deadline = default_deadline
 
@@ -472,7 +471,6 @@ class Engine:
         work.worker = worker
         if state.x_holds[x]:
             self.holders.append(work)
-            self._holds_since = now
         return work
 
     def relative_deadline(self, entity: Entity) -> int:
@@ -519,9 +517,16 @@ class Engine:
 
     def _may_be_overtaken(self, now: int) -> bool:
         """Return whether the first waiting execution may overtake the latest holder of the GIL."""
+        work = self.holders[-1]
         return overtaking_pays(
-            self.tables, self._state, 1, now - self._holds_since,
-            self.holders[-1].entity.habit.mean_ns, False)
+            self.tables, self._state, 1, now - self._state.x_started[work.x],
+            work.entity.habit.mean_ns, False)
+
+    def overtaking_at(self) -> int:
+        """Return when the first waiting execution may overtake the latest holder of the GIL."""
+        work = self.holders[-1]
+        return self._state.x_started[work.x] + overtaking_pays_from(
+            self.tables, self._state, 1, work.entity.habit.mean_ns)
 
     def overtaking_bound(self, now: int) -> tuple[int, int]:
         """
@@ -533,15 +538,13 @@ class Engine:
         if len(self.holders) != 1:
             return 0, 0
         work = self.holders[0]
-        mean = work.entity.habit.mean_ns
-        left = mean - (now - self._holds_since)
+        left = work.entity.habit.mean_ns - (now - self._state.x_started[work.x])
         if left < TURN_NS:
             return 0, 0
         bound = PATIENCE * left
         if self._keys_are_deadlines:
             bound = min(bound, max(0, self._state.x_key[work.x][0] - now))
-        until = overtaking_pays_from(self.tables, self._state, 1, mean)
-        return bound, self._holds_since + until
+        return bound, now + left + max(TURN_NS, bound // PATIENCE)
 
     def interpreter_holder(self) -> Work | None:
         """Return the most urgent execution that holds the interpreter."""

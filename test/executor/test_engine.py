@@ -205,6 +205,40 @@ nodes:
   - node: /n
     callbacks: [{name: tick, timer: 10ms, deadline: 10ms}]
 """
+MS = 1_000_000
+
+
+@examples(100)
+@given(st.integers(0, 20), st.integers(1, 60), st.booleans())
+def test_a_holder_that_takes_longer_than_usual_is_overtaken_when_the_engine_says(
+    usual, arrival, has_ended
+):
+    """Also if another one has overtaken it before: its own time counts."""
+    task_set = loads(GRAPH, 'graph.yaml')
+    engine = Engine(task_set, 3, 'rad', default_deadline=10 ** 9, max_active_jobs=NEVER,
+                    expire_after=NEVER)
+    urgent, long = entity_of(engine, task_set, 0, 0), Entity('waitable', None, '', None, -1, 0, '')
+    for entity, mean in ((urgent, 0), (long, usual * MS)):
+        entity.habit = GilHabit(True)
+        entity.habit.mean_ns = mean
+    engine.ready(Work(long, print), 0)
+    assert engine.dispatch(0, 0) is not None
+    now = arrival * MS
+    if has_ended:
+        engine.timer_due(Work(urgent, print), now, now)
+        engine.holders[-1].entity.habit.mean_ns = 10 ** 9
+        other = engine.dispatch(1, now)
+        long.habit.mean_ns = usual * MS
+        engine.finished(other, now, now, now, 0, 1)
+    engine.timer_due(Work(urgent, print), now, now)
+    at = engine.overtaking_at()
+    assert at == usual * MS + 5 * MS  # half of the deadline
+    if arrival <= usual - 5:  # it takes long enough even if it takes as long as usual
+        assert engine.dispatch(1, now) is not None
+        return
+    if now < at:
+        assert engine.dispatch(1, at - 1) is None
+    assert engine.dispatch(1, max(at, now)) is not None
 
 
 class Twin:

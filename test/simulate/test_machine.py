@@ -126,7 +126,7 @@ def test_declared_holders_in_the_simulator():
 
 # --- a model that goes by ticks ------------------------------------------------------------------
 
-SWITCH, SLICE, TAIL, TURN, LONG = 3, 5, 2, 2, 10
+SWITCH, SLICE, TAIL, TURN = 3, 5, 2, 2
 
 
 @dataclass(eq=False)
@@ -223,7 +223,7 @@ class Ticks:
             return True
         last = max(holders, key=lambda job: (job.start, self.on.index(job)))
         held = now - last.start
-        left = last.cost - held if held < 3 * last.cost + LONG else held
+        left = abs(last.cost - held)
         return left >= TURN and 2 * left >= first.deadline
 
     def _needs(self, job):
@@ -274,7 +274,6 @@ def test_as_the_model_that_goes_by_ticks(jobs, workers, cpus, python, divided):
     with pytest.MonkeyPatch.context() as patch:
         for name, ticks in (('SWITCH_NS', SWITCH), ('SLICE_NS', SLICE), ('TAIL_NS', TAIL)):
             patch.setattr(machine, name, ticks)
-        for name, ticks in (('TURN_NS', TURN), ('LONG_NS', LONG)):
-            patch.setattr(queues, name, ticks)
+        patch.setattr(queues, 'TURN_NS', TURN)
         found = times(jobs, workers, cpus, python, divided=divided)
     assert found == Ticks(jobs, workers, cpus, python, divided).times()
