@@ -35,7 +35,7 @@ class AtOnce:
     def __init__(
         self, engine: Engine, lock: Any, executor: Any, fail: Callable[[BaseException], None]
     ) -> None:
-        self.loop = EventLoop(())
+        self.loop = EventLoop()
         self.timers = TimerQueue(self.loop.wake, fail)
         self.executor = executor
         self.fail = fail

@@ -12,8 +12,9 @@ Theory of operation
     holds the GIL for long, callbacks that cannot start wake no thread.  Those that could start are
     known beforehand: they do not compute, or their relative deadline is below a bound (see
     ``Engine.overtaking_bound``).  Short callbacks compute, too: each needs the GIL to start.  The
-    sources of all others are switched off (``loop``), and their timers do not count for the
-    timerfd.  Their arrivals are collected when muting ends.
+    timers of all others do not count for the timerfd.  Their sources are switched off (``loop``)
+    if they are *patient*: their relative deadline is at least that of undeclared callbacks, and
+    the bound is not above it.  Their arrivals are collected when muting ends.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from mddag_executor.executor.bounds import AGAIN_NS, SHORT_CALLBACK_NS, STOP_NS
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import CHECK_NS, GilCheck, LAST_CHECK_NS
 from mddag_executor.executor.listeners import TimerFd
-from mddag_executor.executor.loop import ALWAYS, ChannelSource, urgency_of
+from mddag_executor.executor.loop import ChannelSource
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.sources import SubscriptionSource
 
@@ -256,6 +257,7 @@ class Muting:
         # whether a callback has ever held the GIL for long: else nothing is worth a nested epoll
         self._has_long = False
         self._bound = 0
+        self._patience = pool.engine.tables.rad_offset[-1]
         self._pool = pool
         self._engine = pool.engine
         self._loop = pool.loop
@@ -269,11 +271,11 @@ class Muting:
                 if entity.classify is not None:
                     entity.classify()
         bound, until = self._engine.overtaking_bound(now)
-        if bound:
-            self.until, self._bound = until, bound
-            self._loop.mute(bound)
-        else:
+        if not 0 < bound <= self._patience:
             self.end()
+        else:
+            self.until, self._bound = until, bound
+            self._loop.mute()
 
     def end(self) -> None:
         """End muting, and collect arrivals; timers only if callbacks may start."""
@@ -292,10 +294,8 @@ class Muting:
         if not habit.is_known:
             return
         entity.is_nested = habit.computes
-        urgency = ALWAYS
-        if habit.computes and self._has_long:
-            urgency = urgency_of(self._engine.relative_deadline(entity))
-        self._loop.move(source, urgency)
+        is_patient = self._engine.relative_deadline(entity) >= self._patience
+        self._loop.move(source, is_patient and self._has_long and bool(habit.computes))
 
     def next_timer(self) -> int:
         """Return when the next timer that could start is due (monotonic ns); 0: never."""

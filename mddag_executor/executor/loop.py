@@ -13,9 +13,8 @@ Theory of operation
 3.  *Time.*  One timerfd is set to the earliest time at which anything has to be done.
 4.  *Muting.*  No thread is woken for a callback that cannot start.  While a callback holds the GIL
     for long, messages for callbacks that hold it too and have more time than the running one needs
-    stay in the middleware.  So sources whose callbacks hold the GIL are registered in nested
-    epolls by relative deadline (``URGENCIES_NS``).  ``mute`` switches off those with at least a
-    given relative deadline, with one system call each.  ``unmute`` switches them on again and
+    stay in the middleware.  So the sources of *patient* callbacks (see ``due``) are in a nested
+    epoll.  ``mute`` switches it off, with one system call; ``unmute`` switches it on again and
     returns the arrivals.
 5.  Descriptors of removed sources are used again and closed only at the end.  If an entity is
     being destroyed concurrently, its listener may write once more; that wake-up is spurious.
@@ -29,17 +28,6 @@ import resource
 import select
 
 from mddag_executor.executor.listeners import new_eventfd, TimerFd
-
-URGENCIES_NS = tuple(ms * 1_000_000 for ms in (2, 5, 10, 20, 50, 100, 200, 500))
-"""
-Relative deadlines at which the nested epolls begin; a source is in the last that it reaches.
-
-A callback that holds the GIL for another 250 ms mutes nothing: a callback with a deadline of 500
-ms may overtake it (``core.queues.PATIENCE``).
-"""
-
-ALWAYS = -1
-"""The urgency of sources that are never muted."""
 
 _EDGE = select.EPOLLIN | select.EPOLLET
 
@@ -55,13 +43,13 @@ class ChannelSource:
     Anything that announces arrivals by a descriptor.
 
     :ivar fd: the descriptor, -1: none.
-    :ivar urgency: the nested epoll in which it is registered.
+    :ivar is_patient: whether it is registered in the nested epoll.
     :ivar asks_others: ``collect`` calls foreign code, so the caller must hold no lock.
     :ivar is_counted: the descriptor is not shared, so its count is the number of arrivals.
     """
 
     fd = -1
-    urgency = ALWAYS
+    is_patient = False
     is_counted = False
     asks_others = False
 
@@ -70,36 +58,24 @@ class ChannelSource:
         raise NotImplementedError
 
 
-def urgency_of(relative_deadline_ns: int) -> int:
-    """Return the nested epoll for sources with this relative deadline, or ALWAYS."""
-    found = ALWAYS
-    for index, bound in enumerate(URGENCIES_NS):
-        if relative_deadline_ns >= bound:
-            found = index
-    return found
-
-
 class EventLoop:
     """An epoll with its channels; all methods but ``wait`` and ``wake`` need one lock."""
 
-    def __init__(self, urgencies_ns: tuple[int, ...] = URGENCIES_NS) -> None:
+    def __init__(self) -> None:
         self._epoll = select.epoll()
         #: waits for events until the timeout (s; -1: for ever), and returns them
         self.wait: Callable[..., Events] = self._epoll.poll
-        self._urgencies_ns = urgencies_ns
-        self._nested = [select.epoll() for _ in urgencies_ns]
-        self._nested_fds = {nested.fileno(): nested for nested in self._nested}
+        self._nested = select.epoll()
+        self._nested_fd = self._nested.fileno()
         self.timer = TimerFd()
         self._bell = new_eventfd()
         self._leave = new_eventfd()
         self._epoll.register(self.timer.fd, _EDGE)
         self._epoll.register(self._bell, _EDGE)
-        for nested in self._nested:
-            self._epoll.register(nested.fileno(), _EDGE)
+        self._epoll.register(self._nested_fd, _EDGE)
         self._channels: dict[int, tuple[ChannelSource, ...]] = {}
         self._shared: dict[str, int] = {}
         self._free: list[int] = []
-        self._muted = len(urgencies_ns)
         # a quarter of the descriptors that the process may open
         self._budget = resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4
 
@@ -118,7 +94,7 @@ class EventLoop:
         """
         if not share and len(self._channels) >= self._budget:
             share = 'the rest'
-        source.urgency = ALWAYS
+        source.is_patient = False
         source.is_counted = not share
         if share in self._shared:
             source.fd = self._shared[share]
@@ -143,7 +119,7 @@ class EventLoop:
             self._channels[fd] = rest
             return
         del self._channels[fd]
-        self._home(source.urgency).unregister(fd)
+        self._home(source).unregister(fd)
         self._shared = {name: each for name, each in self._shared.items() if each != fd}
         self._free.append(fd)
 
@@ -151,16 +127,15 @@ class EventLoop:
         """Return whether a source is one of this loop."""
         return source in self._channels.get(source.fd, ())
 
-    def move(self, source: ChannelSource, urgency: int) -> None:
-        """Mute a source with this urgency from now on; ALWAYS: never mute it."""
-        if source.fd < 0 or source.urgency == urgency:
-            return
-        self._home(source.urgency).unregister(source.fd)
-        self._home(urgency).register(source.fd, _EDGE)  # reports earlier arrivals
-        source.urgency = urgency
+    def move(self, source: ChannelSource, is_patient: bool) -> None:
+        """Let ``mute`` apply to a source from now on, or no more."""
+        if source.fd >= 0 and source.is_patient != is_patient:
+            self._home(source).unregister(source.fd)
+            source.is_patient = is_patient
+            self._home(source).register(source.fd, _EDGE)  # reports earlier arrivals
 
-    def _home(self, urgency: int) -> select.epoll:
-        return self._epoll if urgency == ALWAYS else self._nested[urgency]
+    def _home(self, source: ChannelSource) -> select.epoll:
+        return self._nested if source.is_patient else self._epoll
 
     def hold(self, sources: Iterable[ChannelSource]) -> None:
         """Stop wake-ups for some sources until ``release``; from any thread, without the lock."""
@@ -172,8 +147,7 @@ class EventLoop:
 
     def _set_mask(self, sources: Iterable[ChannelSource], mask: int) -> None:
         for source in sources:
-            fd, urgency = source.fd, source.urgency
-            epoll = self._epoll if urgency == ALWAYS else self._nested[urgency]
+            fd, epoll = source.fd, self._home(source)
             try:
                 epoll.modify(fd, mask)
                 if source.fd != fd:  # removed just now: another source may have its descriptor
@@ -209,9 +183,9 @@ class EventLoop:
                     found += several
             elif fd == self.timer.fd:
                 expired = True
-            elif fd in self._nested_fds:
-                for inner, _ in self._nested_fds[fd].poll(0):
-                    found += self._channels.get(inner, ())
+            elif fd == self._nested_fd:
+                for inner, _ in self._nested.poll(0):
+                    found += channels.get(inner, ())
         return found, asking, expired
 
     def wake(self) -> None:
@@ -233,25 +207,14 @@ class EventLoop:
 
     # --- muting ----------------------------------------------------------------------------------
 
-    def mute(self, relative_deadline_ns: int) -> None:
-        """Stop wake-ups for sources that hold the GIL and have at least this relative deadline."""
-        first = len(self._nested)
-        while first > 0 and self._urgencies_ns[first - 1] >= relative_deadline_ns:
-            first -= 1
-        for index in range(first, self._muted):
-            self._epoll.modify(self._nested[index].fileno(), 0)
-        for index in range(self._muted, first):
-            self._epoll.modify(self._nested[index].fileno(), _EDGE)
-        self._muted = first
+    def mute(self) -> None:
+        """Stop wake-ups for the sources of patient callbacks."""
+        self._epoll.modify(self._nested_fd, 0)
 
     def unmute(self) -> Events:
         """End muting; return the arrivals meanwhile, so that no thread is woken for them."""
-        found: Events = []
-        for index in range(self._muted, len(self._nested)):
-            nested = self._nested[index]
-            found += nested.poll(0)
-            self._epoll.modify(nested.fileno(), _EDGE)
-        self._muted = len(self._nested)
+        found = self._nested.poll(0)
+        self._epoll.modify(self._nested_fd, _EDGE)
         return found
 
     def close(self) -> None:
@@ -267,8 +230,8 @@ class EventLoop:
         for fd in fds:
             if fd >= 0:
                 os.close(fd)
-        for epoll in (self._epoll, *self._nested):
-            epoll.close()
+        self._epoll.close()
+        self._nested.close()
 
     def __del__(self) -> None:
         """Close the descriptors of an executor that was never shut down."""

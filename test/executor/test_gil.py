@@ -240,6 +240,16 @@ def test_of_two_arrivals_during_a_long_callback_one_overtakes(computing):
 
 
 @pytest.mark.parametrize('computing', ['elsewhere'], indirect=True)
+def test_an_urgent_arrival_is_not_left_in_the_middleware(computing):
+    for _ in range(20):  # on a busy machine it may be late
+        computing.habit.mean_ns = 50 * MS
+        order = computing.order('urgent')
+        if order[-1] == 'ends':
+            break
+    assert order == ['begins', 'urgent', 'ends']
+
+
+@pytest.mark.parametrize('computing', ['elsewhere'], indirect=True)
 def test_what_cannot_start_is_left_in_the_middleware(computing):
     """While the long one computes for as long as usual, no thread wakes for the patient one."""
     queued = []
