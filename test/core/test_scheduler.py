@@ -239,6 +239,17 @@ class Driver:
         self.core.complete(x, self.now)
 
 
+def test_one_that_turns_out_to_wait_gives_the_interpreter_back():
+    drive = Driver(computing(7))
+    holder, held_back = drive.ready(URGENT, holds=True), drive.ready(URGENT, holds=True)
+    assert drive.go() == [holder]
+    drive.core.stop_holding(holder)
+    assert drive.go() == [held_back]
+    drive.complete(holder)
+    drive.complete(held_back)
+    assert drive.core.state.worker_x.count(-1) == 7
+
+
 def may_start(core, x):
     """Tell by the words of the rules whether a waiting execution may start."""
     state = core.state
