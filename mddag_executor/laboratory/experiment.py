@@ -36,7 +36,6 @@ from mddag_executor.laboratory.draws import (
     Times,
     utilisations,
 )
-from mddag_executor.simulate.load import as_arrays
 from mddag_executor.simulate.schedule import schedule, Settings
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import TaskSet
@@ -102,18 +101,19 @@ def judge_of(task_set: TaskSet, duration_ns: int, compiled: bool) -> Judge:
     load = periodic_load(
         task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
     if compiled:
-        from mddag_executor.simulate.compiled import prepare
+        from mddag_executor.simulate.compiled import prepare, run_each
         prepare()
-        tables, load = as_arrays(tables), as_arrays(load)
 
     def judge(settings: Settings, times: Times) -> Bools:
-        accepted = np.zeros(len(times), dtype=np.bool_)
-        for row, costs in enumerate(times):
-            decisions = np.array(schedule(
-                tables, load._replace(costs=costs), settings, compiled=compiled).decisions)
-            kinds = decisions.reshape(-1, 6)[:, 0].tolist()
-            accepted[row] = not any(map(is_miss, set(kinds)))
-        return accepted
+        if compiled:
+            orders = settings.orders._replace(keep_log=0)
+            _, missed = run_each(
+                tables, load._replace(costs=times.ravel()),  # type: ignore[arg-type]
+                settings.policy, orders, len(times))
+            return np.logical_not(missed)
+        return np.array([not any(is_miss(kind) for kind, *_ in schedule(
+            tables, load._replace(costs=costs), settings, compiled=False).decisions)
+            for costs in times], dtype=np.bool_)
 
     return judge
 

@@ -44,7 +44,8 @@ from mddag_executor.simulate.machine import Machine
 import numpy as np
 import numpy.typing as npt
 
-_COMPILE_S = 25.0   # approximate compile time
+_COMPILE_S = 35.0   # approximate compile time
+_REPEATS = 4        # assumed repetitions of such work, as with other settings
 
 _MODULES = (
     tables, state, queues, jobs, overload, policies, rules, load, machine, deliveries, engine)
@@ -52,7 +53,7 @@ _NOT_COMPILED = frozenset({
     # for plain lists
     'empty', 'as_object', 'add_queue', 'rad_offsets', 'reached_sinks', 'mean_time',
     'policy', 'new_machine', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
-ENTRY_POINTS = ('run_once', 'free_run')
+ENTRY_POINTS = ('free_run', 'run_each')
 _REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')
 
 
@@ -81,8 +82,9 @@ def entry_points() -> dict[str, Callable[..., Any]]:
             space[module.__name__.rsplit('.', 1)[1]] = inner
     kernel.bind_policies(space)
     sources = _hash_of(*_MODULES, kernel, vectors)
-    return {name: _cached(_bound(getattr(kernel, name), space), sources)
-            for name in ENTRY_POINTS}
+    for name in ENTRY_POINTS:
+        space[name] = _cached(_bound(getattr(kernel, name), space), sources)
+    return {name: space[name] for name in ENTRY_POINTS}
 
 
 def _cached(function: FunctionType, sources: str) -> Any:
@@ -123,12 +125,12 @@ def check_available() -> None:
 
 
 def pays(plain_s: float) -> bool:
-    """Return whether compiled code is faster for work that takes plain Python this long."""
-    return available() and (plain_s > _COMPILE_S or _is_compiled())
+    """Return whether compiled code is faster for such work in the long run."""
+    return available() and (plain_s * _REPEATS > _COMPILE_S or _is_compiled())
 
 
 def _is_compiled() -> bool:
-    entry: Any = entry_points()['run_once']
+    entry: Any = entry_points()['run_each']
     folder = entry.stats.cache_path
     return bool(entry.signatures) or (folder is not None and any(
         Path(folder).glob(f'*{entry.py_func.__qualname__}*.nbi')))
@@ -138,28 +140,35 @@ def prepare() -> None:
     """Compile the core, or load it from disk, with a call that runs nothing."""
     if not _is_compiled():
         progress.report(f'compiling the core, once: about {_COMPILE_S:.0f} s')
-    run_once(Tables.build(None), Load([], [], [], [], [], []), 'rad',
+    run_each(Tables.build(None), Load([], [], [], [], [], []), 'rad',
              Orders(*[0] * len(Orders._fields)))
 
 
-def run_once(
-    tables: Tables, load: Load, policy: str, orders: Orders
-) -> tuple[int, Sequence[LogEntry], Sequence[Decision], list[int]]:
+def run_each(
+    tables: Tables, load: Load, policy: str, orders: Orders, runs: int = 1,
+) -> tuple[tuple[int, Sequence[LogEntry], Sequence[Decision], list[int]], list[int]]:
     """
-    Run a load like ``engine.run``.
+    Run a load like ``engine.run``, once or several times.
 
-    :return: the end, the log of every worker, the decisions, the busy time of each worker.
+    :param runs: number of runs; each has the next row of execution times in ``Load.costs``, which
+        has one for each vertex.
+    :return: the end, the log of every worker, the decisions, the busy time of each worker, all of
+        the last run; and by run 1 if a deadline was missed, otherwise 0.
     """
+    load = load._replace(cost_base=[*load.cost_base])   # is changed
     lent = [Memory(*tables, list(POLICIES).index(policy)), Memory(*load), Memory(*orders)]
+    missed = Memory(np.zeros(runs))
     core, _, _, busy, log = working = [
         Memory(*[0] * len(fields)) for fields in (
             State._fields, Deliveries._fields, Machine._fields, ('busy',), ('log',))]
     addresses = [each.address for each in working]
-    ended = entry_points()['run_once'](*(each.address for each in lent), *addresses)
+    ended = entry_points()['run_each'](
+        *(each.address for each in lent), *addresses, missed.address)
     try:
         place = State._fields.index('decisions')
-        return (int(ended), Rows(log.words(0, 6)),  # type: ignore[return-value]
-                Rows(core.words(place, 6)), busy.words(0, 1)[:, 0].tolist())
+        return ((int(ended), Rows(log.words(0, 6)),  # type: ignore[return-value]
+                 Rows(core.words(place, 6)), busy.words(0, 1)[:, 0].tolist()),
+                missed.words(0, 1)[:, 0].tolist())
     finally:
         entry_points()['free_run'](*addresses)
 

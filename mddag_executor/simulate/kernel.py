@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Entry points of the compiled core: a whole run, in memory that ``compiled`` provides.
+Entry points of the compiled core: whole runs, in memory that ``compiled`` provides.
 
 They are only called compiled: the names of the core that they use are then bound to its compiled
 functions.  The core's named tuples are structures (see ``vectors``), which are passed as
@@ -18,7 +18,7 @@ from mddag_executor.core.policies import Key, POLICIES
 from mddag_executor.core.state import State
 from mddag_executor.core.tables import Tables
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import Orders, run
+from mddag_executor.simulate.engine import any_missed, Orders, run
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.vectors import at, free, StructureType, VectorType
@@ -80,18 +80,33 @@ def bind_policies(space: dict[str, Any]) -> None:
     extending.overload(key_of_policy, strict=False)(lambda t, v, release, job, order: chosen)
 
 
-def run_once(
+def run_each(
     tables: int, load: int, orders: int, state: int, deliveries: int, machine: int, busy: int,
-    log: int,
+    log: int, missed: int,
 ) -> int:
-    """Run a load and return when it ended; the caller frees the results."""
-    return run(
-        as_tables(tables), as_state(state), as_deliveries(deliveries), as_machine(machine),
-        key_of_policy, as_load(load), as_orders(orders), as_vector(busy), as_log(log), None)
+    """
+    Run a load with one row of execution times after another; return when the last run ended.
+
+    The caller frees the results of the last run.
+
+    :param missed: receives by run whether a deadline was missed.
+    """
+    t, s, rows, misses = as_tables(tables), as_state(state), as_load(load), as_vector(missed)
+    ended = 0
+    for number in range(len(misses)):
+        if number > 0:
+            free_run(state, deliveries, machine, busy, log)
+            for dag in range(len(rows.cost_base)):
+                rows.cost_base[dag] += t.n_vertices
+        ended = run(
+            t, s, as_deliveries(deliveries), as_machine(machine), key_of_policy, rows,
+            as_orders(orders), as_vector(busy), as_log(log), None)
+        misses[number] = int(any_missed(s, 0))
+    return ended
 
 
 def free_run(state: int, deliveries: int, machine: int, busy: int, log: int) -> None:
-    """Free the results of ``run_once``."""
+    """Free the results of a run."""
     s, m = as_state(state), as_machine(machine)
     for nested in (s.group_heap, s.entity_queue, s.demoted):
         for place in range(len(nested)):

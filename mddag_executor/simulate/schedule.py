@@ -107,8 +107,8 @@ def schedule(
     if compiled is None:
         compiled = prepare(tables, load, settings)
     if compiled:
-        from mddag_executor.simulate.compiled import run_once
-        return Scheduled(*run_once(tables, load, settings.policy, orders))
+        from mddag_executor.simulate.compiled import run_each
+        return Scheduled(*run_each(tables, load, settings.policy, orders)[0])
     state = as_object(empty(State))
     entries: list[LogEntry] = []
     busy: list[int] = []
