@@ -229,10 +229,12 @@ class LoadBuilder:
 
         ``busy`` says whether any execution ran at the release.
         """
-        for dag, jobs in enumerate(self._jobs):
-            here = process == self._process[self._tables.source[dag]]
-            if self._timer[dag] and here.any():
-                start, end = np.sort(piece['start'][here]), piece['end'][here]
+        for number in np.unique(process).tolist():
+            here = process == number
+            start, end = np.sort(piece['start'][here]), piece['end'][here]
+            for source, timer, jobs in zip(self._tables.source, self._timer, self._jobs):
+                if not timer or self._process[source] != number:
+                    continue
                 ended = end[np.maximum(0, np.searchsorted(end, jobs.noticed, 'right') - 1)]
                 begun = np.searchsorted(start, jobs.noticed) - np.searchsorted(start, ended)
                 known = (ended >= jobs.release) & (ended <= jobs.noticed) & (begun == 0)
