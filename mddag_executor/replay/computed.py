@@ -10,17 +10,19 @@ and when.  With the load and the ends of jobs decided by the core this contains 
 recording.  So every analysis works as on a recording and finds the same verdicts.
 
 At the same instant ends of executions come first, each with the job that it aborts, then early
-ends of jobs, then releases, then starts.  A vertex is ready when the last message that it needs
-has arrived: at the end of the publishing execution, shifted by ``delays``.  A preempted execution
-has several pieces, like a suspended coroutine.  A sync callback runs once for all of its legs.
+ends of jobs, then releases, then starts, then ends of executions that took no time.  A vertex is
+ready when the last message that it needs has arrived: at the end of the publishing execution,
+shifted by the delays of the load.  A preempted execution has several pieces, like a suspended
+coroutine.  A sync callback runs once for all of its legs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
 
-from mddag_executor.core import DEFAULT_DEADLINE_NS, legs_of, NEVER
+from mddag_executor.core import DEFAULT_DEADLINE_NS, legs_of, NEVER, Tables
 from mddag_executor.core.state import (
     ABORTED,
     Decision,
@@ -34,16 +36,11 @@ from mddag_executor.core.state import (
 from mddag_executor.recording import tables
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
-from mddag_executor.recording.tables import Recording, Rows, UNKNOWN
+from mddag_executor.recording.tables import Ints, look_up, Recording, sort_by, UNKNOWN
 from mddag_executor.simulate import END, Load, LogEntry, SimulatedRun, START
-from mddag_executor.simulate.load import as_lists, FAILS
+from mddag_executor.simulate.load import edge_numbers, FAILS
 from msg_graph import TaskSet
-
-Delay = Callable[[int, int, int, int], int]
-"""Time (ns) from the end of an execution to its message: DAG, job in the load, edge's ends."""
-
-Id = tuple[int, int, int]
-"""DAG, global vertex, job in the load."""
+import numpy as np
 
 _DROPS = -1, ABORTED, EXPIRED      # ends of jobs, in the order of the drop reasons
 _REASONS = {ABORTED: tables.ABORTED, EXPIRED: tables.EXPIRED, OUTDATED: tables.OUTDATED}
@@ -57,7 +54,6 @@ class ComputedRun(NamedTuple):
     :ivar horizon: no job is released from then on, ns.
     :ivar end: when it ended, ns; open jobs are then judged if ``judged``.
     :ivar numbers: by DAG the recorded numbers of the load's jobs; None: as in the load.
-    :ivar delay: transport time of messages; None: 0.
     :ivar judge_from: jobs released before are not judged.
     """
 
@@ -69,7 +65,6 @@ class ComputedRun(NamedTuple):
     end: int
     judged: bool = True
     numbers: Sequence[Sequence[int]] | None = None
-    delay: Delay | None = None
     judge_from: int = -NEVER
 
     @classmethod
@@ -81,195 +76,258 @@ class ComputedRun(NamedTuple):
         return cls(task_set, load, run.log, run.decisions, horizon, run.ended_ns, judged)
 
     def recording(self, workers: int = 0) -> Recording:
-        """Return the schedule as a recording."""
-        return _Player(self).recording(workers)
+        """
+        Return the schedule as a recording.
 
-
-class _Running(NamedTuple):
-    """The execution of a worker, and its start; `busy` is the time of earlier pieces."""
-
-    since: int
-    ready: int
-    first: int
-    busy: int
-    piece: int
-
-
-class _Player:
-    """Converts a schedule, event by event."""
-
-    def __init__(self, schedule: ComputedRun) -> None:
-        task_set = schedule.task_set
-        self._schedule = schedule
-        self._load = as_lists(schedule.load)
-        self._releases = Rows(tables.RELEASES, 'dag', 'job', 'release', 'noticed', 'order')
-        self._executions = Rows(
-            tables.EXECUTIONS, 'callback', 'dag', 'vertex', 'job', 'leg', 'piece', 'thread',
-            'worker', 'ready', 'began', 'start', 'end', 'busy', 'completes', 'order', 'cpu',
-            'message')
-        self._ends = Rows(
-            tables.JOB_ENDS, 'dag', 'vertex', 'job', 'time', 'reason', 'order')
-        self._order = 0
-        self._vertices = task_set.vertices
-        self._leg = [
-            0 if len(legs_of(vertex, task_set.dags[vertex.dag].vertices)) < 2
-            else tables.ALL_LEGS for vertex in self._vertices]
-        self._n_dags = len(task_set.dags)
-        self._first = [0]
-        for dag in task_set.dags:
-            self._first.append(self._first[-1] + len(dag.vertices))
-        self._sources = [self._first[dag.index] + dag.source for dag in task_set.dags]
-        self._callback = [place + 1 for place in task_set.places_of_vertices()]
-        self._next = 0
-        self._ends_of_jobs = self._job_ends()
-        self._next_end = next(self._ends_of_jobs, None)
-        self._ready: dict[Id, int] = {}
-        self._running: dict[Id, tuple[_Running, int]] = {}
-        self._begun: dict[Id, _Running] = {}
-
-    def recording(self, workers: int) -> Recording:
-        schedule = self._schedule
-        for entry in schedule.log:
-            # ends come before releases and early ends of jobs at the same instant
-            self._until(entry[0] - 1 if entry[1] == END else entry[0])
-            self._change(entry)
-            now, kind, _, dag, v, job = entry
-            if kind == END and self._next_end == (now, dag, job, True, v):
-                self._end_job()     # completions at the same instant are too late
-        self._until(schedule.end)
-        for what, (ran, worker) in self._running.items():
-            self._row(what, ran, worker, UNKNOWN, tables.NOTHING)
-        task_set = schedule.task_set
+        :param workers: number of workers.
+        """
+        task_set, found = self.task_set, _Tables(self)
         who = Entities(by_address=True)
         who.note('ros2:rclcpp_callback_register', {
             '_timestamp': 0, '_vpid': 0, 'callback': 0, 'symbol': 'undeclared callbacks'})
-        found = Recording(
+        releases, executions, job_ends = found.in_order()
+        return Recording(
             task_set.file, Head(0, task_set.text, task_set.file, '', workers,
                                 DEFAULT_DEADLINE_NS, 0, False),
-            task_set, task_set, who, same=False, releases=self._releases.table(),
-            executions=self._executions.table(), job_ends=self._ends.table(),
-            drops=self._drops(), drop_reasons=('newer', 'aborted', 'expired'),
-            demotions=self._demotions(),
-            end=schedule.end, judged=schedule.judged, judged_until=schedule.end,
-            workers_each=workers,
-            judge_from=schedule.judge_from)
-        found.start = tables.earliest(found.releases['release'], found.executions['ready'])
+            task_set, task_set, who, same=False, releases=releases, executions=executions,
+            job_ends=job_ends, drops=found.drops(), drop_reasons=('newer', 'aborted', 'expired'),
+            demotions=found.demotions(),
+            start=tables.earliest(releases['release'], executions['ready']),
+            end=self.end, judged=self.judged, judged_until=self.end, workers_each=workers,
+            judge_from=self.judge_from)
+
+
+class _Pieces(NamedTuple):
+    """
+    Columns by piece of an execution, in the order of vertex, job and start.
+
+    ``begins``, ``ends``: rows of the log, ``ends`` is -1 if it still ran; ``first``: the first
+    piece of the execution; ``ended``: whether it is the last one; ``end`` is 0 if it still ran.
+    """
+
+    dag: Ints
+    vertex: Ints
+    job: Ints
+    worker: Ints
+    begins: Ints
+    ends: Ints
+    start: Ints
+    end: Ints
+    first: Ints
+    ended: Any
+
+
+def _columns(rows: Sequence[tuple[int, ...]]) -> Ints:
+    """Return the six columns of log entries or decisions."""
+    found: Ints = np.asarray(rows, dtype=np.int64).reshape(-1, 6).T
+    return found
+
+
+class _Tables:
+    """Makes the tables of the recording."""
+
+    def __init__(self, schedule: ComputedRun) -> None:
+        self._schedule = schedule
+        self._load: Any = Load(*(np.asarray(each, dtype=np.int64)  # type: ignore[arg-type]
+                                 for each in schedule.load))
+        self._tables = Tables.build(schedule.task_set)
+        self._n_dags = self._tables.n_dags
+        self._log = _columns(schedule.log)
+        self._decisions = _columns(schedule.decisions)
+
+    @cached_property
+    def _pieces(self) -> _Pieces:
+        now, kind, worker, dag, vertex, job = self._log
+        rows = sort_by(vertex, job)     # of each execution starts and stops alternate
+        at = np.flatnonzero(kind[rows] == START)
+        after = np.r_[rows, -1][at + 1]
+        ends = np.where((after >= 0) & (kind[after] != START), after, -1)
+        begins = rows[at]
+        dag, vertex, job, worker = (each[begins] for each in (dag, vertex, job, worker))
+        new = np.r_[True, (vertex[1:] != vertex[:-1]) | (job[1:] != job[:-1])][:len(at)]
+        return _Pieces(
+            dag, vertex, job, worker, begins, ends, now[begins],
+            np.where(ends >= 0, now[ends], 0), np.flatnonzero(new)[np.cumsum(new) - 1],
+            (ends >= 0) & (kind[ends] == END))
+
+    def _numbers(self, dag: Ints, job: Ints) -> Ints:
+        """Return the recorded numbers of jobs."""
+        found = job.copy()
+        for number, recorded in enumerate(self._schedule.numbers or ()):
+            mine = dag == number
+            found[mine] = np.asarray(recorded, dtype=np.int64)[job[mine]]
         return found
 
-    def _drops(self) -> tables.Table:
+    def in_order(self) -> tuple[tables.Table, tables.Table, tables.Table]:
+        """Return releases, executions and ends of jobs, with their positions in the order."""
+        load, pieces = self._load, self._pieces
+        done = np.flatnonzero(pieces.ended & (pieces.dag < self._n_dags))
+        done = done[sort_by(pieces.ends[done])]
+        rank = self._ranks(pieces.ends[done])
+        failed = self._fails(done)
+        early = self._early_ends()
+        causes = self._causes(early, done[rank == 0])
+        released = np.flatnonzero(
+            (load.times < self._schedule.horizon) & (load.times <= self._schedule.end)
+            & (load.dags < self._n_dags))
+        # time, rank at that time, row of the log, position
+        keys: list[tuple[Any, ...]] = [
+            (pieces.end[done], rank, pieces.ends[done], 1),
+            (pieces.end[done[failed]], rank[failed], pieces.ends[done[failed]], 0),
+            (early[4], np.where(causes < 0, 1, 0), causes, 2 + np.arange(len(causes))),
+            (load.times[released], 1, 0, np.arange(len(released)))]
+        order = np.argsort(sort_by(*np.concatenate(
+            [np.array(np.broadcast_arrays(*key)) for key in keys], axis=1))) + 1
+        completions, failures, ends, releases = np.split(
+            order, np.cumsum([len(key[0]) for key in keys])[:-1])
+        completed = np.full(len(pieces.begins), UNKNOWN)
+        completed[done] = completions
+        return (self._releases(released, releases), self._executions(completed),
+                self._job_ends(done[failed], failures, early, ends))
+
+    def _ranks(self, rows: Ints) -> Ints:
+        """Return which ends, by row of the log, come after a start at the same time: 2, else 0."""
+        now, kind = self._log[:2]
+        others = np.r_[np.flatnonzero(kind != END), len(kind)]
+        first = others[np.searchsorted(now[others[:-1]], now[rows])]
+        return np.where((first < rows) & (now[np.minimum(first, len(now) - 1)] == now[rows]), 2, 0)
+
+    def _fails(self, done: Ints) -> Ints:
+        """Return which of the completions are failures."""
+        load, pieces = self._load, self._pieces
+        if not len(load.fates):
+            return done[:0]
+        dag = pieces.dag[done]
+        local = np.array(self._tables.index_in_dag)[pieces.vertex[done]]
+        return np.flatnonzero(load.fates[
+            load.cost_base[dag] + pieces.job[done] * load.cost_stride[dag] + local] == FAILS)
+
+    def _early_ends(self) -> Ints:
+        """Return early ends of jobs: DAG, vertex that aborts it or -1, job, reason, time."""
+        kind, dag, vertex, job, how, time = self._decisions
+        rows = np.flatnonzero(
+            (kind == JOB_END) & np.isin(how, list(_REASONS)) & (dag < self._n_dags))
+        late = np.r_[np.flatnonzero(kind == SINK_LATE), -1]
+        at = late[np.searchsorted(late[:-1], rows) - 1]     # the last one before
+        same = (at >= 0) & (dag[at] == dag[rows]) & (job[at] == job[rows]) & (
+            time[at] == time[rows])
+        reasons = np.array([_REASONS[each] for each in how[rows].tolist()], dtype=np.int64)
+        return np.array([
+            dag[rows], np.where(same, vertex[at], -1), job[rows], reasons, time[rows]])
+
+    def _causes(self, early: Ints, done: Ints) -> Ints:
+        """
+        Return by early end the row of the log that aborts the job, or -1.
+
+        -1 also if an earlier end at the same time comes after all completions.
+
+        :param done: the completions before all starts at their time.
+        """
+        pieces = self._pieces
+        done = done[np.isin(pieces.end[done], early[4][early[3] == tables.ABORTED])]
+        row_of = dict(zip(zip(*(each[done].tolist() for each in (
+            pieces.vertex, pieces.job, pieces.end))), pieces.ends[done].tolist()))
+        found, pending = [], -1
+        for _, vertex, job, reason, time in early.T.tolist():
+            row = row_of.get((vertex, job, time), -1) if reason == tables.ABORTED else -1
+            if row < 0:
+                pending = time
+            found.append(-1 if pending == time else row)
+        return np.array(found, dtype=np.int64)
+
+    def _releases(self, rows: Ints, order: Ints) -> tables.Table:
+        load = self._load
+        dag, times = load.dags[rows], load.times[rows]
+        return tables.rows(
+            tables.RELEASES, len(rows), dag=dag, job=self._numbers(dag, load.jobs[rows]),
+            release=load.releases[rows] if len(load.releases) else times, noticed=times,
+            order=order)
+
+    def _job_ends(self, failed: Ints, failures: Ints, early: Ints, order: Ints) -> tables.Table:
+        pieces = self._pieces
+        early[1] = UNKNOWN
+        dag, vertex, job, reason, time = np.concatenate([np.array(np.broadcast_arrays(
+            pieces.dag[failed], pieces.vertex[failed], pieces.job[failed], tables.FAILED,
+            pieces.end[failed])), early], axis=1)
+        found = tables.rows(
+            tables.JOB_ENDS, len(dag), dag=dag, vertex=vertex, job=self._numbers(dag, job),
+            time=time, reason=reason, order=np.r_[failures, order])
+        return found[sort_by(found['order'])]
+
+    def _executions(self, order: Ints) -> tables.Table:
+        """
+        Return the executions, in the order of their ends.
+
+        :param order: by piece its position in the order, if it completes a vertex.
+        """
+        each = self._pieces
+        rows = sort_by(np.where(each.ends >= 0, each.ends, len(self._log[0]) + each.begins))
+        first, ran, completes, declared = (
+            each.first, each.ends >= 0, order >= 0, each.dag < self._n_dags)
+        total = np.cumsum(np.where(ran, each.end - each.start, 0))
+        before = np.r_[0, total][first]
+        task_set = self._schedule.task_set
+        callback = np.r_[np.array(task_set.places_of_vertices(), dtype=np.int64) + 1, 0]
+        legs = np.array([tables.ALL_LEGS * (len(legs_of(v, task_set.dags[v.dag].vertices)) > 1)
+                         for v in task_set.vertices] + [0])
+        return tables.pick(tables.rows(
+            tables.EXECUTIONS, len(first), callback=callback[each.vertex],
+            dag=np.where(declared, each.dag, -1), vertex=np.where(declared, each.vertex, -1),
+            job=self._numbers(each.dag, each.job), leg=np.where(completes, legs[each.vertex], 0),
+            piece=np.arange(len(first)) - first, thread=each.worker + 1, worker=each.worker,
+            ready=self._ready()[first], began=each.start[first], start=each.start,
+            end=np.where(ran, each.end, UNKNOWN), busy=np.where(ran, total - before, UNKNOWN),
+            completes=np.where(completes, tables.VERTEX, tables.NOTHING), order=order,
+            cpu=UNKNOWN, message=UNKNOWN), rows)
+
+    def _ready(self) -> Ints:
+        """Return by piece when its execution became ready; valid for first pieces."""
+        load, each = self._load, self._pieces
+        first = np.arange(len(each.first)) == each.first
+        of_vertex = [np.flatnonzero(first & (each.vertex == v))
+                     for v in range(self._tables.n_vertices + 1)]
+        ready = np.full(len(first), -NEVER)
+        jobs = 1 + max(int(each.job.max(initial=0)), int(load.jobs.max(initial=0)))
+        for dag, source in enumerate(self._tables.source):
+            mine, rows = load.dags == dag, of_vertex[source]
+            times = np.full(jobs, -NEVER)
+            times[load.jobs[mine]] = load.times[mine]
+            ready[rows] = times[each.job[rows]]
+        for (before, after), edge in edge_numbers(self._tables).items():
+            ended = np.flatnonzero(each.ended & (each.vertex == before))
+            rows = of_vertex[after]
+            at = look_up(each.job[rows], each.job[ended])
+            ended, rows = ended[at >= 0], rows[at[at >= 0]]
+            arrived = each.end[ended]
+            if len(load.delay_base):
+                dag = self._tables.dag_of[before]
+                delay = load.delays[
+                    load.delay_base[dag] + each.job[ended] * load.delay_stride[dag] + edge]
+                arrived = np.maximum(each.start[each.first[ended]], arrived + delay)
+            arrived = np.where(each.ends[ended] < each.begins[rows], arrived, -NEVER)
+            ready[rows] = np.maximum(ready[rows], arrived)
+        return np.where(ready > -NEVER, np.minimum(ready, each.start), each.start)
+
+    def drops(self) -> tables.Table:
         """Return the dropped executions; ``reason``: how their job had ended."""
+        kind, dag, vertex, job, end, now = self._decisions
         ended: dict[tuple[int, int], int] = {}
-        drops = Rows(tables.DROPS, 'vertex', 'job', 'time', 'reason')
-        for kind, dag, vertex, job, end, now in self._schedule.decisions:
-            if kind == JOB_END and end in _DROPS:
-                ended[dag, job] = _DROPS.index(end)
-            elif kind == DROP and dag < self._n_dags:
-                drops.add(vertex, self._number(dag, job), now, ended.get((dag, job), 0))
-        return drops.table()
-
-    def _demotions(self) -> tables.Table:
-        demotions = Rows(tables.DEMOTIONS, 'dag', 'vertex', 'job', 'time')
-        for kind, dag, vertex, job, _, now in self._schedule.decisions:
-            if kind == SINK_DEMOTED:
-                demotions.add(dag, vertex, self._number(dag, job), now)
-        return demotions.table()
-
-    def _next_order(self) -> int:
-        self._order += 1
-        return self._order
-
-    def _number(self, dag: int, job: int) -> int:
-        numbers = self._schedule.numbers
-        return job if numbers is None or dag >= self._n_dags else numbers[dag][job]
-
-    def _job_ends(self) -> Iterator[tuple[int, int, int, int, int]]:
-        """Yield early ends of jobs, and the vertex that aborts one."""
-        late = (-1, -1, -1), -1
-        for kind, dag, v, job, how, time in self._schedule.decisions:
-            if kind == SINK_LATE:
-                late = (dag, job, time), v
-            elif kind == JOB_END and how in _REASONS and dag < self._n_dags:
-                vertex = late[1] if late[0] == (dag, job, time) else -1
-                yield time, dag, job, _REASONS[how], vertex
-
-    def _until(self, now: int) -> None:
-        """Process releases and early ends up to an instant."""
-        load, schedule = self._load, self._schedule
-        while True:
-            release = load.times[self._next] if self._next < len(load.times) else now + 1
-            if release >= schedule.horizon:
-                release = now + 1
-            end = self._next_end
-            if end is not None and end[0] <= min(now, release):
-                self._end_job()
-            elif release <= now:
-                self._release(self._next, release)
-                self._next += 1
+        found, reasons = [], []
+        for row in np.flatnonzero(
+                (dag < self._n_dags) & ((kind == DROP) | (kind == JOB_END) & np.isin(
+                    end, _DROPS))).tolist():
+            if kind[row] == DROP:
+                found.append(row)
+                reasons.append(ended.get((dag[row], job[row]), 0))
             else:
-                return
+                ended[dag[row], job[row]] = _DROPS.index(end[row])
+        rows = np.array(found, dtype=np.int64)
+        return tables.rows(
+            tables.DROPS, len(rows), vertex=vertex[rows], job=self._numbers(dag[rows], job[rows]),
+            time=now[rows], reason=reasons)
 
-    def _end_job(self) -> None:
-        assert self._next_end is not None
-        now, dag, job, reason, _ = self._next_end
-        self._ends.add(dag, -1, self._number(dag, job), now,
-                       reason, self._next_order())
-        self._next_end = next(self._ends_of_jobs, None)
-
-    def _release(self, i: int, now: int) -> None:
-        load = self._load
-        dag, job = load.dags[i], load.jobs[i]
-        if dag >= self._n_dags:
-            self._ready[dag, len(self._vertices), job] = now
-            return
-        self._ready[dag, self._sources[dag], job] = now
-        release = load.releases[i] if load.releases else now
-        self._releases.add(dag, self._number(dag, job), release, now, self._next_order())
-
-    def _change(self, entry: LogEntry) -> None:
-        now, kind, worker, dag, v, job = entry
-        what = (dag, v, job)
-        if kind == START:
-            before = self._begun.pop(what, None)
-            if before is None:
-                ready = min(now, self._ready.pop(what, now))
-                before = _Running(now, ready, now, 0, 0)
-            self._running[what] = before._replace(since=now), worker
-            return
-        ran, worker = self._running.pop(what)
-        busy = ran.busy + now - ran.since
-        ended = kind == END and dag < self._n_dags
-        if ended and self._fails(dag, v, job):
-            self._ends.add(
-                dag, v, self._number(dag, job), now, tables.FAILED, self._next_order())
-        self._row(what, ran, worker, now, tables.VERTEX if ended else tables.NOTHING)
-        if kind != END:
-            self._begun[what] = ran._replace(busy=busy, piece=ran.piece + 1)
-        elif ended:
-            self._complete(what, ran, now)
-
-    def _row(self, what: Id, ran: _Running, worker: int, end: int, completes: int) -> None:
-        """Add a row of an execution."""
-        dag, v, job = what
-        declared = dag < self._n_dags
-        self._executions.add(
-            self._callback[v] if declared else 0, dag if declared else -1,
-            v if declared else -1,
-            self._number(dag, job), self._leg[v] if completes else 0, ran.piece, worker + 1,
-            worker, ran.ready, ran.first, ran.since, end,
-            UNKNOWN if end < 0 else ran.busy + end - ran.since, completes,
-            self._next_order() if completes else UNKNOWN, UNKNOWN, UNKNOWN)
-
-    def _fails(self, dag: int, v: int, job: int) -> bool:
-        load = self._load
-        return len(load.fates) > 0 and load.fates[
-            load.cost_base[dag] + job * load.cost_stride[dag] + v - self._first[dag]] == FAILS
-
-    def _complete(self, what: Id, ran: _Running, now: int) -> None:
-        """Deliver the messages of an execution that has ended."""
-        dag, v, job = what
-        delay = self._schedule.delay
-        for local in self._vertices[v].successors:
-            after = (dag, self._first[dag] + local, job)
-            arrival = now if delay is None else \
-                max(ran.first, now + delay(dag, job, v, after[1]))
-            self._ready[after] = max(arrival, self._ready.get(after, arrival))
+    def demotions(self) -> tables.Table:
+        """Return the demotions of sinks."""
+        _, dag, vertex, job, _, time = self._decisions[:, self._decisions[0] == SINK_DEMOTED]
+        return tables.rows(tables.DEMOTIONS, len(dag), dag=dag, vertex=vertex,
+                           job=self._numbers(dag, job), time=time)

@@ -28,7 +28,7 @@ from mddag_executor.replay.load import LoadBuilder, RecordedLoad
 from mddag_executor.replay.run import Given, open_recording, Progress, undeclared
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import LogEntry, schedule, Settings
-from mddag_executor.simulate.load import edge_numbers, SKIPPED
+from mddag_executor.simulate.load import SKIPPED
 from mddag_executor.simulate.workload import with_execution_times
 from mddag_executor.text import counted, listed
 from msg_graph import NO_GRAPH, Process, TaskSet
@@ -83,16 +83,10 @@ class Reschedule:
 
     def computed(self) -> ComputedRun:
         """Return the schedule as a computed run."""
-        load, edges = self.work.load, edge_numbers(self.tables)
         end = self.settings.duration_ns
-
-        def delay(dag: int, job: int, before: int, after: int) -> int:
-            return int(load.delays[
-                load.delay_base[dag] + job * load.delay_stride[dag] + edges[before, after]])
-
         return ComputedRun(
-            self.task_set, load, self.log, self.decisions, end, end, True, self.work.jobs,
-            delay if load.delay_base else None, self.settings.judge_from)
+            self.task_set, self.work.load, self.log, self.decisions, end, end, True,
+            self.work.jobs, self.settings.judge_from)
 
     def recorded_job(self, dag: int, job: int) -> int:
         """Return the recorded index of a job of the log or tally."""
