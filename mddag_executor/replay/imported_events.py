@@ -87,8 +87,7 @@ def read_events(
     tuples: list[tuple[int, Event]] = []
     count = 0
     for batch in reader.batches({*kinds, *others}, as_table=False):
-        for column in batch.columns:
-            head, rows, places = batch.table(column)
+        for head, rows, places in batch.tables():
             if head[0].name in kinds:
                 parts.append(_normal(rows, places, kinds[head[0].name]))
             if head[0].name not in kinds or head[0].name in others:

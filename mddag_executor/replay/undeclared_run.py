@@ -29,8 +29,8 @@ from bisect import bisect_right
 from collections import Counter
 
 from mddag_executor.recording.entities import INIT_EVENTS
+from mddag_executor.recording.executions import number_pieces
 from mddag_executor.recording.head import no_end
-from mddag_executor.recording.own import number_pieces
 from mddag_executor.recording.tables import (
     DROPS,
     find_pairs,
@@ -139,9 +139,7 @@ class UndeclaredRun(ImportedRun):
     def read(self) -> Recording:
         """Return the recording."""
         found = super().read()
-        ended = self.links.runs['end_at']
-        number_pieces(found.executions, np.arange(len(ended)), 'callback',
-                      np.where(ended < 0, NEVER, ended))
+        number_pieces(found.executions, np.arange(len(found.executions)), 'callback')
         found.shut_down = bool((self._events.table['kind'] == SHUTDOWN).any())
         if not found.shut_down:
             found.warnings.append(no_end(self.name))

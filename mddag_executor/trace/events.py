@@ -30,19 +30,6 @@ class Fixed(NamedTuple):
     missing: dict[str, int]
 
 
-class Column(NamedTuple):
-    """
-    The events of one channel in a batch.
-
-    :ivar at: positions of their records in the data, ascending.
-    :ivar size: bytes of each record; 0: they differ.
-    """
-
-    fixed: Fixed
-    at: Ints
-    size: int
-
-
 class Table(NamedTuple):
     """
     The events of one kind.
@@ -62,43 +49,42 @@ class Batch:
 
     :param data: the records of the chunks.
     :param base: position of the first byte of the data in the order of the file.
+    :param columns: by channel how its events are decoded, and the positions of their records in
+        the data, ascending.
     :param others: events that numpy cannot decode, with their positions in the data.
     """
 
     def __init__(
-        self, data: bytearray, base: int, columns: Sequence[Column],
+        self, data: bytearray, base: int, columns: Sequence[tuple[Fixed, Ints]],
         others: Sequence[tuple[int, Event]],
     ) -> None:
-        self.data, self.base = data, base
-        self.columns, self._others = columns, others
+        self._data, self._base, self._columns, self._others = data, base, columns, others
 
     def __len__(self) -> int:
-        return sum(len(column.at) for column in self.columns) + len(self._others)
+        return sum(len(at) for _, at in self._columns) + len(self._others)
 
-    def table(self, column: Column) -> Table:
-        """Return the events of one channel."""
-        rows = rows_at(self.data, column.fixed.kind, column.at + FIELDS)
-        return Table(column.fixed.head, with_fields(rows, column.fixed.missing),
-                     column.at + self.base)
+    def tables(self) -> Iterator[Table]:
+        """Yield the events that numpy can decode, by channel."""
+        for fixed, at in self._columns:
+            rows = rows_at(self._data, fixed.kind, at + FIELDS)
+            yield Table(fixed.head, _with_fields(rows, fixed.missing), at + self._base)
 
     def others(self) -> list[tuple[int, Event]]:
         """Return the other events with their positions."""
-        return [(self.base + place, event) for place, event in self._others]
+        return [(self._base + place, event) for place, event in self._others]
 
     def __iter__(self) -> Iterator[Event]:
         """Yield all events as tuples, in the order of the file."""
-        found: list[Event] = []
-        places = [np.array([place for place, _ in self._others], dtype=np.int64)]
-        found += [event for _, event in self._others]
-        for column in self.columns:
-            head, rows, _ = self.table(column)
+        found = [event for _, event in self._others]
+        places = [np.array([place for place, _ in self.others()], dtype=np.int64)]
+        for head, rows, at in self.tables():
             found += [head + row for row in rows.tolist()]
-            places.append(column.at)
+            places.append(at)
         for number in np.argsort(np.concatenate(places), kind='stable').tolist():
             yield found[number]
 
 
-def with_fields(rows: Any, missing: dict[str, int]) -> Any:
+def _with_fields(rows: Any, missing: dict[str, int]) -> Any:
     """Return a structured array with additional fields, each with the same value in all rows."""
     if not missing:
         return rows

@@ -33,7 +33,7 @@ from mddag_executor.trace import records
 from mddag_executor.trace.blocks import blocks, Damage, NO_MEMORY
 from mddag_executor.trace.cdr import ENCAPSULATION
 from mddag_executor.trace.channels import Channels, Topic, UNDEFINED
-from mddag_executor.trace.events import Batch, Column, Event, FIELDS, Ints, rows_at
+from mddag_executor.trace.events import Batch, Event, FIELDS, Ints, rows_at
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
@@ -207,8 +207,7 @@ class Reading:
                 plain = lengths >= FIELDS + fixed.kind.itemsize
                 plain[plain] = rows_at(
                     loaded.data, _ENCAPSULATION, at[plain] + FIELDS - 4) == _LITTLE_ENDIAN
-                size = int(lengths[0]) if (lengths == lengths[0]).all() else 0
-                columns.append(Column(fixed, at[plain], size))
+                columns.append((fixed, at[plain]))
                 at, lengths = at[~plain], lengths[~plain]
             for start, length in zip(at.tolist(), lengths.tolist()):
                 event = self._any(channel, bytes(loaded.data[start:start + length]))
@@ -255,7 +254,8 @@ def _indexed(data: memoryview, indexes: Sequence[bytes]) -> tuple[Ints, Ints, An
         entries = [np.frombuffer(index, _INDEX_ENTRY, offset=_INDEX_HEAD) for index in indexes]
     except ValueError:      # not a number of whole entries
         return nothing
-    at = np.sort(np.concatenate([none, *(each['offset'].astype(np.int64) for each in entries)]))
+    at = np.concatenate([none, *(each['offset'].astype(np.int64) for each in entries)])
+    at.sort(kind='stable')      # fast: each index ascends
     if not len(at) or at[0] < 0 or at[-1] > len(data) - _LEAST:
         return nothing
     heads = rows_at(data, _HEAD, at)

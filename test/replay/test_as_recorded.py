@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.recording.head import declared, Head
 from mddag_executor.replay import replay, ReplayError
+from mddag_executor.replay.run import open_recording
 from mddag_executor.report.replays import times_tables
-from mddag_executor.trace import TraceFile, TraceReader
+from mddag_executor.trace import reading, TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
@@ -54,6 +55,26 @@ def test_replay_counts_what_the_driver_counted(text, seed, workers, policy, long
         assert use['waiting_ns'] == run.waited.get(key, 0)
     assert sum(result['dropped'].values()) == run.drops
     assert result['worker_use']['use'] <= 1
+
+
+@pytest.mark.parametrize('in_order', [False, True])
+def test_executions_do_not_depend_on_where_batches_end(tmp_path, monkeypatch, in_order):
+    """Threads take turns in the file, or each execution's events are adjacent (live)."""
+    VirtualRun(tmp_path / 'whole.mcap', small(), 3, 3, duration=1000 * MS)
+    events = list(TraceReader(tmp_path / 'whole.mcap').events(sorted=in_order))
+    for name, most in (('whole', len(events)), ('parts', 3)):
+        with TraceFile(tmp_path / f'{name}.mcap', overwrite=True) as file:
+            for place, event in enumerate(events):
+                file.add(event[0], *event[1:])
+                if place % most == most - 1:
+                    file.flush()
+    whole = open_recording(tmp_path / 'whole.mcap')
+    monkeypatch.setattr(reading, '_BATCH_BYTES', 1)
+    parts = open_recording(tmp_path / 'parts.mcap')
+    assert len(whole.executions) > 300
+    assert sorted(parts.executions.tolist()) == sorted(whole.executions.tolist())
+    assert parts.releases.tolist() == whole.releases.tolist()
+    assert (parts.warnings, whole.warnings) == ([], [])
 
 
 def test_breakdowns_add_up_to_the_response_times(tmp_path):
