@@ -302,7 +302,9 @@ def _pending(
     A timer's skipped release waited if all workers were busy for most of the time.
     """
     pending = np.flatnonzero(spans['kind'] == _PENDING)
-    started = never.started if len(pending) else never.started[:0]
+    started = never.started
+    started = started[np.isin(started['vertex'], spans['vertex'][pending]) & np.isin(
+        started['job'], rows['job'][spans['miss'][pending]])]
     waiting = {(vertex, job): (ready, start, group) for vertex, job, ready, start, group in zip(
         *(started[name].tolist() for name in ('vertex', 'job', 'ready', 'start', 'group')))}
     before = never.waiting(spans['vertex'][pending], spans['end'][pending])

@@ -81,6 +81,7 @@ class Chains:
         if not len(executions):     # row -1 must exist
             executions, waited = rows(EXECUTIONS, 1), np.zeros(1, dtype=np.int64)
         self._judged, self._executions, self.waited = judged, executions, waited
+        self._has_start = np.append(executions['start'] >= 0, False)    # for no row
         self._dags = [self._dag(dag, first) for dag, first in zip(
             judged.task_set.dags, judged.tables.first_vertex)]
         self._started: dict[int, tuple[Ints, Ints, Ints]] = {}
@@ -106,9 +107,8 @@ class Chains:
         """
         jobs = self._judged.jobs[dag]
         found = np.where(jobs.done_order[row, vertex] < order, jobs.done[row, vertex], -1)
-        found[found >= 0] = np.where(
-            self._executions['start'][found[found >= 0]] >= 0, found[found >= 0], -1)
-        running = found < 0
+        running = ~self._has_start[found]
+        found[running] = -1
         if running.any():
             found[running] = self._running(dag, row[running], vertex[running], time[running])
         return found, running
@@ -153,11 +153,10 @@ class Chains:
             found = self._started[dag] = cell, start, mine[first]
         return found
 
-    def links(self, dag: int, link: Ints, running: Mask) -> Table:
+    def _links(self, dag: int, table: Table, running: Mask) -> Table:
         """Return executions as links; the end of a running execution is unknown."""
-        table = pick(self._executions, link)
         running = running & (table['completes'] != LEG)     # a sync waits for its other messages
-        found = np.zeros(len(link), dtype=LINKS)
+        found = np.zeros(len(table), dtype=LINKS)
         found['vertex'], found['ready'] = table['vertex'], table['ready']
         n_legs = self._dags[dag].n_legs[found['vertex'] - self._dags[dag].first]
         known = (table['leg'] >= 0) & (table['leg'] < n_legs)   # otherwise the last one
@@ -167,7 +166,6 @@ class Chains:
         for name in ('end', 'busy'):
             found[name] = np.where(running, NEVER, table[name])
         found['cpu'] = np.where(running, -1, table['cpu'])
-        found['group'] = self.waited[link]
         return found
 
     def follow(
@@ -180,9 +178,10 @@ class Chains:
         """
         of, which = self._dags[dag], np.flatnonzero(link >= 0)
         link, running = link[which], running[which]
+        table = pick(self._executions, link)
         while len(which):
-            links = self.links(dag, link, running)
-            links['of'] = which
+            links = self._links(dag, table, running)
+            links['of'], links['group'] = which, self.waited[link]
             yield which, links
             local = links['vertex'] - of.first
             known = ~of.is_source[local]
@@ -190,20 +189,14 @@ class Chains:
             since, leg = links['ready'], links['leg']
             publisher = of.before[local, np.maximum(leg, 0)]
             link, running = self.link(dag, row[which], publisher, order[which], time[which])
-            started = self._start(link, running)
-            good = (link >= 0) & (started <= since)
             # the publisher of the message is unknown
             for i in np.flatnonzero(leg < 0).tolist():
                 link[i], running[i] = self._latest(
                     dag, row[which[i]], of.before[local[i], :of.n_legs[local[i]]],
                     order[which[i]], time[which[i]], since[i])
-                good[i] = link[i] >= 0
-            which, link, running = which[good], link[good], running[good]
-
-    def _start(self, link: Ints, running: Mask) -> Ints:
-        found: Ints = np.where(
-            running, self._executions['start'][link], self._executions['began'][link])
-        return found
+            table = pick(self._executions, link)
+            good = (link >= 0) & (_started(table, running) <= since)
+            which, link, running, table = which[good], link[good], running[good], pick(table, good)
 
     def _latest(
         self, dag: int, row: Any, publishers: Ints, order: Any, time: Any, since: Any
@@ -212,8 +205,9 @@ class Chains:
         n = len(publishers)
         link, running = self.link(dag, np.full(n, row), publishers, np.full(n, order),
                                   np.full(n, time))
-        end = np.where(running, NEVER, self._executions['end'][link])
-        end[(link < 0) | (self._start(link, running) > since)] = -1
+        table = pick(self._executions, link)
+        end = np.where(running, NEVER, table['end'])
+        end[(link < 0) | (_started(table, running) > since)] = -1
         best = int(end.argmax()) if n else 0
         if not n or end[best] < 0:
             return -1, False
@@ -321,6 +315,12 @@ class Chains:
         rest = until - release
         lag[begun], unknown[~begun] = rest[begun], rest[~begun]
         return parts, group, kept
+
+
+def _started(table: Table, running: Mask) -> Ints:
+    """Return when executions started: running ones are their last pieces."""
+    found: Ints = np.where(running, table['start'], table['began'])
+    return found
 
 
 def _step_result(task_set: TaskSet, link: Any) -> dict[str, Any]:

@@ -54,6 +54,7 @@ from mddag_executor.recording.tables import (
     JobNumbers,
     look_up,
     Mask,
+    pick,
     Recording,
     rows_by,
     sort_by,
@@ -129,8 +130,9 @@ class Judged:
             jobs, verdicts = self._judge(dag, releases[dag], by_dag[dag], ends[dag])
             self.jobs.append(jobs)
             found += verdicts
-        table = np.concatenate(found) if found else np.empty(0, dtype=VERDICTS)
-        self.verdicts = table[np.argsort(table['order'], kind='stable')]
+        table = np.concatenate([np.empty(0, dtype=VERDICTS), *found])
+        found.clear()
+        self.verdicts = pick(table, sort_by(table['order']))
         self.tally = self._tally()
 
     @cached_property
@@ -290,10 +292,9 @@ class Judged:
 
         :return: positions of duplicate completions, and the rows of their jobs.
         """
-        executions = self._recording.executions
         first = self.tables.first_vertex[dag]
-        row = jobs.rows_of(executions['job'][completing])
-        order = executions['order'][completing]
+        table = pick(self._recording.executions, completing)
+        row, order, vertex = jobs.rows_of(table['job']), table['order'], table['vertex'] - first
         known = row >= 0
         if len(jobs.number):
             known &= order > jobs.released[np.maximum(row, 0)]
@@ -301,12 +302,12 @@ class Judged:
             # no such job was released before, or it has ended
             newest = np.maximum.accumulate(np.r_[-1, jobs.number])
             before = newest[np.searchsorted(jobs.released, order)]
-            self.contradictions += int(
-                (~known & (executions['job'][completing] > before)).sum())
-            row, order, completing = row[known], order[known], completing[known]
-        open_ones = order < jobs.ended[row]
-        row, order, completing = row[open_ones], order[open_ones], completing[open_ones]
-        vertex = executions['vertex'][completing] - first
+            self.contradictions += int((~known & (table['job'] > before)).sum())
+        del table
+        known[known] = order[known] < jobs.ended[row[known]]
+        if not known.all():
+            row, order, vertex, completing = (
+                each[known] for each in (row, order, vertex, completing))
         n_legs = np.array(self.tables.n_legs[first:first + jobs.done.shape[1]])
         single = n_legs[vertex] == 1
         # the first completion of each vertex wins: it is written last
@@ -338,8 +339,9 @@ class Judged:
         mine, leg, legs = mine[good], leg[good], legs[good]
         every = leg == recorded.ALL_LEGS
         number = np.r_[mine[~every], np.repeat(mine[every], legs[every])]
-        at = np.r_[leg[~every], np.concatenate(
-            [np.arange(each) for each in legs[every].tolist()] or [leg[:0]])]
+        length = legs[every]
+        at = np.r_[leg[~every], np.arange(length.sum()) - np.repeat(
+            np.cumsum(length) - length, length)]
         back = np.argsort(number, kind='stable')[::-1]      # in the reverse order of completion
         number, at = number[back], at[back]
         done_leg = np.full((jobs.done.size, width), -1)
@@ -404,7 +406,7 @@ class Judged:
         sinks = self.verdicts['sink'][order]
         for v in self.tables.sinks:
             begin, end = np.searchsorted(sinks, (v, v + 1))
-            yield self.verdicts[order[begin:end]]
+            yield pick(self.verdicts, order[begin:end])
 
     def differences(self) -> str | None:
         """

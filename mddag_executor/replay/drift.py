@@ -16,7 +16,7 @@ from collections import Counter, defaultdict
 from collections.abc import Set
 
 from mddag_executor.recording.mapping import declared_keys
-from mddag_executor.recording.tables import Recording, VERTEX
+from mddag_executor.recording.tables import different, Recording, VERTEX
 from msg_graph.drift import Drift, drift, Observed, Releases
 import numpy as np
 
@@ -70,10 +70,10 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
         came.pop(vertices[vertex].callback.key, None)   # it got all of them
     publishes: defaultdict[str, Set[str]] = defaultdict(set)
     sent = recording.publications
-    publishers, publisher_of = np.unique(sent['publisher'], return_inverse=True)
+    publishers, publisher_of = different(sent['publisher'])
     by = np.flatnonzero(sent['execution'] >= 0)
     pairs = np.flatnonzero(np.bincount(
-        publisher_of[by] * len(numbers) + callback_of[sent['execution'][by]]))
+        publisher_of[by].astype(np.int64) * len(numbers) + callback_of[sent['execution'][by]]))
     for pair in pairs.tolist():
         number = int(publishers[pair // len(numbers)])
         callback = int(numbers[pair % len(numbers)])

@@ -54,13 +54,16 @@ from __future__ import annotations
 
 from typing import Any, Literal, NamedTuple
 
+from mddag_executor.memory import give_back
 from mddag_executor.recording.tables import (
+    different,
     EXECUTIONS,
     Growing,
     Ints,
     last_of,
     look_up,
     Mask,
+    pick,
     Recording,
     rows,
     rows_by,
@@ -78,7 +81,7 @@ _CASES = ('all', 'best', 'worst', 'worst_with_external_latency')
 
 
 STEPS = np.dtype([
-    ('parent', 'i8'), ('position', 'i4'), ('is_run', '?'), ('time', 'i8'), ('end', 'i8')])
+    ('parent', 'i4'), ('position', 'i2'), ('is_run', '?'), ('time', 'i8'), ('end', 'i8')])
 """
 Columns of a step: its parent's number or -1, its position, whether it is an execution.
 
@@ -144,7 +147,7 @@ class Paths:
         if not len(table):      # row -1 must exist
             table = rows(EXECUTIONS, 1, vertex=NONE, start=NONE, end=NONE)
         self._table = table
-        self._vertex = table['vertex'].astype(np.int64)
+        self._vertex = table['vertex'].copy()
         if recording.callback_vertex:
             self._add_vertices(recording.callback_vertex)
         # by the index of a callback the rows of its executions
@@ -152,10 +155,22 @@ class Paths:
         self._of_place = rows_by(place, len(self._places))
         self._first = _first_pieces(table)
         # by callback its executions, and the rows of their pieces in order of their ends
-        keys = dict.fromkeys(key for path in self.paths for key in path.callbacks)
-        self._ran = {key: self._of_callback(key) for key in keys}
-        self._ended = {key: self._ends_of(key) for key in keys}
-        self._published()
+        self._ran: dict[str, Executions] = {}
+        self._ended: dict[str, tuple[Ints, Ints]] = {}
+        keys = {key for path in self.paths for key in path.callbacks}
+        records = bool(recording.who.every_publisher) or recording.links
+        sent: list[list[Ints]] = [[] for _ in self._topics]
+        for callback in task_set.callbacks:
+            topics = [] if records else [
+                self._topics[each] for each in callback.publishes if each in self._topics]
+            if topics or callback.key in keys:
+                self._add(callback, topics, sent)
+        if records:
+            self._published(sent)
+        # by topic its publications: callback, node, execution, message and time, in order of time
+        self._sent = [self._in_order(parts) for parts in sent]
+        del self._of_place
+        give_back()
         # messages that running callbacks took themselves, by execution
         self._took = self._first[recording.takes['execution']], recording.takes['message']
 
@@ -169,74 +184,77 @@ class Paths:
         self._vertex[unknown[known]] = np.array(
             [of[each] for each in callbacks.tolist()])[at[known]]
 
-    def _published(self) -> None:
-        """Collect publications on the topics of paths, in order of time."""
-        recording, table = self._recording, self._table
+    def _add(self, callback: Callback, topics: list[int], sent: list[list[Ints]]) -> None:
+        """
+        Collect the executions of a callback.
+
+        :param topics: those on which it publishes when it ends; ``sent``: receives publications.
+        """
+        place = self._places[callback.key]
+        rows = self._of_place[place]
+        table = pick(self._table, rows)     # once: its rows are scattered over the whole table
+        started = table['start'] >= 0
+        self._ran[callback.key] = self._executions(
+            callback, rows, table, started & (self._first[rows] == rows))
+        ended = np.flatnonzero(started & (table['end'] >= 0))
+        ended = ended[sort_by(table['end'][ended])]
+        rows, end = rows[ended], table['end'][ended]
+        self._ended[callback.key] = rows, end
+        for topic in topics:
+            found = np.full((5, len(rows)), NONE)
+            found[0], found[2], found[4] = place, self._first[rows], end
+            found[3] = self._message(table['job'][ended], self._vertex[rows], topic)
+            sent[topic].append(found)
+
+    @staticmethod
+    def _in_order(sent: list[Ints]) -> Ints:
+        found = np.concatenate([np.empty((5, 0), dtype=np.int64), *sent], axis=1)
+        return found[:, sort_by(found[4])]
+
+    def _published(self, found: list[list[Ints]]) -> None:
+        """Collect the recorded publications on the topics of paths."""
+        recording, table, sent = self._recording, self._table, self._recording.publications
         publishers = recording.who.every_publisher
-        if publishers or recording.links:
-            sent = recording.publications
-            different, which = np.unique(sent['publisher'], return_inverse=True)
-            known = [publishers.get(number) for number in different.tolist()]
-            topic, node = np.array(
-                [(NONE, NONE) if each is None else (
-                    self._topics.get(each.topic, NONE),
-                    self._nodes.get(each.node.name if each.node is not None else '', NONE))
-                 for each in known], dtype=np.int64).reshape(-1, 2)[which].T
-            by, vertex = sent['execution'], sent['vertex'].astype(np.int64)
-            message = np.arange(len(sent)) if recording.links else np.where(
+        numbers, which = different(sent['publisher'])
+        known = [publishers.get(number) for number in numbers.tolist()]
+        topics, nodes = np.array(
+            [(NONE, NONE) if each is None else (
+                self._topics.get(each.topic, NONE),
+                self._nodes.get(each.node.name if each.node is not None else '', NONE))
+             for each in known], dtype=np.int64).reshape(-1, 2).T
+        for number, mine in enumerate(rows_by(topics[which].astype(np.int16), len(self._topics))):
+            by, vertex = sent['execution'][mine], sent['vertex'][mine]
+            message = mine if recording.links else np.where(
                 (by >= 0) & (vertex >= 0),
-                self._message(table['job'][by], table['vertex'][by], topic), NONE)
-            time = sent['time']
-        else:       # publications are not recorded
-            parts = []
-            for callback in self._task_set.callbacks:
-                topics = [each for each in callback.publishes if each in self._topics]
-                if topics:
-                    mine, _ = self._ends_of(callback.key)
-                    parts += [(mine, self._topics[topic]) for topic in topics]
-            by = np.concatenate([mine for mine, _ in parts] or [self._first[:0]])
-            topic = np.repeat(np.array([topic for _, topic in parts], dtype=np.int64),
-                              [len(mine) for mine, _ in parts])
-            vertex, node = self._vertex[by], np.full(len(by), NONE)
-            message = self._message(table['job'][by], vertex, topic)
-            time = table['end'][by]
-        place = np.where(vertex >= 0, self._place[vertex], NONE)
-        chosen = np.flatnonzero(topic != NONE)
-        chosen = chosen[sort_by(time[chosen])]
-        run = np.where(by >= 0, self._first[by], NONE)
-        # by topic its publications
-        self._sent = [
-            np.stack([each[chosen[mine]] for each in (place, node, run, message, time)])
-            for mine in rows_by(topic[chosen].astype(np.int16), len(self._topics))]
+                self._message(table['job'][by], table['vertex'][by], number), NONE)
+            found[number].append(np.stack([
+                np.where(vertex >= 0, self._place[vertex], NONE), nodes[which[mine]],
+                np.where(by >= 0, self._first[by], NONE), message, sent['time'][mine]]))
 
     def _message(self, job: Any, vertex: Any, topic: Any) -> Ints:
         """Return the numbers of the messages that vertices publish in jobs."""
         number: Ints = (job * len(self._place) + vertex) * (len(self._topics) + 1) + topic
         return number
 
-    def _of_callback(self, key: str) -> Executions:
-        """Return the executions of a callback."""
-        table, mine = self._table, self._of_place[self._places[key]]
-        mine = mine[(self._first[mine] == mine) & (table['start'][mine] >= 0)]
-        start = table['start'][mine]
-        order = sort_by(start)
-        mine, start = mine[order], start[order]
-        if not self._task_set.callback(key).topics:
+    def _executions(
+        self, callback: Callback, rows: Ints, table: Table, first: Mask
+    ) -> Executions:
+        """
+        Return the executions of a callback.
+
+        :param rows: the rows of their pieces, and their ``table``; ``first``: the first pieces.
+        """
+        mine = np.flatnonzero(first)
+        mine = mine[sort_by(table['start'][mine])]
+        if not callback.topics:
             topics = np.full(len(mine), NONE)
         else:
-            different, which = np.unique(table['callback'][mine], return_inverse=True)
-            names = [self._recording.who.topic(callback) for callback in different.tolist()]
+            numbers, which = different(table['callback'][mine])
+            names = [self._recording.who.topic(number) for number in numbers.tolist()]
             topics = np.array([self._topics.get(name, -2) if name else NONE
                                for name in names], dtype=np.int64)[which]
-        return Executions(mine, start, topics, self._vertex[mine], table['job'][mine])
-
-    def _ends_of(self, key: str) -> tuple[Ints, Ints]:
-        """Return the rows of a callback's pieces that ended, in order of time; and the times."""
-        table, mine = self._table, self._of_place[self._places[key]]
-        mine = mine[(table['start'][mine] >= 0) & (table['end'][mine] >= 0)]
-        end = table['end'][mine]
-        order = sort_by(end)
-        return mine[order], end[order]
+        return Executions(rows[mine], table['start'][mine], topics, self._vertex[rows[mine]],
+                          table['job'][mine])
 
     def flows(self, number: int) -> Flows:
         """Return the flows of a path."""
@@ -482,9 +500,9 @@ def cases(start: Ints, end: Ints) -> dict[str, Ints]:
     return found
 
 
-def _first_pieces(table: Table) -> Ints:
+def _first_pieces(table: Table) -> Any:
     """Return by row of ``executions`` the row of the first piece of that execution."""
-    found = np.arange(len(table))
+    found = np.arange(len(table), dtype=np.int32)
     later = np.flatnonzero(table['piece'] > 0)
     if len(later):
         names = ['callback', 'vertex', 'job', 'ready', 'began']

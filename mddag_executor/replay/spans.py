@@ -17,7 +17,8 @@ class Spans:
     """
 
     def __init__(self, starts: Ints, ends: Ints) -> None:
-        self._starts, self._ends = np.sort(starts), np.sort(ends)
+        # most are in order of time
+        self._starts, self._ends = (np.sort(each, kind='stable') for each in (starts, ends))
         self._origin = int(self._starts[0]) if len(starts) else 0
         self._sums = [np.r_[0, np.cumsum(each - self._origin)]
                       for each in (self._starts, self._ends)]
@@ -38,7 +39,7 @@ class Spans:
 
 def crowded(starts: Ints, ends: Ints, least: int) -> tuple[Ints, Ints]:
     """Return the starts and ends of the times at which at least ``least`` spans overlap."""
-    times = np.concatenate([np.sort(ends), np.sort(starts)])
+    times = np.concatenate([np.sort(each, kind='stable') for each in (ends, starts)])
     order = np.argsort(times, kind='stable')    # at the same instant, ends come first
     times, count = times[order], np.cumsum(np.where(order < len(ends), -1, 1))
     full = count >= least

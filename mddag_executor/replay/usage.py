@@ -8,13 +8,17 @@ An execution of a declared callback counts when it completes; its time so far al
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 from mddag_executor.recording.tables import (
     groups,
+    in_parts,
     Ints,
     look_up,
     NOTHING,
+    pick,
     Recording,
     sort_by,
     Table,
@@ -90,25 +94,34 @@ class PoolUse:
     MOST_STEPS = 600
 
     def __init__(self, starts: Ints, ends: Ints, step: int = FIRST_STEP_NS) -> None:
-        some = starts < ends
-        starts, ends = starts[some], ends[some]
-        if len(starts):
-            first, last = int(starts.min()), int(ends.max()) - 1
-            while last // step - first // step >= self.MOST_STEPS:
-                step *= 2
         self.step = step
         self.start: int | None = None
         self.busy: list[int] = []
-        if not len(starts):
+        borders = [(int(begin.min()), int(end.max()) - 1) for begin, end in _spans(starts, ends)]
+        if not borders:
             return
-        number = int(starts.min()) // step
-        borders = (number + np.arange(int(ends.max() - 1) // step - number + 2)) * step
-        self.start = number * step
-        self.busy = Spans(starts, ends).within(borders[:-1], borders[1:]).tolist()
+        first, last = min(first for first, _ in borders), max(last for _, last in borders)
+        while last // self.step - first // self.step >= self.MOST_STEPS:
+            self.step *= 2
+        number = first // self.step
+        self.start = number * self.step
+        steps = (number + np.arange(last // self.step - number + 2)) * self.step
+        busy = np.zeros(len(steps) - 1, dtype=np.int64)
+        for each in _spans(starts, ends):
+            busy += Spans(*each).within(steps[:-1], steps[1:])
+        self.busy = busy.tolist()
 
     def result(self) -> dict[str, Any]:
         """Return the length of steps, the first begin, and the busy time of each, ns."""
         return {'step_ns': self.step, 'start_ns': self.start, 'busy_ns': self.busy}
+
+
+def _spans(starts: Ints, ends: Ints) -> Iterator[tuple[Ints, Ints]]:
+    """Yield parts of the spans that are known and not empty."""
+    for start, end in zip(in_parts(starts), in_parts(ends)):
+        some = (start >= 0) & (start < end)
+        if some.any():
+            yield start[some], end[some]
 
 
 class Usage:
@@ -121,41 +134,40 @@ class Usage:
         self._place = np.array([*task_set.places_of_vertices(), len(self._places)])
         self._table = np.zeros((len(NAMES), len(self._places) + 1), dtype=np.int64)
         table = recording.executions
-        rows = ran(table)
         #: By worker how long it ran callbacks, ns.
-        self.by_worker: dict[int, int] = {}
-        if len(rows):
-            self._ran(table, rows, waited)
-            self._completed(table, rows)
-        self.pool = PoolUse(table['start'][rows], table['end'][rows])
+        self.by_worker: Counter[int] = Counter()
+        for part, wait in zip(in_parts(table), in_parts(waited)):
+            ran = (part['start'] >= 0) & (part['end'] >= 0)
+            self._ran(pick(part, ran), wait[ran])
+            self._completed(pick(part, ran & (part['completes'] != NOTHING) & (
+                part['vertex'] >= 0)))
+        self.pool = PoolUse(table['start'], table['end'])
 
-    def _ran(self, table: Table, rows: Ints, waited: Ints) -> None:
-        vertex, piece = table['vertex'][rows], table['piece'][rows]
-        start = table['start'][rows]
-        took, place = table['end'][rows] - start, self._place[vertex]
-        worker = table['worker'][rows]
-        for number in np.unique(worker).tolist():
-            self.by_worker[number] = int(took[worker == number].sum())
+    def _ran(self, table: Table, waited: Ints) -> None:
+        vertex, start = table['vertex'], table['start']
+        took, place = table['end'] - start, self._place[vertex]
+        for number in np.unique(table['worker']).tolist():
+            self.by_worker[number] += int(took[table['worker'] == number].sum())
         self._add('busy_ns', place, took)
-        first, undeclared = piece == 0, vertex < 0
+        first, undeclared = table['piece'] == 0, vertex < 0
         self._add('executions', place[undeclared & first])
         self._most('longest_ns', place[undeclared], took[undeclared])
-        place, wait = place[first], (start - table['ready'][rows])[first]
+        place, wait = place[first], (start - table['ready'])[first]
         self._add('waiting_ns', place, wait)
         self._most('longest_wait_ns', place, wait)
-        self._add('waiting_group_ns', place, waited[rows][first])
+        self._add('waiting_group_ns', place, waited[first])
 
-    def _completed(self, table: Table, rows: Ints) -> None:
-        rows = rows[(table['completes'][rows] != NOTHING) & (table['vertex'][rows] >= 0)]
-        place, busy = self._place[table['vertex'][rows]], table['busy'][rows]
+    def _completed(self, table: Table) -> None:
+        place, busy = self._place[table['vertex']], table['busy']
         self._add('executions', place)
         self._most('longest_ns', place, busy)
-        known = table['cpu'][rows] >= 0
-        place, rows = place[known], rows[known]
-        self._add('measured', place)
-        self._add('measured_busy_ns', place, busy[known])
-        self._add('cpu_ns', place, table['cpu'][rows])
-        self._add('held_interpreter', place, table['holds_gil'][rows])
+        known = table['cpu'] >= 0
+        if known.any():
+            place, table = place[known], pick(table, known)
+            self._add('measured', place)
+            self._add('measured_busy_ns', place, table['busy'])
+            self._add('cpu_ns', place, table['cpu'])
+            self._add('held_interpreter', place, table['holds_gil'])
 
     def _add(self, name: str, places: Ints, values: Any = None) -> None:
         """Add values to callbacks by index; without values count them."""
