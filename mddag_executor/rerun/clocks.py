@@ -9,13 +9,15 @@ Theory of operation
 a node's clock (ROS time)             is virtual; but if the recording has ``/clock`` and the node
                                       uses simulated time, it has the last recorded time
 steady and system clocks, ``time``    virtual on request; else real, and a warning names the first
-                                      use of each by code of a node
+                                      use of each by code of a node; but always virtual where
+                                      Python or rclpy waits with them
 ``Clock.sleep_until``                 waits in virtual time for a virtual clock
-``Condition.wait``                    waits in virtual time in a run thread, and so does all that
-                                      Python builds on it: events, queues, rates, futures
+``Condition.wait``                    waits at a lock of a run thread in virtual time, and so does
+                                      all that builds on it: events, queues, rates, futures
 ``Thread.start``, ``Thread.join``     threads that a run thread starts are run threads; waiting
                                       for their end takes virtual time
-``uuid.uuid4``                        is drawn with the seed: goals of actions are named by it
+``os.urandom``                        is drawn with the seed, so are ``uuid4``, by which goals of
+                                      actions are named, ``secrets`` and generators of numpy
 ``random``, ``numpy.random``          generators that nodes make without a seed get one
 ====================================  ============================================================
 
@@ -27,13 +29,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, partial
+import os
 import queue
 import random
 import sys
 import threading
 import time
 from typing import Any, ClassVar
-import uuid
 import weakref
 
 from mddag_executor.replacements import Replacements
@@ -43,6 +45,8 @@ from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
 from rclpy.time import Time
 
+_WAITING = ('rclpy', 'threading', 'queue', 'concurrent')
+"""Packages that use real time only to wait."""
 _READS = ('time', 'time_ns', 'monotonic', 'monotonic_ns', 'perf_counter', 'perf_counter_ns')
 
 
@@ -85,23 +89,22 @@ class VirtualTime:
         replace = replacements.replace
         replace(Clock, 'now', self._clock_now)
         replace(Clock, 'sleep_until', self._sleep_until)
-        replace(threading.Condition, 'wait', self._condition_wait)
+        replace(threading, '_allocate_lock', self._allocate_lock)  # for ``Condition.wait``
         replace(threading.Thread, 'start', self._thread_start)
         replace(threading.Thread, 'join', self._thread_join)
         # The one in C waits without asking anybody; pools of threads are built on it.
         replace(queue, 'SimpleQueue', lambda original: vars(queue)['_PySimpleQueue'])
-        replace(uuid, 'uuid4', _replaced)
         replace(random.Random, 'seed', self._seeding)
         # that of the module is a method of a generator, bound before
         replace(random, 'seed', lambda original: partial(random.Random.seed, original.__self__))
         random.seed(self._seed)
         with suppress(ImportError):
             import numpy.random
-            # what all of numpy's generators begin with that get no seed
-            replace(numpy.random.bit_generator, 'randbits', self._randbits)
             numpy.random.seed(self._seed % 2 ** 32)
-        for name in (*_READS, 'sleep'):
-            replace(time, name, _replaced)
+        for owner, names in ((time, (*_READS, 'sleep')), (threading, ('_time',)),
+                             (queue, ('time',)), (os, ('urandom',)), (random, ('_urandom',))):
+            for name in names:
+                replace(owner, name, _replaced)
         VirtualTime.current = self
         replacements.callback(setattr, VirtualTime, 'current', None)
 
@@ -146,13 +149,14 @@ class VirtualTime:
     # --- Python's time ---------------------------------------------------------------------------
 
     def call(self, original: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-        """Do what a function of ``time`` does, or ``uuid4``."""
+        """Do what a function of ``time`` does, or ``urandom``."""
         loop, name = self._loop, original.__name__
         if loop.run_threads.current() is None:
             return original(*args)
-        if name == 'uuid4':
-            return uuid.UUID(int=self._random.getrandbits(128), version=4)
-        if not self._all:
+        if name == 'urandom':
+            return self._random.randbytes(*args)
+        caller = sys._getframe(2).f_globals.get('__name__', '')
+        if not self._all and caller.partition('.')[0] not in _WAITING:
             self._warn_of(f'time.{name}()', 3)
             return original(*args)
         if name in _READS:
@@ -179,39 +183,26 @@ class VirtualTime:
 
     def _seeding(self, original: Callable[..., None]) -> Callable[..., None]:
         def seed(generator: random.Random, a: Any = None, version: int = 2) -> None:
-            if a is None and self._is_asked_by_node():
+            caller = sys._getframe(1)
+            while caller.f_back is not None and caller.f_globals.get('__name__') == 'random':
+                caller = caller.f_back
+            # libraries keep what they draw
+            if a is None and self._loop.run_threads.current() is not None and not is_library(
+                    caller.f_globals.get('__name__', '')):
                 a = self._random.getrandbits(128)
             original(generator, a, version)
 
         return seed
 
-    def _randbits(self, original: Callable[[int], int]) -> Callable[[int], int]:
-        def randbits(bits: int) -> int:
-            draw = self._random.getrandbits if self._is_asked_by_node() else original
-            return draw(bits)
-
-        return randbits
-
-    def _is_asked_by_node(self) -> bool:
-        """Return whether code of a node calls what calls this; libraries keep what they draw."""
-        caller = sys._getframe(2)
-        while caller.f_back is not None and caller.f_globals.get('__name__') == 'random':
-            caller = caller.f_back
-        return self._loop.run_threads.current() is not None and not is_library(
-            caller.f_globals.get('__name__', ''))
-
     # --- waiting and threads ---------------------------------------------------------------------
 
-    def _condition_wait(self, original: Callable[..., bool]) -> Callable[..., bool]:
-        def wait(condition: Any, timeout: float | None = None) -> bool:
-            loop = self._loop
-            if loop.run_threads.current() is None or loop.run_threads.over:
-                return original(condition, timeout)
-            deadline = loop.deadline_after(timeout)
-            return _wait_for_notify(
-                condition, lambda until: loop.wait(until, deadline, 'for another thread'))
+    def _allocate_lock(self, original: Callable[[], Any]) -> Callable[[], Any]:
+        def allocate() -> Any:
+            run_threads = self._loop.run_threads
+            in_run = run_threads.current() is not None and not run_threads.over
+            return _Waiter(self._loop) if in_run else original()
 
-        return wait
+        return allocate
 
     def _thread_start(self, original: Callable[[Any], None]) -> Callable[[Any], None]:
         def start(thread: threading.Thread) -> None:
@@ -240,22 +231,20 @@ class VirtualTime:
         return join
 
 
-def _wait_for_notify(condition: Any, wait: Callable[[Callable[[], bool]], bool]) -> bool:
-    """Wait for a condition's ``notify`` as ``Condition.wait`` does, but for how it waits."""
-    if not condition._is_owned():
-        raise RuntimeError('cannot wait on un-acquired lock')
-    waiter = threading.Lock()
-    waiter.acquire()
-    condition._waiters.append(waiter)
-    saved = condition._release_save()
-    notified = False
-    try:
-        notified = wait(lambda: not waiter.locked())
-        return notified
-    finally:
-        condition._acquire_restore(saved)
-        if not notified:
-            try:
-                condition._waiters.remove(waiter)
-            except ValueError:
-                pass
+class _Waiter:
+    """A lock of a run thread, which waits for it in virtual time."""
+
+    def __init__(self, loop: Loop) -> None:
+        self._loop = loop
+        self._locked = False
+
+    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
+        loop = self._loop
+        timeout_s = 0.0 if not blocking else None if timeout < 0 else timeout
+        acquired = loop.wait(
+            lambda: not self._locked, loop.deadline_after(timeout_s), 'for another thread')
+        self._locked = True
+        return acquired
+
+    def release(self) -> None:
+        self._locked = False

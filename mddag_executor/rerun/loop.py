@@ -280,8 +280,9 @@ class Loop:
         except (Exception, SystemExit) as error:
             if isinstance(error, SystemExit) and error.code in (None, 0):
                 self.stop()
-            elif self.run_threads.over:
-                self.warn(f'{entity.name}: after the end of the run it raised {describe(error)}')
+            elif self.run_threads.over or entity.removed:  # while it has waited
+                end = 'the run' if self.run_threads.over else 'its node'
+                self.warn(f'{entity.name}: after the end of {end} it raised {describe(error)}')
             else:
                 raise CallbackFailed(entity.name, error, self.now - self.start) from error
         finally:

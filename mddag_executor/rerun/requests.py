@@ -77,11 +77,9 @@ class Requests:
         replace(Client, 'call_async', instead(self.call_async))
         replace(Client, 'call', instead(self.call))
         replace(Client, 'service_is_ready', instead(self.is_offered))
-        replace(Client, 'wait_for_service', instead(self.wait_for_service))
         replace(Service, 'send_response', instead(self.send_response))
         replace(ActionClient, '__init__', self._made)
         replace(ActionServer, '__init__', self._made)
-        replace(ActionClient, 'wait_for_server', instead(self.wait_for_server))
         replace(CLIENT_HANDLE, 'is_action_server_available',
                 instead(lambda handle: bool(self._peers(handle))))
         replace(SERVER_HANDLE, 'publish_feedback', instead(self._feedback))
@@ -93,10 +91,6 @@ class Requests:
             replace(SERVER_HANDLE, f'send_{kind}_response',
                     instead(partial(self._answer_action, kind)))
 
-    def _wait(self, until: Callable[[], bool], timeout_sec: float | None, what: str,
-              lends: bool = False) -> bool:
-        return self._loop.wait(until, self._loop.deadline_after(timeout_sec), f'for {what}', lends)
-
     def _send(self, content: Any, deliver: Callable[[Any], None]) -> None:
         """Deliver a copy of something when the callback that runs ends, or else at once."""
         self._loop.call_at_end(partial(deliver, copy.deepcopy(content)))
@@ -107,11 +101,6 @@ class Requests:
         """Return whether a node of the run offers a client's service."""
         entity = self._services.get(service_name(client))
         return entity is not None and not entity.removed
-
-    def wait_for_service(self, client: Client, timeout_sec: float | None = None) -> bool:
-        """Wait until a client's service is offered."""
-        return self._wait(
-            lambda: self.is_offered(client), timeout_sec, f'service {service_name(client)}')
 
     def call_async(self, client: Any, request: Any) -> Future:
         """Send a request; return the future of its response."""
@@ -127,8 +116,9 @@ class Requests:
     def call(self, client: Client, request: Any, timeout_sec: float | None = None) -> Any:
         """Send a request and wait for its response; None if it does not come in time."""
         future = self.call_async(client, request)
-        if not self._wait(
-                future.done, timeout_sec, f'service {service_name(client)}', lends=True):
+        loop = self._loop
+        if not loop.wait(future.done, loop.deadline_after(timeout_sec),
+                         f'for service {service_name(client)}', lends=True):
             client.remove_pending_request(future)
         error = future.exception()
         if error is not None:
@@ -190,12 +180,6 @@ class Requests:
         return [each for known, each in self._actions.values()
                 if known == name and id(each) in self._entities
                 and type(action_handle(each)) is not type(handle)]
-
-    def wait_for_server(self, client: Any, timeout_sec: float | None = None) -> bool:
-        """Wait until a client's action is offered."""
-        handle = action_handle(client)
-        return self._wait(lambda: bool(self._peers(handle)), timeout_sec,
-                          f'action {self._actions[id(handle)][0]}')
 
     def _ask_action(self, kind: str, handle: Any, request: Any) -> int:
         number = next(self._numbers)

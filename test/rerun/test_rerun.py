@@ -6,6 +6,7 @@ from functools import partial
 import os
 import random
 import threading
+import uuid
 
 from builtin_interfaces.msg import Time
 from mddag_executor import open_recording
@@ -272,6 +273,7 @@ def seeded(function):
     lambda: seeded(random.seed),
     lambda: numpy.random.default_rng().random(),
     lambda: numpy.random.RandomState().random_sample(),
+    uuid.uuid4,
 ])
 def test_random_numbers_are_those_of_the_seed(bag, graph, draw):
     seen = []

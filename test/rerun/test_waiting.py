@@ -22,6 +22,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
@@ -107,6 +108,23 @@ def test_rates_and_clocks_sleep_in_virtual_time(bag, graph):
 
     seen, _ = run_filter(bag, graph, take)
     assert seen == [(210.0, 'rate'), (710.0, 'clock')]
+
+
+def test_timeouts_of_python_and_rclpy_take_virtual_time(bag, graph):
+    def take(node, number):
+        if number == 2:
+            with suppress(queue.Empty):
+                queue.Queue().get(timeout=0.05)
+            node.note('queue')
+            threading.Semaphore(0).acquire(timeout=0.05)
+            node.note('semaphore')
+            AsyncParameterClient(node, 'none').wait_for_services(0.5)
+            node.note('services')
+
+    seen, _ = run_filter(bag, graph, take)
+    # seconds since the epoch are floats with a resolution of 0.2 us
+    assert [(round(time, 2), what) for time, what in seen] == [
+        (250.0, 'queue'), (300.0, 'semaphore'), (800.0, 'services')]
 
 
 def test_threads_of_nodes_are_in_virtual_time_too(bag, graph):
@@ -228,6 +246,31 @@ def test_a_program_with_a_loop_of_its_own(bag, graph):
     assert seen[:8] == [
         (0.0, 0), (500.0, 'loop'), (500.0, 5), (1000.0, 'loop'), (1000.0, 10), (1500.0, 'loop'),
         (1500.0, 15)]
+
+
+@pytest.mark.parametrize('use', [
+    lambda node: node.get_logger().info(node.publisher.topic_name),
+    lambda node: node.create_client(Trigger, '/greet').wait_for_service()])
+def test_a_program_ends_while_its_callback_waits(bag, graph, use):
+    def main():
+        rclpy.init()
+        node = rclpy.create_node('short')
+        node.publisher = node.create_publisher(String, '/other', 10)
+
+        def take(message):
+            node.get_clock().sleep_for(Duration(seconds=0.3))
+            use(node)
+
+        node.create_subscription(Header, '/points', take, 10)
+        end = node.get_clock().now() + Duration(seconds=0.35)
+        while node.get_clock().now() < end:
+            rclpy.spin_once(node, timeout_sec=0.05)
+        node.destroy_node()
+        rclpy.shutdown()
+
+    seen, result = run_filter(bag, graph, lambda node, number: node.note(number), main)
+    assert len(seen) == 20
+    assert 'after the end of its node it raised InvalidHandle' in result.warnings[-1]
 
 
 # --- clocks --------------------------------------------------------------------------------------
