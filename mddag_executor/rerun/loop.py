@@ -7,9 +7,9 @@ Theory of operation
 -------------------
 Time jumps from event to event. At one instant first executions end, workers in ascending order;
 then messages arrive, in the order in which they were sent; then come the recorded messages, in
-their order, and the timers that are due; then run threads go on whose time is over (``run
-threads``); then the core dispatches until it has nothing left to do. All that this causes at the
-same instant is done before time goes on.
+their order, and the timers that are due; then run threads go on whose time is over; then the core
+dispatches until it has nothing left to do. All that this causes at the same instant is done before
+time goes on.
 
 A callback runs, for real and at once, when the core dispatches it. In virtual time it takes as
 long as ``times`` says, or as long as it has waited, if that is more. What it sends is kept until
@@ -58,28 +58,21 @@ MOST_POLLS = 1000
 MOST_AT_ONCE = 20_000
 """More callbacks at one instant than this go in a circle in which nothing takes time."""
 
-_WORKER_BITS = 48
 _LENT = 1 << 20
 # What happens at one instant, in this order.
-ENDED, ARRIVED, RECORDED, TIMER = range(4)
+ENDED, ARRIVED, RECORDED, TIMER, WAITED = range(5)
 
-
-@dataclass
-class Sent:
-    """
-    Something that an execution has sent.
-
-    :ivar leave: sends it, given the execution's job and release.
-    :ivar record: records it, as sent by a thread of the trace.
-    """
-
-    leave: Callable[[Origin | None, int], None]
-    record: Callable[[int], None] = lambda thread: None
+Leave = Callable[[Origin | None, int], None]
+"""Sends something, given the job and release of the execution that sends it."""
 
 
 @dataclass(eq=False, slots=True)
 class Execution:
-    """A callback that runs, or has run for real and not ended in virtual time."""
+    """
+    A callback that runs, or has run for real and not ended in virtual time.
+
+    :ivar sent: what it has sent, each with what records that, given the thread.
+    """
 
     work: Work
     start: int
@@ -87,7 +80,7 @@ class Execution:
     thread: int
     origin: Origin | None
     release: int
-    sent: list[Sent] = field(default_factory=list)
+    sent: list[tuple[Leave, Callable[[int], None]]] = field(default_factory=list)
     waits_for: Any = None
 
 
@@ -191,10 +184,6 @@ class Loop:
             _, _, _, function, args = heappop(events)
             function(*args)
             return True
-        deadline = self.run_threads.next_deadline() if self.run_threads.waiting else None
-        if deadline is not None and deadline <= now:
-            self.run_threads.expire(now)
-            return True
         engine = self.engine
         work = engine.dispatch(0, now)
         if work is not None:
@@ -206,12 +195,12 @@ class Loop:
         if engine.has_waiting and engine.interpreter_holder() and now >= self._ask_at:
             self._ask_at = now + POLL_NS
             self.at(self._ask_at, TIMER, lambda: None)  # it may overtake by then
-        return self._advance(deadline)
+        return self._advance()
 
     def _end_finished(self) -> bool:
         execution = self._cpus.take_finished(self.now)
         if execution is not None:
-            self._end(execution, self.now)
+            self._end(execution)
         return execution is not None
 
     def refresh_now(self) -> None:
@@ -220,13 +209,11 @@ class Loop:
             self.changed = False
             self._refresh()
 
-    def _advance(self, deadline: int | None) -> bool:
+    def _advance(self) -> bool:
         """Let time go on to what comes next."""
         next_at = max(self.now + 1, self._cpus.next_time())
         if self._events:
             next_at = min(next_at, self._events[0][0])
-        if deadline is not None and deadline <= self.end:
-            next_at = min(next_at, deadline)
         if self.engine.check_at > self.now:  # else a worker is needed first
             next_at = min(next_at, self.engine.check_at)
         if next_at > self.end + DRAIN_NS:
@@ -260,9 +247,7 @@ class Loop:
         if execution.worker >= 0 and self.now == execution.start:  # it has not waited
             self._cpus.begin(execution, takes)
             return
-        end = max(self.now, execution.start + takes)
-        order = (work.worker << _WORKER_BITS) + next(self._order)
-        heappush(self._events, (end, ENDED, order, self._end, (execution, end)))
+        self.at(max(self.now, execution.start + takes), ENDED, self._end, execution)
 
     def _call(self, execution: Execution) -> bool:
         """Run an execution's callback; return whether it ran."""
@@ -300,20 +285,20 @@ class Loop:
             return 0
         return self._times.execution(origin.dag, origin.vertex, release)
 
-    def _end(self, execution: Execution, now: int) -> None:
+    def _end(self, execution: Execution) -> None:
         """End an execution in virtual time, or suspend it."""
         work, engine, worker = execution.work, self.engine, execution.worker
-        start, waits_for = execution.start, execution.waits_for
-        for each in execution.sent:
-            each.record(execution.thread)  # before its callback's end
+        start, waits_for, now = execution.start, execution.waits_for, self.now
+        for _, record in execution.sent:
+            record(execution.thread)  # before its callback's end
         if waits_for is None:
             engine.finished(work, start, now, now, execution.thread, worker)
             self.on_ended(work.entity.rclpy)
         else:
             engine.suspended(work, start, now, execution.thread, worker)
             self._resume_when_done(work, waits_for)
-        for each in execution.sent:
-            each.leave(execution.origin, execution.release)
+        for leave, _ in execution.sent:
+            leave(execution.origin, execution.release)
         if engine.to_ask_again:
             engine.ask_again()
 
@@ -324,17 +309,17 @@ class Loop:
         else:
             waits_for.add_done_callback(QuickCallback(partial(self.call_in_run, resume)))
 
-    def send(self, sent: Sent) -> None:
-        """Send something: when the callback that runs ends, or else at once."""
+    def send(self, leave: Leave, record: Callable[[int], None] = lambda thread: None) -> None:
+        """
+        Send something: when the callback that runs ends, or else at once.
+
+        :param record: records that, as done by a thread of the trace.
+        """
         execution = self.current
         if execution is not None:
-            execution.sent.append(sent)
+            execution.sent.append((leave, record))
         else:
-            self.call_in_run(partial(sent.leave, None, 0))
-
-    def call_at_end(self, function: Callable[[], None]) -> None:
-        """Do something when the callback that runs ends, or else at once."""
-        self.send(Sent(lambda *_: function()))
+            self.call_in_run(partial(leave, None, 0))
 
     # --- waiting ---------------------------------------------------------------------------------
 
@@ -364,15 +349,17 @@ class Loop:
         execution = self._current
         if execution is not None:
             sent, execution.sent = execution.sent, []
-            for each in sent:
-                each.record(execution.thread)
-                each.leave(execution.origin, execution.release)
+            for leave, record in sent:
+                record(execution.thread)
+                leave(execution.origin, execution.release)
             if lends and execution.worker >= 0 and execution.work.x >= 0:
                 self.engine.lend(execution.work)
                 execution.worker = -1
                 execution.thread = _LENT + next(self._order)
         run_thread = self.run_threads.current()
         assert run_thread is not None
+        if deadline is not None and deadline <= self.end:
+            self.at(deadline, WAITED, self.run_threads.expire, run_thread, deadline)
         run_thread.execution, self._current = execution, None
         try:
             return self.run_threads.wait(until, deadline, place)

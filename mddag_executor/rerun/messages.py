@@ -30,17 +30,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+import re
 from typing import Any
 
 from mddag_executor.executor.compat import alive, callback_type, WITH_INFO
-from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.entity import Entity, SUBSCRIPTION
 from mddag_executor.executor.jobs import header_stamp, Origin
+from mddag_executor.executor.publishing import state_of
 from mddag_executor.executor.work import Work
 from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError
 from mddag_executor.rerun.inputs import MessageBag, RecordedMessage
-from mddag_executor.rerun.loop import ARRIVED, Loop, RECORDED, Sent
+from mddag_executor.rerun.loop import ARRIVED, Loop, RECORDED
 from mddag_executor.rerun.message_types import canonical, type_name
 from mddag_executor.rerun.outputs import Outputs
 from mddag_executor.trace.groups import PUBLICATION
@@ -56,53 +58,33 @@ from rosgraph_msgs.msg import Clock
 CLOCK = '/clock'
 CLOCK_EVERY_NS = 10_000_000
 """How often ``/clock`` gives the time."""
-_ASK_MIDDLEWARE = (
-    'get_topic_names_and_types', 'get_node_names', 'get_node_names_and_namespaces',
-    'get_publisher_names_and_types_by_node', 'get_subscriber_names_and_types_by_node',
-    'get_service_names_and_types_by_node', 'get_client_names_and_types_by_node',
-    'get_service_names_and_types', 'get_publishers_info_by_topic',
-    'get_subscriptions_info_by_topic', 'count_clients', 'count_services')
-
-
-class Inlet:
-    """A subscription of a node of the run."""
-
-    __slots__ = ('entity', 'kind', 'raw', 'with_info', 'received')
-
-    def __init__(self, entity: Entity) -> None:
-        subscription = entity.rclpy
-        self.entity = entity
-        self.kind = subscription.msg_type
-        self.raw = subscription.raw
-        self.with_info = callback_type(subscription) is WITH_INFO
-        self.received = 0
+_ASK_MIDDLEWARE = re.compile(r'get_.*(_names.*|_info_by_topic)|count_(clients|services)')
 
 
 class Outlet:
     """
     A publisher of a node of the run.
 
-    :ivar inlets: those whose QoS fits; None: to be found out.
+    :ivar state: its topic and address in a trace, and how many messages it has sent.
+    :ivar subscriptions: those whose QoS fits; None: to be found out.
     :ivar kept: what later subscriptions get, with the times of publication.
     """
 
-    __slots__ = ('publisher', 'topic', 'kind', 'inlets', 'count', 'kept')
+    __slots__ = ('publisher', 'kind', 'state', 'subscriptions', 'kept')
 
     def __init__(self, publisher: Any) -> None:
         self.publisher = publisher
-        self.topic: str = publisher.topic_name
         self.kind = publisher.msg_type
-        self.inlets: list[Inlet] | None = None
-        self.count = 0
+        self.state = state_of(publisher)
+        self.subscriptions: list[Entity] | None = None
         qos = publisher.qos_profile
         self.kept: deque[tuple[int, bytes]] = deque(
             maxlen=max(1, qos.depth) if _is_latched(qos) else 0)
 
-    def fits(self, inlet: Inlet) -> bool:
+    def fits(self, subscription: Any) -> bool:
         """Return whether a subscription gets what is published."""
-        found, _ = qos_check_compatible(
-            self.publisher.qos_profile, inlet.entity.rclpy.qos_profile)
-        return bool(found != QoSCompatibility.ERROR) and inlet.kind is self.kind
+        found, _ = qos_check_compatible(self.publisher.qos_profile, subscription.qos_profile)
+        return bool(found != QoSCompatibility.ERROR) and subscription.msg_type is self.kind
 
 
 def _is_latched(qos: Any) -> bool:
@@ -117,7 +99,7 @@ class Messages:
         task_set: TaskSet,
     ) -> None:
         self._loop = loop
-        self._inlets: dict[str, list[Inlet]] = {}
+        self._subscriptions: dict[str, list[Entity]] = {}
         self.offered: dict[str, list[Outlet]] = {}
         self._engine = loop.engine
         self._recording = recording
@@ -143,23 +125,18 @@ class Messages:
             lambda node, topic_name: self._count_publishers(node.resolve_topic_name(topic_name))))
         replace(Node, 'count_subscribers', instead(
             lambda node, topic_name: self._count_subscribers(node.resolve_topic_name(topic_name))))
-        for name in _ASK_MIDDLEWARE:
-            if name in vars(Node):
-                replace(Node, name, self._asking)
+        for name in filter(_ASK_MIDDLEWARE.fullmatch, list(vars(Node))):
+            replace(Node, name, self._asking)
 
     # --- publishers and subscriptions ------------------------------------------------------------
 
-    def refresh(self, nodes: Sequence[Node], subscriptions: Iterable[Entity]) -> None:
+    def refresh(
+        self, nodes: Sequence[Node], added: Iterable[Entity], subscriptions: Iterable[Entity],
+    ) -> None:
         """Update which subscriptions and publishers there are."""
-        known = {inlet.entity: inlet for inlets in self._inlets.values() for inlet in inlets}
-        new = []
-        self._inlets = {}
+        self._subscriptions = {}
         for entity in subscriptions:
-            inlet = known.get(entity)
-            if inlet is None:
-                inlet = Inlet(entity)
-                new.append(inlet)
-            self._inlets.setdefault(entity.label, []).append(inlet)
+            self._subscriptions.setdefault(entity.label, []).append(entity)
         for publisher in (each for node in nodes for each in node.publishers):
             if alive(publisher):
                 self._outlet(publisher)
@@ -167,28 +144,28 @@ class Messages:
         self._outlets = {p: outlet for p, outlet in self._outlets.items() if alive(p)}
         self.offered = {}
         for outlet in self._outlets.values():
-            outlet.inlets = None
-            self.offered.setdefault(outlet.topic, []).append(outlet)
-        for inlet in new:
-            if _is_latched(inlet.entity.rclpy.qos_profile):
-                self._deliver_kept(inlet)
-        if not self._gives_clock and CLOCK in self._inlets and (
+            outlet.subscriptions = None
+            self.offered.setdefault(outlet.state.topic, []).append(outlet)
+        for entity in added:
+            if entity.kind == SUBSCRIPTION and _is_latched(entity.rclpy.qos_profile):
+                self._deliver_kept(entity)
+        if not self._gives_clock and CLOCK in self._subscriptions and (
                 CLOCK not in self._recording.topics and CLOCK not in self.offered):
             self._gives_clock = True
             self._publish_time()
         if self._has_begun:
             self._load()
 
-    def _deliver_kept(self, inlet: Inlet) -> None:
+    def _deliver_kept(self, entity: Entity) -> None:
         """Give a subscription what was published before it was there, as far as that is kept."""
-        topic = inlet.entity.label
+        topic = entity.label
         for outlet in self.offered.get(topic, ()):
-            if outlet.kept and outlet.fits(inlet):
+            if outlet.kept and outlet.fits(entity.rclpy):
                 for stamp, data in outlet.kept:
-                    self._arrive(inlet, data, stamp, None)
+                    self._arrive(entity, data, stamp, None)
         if topic in self._last and topic not in self.offered:
             stamp, data = self._last[topic]
-            self._arrive(inlet, data, stamp, None)
+            self._arrive(entity, data, stamp, None)
 
     def _outlet(self, publisher: Any) -> Outlet:
         outlet = self._outlets.get(publisher)
@@ -196,10 +173,12 @@ class Messages:
             outlet = self._outlets[publisher] = Outlet(publisher)
         return outlet
 
-    def _inlets_of(self, outlet: Outlet) -> list[Inlet]:
-        if outlet.inlets is None:
-            outlet.inlets = [i for i in self._inlets.get(outlet.topic, ()) if outlet.fits(i)]
-        return outlet.inlets
+    def _subscriptions_of(self, outlet: Outlet) -> list[Entity]:
+        if outlet.subscriptions is None:
+            outlet.subscriptions = [
+                entity for entity in self._subscriptions.get(outlet.state.topic, ())
+                if outlet.fits(entity.rclpy)]
+        return outlet.subscriptions
 
     # --- questions about the ROS graph -----------------------------------------------------------
 
@@ -220,7 +199,7 @@ class Messages:
     def _count_subscribers(self, topic: str) -> int:
         """Count those of nodes of the run, and the rerun itself, which keeps all messages."""
         self._loop.refresh_now()
-        return 1 + len(self._inlets.get(topic, ()))
+        return 1 + len(self._subscriptions.get(topic, ()))
 
     # --- what nodes publish ----------------------------------------------------------------------
 
@@ -236,36 +215,36 @@ class Messages:
             raise TypeError(f'Expected {publisher.msg_type}, got {type(msg)}')
         if self._loop.run_threads.current() is None:
             self._loop.warn(
-                f'{outlet.topic}: a thread publishes on it that is not of the run: when '
+                f'{outlet.state.topic}: a thread publishes on it that is not of the run: when '
                 'that happens depends on the machine')
         current = self._loop.current
         if current is not None:
-            current.work.entity.publishes.add(outlet.topic)
-        self._loop.send(Sent(partial(self._leave, outlet, data), partial(self._record, outlet)))
+            current.work.entity.publishes.add(outlet.state.topic)
+        self._loop.send(partial(self._leave, outlet, data), partial(self._record, outlet))
 
     def _record(self, outlet: Outlet, thread: int) -> None:
         """Record a publication."""
         if self._engine.record is not None:
             self._sequence += 1
             self._engine.record(
-                PUBLICATION, self._loop.now, thread, id(outlet.publisher), self._sequence)
+                PUBLICATION, self._loop.now, thread, outlet.state.address, self._sequence)
 
-    def _delay(self, inlet: Inlet, origin: Origin | None, release: int) -> int:
-        target = None if origin is None else inlet.entity.targets.get(origin.vertex)
+    def _delay(self, entity: Entity, origin: Origin | None, release: int) -> int:
+        target = None if origin is None else entity.targets.get(origin.vertex)
         if origin is None or target is None:
             return 0
         return self._times.transport(origin.dag, origin.vertex, target[0], release)
 
     def _leave(self, outlet: Outlet, data: bytes, origin: Origin | None, release: int) -> None:
         """Send a message to the outputs and to the subscriptions."""
-        now = self._loop.now
-        self._outputs.add(now, outlet.topic, outlet.kind, data, outlet.publisher)
-        outlet.count += 1
+        now, state = self._loop.now, outlet.state
+        self._outputs.add(now, state.topic, outlet.kind, data, outlet.publisher)
+        state.count += 1
         if outlet.kept.maxlen:
             outlet.kept.append((now, data))
-        for inlet in self._inlets_of(outlet):
-            arrive = partial(self._arrive, inlet, data, now, origin, outlet.count)
-            delay = self._delay(inlet, origin, release)
+        for entity in self._subscriptions_of(outlet):
+            arrive = partial(self._arrive, entity, data, now, origin, state.count)
+            delay = self._delay(entity, origin, release)
             if delay:
                 self._loop.at(now + delay, ARRIVED, arrive)
             else:
@@ -281,9 +260,9 @@ class Messages:
     def _load(self) -> None:
         """Load the messages that nodes need by now, and begin to deliver them."""
         recording = self._recording
-        new = recording.load({*self._inlets, *self.offered})
-        for topic, inlets in self._inlets.items():
-            recorded, wanted = recording.kinds.get(topic), type_name(inlets[0].kind)
+        new = recording.load({*self._subscriptions, *self.offered})
+        for topic, entities in self._subscriptions.items():
+            recorded, wanted = recording.kinds.get(topic), type_name(entities[0].rclpy.msg_type)
             if recorded not in (None, wanted) and topic not in self.offered:
                 raise RerunError(
                     f'{recording.name}: {topic} was recorded as {recorded}, and the node '
@@ -304,8 +283,8 @@ class Messages:
         if topic in self.offered:
             return  # the node's count
         self._last[topic] = published, data
-        for inlet in self._inlets.get(topic, ()):
-            self._arrive(inlet, data, published, None)
+        for entity in self._subscriptions.get(topic, ()):
+            self._arrive(entity, data, published, None)
 
     def _publish_time(self) -> None:
         now = self._loop.now
@@ -317,24 +296,24 @@ class Messages:
     # --- what arrives ----------------------------------------------------------------------------
 
     def _arrive(
-        self, inlet: Inlet, data: bytes, source_stamp: int, origin: Origin | None, number: int = 0
+        self, entity: Entity, data: bytes, source_stamp: int, origin: Origin | None,
+        number: int = 0,
     ) -> None:
         """Have a subscription's callback run with a message."""
-        entity, now, engine = inlet.entity, self._loop.now, self._engine
+        now, engine = self._loop.now, self._engine
         if entity.removed:
             return
-        message = self._message(inlet, data)
-        inlet.received += 1
+        message = self._message(entity, data)
         if entity.at_once:
             entity.rclpy.callback(message)
             engine.ran_at_once(entity)
             return
         args: tuple[Any, ...] = (message,)
-        if inlet.with_info:
+        if callback_type(entity.rclpy) is WITH_INFO:
             args = message, {
                 'source_timestamp': source_stamp, 'received_timestamp': now,
                 'publication_sequence_number': number,
-                'reception_sequence_number': inlet.received}
+                'reception_sequence_number': entity.ready + 1}
         release = stamp = -1
         if entity.source >= 0:
             release, stamp = self._release(entity, message, source_stamp)
@@ -354,14 +333,15 @@ class Messages:
             return stamp, stamp
         return source_stamp if kind == 'source_timestamp' else self._loop.now, stamp
 
-    def _message(self, inlet: Inlet, data: bytes) -> Any:
-        if inlet.raw:
+    def _message(self, entity: Entity, data: bytes) -> Any:
+        kind = entity.rclpy.msg_type
+        if entity.rclpy.raw:
             return data
         try:
-            return deserialize_message(data, inlet.kind)
+            return deserialize_message(data, kind)
         except Exception as error:
             raise RerunError(
-                f'{inlet.entity.label}: a message of it does not decode as '
-                f'{type_name(inlet.kind)}, at {(self._loop.now - self._loop.start) / 1e9:.6f} s '
+                f'{entity.label}: a message of it does not decode as '
+                f'{type_name(kind)}, at {(self._loop.now - self._loop.start) / 1e9:.6f} s '
                 f'({" ".join(str(error).split())[:120]}): record it with the type that the node '
                 'has') from None

@@ -17,11 +17,9 @@ import struct
 from typing import Any, BinaryIO, NamedTuple
 
 from mddag_executor.rerun.message_types import definition, type_name
-from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.trace_file import TraceFile
 
 _HEAD = struct.Struct('<qII')
-_MANY = 4096
 
 
 class Output(NamedTuple):
@@ -105,28 +103,13 @@ def _qos(profile: Any) -> str:
         '  avoid_ros_namespace_conventions: false\n'))
 
 
-class VirtualTraceWriter:
+class VirtualTraceWriter(TraceFile):
     """Records events as ``TraceWriter`` does, but at once: nothing waits, and nothing is lost."""
-
-    dropped = 0
-    error: TraceError | None = None
-
-    def __init__(self, path: str) -> None:
-        self.path = path
-        self._file = TraceFile(path, overwrite=True)  # checked before the run
-        self._events: list[tuple[Any, ...]] = []
 
     def record(self, *event: Any) -> None:
         """Record one event, or several at once as an entry of ``groups``."""
-        self._events.append(event)
-        if len(self._events) >= _MANY:
-            self._write()
-
-    def _write(self) -> None:
-        self._file.extend(self._events, os.getpid())
-        self._events = []
+        self.extend((event,), os.getpid())
 
     def close(self) -> None:
-        """Write the rest, and complete the file."""
-        self._write()
-        self._file.finish()
+        """Complete the file."""
+        self.finish()

@@ -30,6 +30,7 @@ from mddag_executor.executor.compat import (
     service_name,
 )
 from mddag_executor.executor.entity import Entity, SERVICE
+from mddag_executor.executor.registry import Registry
 from mddag_executor.executor.work import Work
 from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.compat import (
@@ -53,21 +54,15 @@ Header = tuple[Any, int]
 class Requests:
     """Carries what clients and servers of services and actions send."""
 
-    def __init__(self, loop: Loop, executor: Any) -> None:
+    def __init__(self, loop: Loop, executor: Any, registry: Registry) -> None:
         self._loop = loop
         self._executor = executor
+        self._registry = registry
         self._numbers = itertools.count(1)
-        self._entities: dict[int, Entity] = {}
-        self._services: dict[str, Entity] = {}
         # clients and servers of actions with their names, by the id of their handles
         self._actions: dict[int, tuple[str, Any]] = {}
         self._result_timeout_ns: dict[int, int] = {}  # by the id of a server's handle
         self._ended_goals: set[bytes] = set()
-
-    def refresh(self, entities: dict[int, Entity]) -> None:
-        """Update which entities there are, by the id of those of rclpy."""
-        self._entities = entities
-        self._services = {e.label: e for e in entities.values() if e.kind == SERVICE}
 
     def install(self, replacements: Replacements) -> None:
         """Have clients and servers use this."""
@@ -93,14 +88,18 @@ class Requests:
 
     def _send(self, content: Any, deliver: Callable[[Any], None]) -> None:
         """Deliver a copy of something when the callback that runs ends, or else at once."""
-        self._loop.call_at_end(partial(deliver, copy.deepcopy(content)))
+        copied = copy.deepcopy(content)
+        self._loop.send(lambda *_: deliver(copied))
 
     # --- services --------------------------------------------------------------------------------
 
     def is_offered(self, client: Client) -> bool:
         """Return whether a node of the run offers a client's service."""
-        entity = self._services.get(service_name(client))
-        return entity is not None and not entity.removed
+        return self._service(service_name(client)) is not None
+
+    def _service(self, name: str) -> Entity | None:
+        return next((entity for entity in self._registry.by_id.values()
+                     if entity.kind == SERVICE and entity.label == name), None)
 
     def call_async(self, client: Any, request: Any) -> Future:
         """Send a request; return the future of its response."""
@@ -126,11 +125,11 @@ class Requests:
         return future.result()
 
     def _ask(self, client: Client, number: int, request: Any) -> None:
-        if not self.is_offered(client):
-            self._loop.warn(f'{service_name(client)}: it is called, and no node of the run offers '
-                            'this service')
+        name = service_name(client)
+        entity = self._service(name)
+        if entity is None:
+            self._loop.warn(f'{name}: it is called, and no node of the run offers this service')
             return
-        entity = self._services[service_name(client)]
         service = entity.rclpy
         work = Work(
             entity, service.callback, (request, service.srv_type.Response()),
@@ -178,7 +177,7 @@ class Requests:
         """Return the clients of an action server, or the servers of an action client."""
         name, _ = self._actions[id(handle)]
         return [each for known, each in self._actions.values()
-                if known == name and id(each) in self._entities
+                if known == name and id(each) in self._registry.by_id
                 and type(action_handle(each)) is not type(handle)]
 
     def _ask_action(self, kind: str, handle: Any, request: Any) -> int:
@@ -216,11 +215,11 @@ class Requests:
         message = GoalStatusArray(status_list=[
             GoalStatus(goal_info=info, status=status) for info, status in goal_states(server)])
 
-        def deliver() -> None:
+        def deliver(*_: Any) -> None:
             for client in self._peers(handle):
                 self._take(client, {'status': message})
 
-        self._loop.call_at_end(deliver)
+        self._loop.send(deliver)
 
     def _goal_done(self, handle: Any) -> None:
         """Have the results of goals that have ended expire after the server's timeout."""
@@ -246,7 +245,7 @@ class Requests:
         self._ready(waitable, waitable.execute, data)
 
     def _ready(self, waitable: Any, function: Callable[[Any], Any], argument: Any) -> None:
-        entity = self._entities.get(id(waitable))
+        entity = self._registry.by_id.get(id(waitable))
         if entity is not None and not entity.removed:
             engine = self._loop.engine
             engine.ready(Work(entity, function, (argument,)), self._loop.now)

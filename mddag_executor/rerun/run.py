@@ -149,7 +149,8 @@ class Rerun:
 
     def _make(self, context: Any) -> None:
         settings, recording, task_set = self._settings, self._recording, self._task_set
-        writer = None if self._trace is None else VirtualTraceWriter(self._trace)
+        writer = None if self._trace is None else VirtualTraceWriter(
+            self._trace, overwrite=True)  # checked before the run
         self._engine = engine = Engine(
             task_set, settings.workers, settings.policy, default_deadline=DEFAULT_DEADLINE_NS,
             max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER_NS,
@@ -175,7 +176,7 @@ class Rerun:
             self._recorder.entities((), [self._holder.task_entity])
         self._registry = Registry(task_set, engine, engine.leave_group)
         self._messages = Messages(loop, recording, self._times, self._outputs, task_set)
-        self._requests = Requests(loop, self._holder)
+        self._requests = Requests(loop, self._holder, self._registry)
         self._timers = Timers(loop, self._times.first_release)
         self._host = RerunHost(loop)
 
@@ -217,10 +218,9 @@ class Rerun:
         for entity in gone:
             engine.remove(entity, now)
         self._timers.refresh(registry.timers())
-        self._requests.refresh(registry.by_id)
         if self._recorder is not None:
             self._recorder.entities(nodes, added)
-        self._messages.refresh(nodes, registry.subscriptions())
+        self._messages.refresh(nodes, added, registry.subscriptions())
 
     # --- the run ---------------------------------------------------------------------------------
 

@@ -223,14 +223,9 @@ class RunThreads:
         """Return whether a thread is a run thread that waits."""
         return thread is not None and any(s.ident == thread.ident for s in self.waiting)
 
-    def next_deadline(self) -> int | None:
-        """Return the earliest time at which a run thread waits no longer."""
-        return min((s.deadline for s in self.waiting if s.deadline is not None), default=None)
-
-    def expire(self, now: int) -> None:
-        """Let run threads go on whose time is over."""
-        late = [s for s in self.waiting if s.deadline is not None and s.deadline <= now]
-        for run_thread in sorted(late, key=lambda s: s.deadline or 0):
+    def expire(self, run_thread: RunThread, deadline: int) -> None:
+        """Let a run thread go on whose time is over, if it still waits."""
+        if run_thread in self.waiting and run_thread.deadline == deadline:
             self.waiting.remove(run_thread)
             self._ready.append(run_thread)
 

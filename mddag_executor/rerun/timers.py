@@ -53,19 +53,8 @@ class Timers:
 
     def install(self, replacements: Replacements) -> None:
         """Have what nodes do with their timers count in virtual time."""
-        def then(after: Callable[[Timer], None]) -> Callable[[Any], Any]:
-            def make(original: Callable[[Timer], None]) -> Callable[[Timer], None]:
-                def method(timer: Timer) -> None:
-                    original(timer)
-                    after(timer)
-
-                return method
-
-            return make
-
         replace = replacements.replace
-        replace(Timer, 'reset', then(self._reset))
-        replace(Timer, 'cancel', then(self._cancelled))
+        replace(Timer, 'reset', self._reset)
         replace(Timer, 'time_until_next_call', instead(self._until_next))
         replace(Timer, 'time_since_last_call', instead(self._since_last))
 
@@ -101,10 +90,10 @@ class Timers:
     def _fire(self, known: _TimerState, due: int) -> None:
         timer, engine, now = known.entity.rclpy, self._loop.engine, self._loop.now
         if known.due != due or self._known.get(timer) is not known or not alive(timer):
-            return  # it was reset or cancelled meanwhile, or is gone
+            return  # it was reset meanwhile, or is gone
         period = _period(timer)
         self._schedule(known, due + ((now - due) // period + 1) * period)
-        if known.due < 0:
+        if known.due < 0:  # it was cancelled
             return
         known.last = now
         callback = timer.callback
@@ -118,16 +107,15 @@ class Timers:
 
     # --- what nodes do with them -----------------------------------------------------------------
 
-    def _reset(self, timer: Timer) -> None:
-        known = self._known.get(timer)
-        if known is not None:
-            known.last = self._loop.now
-            self._schedule(known, self._loop.now + _period(timer))
+    def _reset(self, original: Callable[[Timer], None]) -> Callable[[Timer], None]:
+        def reset(timer: Timer) -> None:
+            original(timer)
+            known = self._known.get(timer)
+            if known is not None:
+                known.last = self._loop.now
+                self._schedule(known, known.last + _period(timer))
 
-    def _cancelled(self, timer: Timer) -> None:
-        known = self._known.get(timer)
-        if known is not None:
-            known.due = -1
+        return reset
 
     def _until_next(self, timer: Timer) -> int | None:
         """Return how long it is until a timer is due; None if it is cancelled."""

@@ -19,6 +19,7 @@ from mddag_executor.rerun.inputs import MessageBag, open_input
 from mddag_executor.rerun.run import Rerun, Settings
 from mddag_executor.simulate import draw_execution_times, Load, periodic_load, simulate
 from mddag_executor.simulate import Settings as SimulatorSettings
+from mddag_executor.trace import TraceReader
 from msg_graph import load, loads
 from msg_graph.duration import parse_duration
 import numpy
@@ -175,6 +176,10 @@ def test_the_trace_replays(bag, graph, tmp_path):
     assert again.result()['callbacks']['/sink:take']['cpu_ns'] == 20 * 5 * MS
     sink = theirs['sinks']['/sink:take']
     assert sink['response_ns'] == mine['sinks']['/sink:take']['response_ns']
+    handles = {
+        name: {handle for _, _, _, _, handle, *_ in TraceReader(trace).events({name})}
+        for name in ('ros2:rcl_publisher_init', 'ros2:rclcpp_publish')}
+    assert len(handles['ros2:rclcpp_publish'] & handles['ros2:rcl_publisher_init']) == 2
 
 
 def test_recorded_times_come_from_a_trace(bag, graph, tmp_path):
