@@ -11,13 +11,17 @@ What an output may replace: the one rule for all verbs and for the Python API.
 4. Pipes, devices and empty files hold nothing that could be lost.
 5. A folder of results replaces a folder that is empty or holds files with the names of such
    results only: those of an earlier command, or what a killed one left. Other folders stay.
+6. A result is written to a temporary file in the folder of its target, which is renamed when it is
+   complete. So an interrupted or failed run leaves no incomplete file, and an earlier file intact.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 import os
 from pathlib import Path
+import shutil
 import stat
 from typing import BinaryIO, cast
 
@@ -47,6 +51,35 @@ def create_recording(path: str, overwrite: bool = False) -> BinaryIO:
         if not overwrite and holds_data(path):
             raise
         return cast(BinaryIO, open(path, 'wb', buffering=0))
+
+
+@contextmanager
+def whole_file(path: str) -> Iterator[BinaryIO]:
+    """Give a binary file that becomes `path` if the block ends well (rule 6)."""
+    if is_special(path):
+        try:
+            with open(path, 'wb') as special:
+                yield special
+        except OSError as error:
+            error.filename = error.filename or path
+            raise
+        return
+    target = Path(os.path.realpath(path))  # a symbolic link stays one
+    begin = os.fsdecode(os.fsencode(target.name)[:200])     # a name may have 255 bytes
+    part = target.with_name(f'.{begin}.{os.getpid()}.part')
+    try:
+        with part.open('xb') as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        if target.exists():
+            shutil.copymode(target, part)
+        part.replace(target)
+    except BaseException as error:
+        part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(part)):
+            error.filename = path  # a full disk, or the folder
+        raise
 
 
 def check_results(folder: Path, names: Collection[str]) -> None:
@@ -87,6 +120,14 @@ def holds_data(path: str) -> bool:
     except (OSError, ValueError):
         return False
     return stat.S_ISREG(status.st_mode) and status.st_size > 0
+
+
+def is_special(path: str) -> bool:
+    """Return whether it is a pipe or device (`/dev/stdout`), which is never replaced."""
+    try:
+        return not stat.S_ISREG(os.stat(path).st_mode)
+    except OSError:
+        return False
 
 
 def is_recording(path: str) -> bool:

@@ -3,10 +3,7 @@
 """
 Files of the verbs: reading files and standard input, and writing results (see `options`, too).
 
-Theory of operation for outputs: a result is written to a temporary file in the folder of its
-target, which is renamed when it is complete. So an interrupted or failed run leaves no incomplete
-file, and an earlier file intact. `check_output` is called before long work starts, so a mistyped
-path costs nothing.
+`check_output` is called before long work starts, so a mistyped path costs nothing.
 """
 
 from __future__ import annotations
@@ -18,7 +15,6 @@ import json
 import os
 from pathlib import Path
 import shutil
-import stat
 import sys
 import tempfile
 from typing import Any, BinaryIO, cast, TYPE_CHECKING, TypeVar
@@ -31,7 +27,9 @@ from mddag_executor.output_rules import (
     check_distinct,
     check_replaced,
     check_results,
+    is_special,
     remove_results,
+    whole_file,
 )
 
 if TYPE_CHECKING:
@@ -172,10 +170,9 @@ def check_output(path: str | None, recording: bool = False, overwrite: bool = Fa
     """Check that a file can be written: `-` always; a recording may need `overwrite`."""
     if path is None or path == '-':
         return
-    target = Path(path)
-    if target.is_dir():
+    if os.path.isdir(path):
         raise InputError(path, 'this is a directory', 'name a file')
-    if not _is_special(target):
+    if not is_special(path):
         _check_parent(path)
         check_replaced(path, recording=recording, overwrite=overwrite)
 
@@ -188,14 +185,6 @@ def _check_report(path: Report) -> None:
     check_available()
 
 
-def _is_special(path: Path) -> bool:
-    """Return whether it is a pipe or device (`/dev/stdout`), which is never replaced."""
-    try:
-        return not stat.S_ISREG(path.stat().st_mode)
-    except OSError:
-        return False
-
-
 @contextmanager
 def output_file(path: str) -> Iterator[BinaryIO]:
     """Give a binary file that becomes `path` (`-`: standard output) if the block ends well."""
@@ -204,31 +193,8 @@ def output_file(path: str) -> Iterator[BinaryIO]:
         yield cast(BinaryIO, sys.stdout.buffer)
         sys.stdout.buffer.flush()
         return
-    target = Path(path)
-    if _is_special(target):
-        try:
-            with target.open('wb') as special:
-                yield special
-        except OSError as error:
-            error.filename = error.filename or path
-            raise
-        return
-    target = Path(os.path.realpath(path))  # a symbolic link stays one
-    begin = os.fsdecode(os.fsencode(target.name)[:200])     # a name may have 255 bytes
-    part = target.with_name(f'.{begin}.{os.getpid()}.part')
-    try:
-        with part.open('xb') as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        if target.exists():
-            shutil.copymode(target, part)
-        part.replace(target)
-    except BaseException as error:
-        part.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename in (None, str(part)):
-            error.filename = path  # a full disk, or the folder
-        raise
+    with whole_file(path) as file:
+        yield file
 
 
 def check_folder(path: str, names: Collection[str]) -> None:

@@ -14,15 +14,15 @@ In a test::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, ExitStack, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 import os
 from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.core import policy as find_policy
 from mddag_executor.hosting.loading import Program, resolve, ros_arguments
-from mddag_executor.output_rules import check_distinct, check_replaced
+from mddag_executor.output_rules import check_distinct, check_replaced, whole_file
 from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.inputs import MessageBag, open_input
@@ -85,28 +85,10 @@ def rerun(
     messages, taken = open_input(
         os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)
     with ExitStack() as files:
-        parts = {name: files.enter_context(_made_whole(path)) for name, path in written}
-        run = Rerun(
-            messages, taken, task_set, settings,
-            None if output is None else files.enter_context(open(parts['output'], 'wb')),
-            parts.get('trace'))
+        parts = {name: files.enter_context(whole_file(path)) for name, path in written}
+        trace_file = parts['trace'].name if 'trace' in parts else None
+        run = Rerun(messages, taken, task_set, settings, parts.get('output'), trace_file)
         return run.run(lambda: programs(nodes, ros_args))
-
-
-@contextmanager
-def _made_whole(path: str) -> Iterator[str]:
-    """Give a file name that becomes `path` if the block ends well; otherwise the file vanishes."""
-    path = os.path.realpath(path)  # a symbolic link stays one
-    if os.path.exists(path) and not os.path.isfile(path):  # a pipe or device is not replaced
-        yield path
-        return
-    part = f'{path}.{os.getpid()}.part'
-    try:
-        yield part
-        os.replace(part, path)
-    finally:
-        with suppress(FileNotFoundError):
-            os.remove(part)
 
 
 def programs(nodes: Sequence[NodeSpec], ros_args: Sequence[str] = ()) -> list[Program]:

@@ -32,8 +32,7 @@ class Difference(NamedTuple):
     How a topic differs.
 
     :ivar kind: ``content``, ``timing`` (only times differ), or ``missing`` (one side has none).
-    :ivar number: which of its messages is the first that differs, from 0; -1: none, there are
-        only more or fewer.
+    :ivar number: which of its messages is the first that differs, from 0.
     :ivar time: the virtual time of that message in this run, ns after its start.
     :ivar field: the first field that differs; empty: when it was published.
     """
@@ -53,8 +52,6 @@ class Difference(NamedTuple):
         counts = ''
         if self.messages != self.expected_messages:
             counts = f'; {self.messages} messages, expected {self.expected_messages}'
-        if self.number < 0:
-            return f'{self.topic}: {self.kind}{counts}'
         what = self.field or 'the time of publication'
         return (
             f'{self.topic}: {self.kind}, first in message {self.number} at '

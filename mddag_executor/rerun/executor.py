@@ -35,21 +35,6 @@ class NodeHolder(BareExecutor):
         nodes = filter(alive, self.get_nodes())  # a callback may have destroyed its node
         return sorted(nodes, key=lambda node: node.get_fully_qualified_name())
 
-    def wake(self) -> None:
-        """Take note that entities have come or gone."""
-        self._loop.changed = True
-
-    def add_node(self, node: Node) -> bool:
-        """Add a node."""
-        added: bool = super().add_node(node)
-        self.wake()
-        return added
-
-    def remove_node(self, node: Node) -> None:
-        """Remove a node."""
-        super().remove_node(node)
-        self.wake()
-
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
         """Run a function or coroutine in the run; return its task, which is a future."""
         if type(callback) is QuickCallback:

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.errors import UsageError
+from mddag_executor.output_rules import is_recording
 from mddag_executor.recording.tables import Recording
 from mddag_executor.replay.bags import Bag, is_ordinary
 from mddag_executor.replay.load import LoadBuilder
@@ -131,7 +132,7 @@ def open_input(
         taken = _fixed(task_set, draw_execution_times(task_set, seed, undeclared=0))
     elif times == RECORDED and run is not None:
         taken = _recorded(run, task_set)
-    elif os.path.isdir(times) or _begins_as_mcap(times):
+    elif os.path.isdir(times) or is_recording(times):
         taken = _recorded(open_recording(times, task_set, times), task_set)
     else:
         with open(times, 'rb') as file:
@@ -160,8 +161,3 @@ def _recorded(run: Recording, task_set: TaskSet) -> Durations:
     tables = Tables.build(task_set, max_active_jobs=NEVER)
     builder = LoadBuilder(run, tables, run.head.workers)
     return Durations(tables, builder.build().load, recorded=True)
-
-
-def _begins_as_mcap(path: str) -> bool:
-    with open(path, 'rb') as file:
-        return file.read(5) == b'\x89MCAP'

@@ -45,12 +45,11 @@ class Outputs:
         self.messages: list[Output] = []
         self.counts: dict[str, int] = {}
         self._keep = keep
-        self._heads: dict[tuple[str, Any], bytes] = {}
+        # of each topic and type: their names, and their channel in the bag
+        self._channels: dict[tuple[str, Any], tuple[bytes, int]] = {}
         self._hash = hashlib.sha256()
         self._numbers = itertools.count(1)
         self._bag: Any = None
-        self._schemas: dict[Any, int] = {}
-        self._channels: dict[tuple[str, Any], int] = {}
         if file is not None:
             from mcap.writer import CompressionType, Writer
             self._bag = Writer(file, compression=CompressionType.ZSTD)
@@ -61,23 +60,22 @@ class Outputs:
         self.counts[topic] = self.counts.get(topic, 0) + 1
         if self._keep is None or topic in self._keep:
             self.messages.append(Output(time, topic, kind, data))
-        head = self._heads.get((topic, kind))
-        if head is None:
-            head = self._heads[topic, kind] = f'{topic}\n{type_name(kind)}\n'.encode()
-            if self._bag is not None:
-                self._channels[topic, kind] = self._bag.register_channel(
-                    topic, 'cdr', self._schema(kind),
-                    {'offered_qos_profiles': _qos(publisher.qos_profile)})
+        known = self._channels.get((topic, kind))
+        if known is None:
+            known = self._channels[topic, kind] = (
+                f'{topic}\n{type_name(kind)}\n'.encode(), self._new_channel(
+                    topic, kind, publisher))
+        head, channel = known
         self._hash.update(_HEAD.pack(time, len(head), len(data)) + head + data)
         if self._bag is not None:
-            self._bag.add_message(
-                self._channels[topic, kind], time, data, time, next(self._numbers))
+            self._bag.add_message(channel, time, data, time, next(self._numbers))
 
-    def _schema(self, kind: Any) -> int:
-        if kind not in self._schemas:
-            self._schemas[kind] = self._bag.register_schema(
-                type_name(kind), 'ros2msg', definition(kind).encode())
-        return self._schemas[kind]
+    def _new_channel(self, topic: str, kind: Any, publisher: Any) -> int:
+        if self._bag is None:
+            return 0
+        schema = self._bag.register_schema(type_name(kind), 'ros2msg', definition(kind).encode())
+        return int(self._bag.register_channel(
+            topic, 'cdr', schema, {'offered_qos_profiles': _qos(publisher.qos_profile)}))
 
     @property
     def digest(self) -> str:

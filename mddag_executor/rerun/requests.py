@@ -62,7 +62,6 @@ class Requests:
         # clients and servers of actions with their names, by the id of their handles
         self._actions: dict[int, tuple[str, Any]] = {}
         self._result_timeout_ns: dict[int, int] = {}  # by the id of a server's handle
-        self._ended_goals: set[bytes] = set()
 
     def install(self, replacements: Replacements) -> None:
         """Have clients and servers use this."""
@@ -228,17 +227,11 @@ class Requests:
         timeout_ns = self._result_timeout_ns[id(handle)]
         at = self._loop.now + timeout_ns
         if timeout_ns >= 0 and at < self._loop.end:
-            ended = {
-                bytes(info.goal_id.uuid): info for info, status in goal_states(server)
-                if status > GoalStatus.STATUS_CANCELING}
-            new = [info for goal, info in ended.items() if goal not in self._ended_goals]
-            self._ended_goals |= ended.keys()
-            self._loop.at(at, TIMER, self._expire, server, new)
-
-    def _expire(self, server: Any, ended: list[Any]) -> None:
-        expired = [info for info in ended if has_result(server, info)]
-        if expired:
-            self._take(server, {'expired': expired})
+            ended = [info for info, status in goal_states(server)
+                     if status > GoalStatus.STATUS_CANCELING]
+            # those whose results are left then: others have expired before
+            self._loop.at(at, TIMER, self._ready, server, lambda ended: server.execute(
+                {'expired': [info for info in ended if has_result(server, info)]}), ended)
 
     def _take(self, waitable: Any, data: dict[str, Any]) -> None:
         attach_futures(waitable, self._executor)

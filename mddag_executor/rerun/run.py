@@ -192,7 +192,9 @@ class Rerun:
         def trigger(guard: GuardCondition) -> None:
             original(guard)
             entity = self._registry.by_id.get(id(guard))
-            if entity is not None and guard.callback is not None:
+            if entity is None:  # of an executor: entities have come or gone
+                self._loop.changed = True
+            elif guard.callback is not None:
                 work = Work(entity, guard.callback)
                 self._loop.call_in_run(lambda: self._engine.ready(work, self._loop.now))
 
