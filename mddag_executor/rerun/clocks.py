@@ -113,18 +113,19 @@ class VirtualTime:
     def _is_virtual(self, clock: Clock) -> bool:
         if clock.clock_type != ClockType.ROS_TIME:
             return self._all
-        return not (self._simulated and isinstance(clock, ROSClock) and clock.ros_time_is_active)
+        return not self._simulated or not (
+            isinstance(clock, ROSClock) and clock.ros_time_is_active)
 
     def _clock_now(self, original: Callable[[Clock], Time]) -> Callable[[Clock], Time]:
-        ros_time, loop = ClockType.ROS_TIME, self._loop
+        loop = self._loop
 
         def now(clock: Clock) -> Time:
             kind = clock.clock_type
-            if kind is ros_time and not self._simulated or self._is_virtual(clock):
+            if self._is_virtual(clock):
                 if loop.run_threads.current() is not None:
                     loop.note_poll()
                 return Time(nanoseconds=loop.now, clock_type=kind)
-            if kind is not ros_time:
+            if kind is not ClockType.ROS_TIME:
                 self._warn_of(f'a clock of {kind.name}', 2)
             return original(clock)
 

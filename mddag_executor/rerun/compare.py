@@ -67,19 +67,13 @@ def differences(
 
     :param start: the virtual time at which the run began.
     """
-    found: dict[str, list[Output]] = {}
+    topics: dict[str, tuple[list[Output], list[RecordedMessage]]] = {}
     for output in outputs:
-        found.setdefault(output.topic, []).append(output)
-    wanted: dict[str, list[RecordedMessage]] = {}
+        topics.setdefault(output.topic, ([], []))[0].append(output)
     for message in expected:
-        wanted.setdefault(message.topic, []).append(message)
-    results = []
-    for topic in sorted({*found, *wanted}):
-        one = _difference(
-            topic, found.get(topic, []), wanted.get(topic, []), start, tolerance)
-        if one is not None:
-            results.append(one)
-    return results
+        topics.setdefault(message.topic, ([], []))[1].append(message)
+    every = (_difference(topic, *both, start, tolerance) for topic, both in sorted(topics.items()))
+    return [difference for difference in every if difference is not None]
 
 
 def _difference(

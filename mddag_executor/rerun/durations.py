@@ -52,10 +52,19 @@ class Durations:
 
     def execution(self, dag: int, vertex: int, release: int) -> int:
         """Return how long a vertex of the job with that release executed."""
+        return self._cost(self._load.costs, dag, vertex, release, -1)
+
+    def computed(self, dag: int, vertex: int, release: int) -> int:
+        """Return the CPU time that a vertex of the job with that release took."""
         load = self._load
-        local = vertex - self._tables.first_vertex[dag]
-        first, stride = load.cost_base[dag] + local, load.cost_stride[dag]
-        return self._value(load.costs, first, stride, dag, release, (vertex, -1))
+        return self._cost(load.computed or load.costs, dag, vertex, release, -2)
+
+    def _cost(
+        self, values: Sequence[int], dag: int, vertex: int, release: int, column: int
+    ) -> int:
+        load, local = self._load, vertex - self._tables.first_vertex[dag]
+        return self._value(values, load.cost_base[dag] + local, load.cost_stride[dag], dag,
+                           release, (vertex, column))
 
     def transport(self, dag: int, before: int, after: int, release: int) -> int:
         """Return how long after the end of a vertex its message arrived."""
@@ -65,14 +74,6 @@ class Durations:
         load = self._load
         return max(0, self._value(load.delays, load.delay_base[dag] + edge,
                                   load.delay_stride[dag], dag, release, (before, after)))
-
-    def computed(self, dag: int, vertex: int, release: int) -> int:
-        """Return the CPU time that a vertex of the job with that release took."""
-        load, local = self._load, vertex - self._tables.first_vertex[dag]
-        if not load.computed:
-            return self.execution(dag, vertex, release)
-        first, stride = load.cost_base[dag] + local, load.cost_stride[dag]
-        return self._value(load.computed, first, stride, dag, release, (vertex, -2))
 
     def holds(self, vertex: int) -> bool:
         """Return whether a vertex held the interpreter in most jobs."""

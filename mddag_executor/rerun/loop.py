@@ -12,7 +12,8 @@ dispatches until it has nothing left to do. All that this causes at the same ins
 time goes on.
 
 A callback runs, for real and at once, when the core dispatches it. In virtual time it takes as
-long as ``times`` says, or as long as it has waited, if that is more. What it sends is kept until
+long as ``times`` says, on the CPUs and with the interpreter that it shares as in the simulator
+(``simulate.machine``), or as long as it has waited, if that is more. What it sends is kept until
 its virtual end, or until it begins to wait, because others may have to answer it.
 
 A message that another thread sends has no virtual time: it gets the time at which it arrives, and
@@ -38,6 +39,7 @@ import itertools
 import math
 from typing import Any
 
+from mddag_executor.core import NEVER
 from mddag_executor.core.state import DONE
 from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.engine import Engine
@@ -47,7 +49,7 @@ from mddag_executor.hosting.loading import describe
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.run_threads import RunThreads
-from mddag_executor.rerun.shared_cpus import SharedCpus
+from mddag_executor.simulate.machine import begins, new_machine, NEXT_TIME, settle, share
 
 DRAIN_NS = 10_000_000_000
 """What has begun may go on this long after the end of the recording, and in a pause of it."""
@@ -88,6 +90,8 @@ class Loop:
     """
     Runs callbacks in virtual time.
 
+    :param cpus: how many there are; None: as many as are needed.
+    :param python: whether all callbacks need the interpreter at their end: see ``Machine``.
     :param start: the virtual time at which it begins, ns since the epoch.
     :param end: when the recording ends.
     :param pauses: from when to when it has no messages.
@@ -102,8 +106,8 @@ class Loop:
     """
 
     def __init__(
-        self, engine: Engine, times: Durations, cpus: SharedCpus, start: int, end: int,
-        pauses: Sequence[tuple[int, int]], refresh: Callable[[], None],
+        self, engine: Engine, times: Durations, cpus: int | None, python: bool, start: int,
+        end: int, pauses: Sequence[tuple[int, int]], refresh: Callable[[], None],
         begin: Callable[[], None], over: Callable[[], None],
     ) -> None:
         self.engine = engine
@@ -113,8 +117,12 @@ class Loop:
         self.callbacks = 0
         self.changed = True
         self.warnings: list[str] = []
-        self._cpus = cpus
-        cpus.settle(start)
+        self._state = engine.scheduler.state
+        self._machine = new_machine(engine.tables, self._state, cpus, python)
+        settle(self._state, self._machine, start)
+        # by worker: what runs on it, and when that ends if nothing changes
+        self._running: list[Execution | None] = [None] * engine.n_workers
+        self._finish_at = [NEVER] * engine.n_workers
         self.on_ended: Callable[[Any], object] = lambda entity: None
         self.run_threads = RunThreads(self._step, over)
         self._times = times
@@ -189,7 +197,7 @@ class Loop:
         if work is not None:
             self._execute(work)
             return True
-        self._cpus.share(now)
+        self._share()
         if self._end_finished():
             return True
         if engine.has_waiting and engine.interpreter_holder() and now >= self._ask_at:
@@ -197,11 +205,22 @@ class Loop:
             self.at(self._ask_at, TIMER, lambda: None)  # it may overtake by then
         return self._advance()
 
+    def _share(self) -> None:
+        """Decide which executions go on, and when they end."""
+        share(self.engine.tables, self._state, self._machine, self.now, self._finish_at)
+        for worker, execution in enumerate(self._running):
+            if execution is None:  # it waits
+                self._finish_at[worker] = NEVER
+
     def _end_finished(self) -> bool:
-        execution = self._cpus.take_finished(self.now)
-        if execution is not None:
-            self._end(execution)
-        return execution is not None
+        """End the execution of the first worker on which one has finished."""
+        for worker, execution in enumerate(self._running):
+            if execution is not None and self._finish_at[worker] <= self.now:
+                self._running[worker] = None
+                self._finish_at[worker] = NEVER
+                self._end(execution)
+                return True
+        return False
 
     def refresh_now(self) -> None:
         """Bring up to date which entities there are, if any may have come or gone."""
@@ -211,7 +230,8 @@ class Loop:
 
     def _advance(self) -> bool:
         """Let time go on to what comes next."""
-        next_at = max(self.now + 1, self._cpus.next_time())
+        next_at = max(
+            self.now + 1, min(self._machine.scalars[NEXT_TIME], *self._finish_at))
         if self._events:
             next_at = min(next_at, self._events[0][0])
         if self.engine.check_at > self.now:  # else a worker is needed first
@@ -220,7 +240,7 @@ class Loop:
             return False
         self.now = next_at
         self._at_once = 0
-        self._cpus.settle(next_at)
+        settle(self._state, self._machine, next_at)
         return True
 
     # --- callbacks -------------------------------------------------------------------------------
@@ -237,7 +257,7 @@ class Loop:
         release = 0 if origin is None else self.engine.release_of(work)
         execution = Execution(work, self.now, work.worker, work.worker + 1, origin, release)
         takes = self._execution_time(work, origin, release)
-        self._cpus.waits(work)
+        begins(self._state, self._machine, work.x, 0, -1)  # for now it needs nothing
         if not self._call(execution):
             return
         self.callbacks += 1
@@ -245,7 +265,11 @@ class Loop:
             work.cpu_ns = max(0, self._times.computed(origin.dag, origin.vertex, release))
             work.entity.habit.took(takes, takes)
         if execution.worker >= 0 and self.now == execution.start:  # it has not waited
-            self._cpus.begin(execution, takes)
+            state, x = self._state, work.x
+            state.x_left[x] += takes - state.x_cost[x]  # else the core cannot say how far it is
+            state.x_cost[x] = takes
+            begins(state, self._machine, x, takes, work.cpu_ns)
+            self._running[work.worker] = execution
             return
         self.at(max(self.now, execution.start + takes), ENDED, self._end, execution)
 
@@ -278,7 +302,7 @@ class Loop:
         """Return how long a callback takes: its first piece all of it, a sync its last leg."""
         if origin is None or work.coroutine is not None:
             return 0
-        state, tables = self.engine.scheduler.state, self.engine.tables
+        state, tables = self._state, self.engine.tables
         first = state.job_base[origin.slot] + tables.region_offset[origin.vertex]
         legs = range(first, first + tables.n_legs[origin.vertex])
         if any(state.x_state[x] != DONE for x in legs if x != work.x):

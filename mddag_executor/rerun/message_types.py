@@ -58,7 +58,7 @@ def canonical(data: bytes, kind: Any) -> bytes:
 
 @cache
 def _walk_of(kind: Any) -> Walk:
-    walks = [_walk(slot) for slot in kind.SLOT_TYPES] or [_numbers(1, 1)]
+    walks = [_walk(slot) for slot in kind.SLOT_TYPES] or [_values(1, None, 1)]
 
     def walk(data: bytearray, at: int) -> int:
         for each in walks:
@@ -80,35 +80,26 @@ def _walk(slot: Any, count: int | None = 1) -> Walk:
     if isinstance(slot, AbstractNestedType):
         return _walk(slot.value_type, slot.size if isinstance(slot, Array) else None)
     if isinstance(slot, BasicType):
-        return _numbers(_WIDTHS[slot.typename], count)
-    one = _walk_of(_class_of(slot)) if isinstance(slot, NamespacedType) else _numbers(
-        4 if isinstance(slot, AbstractWString) else 1, None)
-    return one if count == 1 else _repeated(one, count)
+        return _values(_WIDTHS[slot.typename], None, count)
+    one = _walk_of(_class_of(slot)) if isinstance(slot, NamespacedType) else _values(
+        4 if isinstance(slot, AbstractWString) else 1, None, None)
+    return one if count == 1 else _values(0, one, count)
 
 
 def _class_of(slot: Any) -> Any:
     return getattr(import_module('.'.join(slot.namespaces)), slot.name)
 
 
-def _counted(data: bytearray, at: int, count: int | None) -> tuple[int, int]:
-    """Return where values begin, and how many there are."""
-    if count is not None:
-        return at, count
-    at = _align(data, at, 4)
-    return at + 4, int(_LENGTH.unpack_from(data, at)[0])
-
-
-def _numbers(width: int, count: int | None) -> Walk:
+def _values(width: int, walk_one: Walk | None, count: int | None) -> Walk:
+    """Return the walk over numbers of a width, or over other values."""
     def walk(data: bytearray, at: int) -> int:
-        at, n = _counted(data, at, count)
-        return _align(data, at, width) + width * n if n else at
-
-    return walk
-
-
-def _repeated(walk_one: Walk, count: int | None) -> Walk:
-    def walk(data: bytearray, at: int) -> int:
-        at, n = _counted(data, at, count)
+        n = count
+        if n is None:
+            at = _align(data, at, 4)
+            n = int(_LENGTH.unpack_from(data, at)[0])
+            at += 4
+        if walk_one is None:
+            return _align(data, at, width) + width * n if n else at
         for _ in range(n):
             at = walk_one(data, at)
         return at

@@ -47,7 +47,6 @@ from mddag_executor.rerun.messages import CLOCK, Messages
 from mddag_executor.rerun.outputs import Output, Outputs, VirtualTraceWriter
 from mddag_executor.rerun.requests import Requests
 from mddag_executor.rerun.run_threads import Stalled
-from mddag_executor.rerun.shared_cpus import SharedCpus
 from mddag_executor.rerun.timers import Timers
 from mddag_executor.text import counted
 from msg_graph import TaskSet
@@ -162,9 +161,9 @@ class Rerun:
             vertex.callback.key for place, vertex in enumerate(task_set.vertices)
             if (self._times.holds(place) if vertex.callback.holds_interpreter is None
                 else vertex.callback.holds_interpreter)}
-        cpus = SharedCpus(engine, settings.cpus, bool(self._holders) and self._times.python)
         self._loop = loop = Loop(
-            engine, self._times, cpus, recording.start, recording.end, recording.pauses,
+            engine, self._times, settings.cpus, bool(self._holders) and self._times.python,
+            recording.start, recording.end, recording.pauses,
             self._refresh, self._begin, self._over)
         self._holder = NodeHolder(context, loop)
         self._recorder = None
