@@ -15,7 +15,6 @@ import os
 import sys
 from typing import Any, BinaryIO, TYPE_CHECKING
 
-from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import printable, Progress, warn
 from mddag_executor.text import counted, listed
@@ -103,11 +102,8 @@ def _fix_hashes() -> None:
 def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
     from mddag_executor.rerun import compare, programs
     from mddag_executor.rerun.inputs import open_input
-    from mddag_executor.rerun.run import Rerun, Settings
+    from mddag_executor.rerun.run import Rerun
     task_set = common.load_graph(args.graph)
-    settings = Settings(
-        defaults.workers(args.workers, task_set), args.cpus, args.policy, args.seed,
-        args.all_clocks, ros_args=tuple(args.ros_args))
     path, name = common.input_path(args.recording)
     with ExitStack() as files:
         messages, times = open_input(path, task_set, args.times, args.seed, name)
@@ -118,7 +114,9 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
         if args.trace is not None:
             trace = files.enter_context(common.output_trace(args.trace))
         run = Rerun(
-            messages, times, task_set, settings, output, trace, keep=args.expect is not None)
+            messages, times, task_set, workers=args.workers, cpus=args.cpus, policy=args.policy,
+            seed=args.seed, all_clocks=args.all_clocks, ros_args=args.ros_args, output=output,
+            trace=trace, keep=args.expect is not None)
         with Progress('running', (messages.end - messages.start) / 1e9) as line:
             result = run.run(
                 lambda: programs(args.node, args.ros_args),

@@ -15,11 +15,10 @@ In a test::
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import closing, ExitStack
 import os
 from typing import Any
 
-from mddag_executor import defaults
 from mddag_executor.core import policy as find_policy
 from mddag_executor.hosting.loading import Program, resolve, ros_arguments
 from mddag_executor.output_rules import check_distinct, check_replaced, whole_file
@@ -27,7 +26,7 @@ from mddag_executor.rerun.compare import Difference, differences
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.inputs import MessageBag, open_input
 from mddag_executor.rerun.outputs import Output
-from mddag_executor.rerun.run import PATIENCE_S, Rerun, Result, Settings
+from mddag_executor.rerun.run import PATIENCE_S, Rerun, Result
 from msg_graph import load, TaskSet
 
 __all__ = [
@@ -63,6 +62,9 @@ def rerun(
     :param graph: the declaration: a file, or a task set.
     :param nodes: as for ``mddag run --node``; or classes of nodes, or functions that return nodes.
     :param times: ``recorded``, ``declared``, or a file (see ``inputs.open_input``).
+    :param cpus: that callbacks which compute share; None: as many as are needed.
+    :param seed: of Python's ``random``, of numpy's legacy generator and of what is drawn.
+    :param all_clocks: whether steady and system clocks and Python's ``time`` are virtual, too.
     :param output: a file that gets the outputs as a bag; ``trace``: one that gets the run. A run
         that fails leaves no file.
     :param overwrite: whether ``output`` and ``trace`` may replace files that are there.
@@ -79,15 +81,15 @@ def rerun(
     check_distinct([('recording', os.fspath(recording))], written)
     for _, path in written:
         check_replaced(path, recording=True, overwrite=overwrite)
-    settings = Settings(
-        defaults.workers(workers, task_set), cpus, policy, seed, all_clocks, patience_s,
-        tuple(ros_args))
     messages, taken = open_input(
         os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)
     with ExitStack() as files:
         parts = {name: files.enter_context(whole_file(path)) for name, path in written}
         trace_file = parts['trace'].name if 'trace' in parts else None
-        run = Rerun(messages, taken, task_set, settings, parts.get('output'), trace_file)
+        run = Rerun(
+            messages, taken, task_set, workers=workers, cpus=cpus, policy=policy, seed=seed,
+            all_clocks=all_clocks, patience_s=patience_s, ros_args=ros_args,
+            output=parts.get('output'), trace=trace_file)
         return run.run(lambda: programs(nodes, ros_args))
 
 
@@ -106,13 +108,10 @@ def compare(
 
     :raises mddag_executor.errors.MddagError: when the bag cannot be read.
     """
-    recording = MessageBag(os.fspath(expected))
-    try:
+    with closing(MessageBag(os.fspath(expected))) as recording:
         recording.load(recording.topics)
         return differences(
             result.outputs, recording.messages(recording.topics), result.start_ns, tolerance)
-    finally:
-        recording.close()
 
 
 def assert_same(

@@ -140,7 +140,7 @@ class VirtualTime:
             if until.clock_type != clock.clock_type:
                 raise ValueError("until's clock type does not match this clock's type")
             if self._is_virtual(clock):
-                loop.wait(None, until.nanoseconds, 'Clock.sleep_until')
+                loop.wait(None, (until.nanoseconds - loop.now) / 1e9, 'Clock.sleep_until')
             else:
                 loop.wait(lambda: clock.now() >= until, None, 'Clock.sleep_until')
             return clock.now() >= until
@@ -166,7 +166,7 @@ class VirtualTime:
         seconds, = args
         if seconds < 0:
             raise ValueError('sleep length must be non-negative')
-        loop.wait(None, loop.now + round(seconds * 1e9), 'time.sleep')
+        loop.wait(None, seconds, 'time.sleep')
         return None
 
     def _warn_of(self, what: str, depth: int) -> None:
@@ -226,8 +226,7 @@ class VirtualTime:
             if run_thread is None or loop.run_threads.current() is None or loop.run_threads.over:
                 original(thread, timeout)
                 return
-            loop.wait(lambda: run_thread.ended, loop.deadline_after(timeout),
-                      f'for thread {thread.name}')
+            loop.wait(lambda: run_thread.ended, timeout, f'for thread {thread.name}')
 
         return join
 
@@ -240,10 +239,8 @@ class _Waiter:
         self._locked = False
 
     def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
-        loop = self._loop
         timeout_s = 0.0 if not blocking else None if timeout < 0 else timeout
-        acquired = loop.wait(
-            lambda: not self._locked, loop.deadline_after(timeout_s), 'for another thread')
+        acquired = self._loop.wait(lambda: not self._locked, timeout_s, 'for another thread')
         self._locked = True
         return acquired
 

@@ -34,11 +34,6 @@ def action_handle(waitable: Any) -> Any:
     return waitable._client_handle if hasattr(waitable, '_client_handle') else waitable._handle
 
 
-def feedback_callback(client: Any, message: Any) -> Any:
-    """Return what an action client calls for a feedback message; None for nothing."""
-    return client._feedback_callbacks.get(bytes(message.goal_id.uuid))
-
-
 def goal_states(server: Any) -> Iterator[tuple[Any, int]]:
     """Yield the goals (``GoalInfo``) that an action server knows, with their status."""
     for goal in list(server._goal_handles.values()):

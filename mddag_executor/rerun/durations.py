@@ -68,10 +68,9 @@ class Durations:
 
     def transport(self, dag: int, before: int, after: int, release: int) -> int:
         """Return how long after the end of a vertex its message arrived."""
-        edge = self._edges.get((before, after))
+        edge, load = self._edges.get((before, after)), self._load
         if edge is None or not self.recorded:
             return 0
-        load = self._load
         return max(0, self._value(load.delays, load.delay_base[dag] + edge,
                                   load.delay_stride[dag], dag, release, (before, after)))
 

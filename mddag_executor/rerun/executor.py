@@ -25,10 +25,7 @@ class NodeHolder(BareExecutor):
         super().__init__(context=context)
         self.task_entity = Entity(TASK, None, '', None, -1, 0, '')
         self._loop = loop
-        self._unclaimed = Unclaimed(self._fail)
-
-    def _fail(self, error: BaseException) -> None:
-        raise error
+        self._unclaimed = Unclaimed(lambda error: None)  # none is deferred
 
     def ordered_nodes(self) -> list[Node]:
         """Return the nodes, by name: their order must not depend on the machine."""
@@ -79,7 +76,7 @@ class RerunHost(Host):
         if loop.run_threads.current() is None:
             super().wait(changed, until, timeout_s, guest)
             return
-        deadline = None
-        if timeout_s is not None and timeout_s >= 0:  # callbacks are to run meanwhile
-            deadline = loop.deadline_after(max(POLL_NS / 1e9, timeout_s))
-        loop.wait(lambda: until() or self.is_over(guest), deadline, 'for the end of the run', True)
+        if timeout_s is not None:  # callbacks are to run meanwhile
+            timeout_s = max(POLL_NS / 1e9, timeout_s) if timeout_s >= 0 else None
+        loop.wait(
+            lambda: until() or self.is_over(guest), timeout_s, 'for the end of the run', True)

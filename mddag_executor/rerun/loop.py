@@ -80,7 +80,6 @@ class Execution:
     start: int
     worker: int
     thread: int
-    origin: Origin | None
     release: int
     sent: list[tuple[Leave, Callable[[int], None]]] = field(default_factory=list)
     waits_for: Any = None
@@ -133,7 +132,7 @@ class Loop:
         self._current: Execution | None = None
         self._at_once = 0
         self._stopped = False
-        self._polled_at = self._polls = self._ask_at = 0
+        self._polled_at = self._polls = 0
         self.at(start, ENDED, begin)
 
     # --- what is to happen -----------------------------------------------------------------------
@@ -200,9 +199,6 @@ class Loop:
         self._share()
         if self._end_finished():
             return True
-        if engine.has_waiting and engine.interpreter_holder() and now >= self._ask_at:
-            self._ask_at = now + POLL_NS
-            self.at(self._ask_at, TIMER, lambda: None)  # it may overtake by then
         return self._advance()
 
     def _share(self) -> None:
@@ -236,6 +232,8 @@ class Loop:
             next_at = min(next_at, self._events[0][0])
         if self.engine.check_at > self.now:  # else a worker is needed first
             next_at = min(next_at, self.engine.check_at)
+        if self.engine.holders and self.engine.has_waiting:  # it may overtake by then
+            next_at = min(next_at, self.now + POLL_NS)
         if next_at > self.end + DRAIN_NS:
             return False
         self.now = next_at
@@ -255,7 +253,7 @@ class Loop:
                 'time: declare their execution_time')
         origin = work.origin
         release = 0 if origin is None else self.engine.release_of(work)
-        execution = Execution(work, self.now, work.worker, work.worker + 1, origin, release)
+        execution = Execution(work, self.now, work.worker, work.worker + 1, release)
         takes = self._execution_time(work, origin, release)
         begins(self._state, self._machine, work.x, 0, -1)  # for now it needs nothing
         if not self._call(execution):
@@ -322,7 +320,7 @@ class Loop:
             engine.suspended(work, start, now, execution.thread, worker)
             self._resume_when_done(work, waits_for)
         for leave, _ in execution.sent:
-            leave(execution.origin, execution.release)
+            leave(execution.work.origin, execution.release)
         if engine.to_ask_again:
             engine.ask_again()
 
@@ -347,35 +345,30 @@ class Loop:
 
     # --- waiting ---------------------------------------------------------------------------------
 
-    def deadline_after(self, timeout_s: float | None) -> int | None:
-        """Return the virtual time at which a time-out is over; None for never."""
-        if timeout_s is None or not math.isfinite(timeout_s):
-            return None
-        return self.now + max(0, round(timeout_s * 1e9))
-
     def wait(
-        self, until: Callable[[], bool] | None, deadline: int | None, place: str,
+        self, until: Callable[[], bool] | None, timeout_s: float | None, place: str,
         lends: bool = False,
     ) -> bool:
         """
         Wait in virtual time, in the run thread that calls; return whether it came true.
 
-        :param deadline: when not to wait any longer; None: never.
+        :param timeout_s: how long to wait at most; None: there is no timeout.
         :param lends: whether its worker may run something else meanwhile.
         """
         if until is not None and until():
             return True
-        if deadline is not None:
+        deadline = None
+        if timeout_s is not None and math.isfinite(timeout_s):
+            deadline = self.after_pause(self.now + round(timeout_s * 1e9), DRAIN_NS)
             if deadline <= self.now:
                 self.note_poll()
                 return until is not None and until()
-            deadline = self.after_pause(deadline, DRAIN_NS)
         execution = self._current
         if execution is not None:
             sent, execution.sent = execution.sent, []
             for leave, record in sent:
                 record(execution.thread)
-                leave(execution.origin, execution.release)
+                leave(execution.work.origin, execution.release)
             if lends and execution.worker >= 0 and execution.work.x >= 0:
                 self.engine.lend(execution.work)
                 execution.worker = -1
@@ -401,7 +394,7 @@ class Loop:
         self._polls += 1
         if self._polls >= MOST_POLLS:
             self._polls = 0
-            self.wait(None, self.now + POLL_NS, 'for time to pass')
+            self.wait(None, POLL_NS / 1e9, 'for time to pass')
 
     def warn_of_waiting(self) -> None:
         """Warn of callbacks that wait for something that has not come."""

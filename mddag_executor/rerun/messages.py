@@ -33,6 +33,7 @@ from functools import partial
 import re
 from typing import Any
 
+from mddag_executor.clocks import TraceClock
 from mddag_executor.executor.compat import alive, callback_type, WITH_INFO
 from mddag_executor.executor.entity import Entity, SUBSCRIPTION
 from mddag_executor.executor.jobs import header_stamp, Origin
@@ -46,7 +47,6 @@ from mddag_executor.rerun.loop import ARRIVED, Loop, RECORDED
 from mddag_executor.rerun.message_types import canonical, type_name
 from mddag_executor.rerun.outputs import Outputs
 from mddag_executor.trace.groups import PUBLICATION
-from msg_graph import TaskSet
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, qos_check_compatible, QoSCompatibility
@@ -96,14 +96,14 @@ class Messages:
 
     def __init__(
         self, loop: Loop, recording: MessageBag, times: Durations, outputs: Outputs,
-        task_set: TaskSet,
+        clock: TraceClock,
     ) -> None:
         self._loop = loop
         self._subscriptions: dict[str, list[Entity]] = {}
         self.offered: dict[str, list[Outlet]] = {}
         self._engine = loop.engine
         self._recording = recording
-        self._release_from = [dag.release_from for dag in task_set.dags]
+        self._clock = clock
         self._times = times
         self._outputs = outputs
         self._outlets: dict[Any, Outlet] = {}
@@ -270,13 +270,13 @@ class Messages:
         if new:
             self._deliver_next(recording.messages(new, self._loop.now))
 
-    def _deliver_next(self, coming: Iterator[RecordedMessage]) -> None:
-        def deliver(message: RecordedMessage) -> None:
+    def _deliver_next(
+        self, coming: Iterator[RecordedMessage], message: RecordedMessage | None = None
+    ) -> None:
+        if message is not None:
             self._recorded(message.topic, message.data, message.published)
-            self._deliver_next(coming)
-
-        for message in coming:
-            self._loop.at(message.time, RECORDED, deliver, message)
+        for following in coming:
+            self._loop.at(following.time, RECORDED, self._deliver_next, coming, following)
             break
 
     def _recorded(self, topic: str, data: bytes, published: int) -> None:
@@ -316,7 +316,9 @@ class Messages:
                 'reception_sequence_number': entity.ready + 1}
         release = stamp = -1
         if entity.source >= 0:
-            release, stamp = self._release(entity, message, source_stamp)
+            release, _ = engine.jobs.release(
+                engine.tables.dag_of[entity.source], message, source_stamp, now, self._clock)
+            stamp = header_stamp(message)
         elif origin is None and entity.remote_publishers:
             release, stamp = now, header_stamp(message)
             if stamp < 0:
@@ -324,14 +326,6 @@ class Messages:
         if engine.record is not None:
             engine.taken(entity, message, source_stamp, now)
         engine.arrived(Work(entity, entity.rclpy.callback, args), origin, release, stamp, now)
-
-    def _release(self, entity: Entity, message: Any, source_stamp: int) -> tuple[int, int]:
-        """Return the release of the job that a message starts, and the stamp that names it."""
-        kind = self._release_from[self._engine.tables.dag_of[entity.source]]
-        stamp = header_stamp(message)
-        if kind == 'header_stamp' and stamp >= 0:
-            return stamp, stamp
-        return source_stamp if kind == 'source_timestamp' else self._loop.now, stamp
 
     def _message(self, entity: Entity, data: bytes) -> Any:
         kind = entity.rclpy.msg_type

@@ -90,15 +90,13 @@ class Outputs:
 
 def _qos(profile: Any) -> str:
     """Return a QoS profile as rosbag2 writes it, so that it plays the topic with it."""
-    return ''.join((
-        f'- history: {profile.history.short_key}\n  depth: {profile.depth}\n',
-        f'  reliability: {profile.reliability.short_key}\n',
-        f'  durability: {profile.durability.short_key}\n',
-        '  deadline:\n    sec: 9223372036\n    nsec: 854775807\n',
-        '  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n',
-        f'  liveliness: {profile.liveliness.short_key}\n',
-        '  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n',
-        '  avoid_ros_namespace_conventions: false\n'))
+    never = '\n    sec: 9223372036\n    nsec: 854775807\n'
+    return (
+        f'- history: {profile.history.short_key}\n  depth: {profile.depth}\n'
+        f'  reliability: {profile.reliability.short_key}\n'
+        f'  durability: {profile.durability.short_key}\n  deadline:{never}  lifespan:{never}'
+        f'  liveliness: {profile.liveliness.short_key}\n  liveliness_lease_duration:{never}'
+        '  avoid_ros_namespace_conventions: false\n')
 
 
 class VirtualTraceWriter(TraceFile):

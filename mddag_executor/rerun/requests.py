@@ -27,6 +27,7 @@ from mddag_executor.executor.compat import (
     alive,
     attach_futures,
     complete_request,
+    feedback_taken,
     service_name,
 )
 from mddag_executor.executor.entity import Entity, SERVICE
@@ -36,7 +37,6 @@ from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.compat import (
     action_handle,
     CLIENT_HANDLE,
-    feedback_callback,
     goal_states,
     has_result,
     new_request,
@@ -114,9 +114,8 @@ class Requests:
     def call(self, client: Client, request: Any, timeout_sec: float | None = None) -> Any:
         """Send a request and wait for its response; None if it does not come in time."""
         future = self.call_async(client, request)
-        loop = self._loop
-        if not loop.wait(future.done, loop.deadline_after(timeout_sec),
-                         f'for service {service_name(client)}', lends=True):
+        if not self._loop.wait(
+                future.done, timeout_sec, f'for service {service_name(client)}', lends=True):
             client.remove_pending_request(future)
         error = future.exception()
         if error is not None:
@@ -201,8 +200,7 @@ class Requests:
     def _feedback(self, handle: Any, message: Any) -> None:
         def deliver(message: Any) -> None:
             for client in self._peers(handle):
-                callback = feedback_callback(client, message)
-                if callback is not None:
+                for callback, _ in feedback_taken(client, {'feedback': message}, 1):
                     self._ready(client, callback, copy.deepcopy(message))
 
         self._send(message, deliver)

@@ -4,7 +4,7 @@
 A rerun: real nodes, a recording, virtual time.
 
 ``Rerun`` puts the parts together: the recording (``inputs``), the engine of live runs, the loop
-that drives it (``loop``), the ways of messages (``messages``, ``services``, ``actions``), and the
+that drives it (``loop``), the ways of messages (``messages``, ``requests``), and the
 time that nodes see (``clocks``, ``timers``). The nodes are rclpy's own, in a context that
 discovers no others: for the middleware they do nothing at all.
 """
@@ -33,7 +33,6 @@ from mddag_executor.executor.registry import Registry, snapshot
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.waitables import is_qos_event
 from mddag_executor.executor.work import Work
-from mddag_executor.hosting.host import Guest
 from mddag_executor.hosting.loading import describe, Program, ros_arguments
 from mddag_executor.replacements import Replacements
 from mddag_executor.rerun.clocks import VirtualTime
@@ -61,27 +60,6 @@ PATIENCE_S = 30.0
 _OF_ALL_NODES = {'/parameter_events'}
 _ENDS = (ExternalShutdownException, KeyboardInterrupt, ROSInterruptException)
 _NO_DISCOVERY = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
-
-
-@dataclass(frozen=True)
-class Settings:
-    """
-    How nodes are run again.
-
-    :ivar cpus: that callbacks which compute share; None: as many as are needed.
-    :ivar seed: of Python's ``random``, of numpy's legacy generator and of what is drawn.
-    :ivar all_clocks: whether steady and system clocks and Python's ``time`` are virtual, too.
-    :ivar patience_s: a callback or thread that waits for this long, and not in virtual time, ends
-        the run.
-    """
-
-    workers: int = defaults.WORKERS
-    cpus: int | None = None
-    policy: str = 'rad'
-    seed: int = 0
-    all_clocks: bool = False
-    patience_s: float = PATIENCE_S
-    ros_args: tuple[str, ...] = ()
 
 
 @dataclass
@@ -124,7 +102,7 @@ class Result:
 
 class Rerun:
     """
-    One run; ``run`` runs it.
+    One run; ``run`` runs it. Other arguments are those of ``rerun``.
 
     :param output: gets the outputs as a bag.
     :param trace: the file that the run is recorded to.
@@ -132,26 +110,33 @@ class Rerun:
     """
 
     def __init__(
-        self, recording: MessageBag, times: Durations, task_set: TaskSet, settings: Settings,
+        self, recording: MessageBag, times: Durations, task_set: TaskSet, *,
+        workers: int | None = None, cpus: int | None = None, policy: str = 'rad', seed: int = 0,
+        all_clocks: bool = False, patience_s: float = PATIENCE_S, ros_args: Sequence[str] = (),
         output: BinaryIO | None = None, trace: str | None = None, keep: bool = True,
     ) -> None:
         self._recording = recording
         self._times = times
         self._task_set = replace(task_set, processes=())  # all nodes run in one
-        self._settings = settings
+        self._workers = defaults.workers(workers, task_set)
+        self._cpus = cpus
+        self._policy = policy
+        self._seed = seed
+        self._all_clocks = all_clocks
+        self._patience_s = patience_s
+        self._ros_args = ros_args
         self._trace = trace
         self._outputs = Outputs(output, None if keep else recording.topics)
-        self._failed: list[Guest] = []
         self._hosted: set[str] = set()
 
     # --- parts -----------------------------------------------------------------------------------
 
     def _make(self, context: Any) -> None:
-        settings, recording, task_set = self._settings, self._recording, self._task_set
+        recording, task_set = self._recording, self._task_set
         writer = None if self._trace is None else VirtualTraceWriter(
             self._trace, overwrite=True)  # checked before the run
         self._engine = engine = Engine(
-            task_set, settings.workers, settings.policy, default_deadline=DEFAULT_DEADLINE_NS,
+            task_set, self._workers, self._policy, default_deadline=DEFAULT_DEADLINE_NS,
             max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER_NS,
             record=None if writer is None else writer.record)
         engine.other_processes = self._other_processes = OtherProcesses(
@@ -162,27 +147,28 @@ class Rerun:
             if (self._times.holds(place) if vertex.callback.holds_interpreter is None
                 else vertex.callback.holds_interpreter)}
         self._loop = loop = Loop(
-            engine, self._times, settings.cpus, bool(self._holders) and self._times.python,
+            engine, self._times, self._cpus, bool(self._holders) and self._times.python,
             recording.start, recording.end, recording.pauses,
             self._refresh, self._begin, self._over)
         self._holder = NodeHolder(context, loop)
+        clock = _TraceTime(loop)
         self._recorder = None
         if writer is not None:
             self._recorder = Recorder(
-                writer.path, task_set, settings.policy, settings.workers, DEFAULT_DEADLINE_NS,
-                MAX_ACTIVE_JOBS, _TraceTime(loop), writer, settings.cpus or 0,
+                writer.path, task_set, self._policy, self._workers, DEFAULT_DEADLINE_NS,
+                MAX_ACTIVE_JOBS, clock, writer, self._cpus or 0,
                 on_late=engine.on_late)
             self._recorder.entities((), [self._holder.task_entity])
         self._registry = Registry(task_set, engine, engine.leave_group)
-        self._messages = Messages(loop, recording, self._times, self._outputs, task_set)
+        self._messages = Messages(loop, recording, self._times, self._outputs, clock)
         self._requests = Requests(loop, self._holder, self._registry)
         self._timers = Timers(loop, self._times.first_release)
         self._host = RerunHost(loop)
 
     def _install(self, replacements: Replacements) -> None:
         virtual = VirtualTime(
-            self._loop, self._settings.all_clocks, CLOCK in self._recording.topics,
-            self._settings.seed)
+            self._loop, self._all_clocks, CLOCK in self._recording.topics,
+            self._seed)
         for each in (virtual, self._timers, self._requests, self._messages):
             each.install(replacements)
         replacements.replace(GuardCondition, 'trigger', self._trigger)
@@ -238,7 +224,7 @@ class Rerun:
         begun = time.monotonic()
         self._programs = programs
         arguments = sys.argv  # each program has its own
-        with _context(self._settings.ros_args) as context:
+        with _context(self._ros_args) as context:
             publishing.install()
             self._make(context)
             loop = self._loop
@@ -247,7 +233,7 @@ class Rerun:
                     self._install(replacements)
                     with self._host:
                         loop.run_threads.run(
-                            self._settings.patience_s,
+                            self._patience_s,
                             lambda: (loop.now, loop.callbacks, len(self._host.guests)),
                             lambda: tick(self._passed_ns()) if tick is not None else None)
             except Stalled as stuck:
@@ -260,7 +246,11 @@ class Rerun:
                 sys.argv = arguments
                 if self._recorder is not None:
                     self._recorder.close(loop.now)
-        self._check_programs()
+        for guest in self._host.guests:
+            if guest.error is not None and not isinstance(guest.error, _ENDS):
+                loop.warn(
+                    f'--node {guest.program.spec}: after the end of the run its main raised '
+                    f'{describe(guest.error)}')
         if not self._hosted:
             loop.warn(self._none_hosted())
         self._outputs.finish()
@@ -272,7 +262,7 @@ class Rerun:
     def _begin(self) -> None:
         """Start the programs, one after the other; each runs until it waits for something."""
         self._host.start(
-            self._holder, self._programs(), ros_arguments(self._settings.ros_args),
+            self._holder, self._programs(), ros_arguments(self._ros_args),
             self._loop.stop)
         self._loop.at(self._loop.start, ENDED, self._started)
 
@@ -306,21 +296,14 @@ class Rerun:
 
     def _over(self) -> None:
         """Judge what is open; then let programs end, whose context has ended."""
-        self._failed = [guest for guest in self._host.guests if guest.error is not None]
+        failed = [guest for guest in self._host.guests if guest.error is not None]
         self._loop.warn_of_waiting()
         self._engine.finish(self._loop.now)
         self._host.shut_down()
-
-    def _check_programs(self) -> None:
-        for guest in self._failed:
+        for guest in failed:
             assert guest.error is not None
             raise CallbackFailed(
                 f'--node {guest.program.spec}', guest.error, self._passed_ns()) from guest.error
-        for guest in self._host.guests:
-            if guest.error is not None and not isinstance(guest.error, _ENDS):
-                self._loop.warn(
-                    f'--node {guest.program.spec}: after the end of the run its main raised '
-                    f'{describe(guest.error)}')
 
     def _result(self, elapsed_s: float) -> Result:
         loop, recording, outputs = self._loop, self._recording, self._outputs
@@ -330,7 +313,7 @@ class Rerun:
             recording.messages(both), loop.start)
         recording.close()
         verdicts = {
-            'policy': self._settings.policy, 'workers': self._settings.workers,
+            'policy': self._policy, 'workers': self._workers,
             'preemptive': False, 'duration_ns': self._passed_ns(),
             **self._engine.verdicts.tally.result()}
         return Result(
@@ -348,6 +331,9 @@ class _TraceTime(TraceClock):
 
     def now(self) -> int:
         return self._loop.now
+
+    def of_system(self, at: int) -> int:
+        return at
 
 
 @contextmanager

@@ -31,6 +31,7 @@ from dataclasses import dataclass, field
 import sys
 import threading
 import time
+import traceback
 from typing import Any
 
 _CHECK_S = 0.05
@@ -275,21 +276,20 @@ class _StallWatch:
         self._progress = progress
         self._patience_s = patience_s
         self._seen: object = None
-        self._owner: RunThread | None = None
-        self._checked_at, self._cpu_s = time.monotonic(), time.process_time()
+        self._before: tuple[float, float, RunThread | None] = (
+            time.monotonic(), time.process_time(), None)
         self._waited_s = self._computed_s = 0.0
 
     def check(self) -> None:
-        before = self._checked_at, self._cpu_s, self._owner
-        self._checked_at, self._cpu_s = time.monotonic(), time.process_time()
-        owner = self._owner = self._run_threads.owner
-        passed_s = min(self._checked_at - before[0], _LONGEST_CHECK_S)
-        seen = self._progress()
+        before_s, before_cpu_s, before_owner = self._before
+        now_s, cpu_s, owner = self._before = (
+            time.monotonic(), time.process_time(), self._run_threads.owner)
+        passed_s, seen = min(now_s - before_s, _LONGEST_CHECK_S), self._progress()
         if owner is None or seen != self._seen:
             self._seen, self._waited_s, self._computed_s = seen, 0.0, 0.0
-        elif owner is not before[2]:
+        if owner is None or owner is not before_owner:
             return
-        elif self._cpu_s - before[1] > _LITTLE * passed_s:
+        if cpu_s - before_cpu_s > _LITTLE * passed_s:
             self._waited_s = 0.0  # a busy machine gives it little CPU time now and then
             self._computed_s += passed_s
         else:
@@ -297,22 +297,16 @@ class _StallWatch:
         for what, seconds, most in (
                 ('blocking', self._waited_s, self._patience_s),
                 ('computing', self._computed_s, _COMPUTES * self._patience_s)):
-            if owner is not None and seconds > most:
+            if seconds > most:
                 raise Stalled(owner, what, most)
 
 
 def code_position(ident: int) -> str:
     """Return where a thread is: file and line of the innermost code that is no library's."""
-    frame = sys._current_frames().get(ident)
-    found = ''
-    while frame is not None:
-        name = frame.f_code.co_filename
-        here = f'{name}:{frame.f_lineno}'
-        if not is_library(frame.f_globals.get('__name__', '')):
-            return here
-        found = found or here
-        frame = frame.f_back
-    return found
+    stack = traceback.walk_stack(sys._current_frames().get(ident, sys._getframe()))
+    places = [(f'{frame.f_code.co_filename}:{line}', frame.f_globals.get('__name__', ''))
+              for frame, line in stack]
+    return next((place for place, module in places if not is_library(module)), places[0][0])
 
 
 def is_library(module: str) -> bool:

@@ -16,7 +16,7 @@ from mddag_executor.replay import replay
 from mddag_executor.rerun import assert_same, CallbackFailed, compare, programs, rerun, RerunError
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.inputs import MessageBag, open_input
-from mddag_executor.rerun.run import Rerun, Settings
+from mddag_executor.rerun.run import Rerun
 from mddag_executor.simulate import draw_execution_times, Load, periodic_load, simulate
 from mddag_executor.simulate import Settings as SimulatorSettings
 from mddag_executor.trace import TraceReader
@@ -198,7 +198,7 @@ def test_messages_leave_at_the_end_and_take_their_recorded_time(bag, graph, dela
     recorded = Load([0], [0], [0], [0, 10 * MS, 10 * MS], [0], [0],
                     delays=[0, delay_ms * MS], delay_base=[0], delay_stride=[0])
     times = Durations(Tables.build(task_set), recorded, recorded=True)
-    result = Rerun(MessageBag(bag), times, task_set, Settings(workers=2)).run(
+    result = Rerun(MessageBag(bag), times, task_set, workers=2).run(
         lambda: programs([Filter, Sink]))
     assert [time for time, _ in published(result, '/filtered')][:2] == [10, 110]
     assert [time for time, _ in published(result, '/out')][:2] == [out_ms, 100 + out_ms]
@@ -240,7 +240,7 @@ def test_callbacks_start_and_end_as_in_the_simulator(tmp_path, monkeypatch, seed
     bag = write_bag(tmp_path / 'in.mcap', [(t * MS, '/unused', String()) for t in (0, 1000)])
     monkeypatch.setattr(Durations, 'first_release', lambda times, dag: START)
     trace = str(tmp_path / 'run.mcap')
-    Rerun(*open_input(bag, task_set), task_set, Settings(workers, cpus), trace=trace).run(
+    Rerun(*open_input(bag, task_set), task_set, workers=workers, cpus=cpus, trace=trace).run(
         lambda: programs([partial(make_node, node) for node in declared['nodes']]))
     found = [(int(row[name]) - START, int(row['vertex']), int(row['job']))
              for row in open_recording(trace).executions for name in ('start', 'end')]
