@@ -85,11 +85,10 @@ def rerun(
         os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)
     with ExitStack() as files:
         parts = {name: files.enter_context(whole_file(path)) for name, path in written}
-        trace_file = parts['trace'].name if 'trace' in parts else None
         run = Rerun(
             messages, taken, task_set, workers=workers, cpus=cpus, policy=policy, seed=seed,
             all_clocks=all_clocks, patience_s=patience_s, ros_args=ros_args,
-            output=parts.get('output'), trace=trace_file)
+            output=parts.get('output'), trace=parts['trace'].name if 'trace' in parts else None)
         return run.run(lambda: programs(nodes, ros_args))
 
 

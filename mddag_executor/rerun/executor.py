@@ -11,7 +11,7 @@ from typing import Any
 from mddag_executor.executor.compat import alive, BareExecutor
 from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.tasks import make_task, Unclaimed
-from mddag_executor.executor.work import QuickCallback, Work
+from mddag_executor.executor.work import QuickCallback
 from mddag_executor.hosting.host import Guest, Host
 from mddag_executor.rerun.loop import Loop, POLL_NS
 from rclpy.node import Node
@@ -38,17 +38,16 @@ class NodeHolder(BareExecutor):
             task = Task(callback, args, kwargs)
             task()
             return task
+        loop = self._loop
         task, work = make_task(
-            self.task_entity, self, self._resume, self._unclaimed, callback, args, kwargs)
-        self._loop.call_in_run(lambda: self._loop.engine.ready(work, self._loop.now))
+            self.task_entity, self, lambda work: loop.call_in_run(
+                partial(loop.engine.resume, work)), self._unclaimed, callback, args, kwargs)
+        loop.call_in_run(lambda: loop.engine.ready(work, loop.now))
         return task
 
     def on_callback_ended(self, listener: Callable[[Any, BaseException | None], bool]) -> None:
         """Have a function called after each callback; what one raises ends the run."""
         self._loop.on_ended = lambda entity: listener(entity, None)
-
-    def _resume(self, work: Work) -> None:
-        self._loop.call_in_run(partial(self._loop.engine.resume, work))
 
 
 class RerunHost(Host):

@@ -379,7 +379,7 @@ class Loop:
             self.at(deadline, WAITED, self.run_threads.expire, run_thread, deadline)
         run_thread.execution, self._current = execution, None
         try:
-            return self.run_threads.wait(until, deadline, place)
+            return self.run_threads.wait(run_thread, until, deadline, place)
         finally:
             self._current, run_thread.execution = run_thread.execution, None
 

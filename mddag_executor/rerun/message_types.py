@@ -49,8 +49,6 @@ def type_name(kind: Any) -> str:
 
 def canonical(data: bytes, kind: Any) -> bytes:
     """Return a serialised message with nothing in it that is not of its fields."""
-    if data[1:2] != b'\x01':  # big endian: not serialised by rclpy
-        return data
     filled = bytearray(data)
     end = _walk_of(kind)(filled, HEAD)
     return bytes(filled[:end])

@@ -173,13 +173,6 @@ class Messages:
             outlet = self._outlets[publisher] = Outlet(publisher)
         return outlet
 
-    def _subscriptions_of(self, outlet: Outlet) -> list[Entity]:
-        if outlet.subscriptions is None:
-            outlet.subscriptions = [
-                entity for entity in self._subscriptions.get(outlet.state.topic, ())
-                if outlet.fits(entity.rclpy)]
-        return outlet.subscriptions
-
     # --- questions about the ROS graph -----------------------------------------------------------
 
     def _asking(self, original: Callable[..., Any]) -> Callable[..., Any]:
@@ -229,12 +222,6 @@ class Messages:
             self._engine.record(
                 PUBLICATION, self._loop.now, thread, outlet.state.address, self._sequence)
 
-    def _delay(self, entity: Entity, origin: Origin | None, release: int) -> int:
-        target = None if origin is None else entity.targets.get(origin.vertex)
-        if origin is None or target is None:
-            return 0
-        return self._times.transport(origin.dag, origin.vertex, target[0], release)
-
     def _leave(self, outlet: Outlet, data: bytes, origin: Origin | None, release: int) -> None:
         """Send a message to the outputs and to the subscriptions."""
         now, state = self._loop.now, outlet.state
@@ -242,9 +229,15 @@ class Messages:
         state.count += 1
         if outlet.kept.maxlen:
             outlet.kept.append((now, data))
-        for entity in self._subscriptions_of(outlet):
+        if outlet.subscriptions is None:
+            outlet.subscriptions = [
+                entity for entity in self._subscriptions.get(state.topic, ())
+                if outlet.fits(entity.rclpy)]
+        for entity in outlet.subscriptions:
             arrive = partial(self._arrive, entity, data, now, origin, state.count)
-            delay = self._delay(entity, origin, release)
+            target = None if origin is None else entity.targets.get(origin.vertex)
+            delay = 0 if origin is None or target is None else self._times.transport(
+                origin.dag, origin.vertex, target[0], release)
             if delay:
                 self._loop.at(now + delay, ARRIVED, arrive)
             else:

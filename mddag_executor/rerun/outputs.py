@@ -102,10 +102,8 @@ def _qos(profile: Any) -> str:
 class VirtualTraceWriter(TraceFile):
     """Records events as ``TraceWriter`` does, but at once: nothing waits, and nothing is lost."""
 
+    close = TraceFile.finish
+
     def record(self, *event: Any) -> None:
         """Record one event, or several at once as an entry of ``groups``."""
         self.extend((event,), os.getpid())
-
-    def close(self) -> None:
-        """Complete the file."""
-        self.finish()

@@ -70,7 +70,8 @@ class Requests:
         replace = replacements.replace
         replace(Client, 'call_async', instead(self.call_async))
         replace(Client, 'call', instead(self.call))
-        replace(Client, 'service_is_ready', instead(self.is_offered))
+        replace(Client, 'service_is_ready', instead(
+            lambda client: self._service(service_name(client)) is not None))
         replace(Service, 'send_response', instead(self.send_response))
         replace(ActionClient, '__init__', self._made)
         replace(ActionServer, '__init__', self._made)
@@ -91,10 +92,6 @@ class Requests:
         self._loop.send(lambda *_: deliver(copied))
 
     # --- services --------------------------------------------------------------------------------
-
-    def is_offered(self, client: Client) -> bool:
-        """Return whether a node of the run offers a client's service."""
-        return self._service(service_name(client)) is not None
 
     def _service(self, name: str) -> Entity | None:
         return next((entity for entity in self._registry.by_id.values()

@@ -201,17 +201,16 @@ class RunThreads:
             if not self.over or self.owner is run_thread:
                 self._pass_on()
 
-    def wait(self, until: Callable[[], bool] | None, deadline: int | None, place: str) -> bool:
+    def wait(
+        self, run_thread: RunThread, until: Callable[[], bool] | None, deadline: int | None,
+        place: str,
+    ) -> bool:
         """
         Wait in the calling run thread, which has the turn; return whether ``until`` came true.
 
         :param deadline: the virtual time at which it waits no longer; None: there is none.
         :param place: says what it waits for.
         """
-        run_thread = self.current()
-        assert run_thread is not None
-        if until is not None and until():
-            return True
         if self.over:
             return False
         run_thread.until, run_thread.deadline, run_thread.place = until, deadline, place
@@ -246,16 +245,13 @@ class RunThreads:
         """
         self._pass_on()
         watch = _StallWatch(self, progress, patience_s)
-        ending_at = 0.0
         try:
             while not self._finished.wait(_CHECK_S):
                 tick()
-                if not self.over:
-                    watch.check()
-                elif not ending_at:
-                    ending_at = time.monotonic() + _END_S
-                elif time.monotonic() > ending_at:
-                    break  # what does not end is left behind
+                if self.over:
+                    self._finished.wait(_END_S)
+                    break  # what has not ended is left behind
+                watch.check()
         finally:
             self.over = True
         if self.error is not None:
