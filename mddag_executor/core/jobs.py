@@ -33,7 +33,7 @@ from mddag_executor.core.state import (
     State,
     URGENCY,
 )
-from mddag_executor.core.tables import DEMOTE, NEVER, Tables
+from mddag_executor.core.tables import DEMOTE, KEEP_NEWEST, NEVER, Tables
 
 
 def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int) -> int:
@@ -80,6 +80,16 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
 def demotes(t: Tables, s: State, dag: int) -> bool:
     """Return whether jobs of a DAG are demoted when they are late, or refused (rule 7)."""
     return t.on_late[dag] == DEMOTE and s.scalars[URGENCY] != OTHER_KEYS
+
+
+def source_depth(t: Tables, s: State, dag: int) -> int:
+    """
+    Return how many releases of a timer source may wait: as many as can be in time.
+
+    If its executions drop older ones, the last release may do so before it counts (rule 13).
+    """
+    drops = t.keep[t.source[dag]] == KEEP_NEWEST or demotes(t, s, dag)
+    return max(1, -(-t.dag_deadline[dag] // t.period[dag])) + int(drops)
 
 
 def expect(t: Tables, s: State, dag: int, here: list[int]) -> None:

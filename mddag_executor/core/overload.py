@@ -63,12 +63,12 @@ def demote(t: Tables, s: State, x: int, now: int) -> bool:
         if len(demoted) == 0:
             set_start(t, s, vertex)
     if s.urged[vertex] == key[3]:
-        return False  # it has the key of a newer one
+        return False  # it has the key of another one
     fresh = s.x_started[x] < 0
     first = -1
     if fresh and demoted and demoted[0][0] < key[3]:
         first = demoted[0][4]
-    priority = _late_priority(t, s, x, first, now)
+    priority = late_priority(t, s, x, first, now)
     if priority > key[0]:
         if fresh:
             heappush(demoted, (key[3], 0, 0, 0, x))
@@ -104,9 +104,9 @@ def _priority(t: Tables, s: State, x: int, release: int, deadline: int, start: i
     return release + t.dag_deadline[s.job_dag[s.x_slot[x]]]
 
 
-def _late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
+def late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
     """
-    Return the priority of an execution by the sinks that can be in time, if any.
+    Return the priority of an execution by the sinks that can be in time; if none, demote its job.
 
     :param first: the oldest demoted execution of its vertex if that is older, or -1.
     """
@@ -143,6 +143,18 @@ def _late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
             s.passed_on[vertex] = -1
     return _priority(
         t, s, x, s.job_demoted[slot], t.rad_offset[vertex], t.latest_start[vertex])
+
+
+def inherit_age(t: Tables, s: State, x: int) -> None:
+    """Let an execution that was just made ready go as early as one that was dropped before it."""
+    vertex = s.x_vertex[x]
+    if s.passed_on[vertex] < 0 or s.x_state[x] != WAITING:
+        return
+    priority = _priority(
+        t, s, x, s.passed_on[vertex], t.rad_offset[vertex], t.latest_start[vertex])
+    if priority < s.x_key[x][0]:
+        s.urged[vertex] = s.x_key[x][3]
+        _change_key(s, x, priority)
 
 
 def set_start(t: Tables, s: State, vertex: int) -> None:

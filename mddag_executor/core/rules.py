@@ -52,7 +52,8 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     be in time.  Executions of one vertex keep their order: one that comes first while older ones
     are demoted has to wait for these.  If it can be in time, the oldest inherits its priority, so
     a backlog is worked off; if not, it is demoted behind the oldest.  If one is dropped (rule 13,
-    or live a full queue), the next one counts as released as early.  In a lasting overload
+    or live a full queue), the next one counts as released as early, if it is late or that is
+    earlier.  In a lasting overload
     (``State.overloaded``) the mean execution times of the older ones count, too.  Running
     executions keep their keys.  Only policies whose keys are times demote.
 8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
@@ -82,8 +83,9 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     separately; an execution without an idle worker in its process is deferred.  There is no
     preemption and no polling then.
 13. **Only the newest.**  Of a source or sink with ``keep: newest`` at most one execution waits:
-    one that has not started is dropped when that of a later job becomes ready.  A job without its
-    source is ``OUTDATED``; a dropped sink is not in time.
+    one that has not started is dropped when that of a later job becomes ready.  So is a release of
+    a timer if its job is demoted then, or refused (``KEEP_TIMELY``).  A job without its source is
+    ``OUTDATED``; a dropped sink is not in time.
 14. **Importance.**  A vertex has the highest importance of the sinks that it leads to.  If the
     known execution times demand more than the workers or the interpreter of a process can give,
     the least importance is refused, as many as necessary, but never the highest.  Less importance
@@ -108,7 +110,14 @@ from mddag_executor.core.jobs import (
     next_deadline,
     outdate_sink,
 )
-from mddag_executor.core.overload import demote, leaves_room, note_miss, return_reserved
+from mddag_executor.core.overload import (
+    demote,
+    inherit_age,
+    late_priority,
+    leaves_room,
+    note_miss,
+    return_reserved,
+)
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import (
     add_stale,
@@ -150,7 +159,7 @@ from mddag_executor.core.state import (
     SWITCH_OVERHEAD,
     WAITING,
 )
-from mddag_executor.core.tables import ABORT, NEVER, Tables
+from mddag_executor.core.tables import ABORT, KEEP_ALL, KEEP_NEWEST, NEVER, Tables
 
 
 def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
@@ -162,8 +171,13 @@ def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     s.x_key[x] = key(
         t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], order) + (x,)
     _enqueue(t, s, x)
-    if t.keep_newest[s.x_vertex[x]] != 0:
-        _keep_newest(t, s, x, now)
+    keep = t.keep[s.x_vertex[x]]
+    if keep != KEEP_ALL:
+        if keep == KEEP_NEWEST:
+            _keep_newest(t, s, x, now)
+        else:
+            _keep_timely(t, s, x, now)
+        inherit_age(t, s, x)
 
 
 def _keep_newest(t: Tables, s: State, x: int, now: int) -> None:
@@ -180,12 +194,35 @@ def _keep_newest(t: Tables, s: State, x: int, now: int) -> None:
     slot = s.x_slot[older]
     if slot == s.x_slot[s.newest_ready[vertex]]:
         return  # another message of a sync of the same job
+    if s.job_state[slot] == OPEN and s.job_hope[slot] < NEVER:
+        late_priority(t, s, older, -1, now)  # if it is late, the newer one gets its age
+    _outdate(t, s, older, now)
+
+
+def _keep_timely(t: Tables, s: State, x: int, now: int) -> None:
+    """Drop the waiting releases of a timer before this one that are demoted, or should be."""
+    source = s.x_vertex[x]
+    slot = s.job_previous[s.x_slot[x]]
+    while slot >= 0 and s.job_hope[slot] < NEVER:
+        older = s.job_base[slot] + t.region_offset[source]
+        if s.x_state[older] != WAITING or s.x_started[older] >= 0:
+            return  # those before it have started, too
+        before = s.job_previous[slot]
+        late_priority(t, s, older, -1, now)
+        if s.job_demoted[slot] >= 0:
+            _outdate(t, s, older, now)
+        slot = before
+
+
+def _outdate(t: Tables, s: State, x: int, now: int) -> None:
+    """Drop a waiting execution for that of a newer job, and its job or sink with it (rule 13)."""
+    slot, vertex = s.x_slot[x], s.x_vertex[x]
     if s.job_state[slot] == OPEN:
         if t.n_predecessors[vertex] == 0:
             give_up(t, s, slot, OUTDATED, now)
         else:
             outdate_sink(t, s, slot, vertex, now)
-    drop(s, older, now)
+    drop(s, x, now)
 
 
 def ready_undeclared(

@@ -65,6 +65,8 @@ EXPIRE_AFTER_NS = 1_000_000_000
 """An idle job expires this long after its latest deadline, ns."""
 
 CONTINUE, DEMOTE, ABORT = range(3)
+KEEP_ALL, KEEP_TIMELY, KEEP_NEWEST = range(3)
+"""Which waiting executions remain when the next one is ready (rule 13)."""
 IMPORTANCE = {'low': 0, 'normal': 1, 'high': 2}
 IMPORTANT = 2
 """The highest importance."""
@@ -104,7 +106,7 @@ class Tables(NamedTuple):
     reach_sink: list[int]
     reach_deadline: list[int]
     reach_start: list[int]
-    keep_newest: list[int]
+    keep: list[int]
     mean_time: list[int]
     height: list[int]
     importance: list[int]
@@ -154,15 +156,6 @@ class Tables(NamedTuple):
             columns.add_dag(dag)
         columns.lists['process'] += [] if task_set is None else processes_of(task_set)
         return columns.finish(default_deadline)
-
-    def source_depth(self, dag: int) -> int:
-        """
-        Return how many releases of a timer source may wait: as many as can be in time.
-
-        If only the newest is kept, the second drops the first (rule 13).
-        """
-        least = 1 + self.keep_newest[self.source[dag]]
-        return max(least, -(-self.dag_deadline[dag] // self.period[dag]))
 
 
 class _Columns:
@@ -229,7 +222,9 @@ class _Columns:
             lists['tolerated'].append(0 if tolerate is None else tolerate.misses)
             lists['tolerated_of'].append(0 if tolerate is None else tolerate.of)
             lists['first_miss'].append(sum(lists['tolerated'][:-1]))
-            lists['keep_newest'].append(int(vertex.callback.keep == 'newest'))
+            lists['keep'].append(
+                KEEP_NEWEST if vertex.callback.keep == 'newest'
+                else KEEP_TIMELY if vertex.callback.kind == 'timer' else KEEP_ALL)
             lists['sink_deadline'].append(-1 if vertex.deadline_ns is None else vertex.deadline_ns)
             lists['entity'].append(self._entities[vertex.callback.key])
             lists['region_offset'].append(region)
@@ -265,7 +260,7 @@ class _Columns:
         undeclared = {
             'dag_of': n_dags, 'index_in_dag': 0, 'rad_offset': default_deadline,
             'latest_start': default_deadline, 'first_reach': len(lists['reach_sink']),
-            'keep_newest': 0, 'mean_time': 0, 'height': 0,
+            'keep': KEEP_ALL, 'mean_time': 0, 'height': 0,
             'importance': IMPORTANT, 'tolerated': 0, 'tolerated_of': 0, 'first_miss': 0,
             'sink_deadline': -1,
             'entity': self._n_entities, 'region_offset': 0,

@@ -9,6 +9,7 @@ import threading
 from typing import Any
 import weakref
 
+from mddag_executor.core.jobs import source_depth
 from mddag_executor.executor.bounds import MOST, REMEMBERED
 from mddag_executor.executor.compat import keeps_time, service_name
 from mddag_executor.executor.engine import Engine
@@ -260,10 +261,9 @@ class Registry:
             link(entity, self._task_set, self._tables, topic)
             entity.publishes = self._published[callback.key]
             if kind == TIMER and entity.source >= 0:
-                dag = self._tables.dag_of[entity.source]
-                entity.depth = self._tables.source_depth(dag)
-                if callback.keep == 'newest':
-                    entity.depth = max(2, entity.depth)  # the core drops the older one
+                scheduler = self._engine.scheduler
+                entity.depth = source_depth(
+                    scheduler.tables, scheduler.state, self._tables.dag_of[entity.source])
         return entity
 
     def _number(self, group: Any) -> int:

@@ -93,10 +93,11 @@ class CallbackCounts(TypedDict):
 
     ``ready`` counts what became ready: messages, requests, releases of timers. ``ran`` counts
     executions (``failed``: they raised an exception), ``dropped`` those that did not run (QoS
-    depth, destroyed, aborted), ``skipped`` releases of a timer that was too slow, ``unattributed``
-    messages of a declared callback whose job was not found. ``interpreter_share`` is the fraction
-    of its time in which it needs the interpreter, None: not known yet. ``incompatible_qos`` is the
-    policy because of which a subscription gets nothing from a publisher.
+    depth, destroyed, aborted, a newer one), ``skipped`` releases of a timer that was too slow,
+    ``unattributed`` messages of a declared callback whose job was not found. ``interpreter_share``
+    is the fraction of its time in which it needs the interpreter, None: not known yet.
+    ``incompatible_qos`` is the policy because of which a subscription gets nothing from a
+    publisher.
     """
 
     kind: str

@@ -312,7 +312,8 @@ def _pending(
         miss, vertex, _, begin, end, _ = spans[i].item()
         key = vertex, int(rows['job'][miss])
         ready, start, group = waiting.get(key, (end, end, 0))
-        waits = never.dropped.get(key) == 'aborted' or ready < end <= start
+        waits = (ready < end <= start or never.dropped.get(key) == 'aborted'
+                 or is_source[vertex] and never.dropped.get(key) == 'newer')
         if not waits and key not in never.dropped and (
                 rows['kind'][miss] != SINK_EXPIRED or is_source[vertex]):
             full, = pool.full.within(*(np.array([each]) for each in (begin, end)))

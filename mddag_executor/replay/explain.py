@@ -151,22 +151,22 @@ class Explanation:
             *(drops[name].tolist() for name in ('vertex', 'job', 'reason')))}
 
     def _started(self, in_group: Ints) -> Table:
-        """Return the executions that were started, and sources that waited until an abort."""
+        """Return the executions that were started, and sources that waited until a drop."""
         recording, table = self._recording, self._executions
         which = np.flatnonzero((table['vertex'] >= 0) & (table['start'] >= 0))
         started = rows(STARTED, len(which), group=in_group[which], **{
             name: table[name][which] for name in ('vertex', 'leg', 'job', 'ready', 'start')})
-        aborted = {
+        dropped = {
             (self._tables.dag_of[vertex], job): (vertex, time)
             for _, vertex, job, time, reason in recording.drops.tolist()
-            if recording.drop_reasons[reason] == 'aborted'
+            if recording.drop_reasons[reason] in ('aborted', 'newer')
             and not self._task_set.vertices[vertex].predecessors}
-        if not aborted:
+        if not dropped:
             return started
         # a release that was skipped at the time of the abort was skipped before it
         waited = [(vertex, job, noticed, time + 1) for dag, job, noticed in zip(*(
             recording.releases[name].tolist() for name in ('dag', 'job', 'noticed')))
-            if (dag, job) in aborted for vertex, time in [aborted[dag, job]]]
+            if (dag, job) in dropped for vertex, time in [dropped[dag, job]]]
         sources = rows(STARTED, len(waited), **dict(zip(
             ('vertex', 'job', 'ready', 'start'), zip(*waited))))
         return np.concatenate([started, sources])

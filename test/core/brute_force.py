@@ -26,7 +26,8 @@ Its reading of the documents:
   the workers, it is late if the mean time of each execution that was demoted there leaves it no
   deadline within reach.
 * ``keep: newest`` at a source or sink: one of an earlier job that waits there and has never run
-  vanishes when the next one is ready. If it was late, the next late one goes as early.
+  vanishes when the next one is ready. If it was late, the next late one goes as early. So does
+  one of a timer that cannot make any deadline that it leads to any more, with ``demote``.
 * ``ros2`` goes by rounds. When a worker is free and the round has nothing left that it could take,
   the next round is, of all that waits, the first of each callback. The worker goes through it by
   kind (timers, subscriptions and syncs, services), then by the callback's place in the file, and
@@ -171,11 +172,14 @@ class BruteForce:
         return self._priority(
             execution, {*self.laxity[execution.job.dag.index, execution.vertex.index]})
 
+    def _demotes(self, dag):
+        return ((dag.on_late or self.on_late) == 'demote'
+                and self.policy in ('rad', 'gedf', 'llf'))
+
     def _demote(self, execution):
         """Change a priority if the next execution is late or behind one; return whether it did."""
         job, vertex = execution.job, execution.vertex
-        if ((job.dag.on_late or self.on_late) != 'demote'
-                or self.policy not in ('rad', 'gedf', 'llf')):
+        if not self._demotes(job.dag):
             return False
         key = job.dag.index, vertex.index
         demoted = self.demoted.setdefault(key, [])
@@ -296,14 +300,27 @@ class BruteForce:
     def _ready(self, job, vertex):
         new = Execution(job, vertex, self.ticks[job.dag.index][vertex.index], self._arrival())
         self.waiting.append(new)
-        if vertex.callback.keep == 'newest':
-            self._keep_newest([
-                e for e in self.waiting if e.vertex is vertex and not e.has_run])
+        waiting = [e for e in self.waiting if e.vertex is vertex and not e.has_run]
+        newest = max(e.job.index for e in waiting)
+        older = [e for e in waiting if e.job.index < newest]
+        is_open = [e for e in older if e.job.outcome is None and self._demotes(job.dag)]
+        if vertex.callback.keep != 'newest' and vertex.callback.kind != 'timer':
+            return
+        for e in reversed(is_open):
+            self._demoted_priority(e, None, 0)
+        self._drop(older if vertex.callback.keep == 'newest'
+                   else [e for e in is_open if e.job.demoted is not None])
+        age = self.passed_on.get((job.dag.index, vertex.index))
+        if age is not None and new in self.waiting:
+            unit = 1 if self.policy == 'llf' else self.tick
+            starts = self.laxity[job.dag.index, vertex.index]
+            aged = self._priority(new, {*starts}) + (age - job.release * self.tick) // unit
+            if aged < self.priority(new):
+                new.lowered = aged
+                self.urged[job.dag.index, vertex.index] = new.arrival
 
-    def _keep_newest(self, waiting):
-        for old in waiting:
-            if old.job.index == max(e.job.index for e in waiting):
-                continue
+    def _drop(self, dropped):
+        for old in sorted(dropped, key=lambda e: -e.job.index):
             self.waiting.remove(old)
             job, sink = old.job, old.vertex.index
             if job.demoted is not None:

@@ -27,6 +27,7 @@ from mddag_executor.core.state import (
     SINK_ABORTED,
     SINK_COMPLETED,
     SINK_DEMOTED,
+    SINK_DROPPED,
     SINK_EXPIRED,
 )
 
@@ -149,6 +150,7 @@ class LiveDriver(RuleBasedStateMachine):
         self.state.x_group[x] = group
         self.scheduler.ready(x, self.now)
         self.note(Run(x, (job.dag, job.index), vertex, leg, group, self.state.x_key[x][0]))
+        self.settle()  # it may have replaced a late one
 
     def note(self, run):
         assert run.x not in self.by_x, 'an execution that is still alive'
@@ -279,7 +281,7 @@ class LiveDriver(RuleBasedStateMachine):
                 self.sinks[dag, vertex, job] += 1
                 assert self.sinks[dag, vertex, job] == 1, 'two verdicts'
                 self.completed_sinks[dag, job] += kind in SINK_COMPLETED
-                assert kind in (*SINK_COMPLETED, SINK_ABORTED, SINK_EXPIRED)
+                assert kind in (*SINK_COMPLETED, SINK_ABORTED, SINK_EXPIRED, SINK_DROPPED)
 
     def dropped(self, decision):
         _, dag, vertex, job, x, now = decision

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from mddag_executor.core.state import DROPPED, SINK_LATE, SINK_MISSED
+from mddag_executor.core.jobs import is_miss
+from mddag_executor.core.state import DROPPED
 from mddag_executor.core.tally import counts
 from mddag_executor.simulate import Settings, simulate
 from msg_graph import ExecutionTime
@@ -59,11 +60,13 @@ def test_importance_means_nothing_if_late_jobs_are_not_demoted(case, horizon):
        st.integers(5, 60))
 def test_messages_of_a_callback_keep_their_order(case, horizon):
     case = replace(with_times(case, on_late='demote'), workers=1, preemptive=False)
-    latest = {}
+    started = {}
     for _, kind, _, dag, vertex, job in case.events(case.run(horizon)):
         if kind == 'start':
-            assert job == latest.get((dag, vertex), -1) + 1
-            latest[dag, vertex] = job
+            started.setdefault((dag, vertex), []).append(job)
+    for (dag, _), jobs in started.items():
+        of_source = started[dag, case.task_set.dags[dag].source]
+        assert jobs == sorted(of_source)[:len(jobs)]
 
 
 @examples(300)
@@ -145,6 +148,25 @@ def test_demoted_callbacks_do_not_starve():
     assert sinks['sensor']['completed'] >= 4000 // (11 * 2 + 20)  # one in 11 deadlines
 
 
+@pytest.mark.parametrize('keep', ['all', 'newest'])
+def test_callbacks_whose_releases_are_dropped_do_not_starve(keep):
+    # The first one needs the worker always, and goes first among equals.
+    sinks = results([
+        single('first', 20, 20, execution_time='20us', on_late='demote'),
+        single('second', 20, 20, execution_time='12us', on_late='demote', keep=keep)],
+        [20, 12], 4000)
+    assert sinks['second']['dropped'] >= 100
+    assert sinks['second']['completed'] >= 4000 // (12 * 20)
+
+
+def test_late_releases_of_a_timer_give_way_to_newer_ones():
+    """After an overload the newest is in time at once, although there is hardly room."""
+    sinks = results([
+        single('block', 1000, 1000, execution_time='95us', on_late='demote'),
+        single('sensor', 10, 30, execution_time='9us', on_late='demote')], [95, 9], 1000)
+    assert counts(sinks['sensor']).in_time >= 88  # 27 if all run
+
+
 def test_less_important_sinks_are_demoted_first():
     for preemptive in (True, False):
         in_time = {}
@@ -224,9 +246,9 @@ def test_late_jobs_of_an_important_sink_refuse_others():
 def test_a_sink_that_tolerates_no_further_miss_goes_first():
     def run(**more):
         sinks = results([
-            single('plain', 20, 20, execution_time='12us', on_late='demote'),
+            single('plain', 20, 20, execution_time='20us', on_late='demote'),
             single('other', 20, 20, execution_time='12us', on_late='demote', **more)],
-            [12, 12], 4000)
+            [20, 12], 4000)
         return [sinks[name]['completed'] for name in ('plain', 'other')]
     (plain, other), (plain_then, other_then) = run(), run(tolerate='1 of 10')
     assert other_then > other and plain_then < plain
@@ -264,7 +286,7 @@ def misses_of_a_burst(case, period, extra, horizon, on_late):
     run = simulate(case.task_set, load, Settings(
         workers=case.workers, duration_ns=horizon * TICK, on_late=on_late))
     return [(dag, times[dag][job] // TICK) for kind, dag, _, job, _, _ in run.decisions
-            if kind in (SINK_LATE, SINK_MISSED)]
+            if is_miss(kind)]
 
 
 @pytest.mark.parametrize('extra', [3, 6, 10, 20])

@@ -5,6 +5,7 @@
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER, POLICIES
+from mddag_executor.core.jobs import source_depth
 from mddag_executor.core.state import N_HOLDING, N_IDLE, N_STALE, WAITING
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.engine import Engine
@@ -84,25 +85,27 @@ class Driver:
                 Work(after, print), Origin(slot, dag, job, vertex), -1, -1, now)
 
 
-@pytest.mark.parametrize(('keep', 'release', 'dropped'), [('newest', 40, 2), ('all', 0, 0)])
-def test_the_newest_release_of_a_timer_is_kept_if_declared(keep, release, dropped):
+@pytest.mark.parametrize(('keys', 'release', 'dropped'), [
+    ('keep: newest', 60, 3), ('on_late: demote', 40, 2), ('on_late: continue', 0, 0)])
+def test_which_releases_of_a_timer_give_way_to_newer_ones(keys, release, dropped):
+    """All, or late ones: those of 0 and 20 ms, when that of 60 ms is due."""
     task_set = loads(f"""\
 mddag: 1
 nodes:
   - node: /motor
-    callbacks: [{{name: drive, timer: 20ms, deadline: 20ms, dag: motor, keep: {keep}}}]
+    callbacks:
+      - {{name: drive, timer: 20ms, deadline: 40ms, execution_time: 1ms, dag: motor, {keys}}}
 """, 'graph.yaml')
     engine = Engine(task_set, 1, 'rad', default_deadline=1, max_active_jobs=NEVER,
                     expire_after=NEVER)
     timer = entity_of(engine, task_set, 0, 0)
-    timer.depth = engine.tables.source_depth(0)
-    for due in (0, 20_000_000, 40_000_000):
+    timer.depth = source_depth(engine.tables, engine.scheduler.state, 0)
+    for due in (0, 20_000_000, 40_000_000, 60_000_000):
         engine.timer_due(Work(timer, print), due, due)
         engine.validate()
-    work = engine.dispatch(0, 41_000_000)
+    work = engine.dispatch(0, 61_000_000)
     assert engine.release_of(work) == release * 1_000_000
-    assert (timer.dropped, timer.skipped) == (dropped, 2 - dropped)
-    assert engine.dispatch(0, 41_000_000) is None
+    assert (timer.dropped, timer.skipped) == (dropped, 0 if dropped else 2)
 
 
 def engine_of_one_user(policy):

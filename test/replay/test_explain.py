@@ -432,7 +432,7 @@ nodes:
         in lines
     assert '0 results due, 0 in time (-), 0 late, 0 expired' in lines   # and none demoted
     explained = call('explain', trace, '--json', '-').result
-    assert explained['missed'] == explained['causes']['overload'] > 70
+    assert explained['missed'] == explained['causes']['overload'] >= 50  # all there is no time for
     behind = {each['callback'] for job in explained['jobs'] for part in job['parts']
               for each in part['behind']}
     assert '/n:main' in behind
