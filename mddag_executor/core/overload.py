@@ -145,6 +145,15 @@ def late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
         t, s, x, s.job_demoted[slot], t.rad_offset[vertex], t.latest_start[vertex])
 
 
+def is_late(t: Tables, s: State, x: int, now: int) -> bool:
+    """Return whether an execution that starts now can be in time at no sink (rule 7)."""
+    vertex = s.x_vertex[x]
+    for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
+        if now <= s.job_hope[s.x_slot[x]] + s.reach_by[i]:
+            return False
+    return vertex < t.n_vertices
+
+
 def inherit_age(t: Tables, s: State, x: int) -> None:
     """Let an execution that was just made ready go as early as one that was dropped before it."""
     vertex = s.x_vertex[x]

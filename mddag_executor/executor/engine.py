@@ -14,10 +14,11 @@ that times never decrease.  The engine and ``other_processes`` change the core's
     none.  Messages of known publications go to the job of these (``jobs``), others may enter from
     another process (``other_processes``), and all others run as undeclared.
 2.  *Queue depth.*  A queue retains as many messages as its QoS allows; beyond that the oldest are
-    dropped and counted.  Undeclared callbacks run in the order in which they became ready, so that
-    none starves.  In a queue that overflows permanently, every message is young, and its callback
-    would always come after all others.  So the next message takes over the position of the dropped
-    one.
+    dropped and counted, and with ``DEMOTE`` all late ones: a queue that stays full would make
+    every message wait for as many periods.  Undeclared callbacks run in the order in which they
+    became ready, so that none starves.  In a queue that overflows permanently, every message is
+    young, and its callback would always come after all others.  So the next message takes over the
+    position of the dropped one.
 3.  *The core decides* what to run (``dispatch``), and handles the ends of executions
     (``finished``, ``suspended``, ``refused``, …): see ``core.rules``.
 4.  *The bypass.*  While nothing is waiting, running or owning a callback group in the core, short
@@ -41,6 +42,7 @@ from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.estimates import MeanTimes
 from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import is_judged, judge_from
+from mddag_executor.core.overload import is_late
 from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE, TURN_NS
 from mddag_executor.core.state import (
     CHECK_AT,
@@ -173,7 +175,7 @@ class Engine:
         if entity.removed or self._finished:
             return
         if entity.depth and len(entity.waiting) >= entity.depth:
-            self._drop(entity, next(iter(entity.waiting)), 'qos_depth', now)
+            self._drop_oldest(entity, now)
         if entity.source >= 0:
             self._start_job(work, max(entity.since, min(release, now)), now)
             if stamp >= 0 and self.other_processes is not None and work.origin is not None:
@@ -379,6 +381,14 @@ class Engine:
         self.scheduler.drop(x, now)
         self.verdicts.dropped(entity, work.origin or NO_ORIGIN, reason, now)
         self._decided(now)
+
+    def _drop_oldest(self, entity: Entity, now: int) -> None:
+        """Drop the oldest message of a full queue, and others that are late: else all would be."""
+        oldest, *others = entity.waiting
+        self._drop(entity, oldest, 'qos_depth', now)
+        for x in others:
+            if x >= 0 and is_late(self.tables, self._state, x, now):
+                self._drop(entity, x, 'qos_depth', now)
 
     def remove(self, entity: Entity, now: int) -> None:
         """Forget a destroyed entity: its waiting executions never run."""

@@ -108,7 +108,7 @@ nodes:
     assert (timer.dropped, timer.skipped) == (dropped, 0 if dropped else 2)
 
 
-def engine_of_one_user(policy):
+def engine_of_one_user(policy, **more):
     """Return a declaration with one subscription, of deadline 300 ms, and an engine for it."""
     task_set = loads("""\
 mddag: 1
@@ -119,7 +119,28 @@ nodes:
     callbacks: [{name: use, subscription: /data, deadline: 300ms}]
 """, 'graph.yaml')
     return task_set, Engine(task_set, 1, policy, default_deadline=100_000_000,
-                            max_active_jobs=NEVER, expire_after=NEVER)
+                            max_active_jobs=NEVER, expire_after=NEVER, **more)
+
+
+@pytest.mark.parametrize(('on_late', 'dropped'), [('demote', 4), ('continue', 1)])
+def test_late_messages_of_a_full_queue_are_dropped_with_the_oldest(on_late, dropped):
+    """Else all that follow wait for as many periods as it is long, and are late, too."""
+    task_set, engine = engine_of_one_user('rad', on_late=on_late)
+    source, user = (entity_of(engine, task_set, 0, index) for index in (0, 1))
+    user.depth = 4
+    times = range(0, 2_500_000_000, 500_000_000)
+    origins = []
+    for time in times:
+        engine.timer_due(Work(source, print), time, time)
+        running = engine.dispatch(0, time)
+        engine.finished(running, time, time, time, 0, 0)
+        origins.append(running.origin)
+    messages = [Work(user, print) for _ in times]
+    for message, origin in zip(messages, origins):
+        engine.arrived(message, origin, -1, -1, times[-1])
+        engine.validate()
+    assert user.dropped == dropped and len(user.waiting) == 5 - dropped
+    assert (engine.dispatch(0, times[-1]) is messages[-1]) == (on_late == 'demote')
 
 
 def test_a_message_of_no_job_costs_as_much_when_many_wait():
