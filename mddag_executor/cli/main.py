@@ -188,7 +188,8 @@ def _ending_signals() -> Iterator[list[int]]:
         yield received
     finally:
         for number in numbers:
-            signal.signal(number, signal.SIG_DFL)
+            if signal.getsignal(number) is interrupt:  # a run that a signal ended ignores more
+                signal.signal(number, signal.SIG_DFL)
 
 
 def _status_of(run: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:

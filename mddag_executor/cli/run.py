@@ -182,8 +182,7 @@ def run_here(
         from mddag_executor.executor.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, policy=args.policy, on_late=args.on_late,
-            trace=args.trace,
-            freeze_gc=True, diagnostics_period=args.diagnostics, process=args.process,
+            trace=trace, freeze_gc=True, diagnostics_period=args.diagnostics, process=args.process,
             overwrite=args.overwrite)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr
@@ -310,6 +309,8 @@ def _run(
                 warn_of(plan)
             ledger = _run_synthetic(args, session, task_set, plan, seconds, progress)
     counts = executor.statistics()
+    if counts['trace'] is not None:
+        counts['trace']['path'] = args.trace
     result: dict[str, Any] = {
         'file': task_set.file or None, 'nodes': args.node, 'synthetic': args.synthetic, **counts,
         'measured': None if ledger is None or plan is None else measure(ledger, plan)}

@@ -19,7 +19,8 @@ Theory of operation
    ``signal.signal``, ``getsignal``   keep a handler for each program: see ``guest_signals``
    =================================  ============================================================
 
-   Afterwards the working directory is the earlier one, too: paths of results may be relative.
+   Afterwards the working directory is the earlier one, too, if that still exists: paths of results
+   may be relative.
 
 3. A program that spins passes its nodes to the host's executor and waits until the run or the
    program ends.  A program ends by ``rclpy.shutdown`` or when it returns.  Its nodes are then
@@ -110,7 +111,7 @@ class Host:
     def __enter__(self) -> Host:
         context = self.context = rclpy.utilities.get_default_context()
         replace = self._replacements.replace
-        self._replacements.callback(os.chdir, os.getcwd())
+        self._replacements.callback(_return_to, os.getcwd())
         self._replacements.callback(self._signals.uninstall)
         self._signals.install(replace)
         for name, function in (('init', self._init), ('ok', self._ok),
@@ -412,6 +413,11 @@ def nodes_of(specs: Iterable[str], arguments: Iterable[str] = ()) -> list[list[s
                     guest.program.spec, f'it has made no node in {START_TIMEOUT_S:g} s, so its '
                     'process is unknown', f'name that: PROCESS={guest.program.spec}')
         return [[n.get_fully_qualified_name() for n in guest.nodes] for guest in host.guests]
+
+
+def _return_to(folder: str) -> None:
+    with suppress(OSError):  # a program may have removed it
+        os.chdir(folder)
 
 
 def _nodes_in(program: Program, value: Any) -> list[Node]:

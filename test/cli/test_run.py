@@ -191,13 +191,14 @@ def test_a_signal_ends_a_synthetic_run(graph, number):
     assert 'results due' in out
 
 
-def test_a_signal_that_comes_twice_is_one(graph):
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_comes_twice_is_one(graph, number):
     """Who ends a process group sends one, and `ros2 launch` sends its own, too."""
     with started(graph) as process:
         wait_for_run(process, lambda: bool(releases()))
         begin = time.monotonic()
         while process.poll() is None and time.monotonic() < begin + 0.3:  # on to its very end
-            process.send_signal(signal.SIGINT)
+            process.send_signal(number)
             time.sleep(0.02)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 0 and 'Traceback' not in err, err
@@ -358,6 +359,31 @@ def test_nodes_that_change_the_folder_and_raise_what_has_no_text(folder, mddag, 
     assert 'Odd: <' in done.stderr.splitlines()[-1]
     assert os.listdir('elsewhere') == ['out.mcap']
     assert [Path(name).exists() for name in ('out.mcap', 'result.json')] == [ran, ran]
+
+
+LEAVES = """\
+import os, shutil
+from rclpy.node import Node
+start = os.getcwd()
+os.chdir('../other/deep')
+
+
+def leave():
+    shutil.rmtree(start)
+    return Node('n')
+"""
+
+
+def test_a_node_may_remove_the_folder_in_which_the_run_began(folder, mddag):
+    """The trace is where it was named, and the summary is printed."""
+    Path('start').mkdir()
+    Path('other/deep').mkdir(parents=True)
+    Path('start/leaves.py').write_text(LEAVES)
+    done = mddag('run', '--node', 'leaves:leave', '--duration', '100ms', '--trace', '../out.mcap',
+                 cwd='start')
+    assert done.returncode == 0, done.stderr
+    assert 'graph from-trace ../out.mcap ' in done.stdout
+    assert sorted(os.listdir()) == ['other', 'out.mcap'] and os.listdir('other') == ['deep']
 
 
 STUCK = """\
