@@ -14,7 +14,7 @@ that times never decrease.  The engine and ``other_processes`` change the core's
     none.  Messages of known publications go to the job of these (``jobs``), others may enter from
     another process (``other_processes``), and all others run as undeclared.
 2.  *Queue depth.*  A queue retains as many messages as its QoS allows; beyond that the oldest are
-    dropped and counted, and with ``DEMOTE`` all late ones: a queue that stays full would make
+    dropped and counted, and with ``DEMOTE`` late ones after it: a queue that stays full would make
     every message wait for as many periods.  Undeclared callbacks run in the order in which they
     became ready, so that none starves.  In a queue that overflows permanently, every message is
     young, and its callback would always come after all others.  So the next message takes over the
@@ -383,12 +383,12 @@ class Engine:
         self._decided(now)
 
     def _drop_oldest(self, entity: Entity, now: int) -> None:
-        """Drop the oldest message of a full queue, and others that are late: else all would be."""
-        oldest, *others = entity.waiting
-        self._drop(entity, oldest, 'qos_depth', now)
-        for x in others:
-            if x >= 0 and is_late(self.tables, self._state, x, now):
-                self._drop(entity, x, 'qos_depth', now)
+        """Drop the oldest message of a full queue, and the next ones while these are late."""
+        self._core()
+        waiting = entity.waiting
+        self._drop(entity, next(iter(waiting)), 'qos_depth', now)
+        while waiting and is_late(self.tables, self._state, x := next(iter(waiting)), now):
+            self._drop(entity, x, 'qos_depth', now)
 
     def remove(self, entity: Entity, now: int) -> None:
         """Forget a destroyed entity: its waiting executions never run."""

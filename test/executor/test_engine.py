@@ -143,6 +143,40 @@ def test_late_messages_of_a_full_queue_are_dropped_with_the_oldest(on_late, drop
     assert (engine.dispatch(0, times[-1]) is messages[-1]) == (on_late == 'demote')
 
 
+def test_a_long_full_queue_costs_as_much_as_a_short_one(monkeypatch):
+    """The lock is held meanwhile."""
+    task_set, engine = engine_of_one_user('rad', on_late='demote')
+    source, user = (entity_of(engine, task_set, 0, index) for index in (0, 1))
+    user.depth = 100
+    checked = []
+    monkeypatch.setattr('mddag_executor.executor.engine.is_late', lambda *args: checked.append(1))
+    origins = []
+    for time in range(user.depth + 10):
+        engine.timer_due(Work(source, print), time, time)
+        running = engine.dispatch(0, time)
+        engine.finished(running, time, time, time, 0, 0)
+        origins.append(running.origin)
+    for origin in origins:
+        engine.arrived(Work(user, print), origin, -1, -1, time)
+    assert (len(checked), user.dropped) == (10, 10)
+
+
+def test_a_message_of_a_job_comes_to_a_queue_that_is_full_of_short_ones_without_a_job():
+    """Those bypass the core."""
+    task_set, engine = engine_of_one_user('rad')
+    engine.allow_bypass()
+    source, user = (entity_of(engine, task_set, 0, index) for index in (0, 1))
+    user.depth = 2
+    engine.timer_due(Work(source, print), 0, 0)
+    running = engine.dispatch(0, 0)
+    engine.finished(running, 0, 0, 0, 0, 0)
+    works = [Work(user, print) for _ in range(3)]
+    for work, origin in zip(works, (None, None, running.origin)):
+        engine.arrived(work, origin, -1, -1, 0)
+        engine.validate()
+    assert [engine.dispatch(0, 0), user.dropped] == [works[1], 1]
+
+
 def test_a_message_of_no_job_costs_as_much_when_many_wait():
     """The lock is held meanwhile: else a fast foreign publisher would starve the jobs."""
     task_set, engine = engine_of_one_user('rad')
