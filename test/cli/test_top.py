@@ -132,7 +132,7 @@ def test_once_shows_another_process(running, mddag):
     done = mddag('top', '--once')
     assert done.returncode == 0 and re.search(
         r'/\d+ +mddag: main +\w+ .* 20 ms ', done.stdout)
-    done = mddag('top', '--duration', '3s')
+    done = mddag('top', '--duration', '6s')
     assert done.returncode == 0 and done.stdout.count('workers of') >= 2
 
 
