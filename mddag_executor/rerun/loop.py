@@ -285,6 +285,8 @@ class Loop:
             self.engine.refused(work, self.now)
             return False
         except (Exception, SystemExit) as error:
+            if not self.run_threads.over:
+                self.refresh_now()  # its node may just have been destroyed
             if isinstance(error, SystemExit) and error.code in (None, 0):
                 self.stop()
             elif self.run_threads.over or entity.removed:  # while it has waited

@@ -72,6 +72,9 @@ class Requests:
         replace(Client, 'call', instead(self.call))
         replace(Client, 'service_is_ready', instead(
             lambda client: self._service(service_name(client)) is not None))
+        # rclpy's own poll each 250 ms
+        replace(Client, 'wait_for_service', instead(self._wait_for_service))
+        replace(ActionClient, 'wait_for_server', instead(self._wait_for_server))
         replace(Service, 'send_response', instead(self.send_response))
         replace(ActionClient, '__init__', self._made)
         replace(ActionServer, '__init__', self._made)
@@ -96,6 +99,12 @@ class Requests:
     def _service(self, name: str) -> Entity | None:
         return next((entity for entity in self._registry.by_id.values()
                      if entity.kind == SERVICE and entity.label == name), None)
+
+    def _wait_for_service(self, client: Client, timeout_sec: float | None = None) -> bool:
+        name = service_name(client)
+        self._loop.wait(lambda: self._service(name) is not None or not alive(client),
+                        timeout_sec, f'for service {name}')
+        return client.service_is_ready()
 
     def call_async(self, client: Any, request: Any) -> Future:
         """Send a request; return the future of its response."""
@@ -174,6 +183,11 @@ class Requests:
         return [each for known, each in self._actions.values()
                 if known == name and id(each) in self._registry.by_id
                 and type(action_handle(each)) is not type(handle)]
+
+    def _wait_for_server(self, client: Any, timeout_sec: float | None = None) -> bool:
+        handle = action_handle(client)
+        return self._loop.wait(lambda: bool(self._peers(handle)), timeout_sec,
+                               f'for action {self._actions[id(handle)][0]}')
 
     def _ask_action(self, kind: str, handle: Any, request: Any) -> int:
         number = next(self._numbers)

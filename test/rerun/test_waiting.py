@@ -58,6 +58,30 @@ def test_a_service_answers_in_virtual_time(bag, graph):
     assert seen == [(317.0, 'hello')]
 
 
+def test_services_of_later_programs_are_waited_for_without_delay(bag, graph):
+    seen = []
+
+    def main():
+        rclpy.init()
+        node = rclpy.create_node('client')
+        assert node.create_client(Trigger, '/greet').wait_for_service()
+        assert ActionClient(node, Fibonacci, 'fibonacci').wait_for_server()
+        node.create_subscription(
+            Header, '/points', lambda message: seen.append(int(message.frame_id)), 10)
+        rclpy.spin(node)
+
+    run_filter(bag, graph, lambda node, number: None, main, server, fibonacci)
+    assert seen == [*range(20)]
+
+
+@pytest.mark.parametrize('wait, what', [
+    (lambda node: node.create_client(Trigger, '/none').wait_for_service(), 'service /none'),
+    (lambda node: ActionClient(node, Fibonacci, '/none').wait_for_server(), 'action /none')])
+def test_a_callback_that_still_waits_is_named(bag, graph, wait, what):
+    _, result = run_filter(bag, graph, lambda node, number: number == 3 and wait(node))
+    assert result.warnings == [f'/filter:take: it still waits (for {what})']
+
+
 def test_a_synchronous_call_lends_its_worker(bag, graph):
     def take(node, number):
         if number == 3:
