@@ -361,10 +361,11 @@ class Loop:
             return True
         deadline = None
         if timeout_s is not None and math.isfinite(timeout_s):
-            deadline = self.after_pause(self.now + round(timeout_s * 1e9), DRAIN_NS)
+            deadline = self.now + round(timeout_s * 1e9)
             if deadline <= self.now:
                 self.note_poll()
                 return until is not None and until()
+            deadline = self.after_pause(deadline, DRAIN_NS)
         execution = self._current
         if execution is not None:
             sent, execution.sent = execution.sent, []

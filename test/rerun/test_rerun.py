@@ -314,6 +314,22 @@ def test_nothing_happens_in_a_pause_of_the_recording(tmp_path, graph):
         f'{bag}: timers do not fire in 1 pause of over a minute without any message']
 
 
+def test_no_wait_is_none_in_a_pause_either(tmp_path, graph):
+    """A callback that begins late in a pause polls, and ends at once."""
+    bag = write_bag(tmp_path / 'in.mcap', [
+        (time * 1000 * MS, '/points', Header(frame_id=str(time))) for time in (0, 200)])
+    graph.write_text(GRAPH.replace('execution_time: 10ms', 'execution_time: 15s'))
+
+    class Polls(Sink):
+
+        def take(self, message):
+            threading.Event().wait(0)
+            super().take(message)
+
+    result = rerun(bag, graph, [Filter, Polls])
+    assert published(result, '/out')[0][0] == 15_005
+
+
 def test_a_message_is_as_it_was_published(bag, graph):
     """Who publishes may change a message afterwards, and who receives it has one of his own."""
     received = []
