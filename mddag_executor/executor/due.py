@@ -11,10 +11,11 @@ Theory of operation
 2.  *Muting.*  Waking a thread costs 60 to 140 us while a callback computes.  So while a callback
     holds the GIL for long, callbacks that cannot start wake no thread.  Those that could start are
     known beforehand: they do not compute, or their relative deadline is below a bound (see
-    ``Engine.overtaking_bound``).  Short callbacks compute, too: each needs the GIL to start.  The
-    timers of all others do not count for the timerfd.  Their sources are switched off (``loop``)
-    if they are *patient*: their relative deadline is at least that of undeclared callbacks, and
-    the bound is not above it.  Their arrivals are collected when muting ends.
+    ``Engine.overtaking_bound``).  Short callbacks compute, too: each needs the GIL to start.
+    While the bound is at most the relative deadline of undeclared callbacks, the timers of all
+    others do not count for the timerfd, and their sources are switched off (``loop``) if they are
+    *patient*: their relative deadline is at least that of undeclared callbacks.  Their arrivals
+    are collected when muting ends.
 """
 
 from __future__ import annotations
