@@ -24,7 +24,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
 )
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 import logging
 import multiprocessing
@@ -127,7 +127,8 @@ def _collect(
                 progress(outcome.runs)
     except KeyboardInterrupt:
         for future in [each for each in reversed(pending) if not each.cancel()]:
-            outcome.add(future.result())
+            with suppress(BrokenProcessPool):  # the signal may have ended all processes
+                outcome.add(future.result())
         raise
     finally:
         for future in pending:

@@ -11,6 +11,7 @@ execution times drawn from the measured values.
 from dataclasses import replace
 import logging
 import math
+import multiprocessing
 import os
 from pathlib import Path
 import signal
@@ -192,6 +193,18 @@ def test_interrupted(small):
     result = outcome.result()
     assert (result['runs'], result['interrupted']) == (outcome.runs, True)
     assert sum(result['counts']) == outcome.runs
+
+
+def test_interrupted_by_a_signal_to_all_processes(small):
+    """As `timeout` sends it."""
+    def stop(done):
+        for child in multiprocessing.active_children():
+            child.kill()
+        raise KeyboardInterrupt
+
+    outcome = evaluate(
+        Experiment(small, ('rad',), workers=1), 100_000, jobs=2, progress=stop, compiled=False)
+    assert outcome.interrupted and 0 < outcome.runs < 100_000
 
 
 @pytest.mark.parametrize(('runs', 'first', 'problem'), [
