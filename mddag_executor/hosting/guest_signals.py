@@ -8,7 +8,8 @@ Theory of operation
 Python runs handlers in the main thread, and only the main thread may set them.  So this module
 sets a common handler for the signals that programs use, and stores the handlers of programs.  When
 a signal arrives, first its earlier handler runs (SIGINT ends the run), then those of the programs.
-SIGHUP ends the run only if no program handles it, which usually means to read settings again.
+SIGHUP ends the run only if no running program handles it, which usually means to read settings
+again.
 An exception of a program's handler is raised in the program's own thread, as soon as that runs
 Python.
 """
@@ -78,14 +79,16 @@ class GuestSignals:
 
     def _handle(self, number: int, frame: Any) -> None:
         before, handlers = self._before[number], self._handlers[number]
+        running = [(guest, handler) for guest, handler in handlers.items()
+                   if guest is None or not guest.ended]
         if callable(before):
-            if number != signal.SIGHUP or not handlers:
+            if number != signal.SIGHUP or not running:
                 before(number, frame)
         elif before == signal.SIG_DFL and not handlers:
             self._set(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
-        for guest, handler in list(handlers.items()):
-            if callable(handler) and not (guest is not None and guest.ended):
+        for guest, handler in running:
+            if callable(handler):
                 self._call(guest, handler, number, frame)
 
     def _call(self, guest: Guest | None, handler: Any, number: int, frame: Any) -> None:

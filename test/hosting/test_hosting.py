@@ -218,6 +218,32 @@ def test_rclpy_is_as_before_when_the_host_is_left(default_context):
     host.executor.shutdown()
 
 
+@pytest.mark.parametrize('ends', [False, True])
+def test_a_hangup_ends_the_run_unless_a_running_program_handles_it(
+        default_context, monkeypatch, ends):
+    """Programs that have ended handle nothing."""
+    got = []
+
+    def main():
+        rclpy.init()
+        signal.signal(signal.SIGHUP, lambda *_: got.append('program'))
+        if ends:
+            rclpy.shutdown()
+            return None
+        return Node('node')
+
+    before = signal.signal(signal.SIGHUP, lambda *_: got.append('run'))
+    try:
+        with Host() as host:
+            host.start(SingleThreadedExecutor(), [Program('main', 'main', main)])
+            assert wait_for(lambda: host.guests[0].ended == ends)
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert wait_for(lambda: got == ['run' if ends else 'program'])
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    host.executor.shutdown()
+
+
 @pytest.mark.parametrize('kind', [
     SingleThreadedExecutor, MultiThreadedExecutor, rclpy.experimental.EventsExecutor])
 def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host, kind):
