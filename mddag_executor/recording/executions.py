@@ -277,11 +277,18 @@ def number_pieces(table: Table, mine: Ints, of: str) -> None:
     table['busy'][mine[ended]] = (total - total[begin] + table['busy'][mine[begin]])[ended]
 
 
-def running_at(executions: Table, thread: Ints, time: Ints) -> Ints:
+def running_at(
+    executions: Table, completed: Table, thread: Ints, time: Ints, place: Ints
+) -> Ints:
     """
     Return the rows of the executions that ran in threads at given times; -1: none.
 
+    If one ended when the next one started, it is the first one whose completion comes later in the
+    file: in virtual time a callback publishes when it ends.
+
+    :param completed: see ``COMPLETED``.
     :param time: ascending.
+    :param place: positions in the file.
     """
     found = np.full(len(time), UNKNOWN)
     ran = np.flatnonzero((executions['end'] >= 0) & (executions['start'] >= 0))
@@ -301,6 +308,13 @@ def running_at(executions: Table, thread: Ints, time: Ints) -> Ints:
             if not outer.any():
                 break
             at[outer] -= 1
+        later = completed['place'][mine]
+        for _ in range(len(mine)):
+            one = np.maximum(at - 1, 0)
+            before = (at > 0) & (end[one] == time[asked]) & (later[one] > place[asked])
+            if not before.any():
+                break
+            at[before] -= 1
         good = (at >= 0) & (end[np.maximum(at, 0)] >= time[asked])
         found[asked[good]] = mine[at[good]]
     return found

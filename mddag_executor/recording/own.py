@@ -8,7 +8,8 @@ Theory of operation
 1. The file is read chunk by chunk, in the order of the file.  Whole chunks before damage are used.
    No event is dropped because of its time.
 2. ``executions`` joins the events of executions.
-3. A publication belongs to the execution that ran in its thread at that time.
+3. A publication belongs to the execution that ran in its thread at that time, or of several that
+   ended or started then, to the first one that is completed after it in the file.
 4. The core processed events in the order of their times, equal times in the order of the file.
 """
 
@@ -209,7 +210,7 @@ class _Source:
         self._entities()
         found.executions, completed = self._executions.tables()
         self._last_seen = self._executions.last
-        found.publications = self._publications(found.executions)
+        found.publications = self._publications(found.executions, completed)
         found.releases, released_at = self._releases(self._pop(_RELEASE))
         found.job_ends, ends_at = self._job_ends()
         found.misses = self._misses()
@@ -235,13 +236,14 @@ class _Source:
             elif event[0] == TASK_SET and event[4] != self._head.yaml:
                 self._strange[f'{TASK_SET} with another declaration'] += 1
 
-    def _publications(self, executions: Table) -> Table:
+    def _publications(self, executions: Table, completed: Table) -> Table:
         published = self._pop(_PUBLISH)
         time = published['timestamp']
         if (time[1:] < time[:-1]).any():
             published = pick(published, sort_by(time))
             time = published['timestamp']
-        by = running_at(executions, published['vtid'], time)
+        by = running_at(
+            executions, completed, published['vtid'], time, published['place'])
         return rows(
             PUBLICATIONS, len(published), publisher=published['publisher_handle'],
             execution=by, time=time, source_timestamp=UNKNOWN,

@@ -182,6 +182,18 @@ def test_the_trace_replays(bag, graph, tmp_path):
     assert len(handles['ros2:rclcpp_publish'] & handles['ros2:rcl_publisher_init']) == 2
 
 
+@pytest.mark.parametrize('takes', [', execution_time: 10ms', ''])
+def test_recorded_publications_belong_to_their_executions(bag, graph, tmp_path, takes):
+    """Also if the next execution of the thread starts, or even ends, at that instant."""
+    graph.write_text(GRAPH.replace(', execution_time: 10ms', takes).replace(
+        ' execution_time: 5ms,', ''))
+    trace = str(tmp_path / 'run.mcap')
+    rerun(bag, graph, [Filter, Sink], workers=1, trace=trace)
+    run = open_recording(trace)
+    by = [run.task_set.vertices[v].name for v in run.publications['vertex'].tolist() if v >= 0]
+    assert by == 20 * ['/filter:take', '/sink:take']
+
+
 def test_recorded_times_come_from_a_trace(bag, graph, tmp_path):
     trace = tmp_path / 'run.mcap'
     rerun(bag, graph, [Filter, Sink], trace=trace)
