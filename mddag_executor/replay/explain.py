@@ -169,7 +169,24 @@ class Explanation:
             if (dag, job) in dropped for vertex, time in [dropped[dag, job]]]
         sources = rows(STARTED, len(waited), **dict(zip(
             ('vertex', 'job', 'ready', 'start'), zip(*waited))))
+        sources['group'] = self._in_groups(sources)
         return np.concatenate([started, sources])
+
+    def _in_groups(self, waits: Table) -> Ints:
+        """Return how long the callback groups of waiting vertices were busy meanwhile, ns."""
+        table, groups = self._executions, self._who.groups
+        of_vertex = {vertex: callback for callback, vertex in self._vertices().items()}
+        group = np.array([groups.get(of_vertex.get(vertex, 0), -1)
+                          for vertex in waits['vertex'].tolist()], dtype=np.int64)
+        busy = np.zeros(len(waits), dtype=np.int64)
+        for each in np.unique(group[group >= 0]).tolist():
+            members = [callback for callback, number in groups.items() if number == each]
+            which = (table['start'] >= 0) & np.isin(table['callback'], members)
+            end = table['end'][which]
+            spans = Spans(table['start'][which], np.where(end < 0, self._recording.end, end))
+            mine = group == each
+            busy[mine] = spans.within(waits['ready'][mine], waits['start'][mine])
+        return busy
 
     def _stops(self) -> list[tuple[int, int]]:
         """Return the stops of the machine, each from the last event before it."""
