@@ -24,24 +24,22 @@ import itertools
 from typing import Any
 
 from mddag_executor.executor.compat import (
+    action_handle,
     alive,
     attach_futures,
+    CLIENT_HANDLE,
     complete_request,
     feedback_taken,
+    goal_states,
+    has_result,
+    new_request,
+    SERVER_HANDLE,
     service_name,
 )
 from mddag_executor.executor.entity import Entity, SERVICE
 from mddag_executor.executor.registry import Registry
 from mddag_executor.executor.work import Work
 from mddag_executor.replacements import instead, Replacements
-from mddag_executor.rerun.compat import (
-    action_handle,
-    CLIENT_HANDLE,
-    goal_states,
-    has_result,
-    new_request,
-    SERVER_HANDLE,
-)
 from mddag_executor.rerun.loop import Loop, TIMER
 from rclpy.client import Client
 from rclpy.service import Service
