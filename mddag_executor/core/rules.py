@@ -53,9 +53,9 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     are demoted has to wait for these.  If it can be in time, the oldest inherits its priority, so
     a backlog is worked off; if not, it is demoted behind the oldest.  If one is dropped (rule 13,
     or live a full queue), the next one counts as released as early, if it is late or that is
-    earlier.  In a lasting overload
-    (``State.overloaded``) the mean execution times of the older ones count, too.  Running
-    executions keep their keys.  Only policies whose keys are times demote.
+    earlier.  In a lasting overload (``State.overloaded``) the mean execution times of the older
+    ones count, too.  Running executions keep their keys.  Only policies whose keys are times
+    demote.
 8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
     when an execution of it fails (its callback raises): each incomplete sink is missed.
     Executions that have not started are dropped after an abort.  After an expiry or a failure they

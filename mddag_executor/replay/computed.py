@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from mddag_executor.core import DEFAULT_DEADLINE_NS, legs_of, NEVER, Tables
+from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, Tables
 from mddag_executor.core.state import (
     ABORTED,
     Decision,
@@ -35,6 +35,7 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.recording import tables
 from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.executions import Numbering
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import Ints, look_up, Recording, sort_by, UNKNOWN
 from mddag_executor.simulate import END, Load, LogEntry, SimulatedRun, START
@@ -268,8 +269,7 @@ class _Tables:
         before = np.r_[0, total][first]
         task_set = self._schedule.task_set
         callback = np.r_[np.array(task_set.places_of_vertices(), dtype=np.int64) + 1, 0]
-        legs = np.array([tables.ALL_LEGS * (len(legs_of(v, task_set.dags[v.dag].vertices)) > 1)
-                         for v in task_set.vertices] + [0])
+        legs = np.where(Numbering(task_set).n_legs > 1, tables.ALL_LEGS, 0)
         return tables.pick(tables.rows(
             tables.EXECUTIONS, len(first), callback=callback[each.vertex],
             dag=np.where(declared, each.dag, -1), vertex=np.where(declared, each.vertex, -1),

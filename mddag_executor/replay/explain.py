@@ -21,7 +21,15 @@ from mddag_executor.core import legs_of, POLICIES
 from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.recording.tables import Ints, Recording, rows, rows_by, Table, VERTEX
+from mddag_executor.recording.tables import (
+    different,
+    Ints,
+    Recording,
+    rows,
+    rows_by,
+    Table,
+    VERTEX,
+)
 from mddag_executor.replay.causes import (
     behind,
     CAUSES,
@@ -174,10 +182,9 @@ class Explanation:
 
     def _in_groups(self, waits: Table) -> Ints:
         """Return how long the callback groups of waiting vertices were busy meanwhile, ns."""
-        table, groups = self._executions, self._who.groups
-        of_vertex = {vertex: callback for callback, vertex in self._vertices().items()}
-        group = np.array([groups.get(of_vertex.get(vertex, 0), -1)
-                          for vertex in waits['vertex'].tolist()], dtype=np.int64)
+        table, groups, of_vertex = self._executions, self._who.groups, self._groups()
+        group = np.array([of_vertex.get(vertex, -1) for vertex in waits['vertex'].tolist()],
+                         dtype=np.int64)
         busy = np.zeros(len(waits), dtype=np.int64)
         for each in np.unique(group[group >= 0]).tolist():
             members = [callback for callback, number in groups.items() if number == each]
@@ -214,13 +221,12 @@ class Explanation:
         if not len(chosen):
             return self._waited
         table, rows = self._executions, self._rows
-        of_vertex = {vertex: callback for callback, vertex in self._vertices().items()}
-        number = self._who.groups
+        groups, of_vertex = self._who.groups, self._groups()
 
         def same_group(vertex: int, callback: int) -> bool:
-            return number.get(of_vertex.get(vertex, 0), -1) == number.get(callback, -2)
+            return of_vertex.get(vertex, -1) == groups.get(callback, -2)
 
-        callbacks, which = np.unique(table['callback'][rows], return_inverse=True)
+        callbacks, which = different(table['callback'][rows])
         runs, on_workers = {}, {}
         for callback, at in zip(callbacks.tolist(), rows_by(which, len(callbacks))):
             mine = rows[at]
@@ -238,6 +244,11 @@ class Explanation:
         of = self._recording.vertices_of_callbacks(self._rows)
         return {callback: vertex for callback, vertex in zip(numbers.tolist(), of.tolist())
                 if vertex >= 0}
+
+    def _groups(self) -> dict[int, int]:
+        """Return by vertex the callback group of its callback; -1 for a reentrant one."""
+        groups = self._who.groups
+        return {vertex: groups.get(callback, -1) for callback, vertex in self._vertices().items()}
 
     # --- results ---------------------------------------------------------------------------------
 
