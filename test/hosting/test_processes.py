@@ -19,6 +19,7 @@ from msg_graph import loads
 import pytest
 
 from ..conftest import wait_for_run
+from .workspace import TWO_PROCESSES
 
 GUESTS = Path(__file__).resolve().parent / 'guests'
 CHAIN = """\
@@ -110,11 +111,7 @@ def test_synthetic_nodes_in_two_processes_are_one_run(world, mddag):
 
 
 def test_a_process_by_itself_does_not_judge_the_jobs_of_others(world, mddag):
-    (world / 'two.yaml').write_text(
-        'mddag: 1\nnodes:\n'
-        '  - {node: /a, callbacks: [{name: t, timer: 9ms, deadline: 9ms, execution_time: 1ms}]}\n'
-        '  - {node: /b, callbacks: [{name: t, timer: 9ms, deadline: 9ms, execution_time: 1ms}]}\n'
-        'processes: {one: [/a], two: [/b]}\n')
+    (world / 'two.yaml').write_text(TWO_PROCESSES)
     run = mddag('run', 'two.yaml', '--synthetic', 'sleep', '--process', 'one', '--duration',
                 '100ms', '--json', 'result.json')
     assert run.returncode == 0, run.stderr

@@ -15,6 +15,8 @@ from msg_graph import loads
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
+from .workspace import TWO_PROCESSES
+
 MS = 1_000_000
 
 # AND (join), OR (/sink belongs to fast and slow), a source that is a subscription and one that is
@@ -104,6 +106,15 @@ def test_spinning_takes_cpu_of_its_own_thread_only():
 # --- nodes ---------------------------------------------------------------------------------------
 
 
+def executor_with_nodes(task_set, context):
+    executor = MultiDeadlineExecutor(task_set, context=context)
+    workload = SyntheticWorkload(
+        task_set, ExecutionPlan(task_set), context=context, current_job=current_job)
+    for node in workload.nodes:
+        executor.add_node(node)
+    return executor, workload
+
+
 def test_nodes_have_exactly_what_is_declared(task_set, ros_context):
     workload = SyntheticWorkload(task_set, ExecutionPlan(task_set), context=ros_context)
     nodes = {node.get_fully_qualified_name(): node for node in workload.nodes}
@@ -136,11 +147,7 @@ def test_nodes_have_exactly_what_is_declared(task_set, ros_context):
 
 
 def test_a_process_prepares_only_what_it_runs(ros_context, monkeypatch):
-    task_set = loads(
-        'mddag: 1\nnodes:\n'
-        '  - {node: /a, callbacks: [{name: t, timer: 9ms, deadline: 9ms, execution_time: 1ms}]}\n'
-        '  - {node: /b, callbacks: [{name: t, timer: 9ms, deadline: 9ms, execution_time: 1ms}]}\n'
-        'processes: {one: [/a], two: [/b]}\n')
+    task_set = loads(TWO_PROCESSES)
     plan = next(plan for seed in range(99) if [
         (plan := ExecutionPlan(task_set, seed, mode='mixed')).body(vertex)
         for vertex in task_set.vertices] == ['spin', 'native'])
@@ -149,11 +156,7 @@ def test_a_process_prepares_only_what_it_runs(ros_context, monkeypatch):
 
 
 def test_every_release_reaches_every_sink(task_set, ros_context):
-    executor = MultiDeadlineExecutor(task_set, context=ros_context)
-    workload = SyntheticWorkload(
-        task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
-    for node in workload.nodes:
-        executor.add_node(node)
+    executor, workload = executor_with_nodes(task_set, ros_context)
     with Session(executor) as session:
         assert workload.run(session, 1.0, warm_up_s=0.5)
     assert session.error is None
@@ -191,11 +194,7 @@ nodes:
   - node: /b
     callbacks: [{name: both, sync: [/x, /y], deadline: 20ms}]
 """, 'graph.yaml')
-    executor = MultiDeadlineExecutor(task_set, context=ros_context)
-    workload = SyntheticWorkload(
-        task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
-    for node in workload.nodes:
-        executor.add_node(node)
+    executor, workload = executor_with_nodes(task_set, ros_context)
     with Session(executor) as session:
         assert workload.run(session, 0.2, warm_up_s=0.1)
     ran, joined = (len(workload.ledger.durations[name]) for name in ('/a:tick', '/b:both'))
@@ -205,11 +204,7 @@ nodes:
 
 def test_the_ledger_of_a_long_run_is_bounded(task_set, ros_context, monkeypatch):
     monkeypatch.setattr('mddag_executor.hosting.synthetic.MOST_MEASURED_S', 0.4)
-    executor = MultiDeadlineExecutor(task_set, context=ros_context)
-    workload = SyntheticWorkload(
-        task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)
-    for node in workload.nodes:
-        executor.add_node(node)
+    executor, workload = executor_with_nodes(task_set, ros_context)
     ledger, sizes = workload.ledger, []
 
     def tick(passed):

@@ -16,6 +16,13 @@ nodes:
   - node: /listener
     callbacks: [{name: heard, subscription: /chatter, deadline: 50ms}]
 """
+TWO_PROCESSES = """\
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: t, timer: 9ms, deadline: 9ms, execution_time: 1ms}]}
+  - {node: /b, callbacks: [{name: t, timer: 9ms, deadline: 9ms, execution_time: 1ms}]}
+processes: {one: [/a], two: [/b]}
+"""
 
 
 def make_workspace(folder, monkeypatch):
