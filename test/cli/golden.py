@@ -19,12 +19,12 @@ _CHANGING = (
     (re.compile(f'"mddag": "{re.escape(__version__)}"'), '"mddag": "VERSION"'))
 
 
-def compare(name, found):
+def compare(name, found, folder=FOLDER):
     """Compare a text with a file; with UPDATE_GOLDEN in the environment, write the file."""
     found = found.replace('\r\n', '\n')
     for pattern, constant in _CHANGING:
         found = pattern.sub(constant, found)
-    path = FOLDER / f'{name}.txt'
+    path = folder / f'{name}.txt'
     if os.environ.get('UPDATE_GOLDEN'):
         path.write_bytes(found.encode())
     assert found == path.read_bytes().decode()

@@ -5,7 +5,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 from msg_graph import loads
-from msg_graph.binding import Binder, entities_of, Entity, entity_name, is_period, meant
+from msg_graph.binding import Binder, entities_of, Entity, entity_name, meant
 from msg_graph.drift import drift, Observed, Releases
 import pytest
 
@@ -40,123 +40,95 @@ def observed(jobs=50, period=10 * MS):
         publishes={'/a:t': {'/x', '/rosout'}, '/a:y': {'/y'}, '/b:m': {'/z'}})
 
 
-def kinds(found):
-    return [(each.kind, each.callback) for each in found]
-
-
 @given(jobs=st.integers(0, 400))
 def test_nothing_is_said_of_what_is_as_declared(jobs):
     assert drift(TASKS, observed(jobs)) == []
 
 
-def test_a_topic_that_is_not_declared():
+def released(factor):
+    return {'releases': {'/a:t': Releases(50, 0, round(49 * 10 * MS * factor))}}
+
+
+def never_ran(*names):
+    return {'ran': dict.fromkeys(names, 0), 'got': dict.fromkeys(names, 0)}
+
+
+NO_E = "/b:e never ran in 0.500 s: did you mean the topic '/zz'?"
+SKIPPED = {'/a:t': 20, '/b:m': 15, '/b:s': 20, '/b:e': 0}       # of 50 releases
+
+
+@pytest.mark.parametrize(('changes', 'texts'), [
+    ({'publishes': {'/b:w': {'/q\x1b', '/p', '/parameter_events'}}},
+     ['/b:w publishes /p, which it does not declare',
+      '/b:w publishes /q\\x1b, which it does not declare']),
+    (released(0.81), []), (released(1.19), []),
+    (released(0.79), ['/a:t was released every 7.9ms, and 10ms is declared']),
+    (released(1.21), ['/a:t was released every 12.1ms, and 10ms is declared']),
+    ({'got': {'/b:m': 39}}, []), ({'got': {'/b:m': 60}}, []),
+    *(({'got': {'/b:m': got}}, [f'/b:m got {got} messages, and by the declaration 50 were due'])
+      for got in (38, 62)),
+    # Of consecutive callbacks the first that never ran is the reason.
+    (never_ran('/b:m', '/b:s', '/b:e'), ['/b:m never ran in 0.500 s']),
+    (never_ran('/b:s', '/b:e'), [NO_E.replace('e', 's', 1), NO_E]),
+    # What an overload skips and drops is no difference.
+    ({'ran': SKIPPED | {'/b:m': 1}, 'got': {'/b:m': 20, '/b:e': 0}}, []),
+    ({'ran': SKIPPED, 'got': {'/b:m': 20, '/b:e': 0}}, [NO_E]),
+    ({'ran': SKIPPED, 'got': {'/b:m': 20, '/b:e': 15}}, []),
+    ({'came': {'/b:s': {'/x', '/z'}}}, []),
+    ({'came': {'/b:s': {'/x'}}},
+     ["/b:s never got a message of /z in 0.500 s: did you mean the topic '/zz'?"]),
+])
+def test_each_difference(changes, texts):
     seen = observed()
-    seen.publishes['/b:w'] = {'/q\x1b', '/p', '/parameter_events'}
-    found = drift(TASKS, seen)
-    assert [(each.kind, each.topic) for each in found] == [
-        ('publishes', '/p'), ('publishes', '/q\x1b')]
-    assert [each.text for each in found] == [
-        '/b:w publishes /p, which it does not declare',
-        '/b:w publishes /q\\x1b, which it does not declare']
+    seen.undeclared = [Entity('/c', 'subscription', '/x'), Entity('/b', 'subscription', '/zz')]
+    for name, change in changes.items():
+        getattr(seen, name).update(change)
+    assert [each.text for each in drift(TASKS, seen)] == texts
 
 
-@pytest.mark.parametrize(('factor', 'said'), [
-    (1.19, False), (1.21, True), (0.81, False), (0.79, True)])
-def test_the_rate_of_a_source(factor, said):
+def test_a_result_has_what_its_text_says():
     seen = observed()
-    seen.releases['/a:t'] = Releases(50, 0, round(49 * 10 * MS * factor))
-    found = drift(TASKS, seen)
-    assert kinds(found) == ([('rate', '/a:t')] if said else [])
-    if said:
-        assert (found[0].declared, found[0].observed) == (10 * MS, round(10 * MS * factor))
-        assert found[0].text.endswith('ms, and 10ms is declared')
+    seen.releases |= released(2)['releases']
+    seen.got['/b:w'], seen.came = 3, {'/b:s': {'/x'}}
+    assert [tuple(each.result().values())[:5] for each in drift(TASKS, seen)] == [
+        ('rate', '/a:t', None, 10 * MS, 20 * MS), ('rate', '/b:w', None, 25, 3)]
+    del seen.releases['/a:t']
+    found = drift(TASKS, seen)[0].result()
+    assert tuple(found.values())[:5] == ('never ran', '/b:s', '/z', None, 0)
 
 
-@pytest.mark.parametrize(('got', 'said'), [(60, False), (62, True), (39, False), (38, True)])
-def test_the_rate_of_messages(got, said):
-    seen = observed()
-    seen.got['/b:m'] = got
-    found = drift(TASKS, seen)
-    assert kinds(found) == ([('rate', '/b:m')] if said else [])
-    if said:
-        assert found[0].text == f'/b:m got {got} messages, and by the declaration 50 were due'
-
-
-def test_few_messages_prove_nothing():
+def test_few_messages_and_short_runs_prove_nothing():
     seen = observed(jobs=9)
     seen.got['/b:m'] = 3
     assert drift(TASKS, seen) == []
-
-
-def test_what_an_overload_skips_and_drops_is_no_difference():
-    seen = observed()
-    seen.ran['/a:t'] = seen.got['/b:m'] = 20     # of 50 releases
-    seen.ran['/b:m'], seen.ran['/b:s'] = 1, 20
-    seen.got['/b:e'] = seen.ran['/b:e'] = 0
-    assert drift(TASKS, seen) == []
-    seen.ran['/b:m'] = 15
-    assert kinds(drift(TASKS, seen)) == [('never ran', '/b:e')]
-    seen.got['/b:e'] = 15       # all were dropped
-    assert drift(TASKS, seen) == []
-
-
-def test_a_callback_that_never_ran_is_the_reason_for_those_after_it():
-    seen = observed()
-    for key in ('/b:m', '/b:s', '/b:e'):
-        seen.ran[key] = seen.got[key] = 0
-    assert kinds(drift(TASKS, seen)) == [('never ran', '/b:m')]
-    seen.ran['/b:m'] = seen.got['/b:m'] = 50
-    assert kinds(drift(TASKS, seen)) == [('never ran', '/b:s'), ('never ran', '/b:e')]
-
-
-def test_a_sync_that_never_got_one_of_its_topics():
-    seen = observed()
-    seen.came = {'/b:s': {'/x', '/z'}}
-    assert drift(TASKS, seen) == []
-    seen.came = {'/b:s': {'/x'}}
-    seen.undeclared = [Entity('/c', 'subscription', '/x'), Entity('/b', 'subscription', '/zz')]
-    found, = drift(TASKS, seen)
-    assert (found.kind, found.callback, found.topic) == ('never ran', '/b:s', '/z')
-    assert found.text == (
-        "/b:s never got a message of /z in 0.500 s: did you mean the topic '/zz'?")
+    for ms, never_ran in ((24, []), (25, ['/a:t']), (45, ['/a:t', '/a:y'])):
+        found = drift(TASKS, Observed(duration_ns=ms * MS))
+        assert [each.callback for each in found] == never_ran
 
 
 def test_a_sync_publishes_once_for_all_messages_of_a_job():
     """Two publishers of one topic make three legs of two topics."""
-    task_set = loads("""\
-mddag: 1
-nodes:
-  - node: /a
-    callbacks:
-      - {name: t, timer: 10ms, publishes: [/i]}
-      - {name: one, subscription: /i, publishes: [/x]}
-      - {name: two, subscription: /i, publishes: [/x]}
-      - {name: three, subscription: /i, publishes: [/y]}
-      - {name: s, sync: [/x, /y], publishes: [/z]}
-      - {name: e, subscription: /z, deadline: 9ms}
+    task_set = graph("""
+- node: /a
+  callbacks:
+    - {name: t, timer: 10ms, publishes: [/i]}
+    - {name: one, subscription: /i, publishes: [/x]}
+    - {name: two, subscription: /i, publishes: [/x]}
+    - {name: three, subscription: /i, publishes: [/y]}
+    - {name: s, sync: [/x, /y], publishes: [/z]}
+    - {name: e, subscription: /z, deadline: 9ms}
 """)
-    ran = {callback.key: 50 for callback in task_set.callbacks} | {'/a:s': 150}
-    seen = Observed(500 * MS, {'/a:t': Releases(50, 0, 490 * MS)}, ran, ran)
+    runs = {callback.key: 50 for callback in task_set.callbacks} | {'/a:s': 150}
+    seen = Observed(500 * MS, {'/a:t': Releases(50, 0, 490 * MS)}, runs, runs)
     assert drift(task_set, seen) == []
-
-
-def test_a_short_run_says_nothing_of_what_never_ran():
-    seen = Observed(duration_ns=24 * MS)
-    assert drift(TASKS, seen) == []
-    seen.duration_ns = 25 * MS
-    assert kinds(drift(TASKS, seen)) == [('never ran', '/a:t')]
-    seen.duration_ns = 45 * MS
-    assert kinds(drift(TASKS, seen)) == [('never ran', '/a:t'), ('never ran', '/a:y')]
 
 
 def test_what_may_run_in_another_process():
     text = TASKS.text.replace('dag: y}', 'dag: y, release_from: header_stamp}')
     seen = observed()
     seen.ran['/b:w'] = seen.got['/b:w'] = seen.ran['/b:e'] = seen.got['/b:e'] = 0
-    seen.nodes = {'/a'}
-    assert kinds(drift(loads(text), seen)) == [('never ran', '/b:e')]
-    seen.nodes = {'/a', '/b'}
-    assert kinds(drift(loads(text), seen)) == [('never ran', '/b:e'), ('never ran', '/b:w')]
+    for seen.nodes, never_ran in (({'/a'}, ['/b:e']), ({'/a', '/b'}, ['/b:e', '/b:w'])):
+        assert [each.callback for each in drift(loads(text), seen)] == never_ran
 
 
 BOUND = graph("""
@@ -176,37 +148,21 @@ BOUND = graph("""
 """)
 
 
-def key(callback):
-    return None if callback is None else callback.key
-
-
-def test_alike_ones_are_handed_out_in_order():
+@pytest.mark.parametrize(('entity', 'keys'), [      # alike ones in order, periods rounded
+    (Entity('/a', 'subscription', '/x'), ['/a:s0', '/a:j0', '/a:s1', None]),
+    (Entity('/a', 'subscription', '/y'), ['/a:j0', None]),
+    (Entity('/a', 'service', '/ask'), ['/a:q', None]),
+    (Entity('/b', 'subscription', '/x'), ['/b:s', None]),
+    (Entity('/a', 'timer', '', 10_000_000), ['/a:t0', '/a:t1', None]),
+    (Entity('/a', 'timer', '', 9_999_999), ['/a:t0', '/a:t1', None]),
+    (Entity('/a', 'timer', '', 20_000_000), ['/a:t2', None]),
+    (Entity('/b', 'timer', '', 33_333_333), ['/b:t', None]),
+    (Entity('/b', 'timer', '', 33_300_000), ['/b:t', None]),
+    (Entity('/b', 'timer', '', 33_400_000), [None])])
+def test_entities_are_bound_to_callbacks(entity, keys):
     binder = Binder(BOUND)
-    assert [key(binder.bind(Entity('/a', 'subscription', '/x'))) for _ in range(4)] == [
-        '/a:s0', '/a:j0', '/a:s1', None]
-    assert [key(binder.bind(Entity('/a', 'timer', '', 10_000_000))) for _ in range(3)] == [
-        '/a:t0', '/a:t1', None]
-    assert key(binder.bind(Entity('/a', 'timer', '', 20_000_000))) == '/a:t2'
-    assert [key(binder.bind(Entity('/a', 'service', '/ask'))) for _ in range(2)] == ['/a:q', None]
-    assert key(binder.bind(Entity('/b', 'subscription', '/x'))) == '/b:s'
-
-
-def test_a_sync_is_bound_by_each_leg():
-    binder = Binder(BOUND)
-    assert key(binder.bind(Entity('/a', 'subscription', '/y'))) == '/a:j0'
-    assert binder.bind(Entity('/a', 'subscription', '/y')) is None
-    binder.bind(Entity('/a', 'subscription', '/x'))
-    assert key(binder.bind(Entity('/a', 'subscription', '/x'))) == '/a:j0'
-
-
-def test_periods_may_be_rounded():
-    binder = Binder(BOUND)
-    assert key(binder.bind(Entity('/b', 'timer', '', 33_333_333))) == '/b:t'
-    assert is_period(33_333_333, 33_300_000) and is_period(16_666_666, 16_700_000)
-    assert not is_period(33_333_333, 33_000_000)
-    binder = Binder(BOUND)
-    assert binder.bind(Entity('/b', 'timer', '', 33_400_000)) is None
-    assert key(binder.bind(Entity('/a', 'timer', '', 9_999_999))) == '/a:t0'
+    bound = [binder.bind(entity) for _ in keys]
+    assert [callback and callback.key for callback in bound] == keys
 
 
 def test_every_callback_can_be_bound_once():
@@ -224,23 +180,23 @@ def test_every_callback_can_be_bound_once():
             assert binder.bind(entity) is None
 
 
-@pytest.mark.parametrize(('callback', 'seen', 'question'), [
-    ('/b:s', Entity('/robot/b', 'subscription', '/robot/x'), "did you mean the node '/robot/b'?"),
-    ('/b:s', Entity('/b', 'subscription', '/robot/x'), "did you mean the topic '/robot/x'?"),
-    ('/a:q', Entity('/a', 'service', '/a/ask'), "did you mean the service '/a/ask'?"),
-    ('/a:j0', Entity('/robot/a', 'subscription', '/robot/y'), "did you mean the node '/robot/a'?"),
-    ('/b:t', Entity('/b', 'timer', '', 50_000_000), 'did you mean its timer of 50ms?'),
-    ('/b:t', Entity('/robot/b', 'timer', '', 33_333_333), "did you mean the node '/robot/b'?"),
+@pytest.mark.parametrize(('callback', 'seen', 'meaning'), [
+    ('/b:s', Entity('/robot/b', 'subscription', '/robot/x'), "the node '/robot/b'"),
+    ('/b:s', Entity('/b', 'subscription', '/robot/x'), "the topic '/robot/x'"),
+    ('/a:q', Entity('/a', 'service', '/a/ask'), "the service '/a/ask'"),
+    ('/a:j0', Entity('/robot/a', 'subscription', '/robot/y'), "the node '/robot/a'"),
+    ('/b:t', Entity('/b', 'timer', '', 50_000_000), 'its timer of 50ms'),
+    ('/b:t', Entity('/robot/b', 'timer', '', 33_333_333), "the node '/robot/b'"),
     ('/b:t', Entity('/robot/b', 'timer', '', 50_000_000), None),
-    ('/b:s', Entity('/bb', 'subscription', '/x'), "did you mean the node '/bb'?"),
+    ('/b:s', Entity('/bb', 'subscription', '/x'), "the node '/bb'"),
     ('/b:s', Entity('/bb', 'subscription', '/y'), None),
-    ('/b:s', Entity('/b', 'subscription', '/xx'), "did you mean the topic '/xx'?"),
+    ('/b:s', Entity('/b', 'subscription', '/xx'), "the topic '/xx'"),
     ('/b:s', Entity('/b', 'subscription', '/other_topic'), None),
     ('/b:s', Entity('/robot/b', 'service', '/x'), None),
 ])
-def test_a_namespace_more_or_another_period_is_probably_meant(callback, seen, question):
-    assert meant(BOUND.callback(callback), [Entity('/other', seen.kind, '/z', 1000), seen]) \
-        == question
+def test_a_namespace_more_or_another_period_is_probably_meant(callback, seen, meaning):
+    found = meant(BOUND.callback(callback), [Entity('/other', seen.kind, '/z', 1000), seen])
+    assert found == (meaning and f'did you mean {meaning}?')
 
 
 @pytest.mark.parametrize(('symbol', 'name'), [

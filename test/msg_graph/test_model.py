@@ -13,20 +13,13 @@ import pytest
 from .helpers import graph
 
 
-def distribution(ns, percent):
-    return ExecutionTime(tuple(ns), tuple(percent))
-
-
 def test_draws_between_the_quantiles():
-    time = distribution([100, 200, 400], [0.0, 50.0, 100.0])
+    time = ExecutionTime((100, 200, 400), (0.0, 50.0, 100.0))
     assert [time.draw(u) for u in (0.0, 0.25, 0.5, 0.75, 1.0)] == [100, 150, 200, 300, 400]
     assert time.mean_ns == 225
-
-
-@pytest.mark.parametrize('u', [-0.1, 1.1, float('nan'), float('inf')])
-def test_draws_only_from_shares(u):
-    with pytest.raises(ValueError):
-        distribution([1, 2], [0.0, 100.0]).draw(u)
+    for u in (-0.1, 1.1, float('nan'), float('inf')):
+        with pytest.raises(ValueError):
+            time.draw(u)
 
 
 @given(
@@ -34,7 +27,7 @@ def test_draws_only_from_shares(u):
              unique_by=lambda pair: pair[1]))
 def test_mean_is_that_of_the_draws(pairs):
     percent = sorted(share for _, share in pairs)
-    time = distribution(sorted(ns for ns, _ in pairs), percent)
+    time = ExecutionTime(tuple(sorted(ns for ns, _ in pairs)), tuple(percent))
     steps = 2_000
     drawn = [time.draw((i + 0.5) / steps) for i in range(steps)]
     assert drawn == sorted(drawn)
@@ -85,81 +78,46 @@ def test_path_lengths_are_those_of_all_paths(case):
     assert max(model.path_lengths(dag, weights)) == best
 
 
-@pytest.mark.parametrize('text, ns', [
-    ('100ms', 100_000_000),
-    ('20 us', 20_000),
-    ('1.5s', 1_500_000_000),
-    ('1500ns', 1_500),
-    ('2min', 120_000_000_000),
-    ('20µs', 20_000),
-    ('20μs', 20_000),
-    ('.5ms', 500_000),
-    ('5.ms', 5_000_000),
-    (' 1ms\t', 1_000_000),
-    ('33.333333333ms', 33_333_333),
-    ('1us', 1_000),
-])
+@pytest.mark.parametrize(('text', 'ns'), [
+    ('100ms', 100_000_000), ('20 us', 20_000), ('1.5s', 1_500_000_000), ('1500ns', 1_500),
+    ('2min', 120_000_000_000), ('20µs', 20_000), ('20μs', 20_000), ('.5ms', 500_000),
+    ('5.ms', 5_000_000), (' 1ms\t', 1_000_000), ('33.333333333ms', 33_333_333), ('1us', 1_000)])
 def test_reads_times(text, ns):
     assert parse_duration(text) == ns
 
 
-@pytest.mark.parametrize('text, says', [
-    ('100', 'has no unit'),
-    ('0ms', 'too short'),
-    ('999ns', 'is too short: write 1us to 86400s'),
-    ('86401s', 'is too long: write 1us to 86400s'),
-    ('-5ms', 'is not a time'),
-    ('1h', 'write a number and a unit (ns, us, ms, s, min)'),
-    ('999999999999999999min', 'is too long'),
-    ('nanms', 'is not a time'),
-    ('1e9s', 'is not a time'),
-    ('', 'is not a time'),
-    ('.ms', 'is not a time'),
-    ('١ms', 'is not a time'),
-    ('1ms 2us', 'is not a time'),
-    ('1\nms', 'is not a time'),
-    ('9' * 100 + 's', 'is not a time'),
-])
+@pytest.mark.parametrize(('text', 'says'), [
+    ('100', 'has no unit'), ('0ms', 'too short'), ('999ns', 'is too short: write 1us to 86400s'),
+    ('86401s', 'is too long: write 1us to 86400s'), ('999999999999999999min', 'is too long'),
+    *((text, 'is not a time: write a number and a unit (ns, us, ms, s, min)') for text in (
+        '-5ms', '1h', 'nanms', '1e9s', '', '.ms', '١ms', '1ms 2us', '1\nms', '9' * 100 + 's'))])
 def test_refuses_the_rest(text, says):
     with pytest.raises(DurationError) as caught:
         parse_duration(text)
-    assert says in str(caught.value)
-    assert caught.value.problem and caught.value.remedy
-    assert isinstance(caught.value, ValueError)
-    assert str(caught.value).isprintable()
+    assert says in str(caught.value) and isinstance(caught.value, ValueError)
 
 
 @given(st.text())
 def test_text_is_a_time_or_a_duration_error(text):
     try:
-        assert 1_000 <= parse_duration(text) <= 86_400 * 10 ** 9
+        assert 1_000 <= parse_duration(text) <= DAY
     except DurationError as error:
         assert str(error).isprintable()
 
 
-@pytest.mark.parametrize('ns, text', [
-    (0, '0ns'), (999, '999ns'), (1_000, '1us'), (1_500, '1.5us'), (100_000_000, '100ms'),
-    (1_234_567, '1.235ms'), (60_000_000_000, '60s'), (-1_500_000, '-1.5ms'),
-])
-def test_formats_times(ns, text):
-    assert format_duration(ns) == text
+@pytest.mark.parametrize(('ns', 'shown', 'exact'), [
+    (0, '0ns', '0ns'), (1, '1ns', '1ns'), (999, '999ns', '999ns'), (1_000, '1us', '1us'),
+    (1_001, '1.001us', '1.001us'), (100_000_000, '100ms', '100ms'), (DAY, '86400s', '86400s'),
+    (1_234_567, '1.235ms', '1234.567us'), (1_234_000, '1.234ms', '1.234ms'),
+    # What no declaration can say has a text, too: the reader of the text says what is wrong.
+    (-1_500_000, '-1.5ms', '-1500000ns'), (DAY + 1, '86400s', f'{DAY + 1}ns'),
+    (2**63 - 1, '9223372036.855s', f'{2**63 - 1}ns')])
+def test_formats_times(ns, shown, exact):
+    assert (format_duration(ns), exact_duration(ns)) == (shown, exact)
 
 
 @given(st.integers(1, 86_400_000))
 def test_format_reads_back(us):
     exact = parse_duration(f'{us}us')
+    assert parse_duration(exact_duration(exact)) == exact
     assert abs(parse_duration(format_duration(exact)) - exact) <= exact * 0.0005
-
-
-@pytest.mark.parametrize('ns', [-1, -2**63, DAY + 1, 2**63 - 1])
-def test_what_no_declaration_can_say_has_an_exact_text_too(ns):
-    """Traces say such things; the reader of the text then says what is wrong."""
-    assert exact_duration(ns) == f'{ns}ns'
-
-
-@pytest.mark.parametrize(('ns', 'text'), [
-    (1, '1ns'), (999, '999ns'), (1_000, '1us'), (1_001, '1.001us'), (1_234_567, '1234.567us'),
-    (1_234_000, '1.234ms'), (1_500_000_000, '1.5s'), (DAY, '86400s')])
-def test_exact_ones_are_short(ns, text):
-    assert exact_duration(ns) == text
-    assert parse_duration(text, minimum_ns=1) == ns
