@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of the executor share: executors that spin in a thread of their own."""
+"""What the tests of the executor share: executors that spin in a thread, nodes, a waitable."""
 
 import contextlib
 import threading
@@ -9,29 +9,42 @@ import time
 from mddag_executor import MultiDeadlineExecutor
 import pytest
 from rclpy.node import Node
+from rclpy.waitable import NumberOfEntities, Waitable
 
 
 class Spinning:
-    """An executor that spins in a thread until it is left; keeps what spin raised."""
+    """
+    An executor that spins in a thread until it is left, which raises what spin raised.
 
-    def __init__(self, executor):
+    :param raises: the kind of error with which spin has to end; it is in ``error`` then.
+    """
+
+    def __init__(self, executor, raises=None):
         self.executor = executor
         self.error = None
+        self._raises = raises
         self._thread = threading.Thread(target=self._run)
 
     def _run(self):
         try:
-            self.executor.spin()
+            self._spin()
         except BaseException as error:
             self.error = error
+
+    def _spin(self):
+        self.executor.spin()
 
     def __enter__(self):
         self._thread.start()
         return self
 
-    def __exit__(self, *args):
+    def __exit__(self, *_):
         assert self.executor.shutdown(30.0)
         self.join()
+        if self._raises is not None:
+            assert isinstance(self.error, self._raises)
+        elif self.error is not None:
+            raise self.error
 
     def join(self):
         """Wait until spin has ended."""
@@ -42,12 +55,9 @@ class Spinning:
 class Stepping(Spinning):
     """Spins by a loop of ``spin_once``."""
 
-    def _run(self):
-        try:
-            while not self.executor._is_shutdown:
-                self.executor.spin_once()
-        except BaseException as error:
-            self.error = error
+    def _spin(self):
+        while not self.executor._is_shutdown:
+            self.executor.spin_once()
 
 
 @pytest.fixture(params=[Spinning, Stepping], ids=['spin', 'spin_once'])
@@ -64,6 +74,11 @@ def wait_for(condition, seconds=15.0):
             return False
         time.sleep(0.002)
     return True
+
+
+def matched(*publishers, count=1):
+    """Wait until each publisher has met so many subscriptions."""
+    assert wait_for(lambda: all(p.get_subscription_count() == count for p in publishers))
 
 
 def is_idle(executor):
@@ -100,3 +115,39 @@ def make_node(ros_context):
     for node in nodes:
         with contextlib.suppress(Exception):
             node.destroy_node()
+
+
+class Pulse(Waitable):
+    """A waitable that consists of a guard condition."""
+
+    def __init__(self, node, group):
+        super().__init__(group)
+        self.guard = node.create_guard_condition(lambda: None)
+        node._guards.remove(self.guard)
+        self._index = None
+        self.order = []
+
+    def __enter__(self):
+        self.guard.handle.__enter__()
+
+    def __exit__(self, *_):
+        self.guard.handle.__exit__(None, None, None)
+
+    def is_ready(self, wait_set):
+        ready = bool(wait_set.is_ready('guard_condition', self._index))
+        if ready:
+            self.order.append('ready')
+        return ready
+
+    def take_data(self):
+        self.order.append('take')
+        return len(self.order)
+
+    async def execute(self, taken_data):
+        pass
+
+    def get_num_entities(self):
+        return NumberOfEntities(num_gcs=1)
+
+    def add_to_wait_set(self, wait_set):
+        self._index = wait_set.add_guard_condition(self.guard.handle)

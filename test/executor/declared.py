@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from mddag_executor.executor import current_job
 from mddag_executor.executor.jobs import header_stamp
 from msg_graph import loads
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from std_msgs.msg import Header
 
 from .conftest import wait_for
@@ -33,7 +33,8 @@ class Declared:
 
     :param bodies: by the name of a callback, the function or coroutine function that it calls
         before it publishes.
-    :param reentrant: whether all callbacks may run at once, or one of each node.
+    :param reentrant: whether all callbacks may run at once, or one of each node; a timer's never
+        runs twice at once.
     :ivar ran: the executions by the name of the callback.
     """
 
@@ -60,8 +61,8 @@ class Declared:
                     Header, topic, partial(run, topic), 100, callback_group=group)
             if each.timer_period_ns:
                 self.timers.append(node.create_timer(
-                    each.timer_period_ns / 1e9, partial(self._tick, run, node, count()), group,
-                    autostart=False))
+                    each.timer_period_ns / 1e9, partial(self._tick, run, node, count()),
+                    MutuallyExclusiveCallbackGroup() if reentrant else None, autostart=False))
 
     def _tick(self, run, node, numbers):
         now = node.get_clock().now().to_msg()

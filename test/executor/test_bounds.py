@@ -2,8 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is bounded: descriptors, threads, what waits in Python, and what an idle executor does."""
 
+from functools import partial
+import resource
 import threading
 
+from builtin_interfaces.msg import Time
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.sources import SERVICE_DEPTH
 import pytest
@@ -13,63 +16,44 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from ..conftest import run_program
-from .conftest import is_idle, Spinning, wait_for
+from .conftest import is_idle, matched, Spinning, wait_for
 
 # --- descriptors ---------------------------------------------------------------------------------
 
-MANY = """
-import os, resource, threading, time
-import rclpy
-from std_msgs.msg import Header
-from mddag_executor import MultiDeadlineExecutor
 
-rclpy.init()
-node = rclpy.create_node('node', start_parameter_services=False, enable_rosout=False)
-other = rclpy.create_node('other', start_parameter_services=False, enable_rosout=False)
-heard = [[] for _ in range(300)]
-ticks = [0] * 30
-def tick(number):
-    ticks[number] += 1
-for number in range(30):
-    node.create_timer(0.01, lambda number=number: tick(number))
-for number in range(300):
-    node.create_subscription(
-        Header, f'/t{number % 10}', lambda m, to=heard[number]: to.append(m.frame_id), 100)
-publishers = [other.create_publisher(Header, f'/t{number}', 100) for number in range(10)]
-assert len(os.listdir('/proc/self/fd')) < 128
-resource.setrlimit(resource.RLIMIT_NOFILE, (256, 256))
-executor = MultiDeadlineExecutor()
-executor.add_node(node)
-thread = threading.Thread(target=executor.spin, daemon=True)
-thread.start()
-def until(done):
-    end = time.monotonic() + 20
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-until(lambda: all(publisher.get_subscription_count() == 30 for publisher in publishers))
-for number in range(20):
-    for publisher in publishers:
-        publisher.publish(Header(frame_id=str(number)))
-until(lambda: all(len(each) >= 20 for each in heard) and all(ticks))
-# some go, and others come in their place
-for subscription in list(node.subscriptions)[:150]:
-    node.destroy_subscription(subscription)
-late = []
-node.create_subscription(Header, '/t0', lambda m: late.append(m.frame_id), 100)
-until(lambda: publishers[0].get_subscription_count() == 16)
-publishers[0].publish(Header(frame_id='late'))
-until(lambda: late)
-print(all(each[:20] == [str(n) for n in range(20)] for each in heard), all(ticks), late)
-executor.shutdown()
-thread.join()
-rclpy.shutdown()
-"""
+@pytest.fixture
+def few_files():
+    """Let this process open no more than 256 files."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
-def test_many_subscriptions_share_few_descriptors():
-    """300 of them, and no more than 256 files."""
-    assert run_program(MANY)[0] == "True True ['late']\n"
+@pytest.mark.usefixtures('few_files')
+def test_many_subscriptions_share_few_descriptors(make_executor, make_node):
+    """300 of them, and 30 timers; some go, and others come in their place."""
+    node, other = make_node(), make_node('other')
+    heard, ticks, late = [[] for _ in range(300)], set(), []
+    for number in range(30):
+        node.create_timer(0.01, partial(ticks.add, number))
+    for number, to in enumerate(heard):
+        node.create_subscription(
+            Header, f'/t{number % 10}', lambda m, to=to: to.append(m.stamp.sec), 100)
+    publishers = [other.create_publisher(Header, f'/t{number}', 100) for number in range(10)]
+    with Spinning(make_executor(nodes=[node])):
+        matched(*publishers, count=30)
+        for number in range(20):
+            for publisher in publishers:
+                publisher.publish(Header(stamp=Time(sec=number)))
+        assert wait_for(lambda: all(len(each) == 20 for each in heard) and len(ticks) == 30)
+        for subscription in [*node.subscriptions][:150]:
+            node.destroy_subscription(subscription)
+        node.create_subscription(Header, '/t0', late.append, 100)
+        matched(publishers[0], count=16)
+        publishers[0].publish(Header())
+        assert wait_for(lambda: late)
+    assert all(each[:20] == [*range(20)] for each in heard)
 
 
 # --- what waits ----------------------------------------------------------------------------------
@@ -80,8 +64,7 @@ def waiting(executor):
 
 
 def test_few_requests_wait_in_python_and_none_is_lost(make_executor, make_node):
-    node, go_on, answered = make_node(), threading.Event(), []
-    most = []
+    node, go_on, answered, most = make_node(), threading.Event(), [], []
     executor = make_executor(num_workers=2)
 
     def answer(request, response):
@@ -116,9 +99,7 @@ def test_few_messages_of_keep_all_wait_in_python_and_none_is_lost(
     if not from_here:  # as from another process: a worker takes them
         monkeypatch.setattr(
             'mddag_executor.executor.publishing.replace_delivery', lambda *args: None)
-    node, go_on = make_node(), threading.Event()
-    got = []
-    most = []
+    node, go_on, got, most = make_node(), threading.Event(), [], []
     executor = make_executor(num_workers=1)
 
     def hear(message):
@@ -130,12 +111,10 @@ def test_few_messages_of_keep_all_wait_in_python_and_none_is_lost(
     node.create_subscription(Header, '/all', hear, qos)
     publisher = node.create_publisher(Header, '/all', qos)
     executor.add_node(node)
-    message = Header()
     with Spinning(executor):
-        assert wait_for(lambda: publisher.get_subscription_count() == 1)
+        matched(publisher)
         for number in range(300):
-            message.stamp.sec = number
-            publisher.publish(message)
+            publisher.publish(Header(stamp=Time(sec=number)))
         if from_here:
             assert wait_for(lambda: waiting(executor) in (MOST, MOST - 1))
         go_on.set()
@@ -154,18 +133,14 @@ def worker_threads():
 
 def test_blocked_calls_take_a_bounded_number_of_threads(make_executor, make_node):
     """The rest waits for a worker, and all are answered in the end."""
-    workers, answers = 2, []
+    answers, count, most = [], MOST + 30, MOST + 2
     node, other = make_node(), make_node('other')
     other.create_service(
         Trigger, '/ask', lambda request, response: response,
         callback_group=ReentrantCallbackGroup(), qos_profile=QoSProfile(depth=200))
     client = node.create_client(Trigger, '/ask', qos_profile=QoSProfile(depth=200))
-    asking, answering = make_executor(num_workers=workers), make_executor(num_workers=2)
-    asking.add_node(node)
-    answering.add_node(other)
+    asking, answering = (make_executor(num_workers=2, nodes=[each]) for each in (node, other))
     assert client.wait_for_service(15.0)
-    count = MOST + 30
-    most = MOST + workers
 
     def ask():
         answers.append(client.call(Trigger.Request(), 20.0))
@@ -189,7 +164,7 @@ def test_blocked_calls_take_a_bounded_number_of_threads(make_executor, make_node
 # --- an idle executor ----------------------------------------------------------------------------
 
 IDLE = """
-import resource, threading, time
+import resource, sys, threading, time
 import rclpy
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -206,19 +181,8 @@ node.create_timer(3600.0, print)
 node.create_service(Trigger, '/ask', lambda request, response: response)
 client = node.create_client(Trigger, '/ask')
 publisher = node.create_publisher(Header, '/a', 10)
-executor = MultiDeadlineExecutor(loads('''
-mddag: 1
-nodes:
-  - node: /node
-    callbacks:
-      - {name: tick, timer: 5ms, publishes: [/a]}
-      - {name: hear, subscription: /a, deadline: 1s}
-'''))
+executor = MultiDeadlineExecutor(loads(sys.argv[2]))
 executor.add_node(node)
-
-
-def waits():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw
 
 
 def measure():
@@ -228,32 +192,32 @@ def measure():
     found = []
     # discovery and the machine's other programs may disturb: one quiet second is enough
     while not found or found[-1] >= 20 and len(found) < 12:
-        before = waits()
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw
         time.sleep(1.0)
-        found.append(waits() - before)
+        found.append(resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw - before)
     print(found[-1] < 20 or found)
-
-
-def end():
     executor.shutdown()
 
-if WAY == 'spin_once':
-    thread = threading.Thread(target=lambda: (measure(), end()))
-    thread.start()
-    while not executor._is_shutdown:
-        executor.spin_once()
-    thread.join()
-else:
-    thread = threading.Thread(target=executor.spin)
-    thread.start()
-    measure()
-    end()
-    thread.join()
+thread = threading.Thread(target=measure)
+thread.start()
+if sys.argv[1] == 'spin':
+    executor.spin()
+while not executor._is_shutdown:
+    executor.spin_once()
+thread.join()
 rclpy.shutdown()
+"""
+IDLE_GRAPH = """
+mddag: 1
+nodes:
+  - node: /node
+    callbacks:
+      - {name: tick, timer: 5ms, publishes: [/a]}
+      - {name: hear, subscription: /a, deadline: 1s}
 """
 
 
 @pytest.mark.parametrize('way', ['spin', 'spin_once'])
 def test_nothing_wakes_in_an_idle_executor(way):
     """No thread polls: in a second the whole process, with the middleware, waits seldom."""
-    assert run_program(IDLE.replace('WAY', repr(way)))[0] == 'True\n'
+    assert run_program(IDLE, way, IDLE_GRAPH)[0] == 'True\n'

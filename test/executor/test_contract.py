@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What rclpy promises of executors: spins, several executors, contexts and processes."""
+"""What rclpy promises of executors: contexts, several executors, forks, kinds of nodes."""
 
 import multiprocessing
 import re
@@ -8,18 +8,28 @@ import signal
 import threading
 import time
 
+from mddag_executor.executor import waitables
 import pytest
 import rclpy
+from rclpy.action import ActionClient, ActionServer, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import LivelinessPolicy, QoSProfile
 from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
 
 from ..conftest import run_program
-from .conftest import is_idle, Spinning, wait_for
+from .conftest import is_idle, matched, Spinning, wait_for
+
+DEPTH = 1000
 
 
 def counting(node, period=0.005):
@@ -29,29 +39,37 @@ def counting(node, period=0.005):
     return calls
 
 
-def goes_on(calls):
+def goes_on(calls, count=3):
     before = len(calls)
-    return wait_for(lambda: len(calls) >= before + 3)
+    return wait_for(lambda: len(calls) >= before + count)
 
 
-# --- as the global executor, and as a context manager --------------------------------------------
-
-
-@pytest.fixture
-def as_global(make_executor, monkeypatch):
+def test_rclpy_s_functions_spin_the_global_executor(
+        make_executor, make_node, ros_context, monkeypatch):
     executor = make_executor()
     monkeypatch.setattr(rclpy, '__executor', executor)
-    assert rclpy.get_global_executor() is executor
-    return executor
+    node, group = make_node(), ReentrantCallbackGroup()
+    calls = counting(node)
+    for count in range(1, 4):
+        rclpy.spin_once(node, timeout_sec=5.0)
+        assert calls == [threading.get_native_id()] * count
+        assert executor.get_nodes() == []
+    node.destroy_timer(next(iter(node.timers)))
+    begin = time.monotonic()
+    rclpy.spin_once(node, timeout_sec=0.05)
+    rclpy.spin_until_future_complete(node, Future(), timeout_sec=0.05)
+    assert time.monotonic() - begin >= 0.1
 
+    node.create_service(Trigger, '/ask', lambda request, response: response)
+    client = node.create_client(Trigger, '/ask')
+    assert client.wait_for_service(5.0)
+    answer = client.call_async(Trigger.Request())
+    rclpy.spin_until_future_complete(node, answer, timeout_sec=5.0)
+    assert answer.done() and executor.get_nodes() == []
 
-def test_rclpy_spin_as_the_global_executor(as_global, make_node, ros_context):
-    """And on all workers, as with ``executor.spin()``."""
-    node, together = make_node(), threading.Barrier(3)
-    group = ReentrantCallbackGroup()
-    met = []
+    together, met = threading.Barrier(3), []
 
-    def meet():
+    def meet():  # on all workers, as with ``executor.spin()``
         if not met:
             met.append(together.wait(5.0))
             rclpy.try_shutdown(context=ros_context)
@@ -59,34 +77,7 @@ def test_rclpy_spin_as_the_global_executor(as_global, make_node, ros_context):
     for _ in range(3):
         node.create_timer(0.01, meet, group)
     rclpy.spin(node)
-    assert met and as_global.get_nodes() == []
-
-
-def test_rclpy_spin_once_as_the_global_executor(as_global, make_node):
-    node = make_node()
-    calls = counting(node)
-    for count in range(1, 4):
-        rclpy.spin_once(node, timeout_sec=5.0)
-        assert calls == [threading.get_native_id()] * count
-        assert as_global.get_nodes() == []
-    node.destroy_timer(next(iter(node.timers)))
-    begin = time.monotonic()
-    rclpy.spin_once(node, timeout_sec=0.05)
-    assert time.monotonic() - begin >= 0.05
-
-
-def test_rclpy_spin_until_future_complete_as_the_global_executor(as_global, make_node):
-    node, future = make_node(), Future()
-    node.create_timer(0.01, lambda: future.set_result('done') if not future.done() else None)
-    rclpy.spin_until_future_complete(node, future, timeout_sec=5.0)
-    assert future.result() == 'done' and as_global.get_nodes() == []
-    rclpy.spin_until_future_complete(node, Future(), timeout_sec=0.05)
-    node.create_service(Trigger, '/ask', lambda request, response: response)
-    asked = node.create_client(Trigger, '/ask')
-    assert asked.wait_for_service(5.0)
-    answer = asked.call_async(Trigger.Request())
-    rclpy.spin_until_future_complete(node, answer, timeout_sec=5.0)
-    assert answer.done()
+    assert met and executor.get_nodes() == []
 
 
 # --- several at once -----------------------------------------------------------------------------
@@ -101,22 +92,18 @@ def test_several_contexts_in_one_process(make_executor, make_node, ros_context):
     far = Node('far', context=other, start_parameter_services=False, enable_rosout=False)
     near = make_node('near')
     of_far, of_near = counting(far), counting(near)
-    first = make_executor()
-    first.add_node(near)
+    first = make_executor(nodes=[near])
     second.add_node(far)
     heard = []
     near.create_subscription(Header, '/across', heard.append, 10)
     publisher = far.create_publisher(Header, '/across', 10)
-    with Spinning(first) as spinning:
-        ended = Spinning(second)
-        with ended:
+    with Spinning(first):
+        with Spinning(second, raises=ExternalShutdownException) as ended:
             assert goes_on(of_far) and goes_on(of_near)
             assert wait_for(lambda: publisher.publish(Header()) or heard)
             rclpy.shutdown(context=other)
             ended.join()
-        assert isinstance(ended.error, ExternalShutdownException)
         assert ros_context.ok() and goes_on(of_near)
-    assert spinning.error is None
     assert handlers == (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM))
 
 
@@ -166,9 +153,6 @@ def test_a_signal_ends_the_executors_of_all_contexts(number):
     assert 'Traceback' not in err  # a busy machine skips periods of the timers, which is logged
 
 
-DEPTH = 1000
-
-
 def test_one_of_rclpys_executors_in_the_same_process(make_executor, make_node, ros_context):
     """
     They pass a number to each other, a thousand times.
@@ -183,45 +167,38 @@ def test_one_of_rclpys_executors_in_the_same_process(make_executor, make_node, r
     def back(message):
         got.append(message.stamp.sec)
         message.stamp.sec += 1
-        to_there.publish(message) if message.stamp.sec < 1000 else done.set()
+        to_there.publish(message) if message.stamp.sec < DEPTH else done.set()
 
     here.create_subscription(Header, '/to_here', back, DEPTH)
     there.create_subscription(Header, '/to_there', to_here.publish, DEPTH)
     executor = make_executor(nodes=[here])
     other = SingleThreadedExecutor(context=ros_context)
     other.add_node(there)
-    assert wait_for(lambda: to_there.get_subscription_count() == 1
-                    and to_here.get_subscription_count() == 1)
+    matched(to_there, to_here)
     with Spinning(executor), Spinning(other):
         to_there.publish(Header())
         assert done.wait(30.0), got[-1:]
-    assert got == list(range(1000))
+    assert got == list(range(DEPTH))
 
 
 def test_a_node_moves_between_executors_that_spin(make_executor, make_node):
     """Nothing that was published is heard twice, and what is published after the move is heard."""
     node, source, heard = make_node(), make_node('source'), []
     node.create_subscription(Header, '/a', lambda m: heard.append(m.stamp.sec), DEPTH)
-    ticks = []
-    node.create_timer(0.001, lambda: ticks.append(1))
+    ticks = counting(node, 0.001)
     publisher = source.create_publisher(Header, '/a', DEPTH)
     executors = [make_executor(num_workers=2) for _ in range(2)]
-    assert wait_for(lambda: publisher.get_subscription_count() == 1)
+    matched(publisher)
     message = Header()
-    expected = []
-    with Spinning(executors[0]) as first, Spinning(executors[1]) as second:
+    with Spinning(executors[0]), Spinning(executors[1]):
         for number in range(40):
             to = executors[number % 2]
             to.add_node(node)  # which removes it from the other one
             assert node.executor is to
             message.stamp.sec = number
             publisher.publish(message)
-            expected.append(number)
-            before = len(ticks)
-            assert wait_for(lambda n=number: n in heard), number
-            assert wait_for(lambda n=before: len(ticks) > n)
-    assert first.error is second.error is None
-    assert heard == expected
+            assert goes_on(ticks, 1) and wait_for(lambda n=number: n in heard), number
+    assert heard == list(range(40))
 
 
 # --- fork ----------------------------------------------------------------------------------------
@@ -240,21 +217,21 @@ def raise_in_the_child():
 def test_a_forked_process_disturbs_nothing_and_ends(make_executor, make_node):
     """From a callback and from elsewhere, as ``multiprocessing`` does it."""
     fork = multiprocessing.get_context('fork')
-    node, heard, ticks = make_node(), [], []
+    node, heard = make_node(), []
+    ticks = counting(node)
     publisher = node.create_publisher(Header, '/a', DEPTH)
     node.create_subscription(
         Header, '/a', lambda m: heard.append(m.stamp.sec), DEPTH,
         callback_group=ReentrantCallbackGroup())
-    node.create_timer(0.002, lambda: ticks.append(1))
     executor = make_executor(num_workers=3, nodes=[node])
-    assert wait_for(lambda: publisher.get_subscription_count() == 1)
+    matched(publisher)
 
     def start(target, *args):
         process = fork.Process(target=target, args=args)
         process.start()
         return process
 
-    with Spinning(executor) as spinning:
+    with Spinning(executor):
         mine, theirs = fork.Pipe()
         task = executor.create_task(start, wait_until_told, theirs)
         assert wait_for(task.done)
@@ -264,13 +241,228 @@ def test_a_forked_process_disturbs_nothing_and_ends(make_executor, make_node):
         for number in range(50):  # while there is a child that has all the descriptors
             message.stamp.sec = number
             publisher.publish(message)
-        before = len(ticks)
-        assert wait_for(lambda: len(heard) == 50 and len(ticks) > before + 10)
+        assert goes_on(ticks, 10) and wait_for(lambda: len(heard) == 50)
         mine.send('go')
         for child in children:
             child.join(15.0)
     assert [child.exitcode for child in children] == [0, 3]
-    assert spinning.error is None and sorted(heard) == list(range(50))
+    assert sorted(heard) == list(range(50))
     assert is_idle(executor)
     mine.close()
     theirs.close()
+
+
+# --- kinds of nodes and events -------------------------------------------------------------------
+
+
+def test_a_lifecycle_node_goes_through_its_transitions(make_executor, make_node, ros_context):
+    """By its services, called by a callback of another node of the same executor."""
+    lifecycle = pytest.importorskip('rclpy.lifecycle', reason='lifecycle_msgs is not installed')
+    from lifecycle_msgs.msg import Transition
+    from lifecycle_msgs.srv import ChangeState, GetState
+
+    class Managed(lifecycle.LifecycleNode):
+
+        def on_configure(self, state):
+            self.publisher = self.create_lifecycle_publisher(Header, '/managed', 10)
+            self.timer = self.create_timer(0.005, lambda: self.publisher.publish(Header()))
+            return super().on_configure(state)
+
+        def on_cleanup(self, state):
+            self.destroy_timer(self.timer)
+            self.destroy_publisher(self.publisher)
+            return lifecycle.TransitionCallbackReturn.SUCCESS
+
+    managed = Managed('managed', context=ros_context, enable_rosout=False)
+    other = make_node('manager')
+    change = other.create_client(ChangeState, '/managed/change_state')
+    state = other.create_client(GetState, '/managed/get_state')
+    heard = []
+    other.create_subscription(Header, '/managed', heard.append, 10)
+    executor = make_executor(nodes=[managed, other])
+
+    async def go(transition):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert (await change.call_async(request)).success
+        return (await state.call_async(GetState.Request())).current_state.label
+
+    def now_in(transition):
+        task = executor.create_task(go, transition)
+        assert wait_for(task.done)
+        return task.result()
+
+    with Spinning(executor):
+        assert change.wait_for_service(5.0) and state.wait_for_service(5.0)
+        assert now_in(Transition.TRANSITION_CONFIGURE) == 'inactive'
+        time.sleep(0.05)
+        assert heard == []
+        assert now_in(Transition.TRANSITION_ACTIVATE) == 'active'
+        assert wait_for(lambda: len(heard) >= 3)
+        assert now_in(Transition.TRANSITION_DEACTIVATE) == 'inactive'
+        assert now_in(Transition.TRANSITION_CLEANUP) == 'unconfigured'
+    managed.destroy_node()
+
+
+def test_qos_events_reach_their_callbacks(make_executor, make_node):
+    """Deadline missed and liveliness lost, on both sides, in a worker."""
+    node = make_node()
+    got = {'requested': [], 'offered': [], 'changed': [], 'lost': []}
+    qos = QoSProfile(
+        depth=10, deadline=Duration(seconds=0.1), liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
+        liveliness_lease_duration=Duration(seconds=0.2))
+    node.create_subscription(
+        Header, '/topic', lambda m: None, qos, event_callbacks=SubscriptionEventCallbacks(
+            deadline=got['requested'].append, liveliness=got['changed'].append))
+    publisher = node.create_publisher(
+        Header, '/topic', qos, event_callbacks=PublisherEventCallbacks(
+            deadline=got['offered'].append, liveliness=got['lost'].append))
+    with Spinning(make_executor(nodes=[node])):
+        matched(publisher)
+        publisher.publish(Header())
+        assert wait_for(lambda: all(got.values())), got
+        assert wait_for(lambda: got['changed'][-1].not_alive_count == 1)
+        assert wait_for(
+            lambda: publisher.assert_liveliness() or got['changed'][-1].alive_count == 1)
+    assert got['lost'][0].total_count >= 1 and got['requested'][0].total_count >= 1
+
+
+def test_parameters_through_another_node_of_the_same_executor(make_executor, make_node):
+    node, other = make_node('server', start_parameter_services=True), make_node('asker')
+    node.declare_parameter('speed', 3)
+    node.declare_parameter('name', 'first')
+    told = []
+    node.add_post_set_parameters_callback(lambda given: told.extend(p.name for p in given))
+    client = AsyncParameterClient(other, 'server', callback_group=ReentrantCallbackGroup())
+    executor = make_executor(nodes=[node, other])
+
+    async def ask():
+        given = await client.set_parameters([Parameter('speed', value=5)])
+        names = await client.list_parameters([], 10)
+        values = await client.get_parameters(['speed', 'name'])
+        return given.results, names.result.names, values.values
+
+    with Spinning(executor):
+        assert client.wait_for_services(5.0)
+        task = executor.create_task(ask)
+        assert wait_for(task.done)
+    results, names, values = task.result()
+    assert results[0].successful and told == ['speed']
+    assert {'speed', 'name'} <= set(names)
+    assert values[0].integer_value == 5 and values[1].string_value == 'first'
+    assert node.get_parameter('speed').value == 5
+
+
+# --- what callbacks make and destroy -------------------------------------------------------------
+
+
+def test_entities_that_a_callback_makes_run(make_executor, make_node):
+    """Entities of each kind, made in a worker, and a node."""
+    node = make_node()
+    ran = {name: [] for name in (
+        'timer', 'message', 'request', 'response', 'guard', 'result', 'node')}
+    executor = make_executor(nodes=[node])
+    kept = []
+    group = ReentrantCallbackGroup()
+
+    def answer(request, response):
+        ran['request'].append(1)
+        return response
+
+    def execute(goal):
+        goal.succeed()
+        return Fibonacci.Result()
+
+    async def use(publisher, client, actions):
+        while not (publisher.get_subscription_count() and client.service_is_ready()
+                   and actions.server_is_ready()):
+            await pause()
+        publisher.publish(Header())
+        ran['response'].append(await client.call_async(Trigger.Request()))
+        goal = await actions.send_goal_async(Fibonacci.Goal())
+        ran['result'].append(await goal.get_result_async())
+
+    async def pause():
+        future = Future(executor=executor)
+        timer = node.create_timer(0.005, lambda: future.set_result(None), group)
+        await future
+        node.destroy_timer(timer)
+
+    def make():
+        first.cancel()
+        node.create_timer(0.005, lambda: ran['timer'].append(1), group)
+        node.create_subscription(Header, '/made', ran['message'].append, 10)
+        node.create_service(Trigger, '/made', answer)
+        guard = node.create_guard_condition(lambda: ran['guard'].append(1))
+        kept.extend([
+            ActionServer(node, Fibonacci, '/made_action', execute, callback_group=group),
+            ActionClient(node, Fibonacci, '/made_action', callback_group=group)])
+        executor.create_task(use(
+            node.create_publisher(Header, '/made', 10), node.create_client(Trigger, '/made'),
+            kept[-1]))
+        guard.trigger()
+        new = make_node('made')
+        new.create_timer(0.005, lambda: ran['node'].append(1))
+        executor.add_node(new)
+
+    first = node.create_timer(0.005, make)
+    with Spinning(executor):
+        assert wait_for(lambda: all(ran.values()), 10.0), ran
+    for made in kept:
+        made.destroy()
+
+
+def test_a_cancelled_goal_request_does_not_block_its_callback_group(
+        make_executor, make_node, monkeypatch):
+    monkeypatch.setattr(waitables, 'SENDER_CHECKS', 10 ** 9)  # the response is unknown for ever
+    node, ticks = make_node(), []
+    answered, cancelled = threading.Event(), threading.Event()
+
+    def accept(_):
+        cancelled.wait(15.0)
+        answered.set()
+        return GoalResponse.ACCEPT
+
+    server = ActionServer(
+        node, Fibonacci, '/cancelled', lambda goal: Fibonacci.Result(), goal_callback=accept,
+        callback_group=ReentrantCallbackGroup())
+    client = ActionClient(node, Fibonacci, '/cancelled')
+    node.create_timer(0.002, lambda: ticks.append(1))
+    executor = make_executor(nodes=[node])
+    with Spinning(executor):
+        assert client.wait_for_server(15.0)
+        client.send_goal_async(Fibonacci.Goal()).cancel()
+        cancelled.set()
+        assert answered.wait(15.0)
+        for _ in range(50):  # the response comes meanwhile
+            count = len(ticks)
+            assert wait_for(lambda count=count: len(ticks) > count)
+    server.destroy()
+    client.destroy()
+
+
+def test_a_callback_may_destroy_what_it_belongs_to(make_executor, make_node):
+    """A timer itself, a subscription itself, and in the end the node they are of (rclpy#1206)."""
+    executor = make_executor()
+    with Spinning(executor):
+        for _ in range(10):
+            node = make_node()
+            calls = []
+
+            def heard(_, node=node, calls=calls):
+                calls.append('message')
+                node.destroy_subscription(next(iter(node.subscriptions)))
+                node.create_timer(0.001, lambda: calls.append('node') or node.destroy_node())
+
+            publisher = node.create_publisher(Header, '/topic', 10)
+            node.create_subscription(Header, '/topic', heard, 10)
+
+            def tick(node=node, calls=calls, publisher=publisher):
+                calls.append('timer')
+                if publisher.get_subscription_count():
+                    node.destroy_timer(next(iter(node.timers)))
+                    publisher.publish(Header())
+
+            node.create_timer(0.001, tick)
+            executor.add_node(node)
+            assert wait_for(lambda some=calls: 'node' in some), calls
+            assert calls.count('message') == calls.count('node') == 1

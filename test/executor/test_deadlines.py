@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Declared DAGs on real rclpy nodes: which job, in which order, judged how, recorded how."""
+"""Declared DAGs on real rclpy nodes: which job, in which order, judged how; what fails."""
 
 from collections import Counter
 import subprocess
@@ -10,12 +10,14 @@ import time
 
 from mddag_executor.executor import current_job
 from mddag_executor.executor.work import Work
+from mddag_executor.replay import replay, reschedule
 from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Header
 
-from .conftest import is_idle, Spinning, wait_for
+from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import Declared
 
 CHAIN = """
@@ -40,14 +42,26 @@ def sinks(executor):
 
 
 def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executor, make_node):
-    chain = Declared(make_node, CHAIN)
+    """
+    Odd jobs' relays take longer than a period, so jobs overlap, and messages on /b overtake.
+
+    After an overrun of its callback, the timer skips or drops what it missed: there is no burst,
+    and releases stay on the grid (rclcpp#2771).
+    """
+    def tick():
+        if len(chain.ran['tick']) == 3:
+            time.sleep(0.15)
+
+    chain = Declared(make_node, CHAIN, {
+        'tick': tick, 'relay': lambda: time.sleep(0.045 if current_job().job % 2 else 0.001)})
     executor = make_executor(loads(CHAIN))
     with Spinning(executor):
         chain.start(executor)
         assert wait_for(lambda: len(chain.ran['last']) >= 20)
         chain.cancel()
         assert wait_for(lambda: len(chain.ran['last']) == len(chain.ran['tick']))
-    # They may overlap, so the lists need not be in their order.
+    order = [each.number for each in chain.ran['last']]
+    assert order != sorted(order)
     jobs = chain.jobs_of_numbers('tick')
     assert all(chain.jobs_of_numbers(name) == jobs for name in chain.ran)
     assert {job.dag for job in jobs.values()} == {'chain'}
@@ -58,7 +72,8 @@ def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executo
                (after, job) in zip(releases[1:], releases[2:]))  # the first was due earlier
     statistics = executor.statistics()
     ends = statistics['dags']['chain']['ends']
-    missed = ends['expired'] + ends['dropped']  # periods, on a busy machine
+    missed = ends['expired'] + ends['dropped']
+    assert missed >= 4
     assert ran[-1] + 1 <= count + missed <= ran[-1] + 4  # or after the last that ran
     assert statistics['undeclared'] == 0
     assert statistics['unattributed'] == {'unknown': 0, 'doubtful': 0}
@@ -67,28 +82,12 @@ def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executo
     assert statistics['never_ran'] == []
 
 
-def test_jobs_that_overlap_and_overtake_are_told_apart(make_executor, make_node):
-    """Odd jobs' relays take longer than a period, so messages on /b are out of order."""
-    chain = Declared(make_node, CHAIN, {
-        'relay': lambda: time.sleep(0.045 if current_job().job % 2 else 0.001)})
-    executor = make_executor(loads(CHAIN))
-    with Spinning(executor):
-        chain.start(executor)
-        assert wait_for(lambda: len(chain.ran['last']) >= 20)
-        chain.cancel()
-        assert wait_for(lambda: len(chain.ran['last']) == len(chain.ran['tick']))
-    order = [each.number for each in chain.ran['last']]
-    assert order != sorted(order)
-    assert all(chain.jobs_of_numbers(name) == chain.jobs_of_numbers('tick') for name in chain.ran)
-    assert sinks(executor)['/sink:last']['completed'] == len(order)
-
-
 FOREIGN = """
 import time, rclpy
 from std_msgs.msg import Header
 rclpy.init()
 publisher = rclpy.create_node('foreign').create_publisher(Header, '/a', 10)
-while True:
+while rclpy.ok():
     publisher.publish(Header(frame_id='foreign'))
     time.sleep(0.0001)
 """
@@ -106,16 +105,14 @@ def test_messages_of_another_process_in_the_same_microseconds_are_told_apart(
         make_executor, make_node):
     """Many of them lie in the window of a publication here, and have other numbers."""
     counts = Counter[str]()
-    node = make_node('own')
+    node, group = make_node('own'), ReentrantCallbackGroup()
     publisher = node.create_publisher(Header, '/a', 10)
 
     def sink(message):
         job = 'no job' if current_job() is None else 'a job'
         counts[f'{message.frame_id or "own"}: {job}'] += 1
 
-    group = ReentrantCallbackGroup()
-    timer = node.create_timer(
-        0.005, lambda: publisher.publish(Header()), group, autostart=False)
+    timer = node.create_timer(0.005, lambda: publisher.publish(Header()), group, autostart=False)
     node.create_subscription(Header, '/a', sink, 1000, callback_group=group)
     # On a busy machine there are too many foreign ones: they have time, and no job ends before.
     executor = make_executor(
@@ -129,7 +126,7 @@ def test_messages_of_another_process_in_the_same_microseconds_are_told_apart(
             executor.wake()
             assert wait_for(lambda: counts['own: a job'] + counts['own: no job'] >= 150)
     finally:
-        foreign.kill()
+        foreign.terminate()
         foreign.wait()
     assert counts['foreign: a job'] == counts['own: no job'] == 0, counts
 
@@ -213,7 +210,7 @@ def test_ready_callbacks_run_in_the_policys_order(make_executor, make_node, poli
             Header, f'/{name}', lambda m, n=name: ran.append(n), 10, callback_group=group)
     executor = make_executor(loads(ORDER), num_workers=1, policy=policy, nodes=[source, racer])
     with Spinning(executor):
-        assert wait_for(lambda: all(p.get_subscription_count() == 1 for p in publishers))
+        matched(*publishers)
         timer.timer_period_ns = 10_000_000_000
         executor.create_task(tick_as_timer, executor, timer, tick)
         assert wait_for(lambda: len(ran) == 3)
@@ -256,7 +253,7 @@ def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, r
 
     chain = Declared(make_node, CHAIN, {'early': long})
     executor = make_executor(loads(CHAIN))
-    with Spinning(executor) as spinning:
+    with Spinning(executor, raises=ExternalShutdownException) as spinning:
         chain.start(executor)
         assert begun.wait(30.0)
         time.sleep(0.02)    # its deadline is over, and it still runs
@@ -267,3 +264,136 @@ def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, r
         assert counts['/middle:early']['overdue'] > 0
         assert ended.wait(30.0)
     assert sinks(executor) == counts
+
+
+# --- callbacks that raise ------------------------------------------------------------------------
+
+
+class Wrong(Exception):
+    """What the callbacks of these tests raise."""
+
+
+def odd_jobs_raise():
+    job = current_job()
+    if job.job % 2:
+        raise Wrong(job.job)
+
+
+def spin_until(executor, condition):
+    """Spin until something is true; return the jobs of which spin raised an exception."""
+    caught = []
+
+    def look():
+        try:
+            executor.spin_once(timeout_sec=0.002)
+        except Wrong as error:
+            caught.append(error.args[0])
+        return bool(condition())
+
+    assert wait_for(look, 10.0)
+    return caught
+
+
+def agrees(trace, statistics):
+    """Compare the verdicts of the executor with those of its trace, also rescheduled."""
+    recorded = replay(trace)
+    assert recorded.warnings == []
+    result = recorded.result()
+    again = reschedule(trace).result()
+    for name, dag in statistics['dags'].items():
+        assert result['dags'][name]['ends'] == dag['ends']
+        # Rescheduled, skipped releases run, too, and the last ones may not get to an end.
+        assert 0 < again['dags'][name]['ends']['failed'] <= dag['ends']['failed']
+        for sink, counts in dag['sinks'].items():
+            found = result['dags'][name]['sinks'][sink]
+            assert {key: found.get(key, 0) for key in counts if key != 'response_ns'} == {
+                key: value for key, value in counts.items() if key != 'response_ns'}
+
+
+def test_the_job_of_a_callback_that_raises_has_failed(make_executor, make_node, tmp_path):
+    misses = []
+    chain = Declared(make_node, CHAIN, {'relay': odd_jobs_raise})
+    trace = tmp_path / 'run.mcap'
+    graph = CHAIN.replace('50ms', '5s').replace('10ms', '5s')
+    executor = make_executor(loads(graph), trace=trace, on_deadline_miss=misses.append)
+    chain.start(executor)
+    caught = spin_until(executor, lambda: sum(j.job % 2 for j in chain.jobs('relay')) >= 5)
+    chain.cancel()
+    caught += spin_until(executor, lambda: len(chain.ran['relay']) == len(chain.ran['tick'])
+                         == len(chain.ran['early']) and executor.statistics()['queue'] == 0)
+    ran = [job.job for job in chain.jobs('relay')]
+    odd = sorted(job for job in ran if job % 2)
+    assert sorted(caught) == odd
+    executor.shutdown(5.0)
+    statistics = executor.statistics()
+    assert statistics['dags']['chain']['ends']['failed'] == len(odd) >= 5
+    last = sinks(executor)['/sink:last']
+    assert (last['failed'], last['completed']) == (len(odd), len(ran) - len(odd))
+    assert statistics['callbacks']['/middle:relay']['failed'] == len(odd)
+    assert statistics['callbacks']['/middle:early']['failed'] == 0
+    # what ran of a failed job after its failure has no verdict of its own
+    early = sinks(executor)['/middle:early']
+    assert early['completed'] + early['failed'] == len(ran)
+    assert sorted(m.job for m in misses if m.vertex == '/sink:last' and m.kind == 'failed') == odd
+    assert statistics['deadline_missed'] is True
+    agrees(trace, statistics)
+
+
+def test_what_had_been_published_before_still_runs(make_executor, make_node, tmp_path):
+    """It is not judged. The source, a coroutine, has published and waited before it raises."""
+    node, sink = make_node('source'), make_node('sink')
+    publisher = node.create_publisher(Header, '/a', 10)
+    came = []
+
+    async def tick():
+        job = current_job()
+        publisher.publish(Header())
+        await executor.create_task(lambda: None)
+        raise Wrong(job.job)
+
+    timer = node.create_timer(0.02, tick, autostart=False)
+    sink.create_subscription(Header, '/a', came.append, 10)
+    trace = tmp_path / 'run.mcap'
+    executor = make_executor(loads("""
+mddag: 1
+nodes:
+  - node: /source
+    callbacks: [{name: tick, timer: 20ms, publishes: [/a], dag: chain}]
+  - node: /sink
+    callbacks: [{name: last, subscription: /a, deadline: 5s, execution_time: 1ms}]
+"""), num_workers=1, trace=trace, nodes=[node, sink])
+    matched(publisher)
+    timer.reset()
+    caught = spin_until(executor, lambda: len(came) >= 5)
+    timer.cancel()
+    caught += spin_until(executor, lambda: len(came) == len(caught))
+    executor.shutdown(5.0)
+    statistics = executor.statistics()
+    assert statistics['dags']['chain']['ends']['failed'] == len(caught)
+    last = sinks(executor)['/sink:last']
+    assert (last['failed'], last['completed']) == (len(caught), 0)
+    agrees(trace, statistics)
+
+
+def test_a_listener_may_handle_exceptions_of_callbacks(make_executor, make_node):
+    node, ended = make_node(), []
+    numbers = iter(range(1000))
+
+    def tick():
+        if next(numbers) % 2:
+            raise ValueError('odd')
+
+    async def coroutine():
+        pass
+
+    def note(entity, error):
+        ended.append((entity, str(error)))
+        return error is not None
+
+    timers = [node.create_timer(0.01, tick), node.create_timer(0.01, coroutine)]
+    executor = make_executor(nodes=[node])
+    executor.on_callback_ended(note)
+    with Spinning(executor):
+        assert wait_for(lambda: len(ended) > 10)
+    assert set(ended) == {
+        (timers[0], 'None'), (timers[0], 'odd'), (timers[1], 'None')}

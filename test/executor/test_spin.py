@@ -1,22 +1,35 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Spinning: what ends it, what comes out of it, one callback at a time, waiting inside."""
+"""Spinning: what comes out of it, one callback at a time, and what ends it."""
 
+import contextlib
+import itertools
+import signal
+import sys
 import threading
 import time
 
+from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.executor.shutdown import call_at_shutdown
 import pytest
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, ShutdownException
+from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.wait_for_message import wait_for_message
-from std_msgs.msg import Header
+from std_msgs.msg import Empty, Header
 from std_srvs.srv import Trigger
 
-from .conftest import Spinning, wait_for
-from .pulse import Pulse
+from ..conftest import run_program
+from .conftest import Pulse, Spinning, wait_for
+
+# --- what comes out ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    'kind', ['timer', 'subscription', 'service', 'guard', 'waitable', 'task', 'coroutine'])
+@pytest.mark.parametrize('kind', [
+    'timer', 'subscription', 'service', 'guard', 'waitable', 'take', 'task', 'coroutine'])
 def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
     """The only worker ends the spin right after it: who swallows it is found out at once."""
     node = make_node()
@@ -43,9 +56,12 @@ def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
         node.create_timer(0.05, lambda: client.call_async(Trigger.Request()))
     elif kind == 'guard':
         node.create_guard_condition(fail).trigger()
-    elif kind == 'waitable':
+    elif kind in ('waitable', 'take'):
         pulse = Pulse(node, node.default_callback_group)
-        pulse.execute = fail_later
+        if kind == 'take':
+            pulse.take_data = fail
+        else:
+            pulse.execute = fail_later
         node.add_waitable(pulse)
         pulse.guard.trigger()
     else:
@@ -54,47 +70,17 @@ def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
         executor.spin_until_future_complete(after, 5.0)
 
 
-def test_what_fails_when_it_is_taken_comes_out_of_spin(make_executor, make_node):
-    class Broken(Pulse):
-
-        def take_data(self):
-            raise ZeroDivisionError('taken')
-
-    node = make_node()
-    broken = Broken(node, node.default_callback_group)
-    node.add_waitable(broken)
-    executor = make_executor(nodes=[node])
-    broken.guard.trigger()
-    with pytest.raises(ZeroDivisionError, match='taken'):
-        executor.spin_until_future_complete(Future(), 2.0)
+def test_spinning_twice_is_an_error(make_executor):
+    executor = make_executor()
+    assert not executor.is_spinning
+    with Spinning(executor):
+        assert wait_for(lambda: executor.is_spinning)
+        with pytest.raises(RuntimeError, match='already spinning'):
+            executor.spin_once(0)
+    assert not executor.is_spinning
 
 
-class Turn:
-    """What a coroutine may await as well: nothing that says when it is ready."""
-
-    def __await__(self):
-        yield
-
-
-@pytest.mark.parametrize('stepwise', [False, True])
-def test_a_coroutine_that_awaits_something_unknown_is_asked_again(make_executor, stepwise):
-    executor, turns = make_executor(), []
-
-    async def work():
-        for turn in range(5):
-            await Turn()
-            turns.append(turn)
-        return 'done'
-
-    task = executor.create_task(work)
-    if stepwise:
-        for step in range(6):
-            executor.spin_once(0.1)
-            assert turns == [*range(step)]
-    else:
-        executor.spin_until_future_complete(task, 3.0)
-    assert task.done() and task.result() == 'done' and turns == [0, 1, 2, 3, 4]
-    assert not getattr(executor, '_ready_tasks', ())  # rclpy's own, which are not used here
+# --- spin_once -----------------------------------------------------------------------------------
 
 
 def test_spin_once_runs_one_callback_and_has_finished_it(make_executor, make_node):
@@ -129,16 +115,15 @@ def test_what_is_new_wakes_a_spin_once_that_waits(make_executor, make_node, what
         waiting.join()
 
 
-def test_every_task_wakes_a_loop_of_spin_once_and_a_spin_after_it(make_executor, make_node):
+def test_every_task_wakes_a_loop_of_spin_once_and_a_spin_after_it(make_executor):
     """Not only the first one: what wakes has to be ready to wake again."""
-    executor, ran = make_executor(), [threading.Event() for _ in range(20)]
+    executor, ran, done = make_executor(), [threading.Event() for _ in range(20)], Future()
 
     def loop():
         while not ran[9].is_set():
             executor.spin_once()
         executor.spin_until_future_complete(done, 30.0)
 
-    done = Future()
     thread = threading.Thread(target=loop)
     thread.start()
     try:
@@ -154,15 +139,16 @@ def test_every_task_wakes_a_loop_of_spin_once_and_a_spin_after_it(make_executor,
             thread.join(0.1)
 
 
-def test_spinning_twice_is_an_error(make_executor):
-    executor = make_executor()
-    assert not executor.is_spinning
-    with Spinning(executor):
-        time.sleep(0.05)
-        assert executor.is_spinning
-        with pytest.raises(RuntimeError, match='already spinning'):
-            executor.spin_once(0)
-    assert not executor.is_spinning
+def test_wait_for_message_while_another_thread_spins(make_executor, make_node):
+    node = make_node()
+    publisher = node.create_publisher(Header, '/topic', 10)
+    node.create_timer(0.01, lambda: publisher.publish(Header(frame_id='it')))
+    with Spinning(make_executor(nodes=[node])):
+        found, message = wait_for_message(Header, node, '/topic', time_to_wait=5.0)
+    assert found and message.frame_id == 'it'
+
+
+# --- a shutdown of the executor ------------------------------------------------------------------
 
 
 def test_shutdown_waits_for_a_running_callback(make_executor):
@@ -182,11 +168,42 @@ def test_shutdown_waits_for_a_running_callback(make_executor):
         assert done
 
 
+@pytest.mark.parametrize('timeout', [0, None])
+def test_a_callback_may_shut_the_executor_down(make_executor, make_node, timeout):
+    """It hangs in rclpy: rclpy#1646."""
+    node, calls = make_node(), []
+    executor = make_executor(nodes=[node])
+    node.create_timer(0.01, lambda: calls.append(executor.shutdown(timeout)))
+    node.create_timer(0.001, lambda: time.sleep(0.002), ReentrantCallbackGroup())
+    with Spinning(executor) as spinning:
+        spinning.join()
+    assert len(calls) == 1
+
+
+def test_a_callback_of_spin_once_may_shut_down(make_executor, make_node):
+    """After a spin, threads are parked; the shutdown ends them though a step is running."""
+    node, future, done = make_node(), Future(), []
+    executor = make_executor(num_workers=2, nodes=[node])
+
+    def callback():
+        if threading.current_thread() is threading.main_thread():
+            done.append(executor.shutdown(5.0))
+        elif not future.done():  # a worker may run it again before the spin has ended
+            future.set_result(None)
+    node.create_timer(0.01, callback)
+    executor.spin_until_future_complete(future, 10.0)
+    with contextlib.suppress(ExternalShutdownException, ShutdownException):
+        for _ in range(100):
+            executor.spin_once(0.1)
+            if done:
+                break
+    assert done == [True]
+
+
 @pytest.mark.parametrize('end', ['shutdown', 'future'])
 def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros_context, end):
     before = set(threading.enumerate())
-    node, calls = make_node(), []
-    done = Future()
+    node, calls, done = make_node(), [], Future()
 
     def tick():
         calls.append(1)
@@ -215,11 +232,237 @@ def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros
     assert wait_for(lambda: not left()), left()
 
 
-def test_wait_for_message_from_a_callback(make_executor, make_node, ros_context):
+# --- the end of a context ------------------------------------------------------------------------
+
+ENDS = {
+    'shutdown': Context.try_shutdown, 'destroy': Context.destroy,
+    'both': lambda context: (context.try_shutdown(), context.destroy())}
+
+
+@pytest.mark.parametrize('inside', [False, True], ids=['outside', 'callback'])
+@pytest.mark.parametrize('end', ENDS)
+@pytest.mark.parametrize('way', ['spin', 'steps'])
+def test_spin_ends_with_its_context(way, end, inside, no_thread_leak, monkeypatch, capfd):
+    """Callbacks that fail just because the context has ended make no noise (rclpy#944)."""
+    in_threads = []
+    monkeypatch.setattr(threading, 'excepthook', in_threads.append)
+    context = Context()
+    rclpy.init(context=context)
+    node = Node('node', context=context)
+    node.create_subscription(Empty, '/topic', lambda m: None, 10)
+    publisher = node.create_publisher(Empty, '/topic', 1)
+    node.create_timer(0.005, lambda: publisher.publish(Empty()), ReentrantCallbackGroup())
+    errors = []
+    ran = threading.Event()
+
+    def callback():
+        ran.set()
+        if inside:
+            ENDS[end](context)
+
+    def spin():
+        try:
+            while way == 'steps':
+                executor.spin_once(0.02)
+            executor.spin()
+            executor.spin()  # and at once when it has ended before
+        except BaseException as error:
+            errors.append(error)
+
+    node.create_timer(0.02, callback)
+    executor = MultiDeadlineExecutor(context=context)
+    executor.add_node(node)
+    thread = threading.Thread(target=spin)
+    thread.start()
+    assert ran.wait(5.0)
+    if not inside:
+        ENDS[end](context)
+    thread.join(10.0)
+    assert not thread.is_alive()
+    # As rclpy's: spin returns when a callback has shut the context down.
+    returns = inside and end != 'destroy' and way != 'steps'
+    assert [type(error) for error in errors] == (
+        [] if returns else [ExternalShutdownException])
+    assert executor.shutdown(5.0)
+    assert in_threads == [] and 'Traceback' not in capfd.readouterr().err
+    with contextlib.suppress(Exception):
+        node.destroy_node()
+
+
+def test_what_the_callback_raises_that_shuts_down_comes_out(make_executor, make_node, ros_context):
     node = make_node()
-    publisher = node.create_publisher(Header, '/topic', 10)
-    node.create_timer(0.01, lambda: publisher.publish(Header(frame_id='it')))
+
+    def end():
+        rclpy.shutdown(context=ros_context)
+        time.sleep(0.05)
+        raise SystemExit('done')
+
+    node.create_timer(0.01, end)
     executor = make_executor(nodes=[node])
-    with Spinning(executor):
-        found, message = wait_for_message(Header, node, '/topic', time_to_wait=5.0)
-    assert found and message.frame_id == 'it'
+    with pytest.raises(SystemExit, match='done'):
+        executor.spin()
+
+
+def test_no_interrupt_gets_lost_where_something_of_a_context_dies(ros_context, monkeypatch):
+    """A KeyboardInterrupt in the Python code of a weak reference is printed and forgotten."""
+    class Thing:
+
+        def wake(self):
+            pass
+
+    lost = []
+    monkeypatch.setattr(sys, 'unraisablehook', lost.append)
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    interrupts = 0
+    try:
+        for number in itertools.count():
+            try:
+                signal.setitimer(signal.ITIMER_REAL, 0.0005)
+                while True:
+                    call_at_shutdown(ros_context, Thing().wake)
+            except KeyboardInterrupt:
+                interrupts += 1
+            if number >= 200:
+                break
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert interrupts > 200 and lost == []
+
+
+PROGRAM = """
+import os, sys, threading, time
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
+from mddag_executor import MultiDeadlineExecutor
+
+
+def sleep():  # in C++, without the interpreter lock
+    ran.set()
+    node.get_clock().sleep_for(Duration(nanoseconds=10_000_000))
+
+
+def block():
+    ran.set()
+    threading.Event().wait()
+
+
+def spin():
+    {spin}
+
+rclpy.init()
+node = rclpy.create_node('node')
+ran = threading.Event()
+group = ReentrantCallbackGroup()
+for _ in range(7):
+    node.create_timer(0.005, {callback}, callback_group=group)
+executor = MultiDeadlineExecutor()
+executor.add_node(node)
+threading.Thread(target=spin, daemon=True).start()
+assert ran.wait(10)
+time.sleep(0.1)
+{end}
+print('end', flush=True)
+"""
+
+SPIN = 'executor.spin()'
+# threads of a spin are parked then
+SPUN_BEFORE = """executor.spin_until_future_complete(rclpy.Future(), 0.1)
+    while True: executor.spin_once(0.3)"""
+# Only what Python does at exit: Fast DDS itself does not survive the end of such a child.
+FORK = """
+import atexit, warnings
+warnings.simplefilter("ignore", DeprecationWarning)  # of a fork with threads
+with executor._pool.lock:
+    child = os.fork()
+    if not child:
+        atexit._run_exitfuncs()
+        os._exit(3)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
+"""
+
+
+@pytest.mark.parametrize('parts', [
+    {'spin': SPIN},
+    {'spin': 'while rclpy.ok(): executor.spin_once(timeout_sec=0.005)'},
+    {'spin': SPUN_BEFORE},
+    {'spin': SPIN, 'callback': 'block'},
+    {'spin': SPIN, 'end': 'executor.shutdown(0)'},
+    {'spin': SPIN, 'callback': 'ran.set', 'end': FORK},
+], ids=['spin', 'steps', 'spun before', 'never ends', 'shut down', 'forked'])
+def test_a_program_may_end_while_a_daemon_thread_spins(parts):
+    out, err = run_program(PROGRAM.format(**{'callback': 'sleep', 'end': '', **parts}))
+    assert out.splitlines()[-1] == 'end'
+    expected = 'cannot keep its rate', 'use of fork() may lead to deadlocks'
+    assert [line for line in err.splitlines()
+            if not any(text in line for text in expected)] == []
+
+
+PUBLISHES = """
+import faulthandler, signal, sys, threading, time
+import rclpy
+from std_msgs.msg import String
+from mddag_executor import MultiDeadlineExecutor
+from msg_graph import loads
+
+faulthandler.dump_traceback_later(40, exit=True)
+rclpy.init()
+node = rclpy.create_node('node')
+publisher = node.create_publisher(String, '/command', 10)
+heard = []
+node.create_subscription(String, '/command', lambda message: heard.append(message.data), 10000)
+timer = node.create_timer(0.001, lambda: publisher.publish(String(data='job')))
+executor = MultiDeadlineExecutor(loads('''
+mddag: 1
+nodes:
+  - node: /node
+    callbacks:
+      - {name: tick, timer: 1ms, publishes: [/command]}
+      - {name: obey, subscription: /command, deadline: 1s}
+'''))
+executor.add_node(node)
+where = sys.argv[1]
+stops = 0
+
+
+def stop(*_):
+    global stops
+    publisher.publish(String(data='stop'))
+    stops += 1
+    if stops < 200:
+        signal.setitimer(signal.ITIMER_REAL, 0.001)
+
+signal.signal(signal.SIGALRM, stop)
+signal.setitimer(signal.ITIMER_REAL, 0.001)
+
+
+def done():
+    return stops == 200 and heard.count('stop') >= 200
+
+if where == 'spin':
+    thread = threading.Thread(target=lambda: [time.sleep(0.01) for _ in iter(done, True)])
+    thread.start()
+    future = rclpy.Future()
+    threading.Thread(target=lambda: (thread.join(), future.set_result(None))).start()
+    executor.spin_until_future_complete(future)
+elif where == 'spin_once':
+    while not done():
+        executor.spin_once(0.1)
+else:
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    while not done():
+        publisher.publish(String(data='go'))
+        executor.statistics()
+        executor.create_task(lambda: None)
+    executor.shutdown()
+    thread.join()
+print(stops, heard.count('stop'))
+"""
+
+
+@pytest.mark.parametrize('where', ['spin', 'spin_once', 'other thread'])
+def test_a_signal_s_handler_may_publish(where):
+    """Whatever the main thread does when the signal comes: it holds locks now and then."""
+    assert run_program(PUBLISHES, where)[0] == '200 200\n'

@@ -17,7 +17,6 @@ from std_msgs.msg import Header
 from test_msgs.action import Fibonacci
 
 from .conftest import is_idle, Spinning, wait_for
-from .pulse import Pulse
 
 SUCCEEDED, CANCELED = 4, 5
 
@@ -191,9 +190,6 @@ def test_the_middleware_writes_to_no_file_after_the_executor_has_ended(
     assert sizes == [0] * 200
 
 
-# --- timers, and a waitable of a user's own ------------------------------------------------------
-
-
 @pytest.mark.skipif(compat.TimerInfo is None, reason='this rclpy has no TimerInfo')
 def test_a_timer_gives_its_info_to_who_asks_for_it(make_executor, make_node):
     node, seen, plain = make_node(), [], []
@@ -214,28 +210,3 @@ def test_a_timer_gives_its_info_to_who_asks_for_it(make_executor, make_node):
     steps = {(b.expected_call_time - a.expected_call_time).nanoseconds
              for a, b in zip(seen, seen[1:])}
     assert all(step % 20_000_000 == 0 for step in steps)
-
-
-class Empty(Pulse):
-    """A waitable whose take gives nothing."""
-
-    def __init__(self, node):
-        super().__init__(node, node.default_callback_group)
-        self.got = []
-
-    def take_data(self):
-        return None
-
-    async def execute(self, taken_data):
-        self.got.append(taken_data)
-
-
-def test_a_waitable_that_takes_nothing_is_executed(make_executor, make_node):
-    node = make_node()
-    waitable = Empty(node)
-    node.add_waitable(waitable)
-    executor = make_executor(nodes=[node])
-    with Spinning(executor):
-        assert wait_for(lambda: waitable.guard.trigger() or len(waitable.got) >= 3)
-    assert set(waitable.got) == {None}
-    node.remove_waitable(waitable)

@@ -70,7 +70,7 @@ CASES = [
 def step(self, must_check: bool = True) -> Any:
         if self.coroutine is None and self.entity.ran % 20 == 19:
             return None""")], of(
-        'test_each_runs.py', 'test_each_time_that_a_timer_is_due_counts', *(
+        'test_executor.py', 'test_each_time_that_a_timer_is_due_counts', *(
             f'test_each_of_many_runs_once[spin-of_{kind}]' for kind in (
                 'tasks', 'subscriptions', 'services', 'guards', 'waitables'))), every=True),
     Case('create_task_does_not_wake_spin_once', [
@@ -89,9 +89,9 @@ may not check
         ('executor/workers.py', 'self._of_next_step.append(work)', 'pass'),
         ('executor/workers.py',
          'self.call_at(monotonic_ns() + rest, partial(self.resume, work))', 'pass')], of(
-        'test_spin.py',
-        'test_a_coroutine_that_awaits_something_unknown_is_asked_again[False]',
-        'test_a_coroutine_that_awaits_something_unknown_is_asked_again[True]'),
+        'test_tasks.py',
+        'test_a_coroutine_that_awaits_something_unknown_is_asked_again[installed-False]',
+        'test_a_coroutine_that_awaits_something_unknown_is_asked_again[installed-True]'),
         every=True),
     Case('groups_ignored', [(
         'executor/entity.py', 'self.group = group', 'self.group = -1')], of(
@@ -107,12 +107,13 @@ may not check
 client.completed = getattr(client, 'completed', 0) + 1
     if client.completed % 20:
         future.set_result(response)""")], of(
-        'test_each_runs.py', 'test_each_of_many_runs_once[spin-of_services]')),
+        'test_executor.py', 'test_each_of_many_runs_once[spin-of_services]')),
     Case('coroutines_not_resumed', [(
         'executor/engine.py', 'self._core().resume(work.x)', 'pass')], [
-        *of('test_each_runs.py', 'test_each_of_many_runs_once[spin-of_coroutines]'),
-        *of('test_like_rclpy.py',
-            'test_a_coroutine_goes_on_in_the_step_after_its_future_is_done')], every=True),
+        *of('test_executor.py', 'test_each_of_many_runs_once[spin-of_coroutines]'),
+        *of('test_tasks.py',
+            'test_a_coroutine_goes_on_in_the_step_after_its_future_is_done[installed]')],
+        every=True),
     Case('what_bypasses_the_core_stays_unknown', [(
         'executor/engine.py', 'self._start_next(work.worker, self._bypassing_since)', 'pass')],
         of('test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
@@ -121,7 +122,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         of('test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
     Case('tasks_go_on_by_themselves_as_well', [(
         'executor/compat.py', 'def _add_resume_callback(', 'def _not_called(')], of(
-        'test_newer_rclpy.py', 'test_a_task_awaits_one_future_after_another[await-own]')),
+        'test_tasks.py', 'test_a_task_awaits_one_future_after_another[newer]')),
     Case('exceptions_swallowed', [(
         'executor/executor.py', 'self._errors.append(error)', 'pass')], of(
         'test_spin.py', *(
@@ -130,7 +131,7 @@ client.completed = getattr(client, 'completed', 0) + 1
                 'coroutine'))), every=True, at_once=True),
     Case('exceptions_of_takes_swallowed', [
         (f'executor/{file}.py', 'self._fail(error)', 'pass') for file in ('sources', 'waitables')],
-        of('test_spin.py', 'test_what_fails_when_it_is_taken_comes_out_of_spin'), at_once=True),
+        of('test_spin.py', 'test_an_exception_comes_out_of_spin[take]'), at_once=True),
     Case('create_task_does_not_wake_workers', [(
         'executor/executor.py', 'self._pool.report(self._engine.ready, work)', UNNOTICED)], of(
         'test_executor.py', 'test_tasks_and_nodes_wake_an_idle_executor')),
@@ -175,7 +176,8 @@ vertex, leg = target
             if of == dag and state.job_state[i] == OPEN and state.x_state[
                 state.job_base[i] + self.tables.region_offset[vertex] + leg] == IDLE),
             default=(origin.job, origin.slot))""")], of(
-        'test_deadlines.py', 'test_jobs_that_overlap_and_overtake_are_told_apart')),
+        'test_deadlines.py',
+        'test_each_callback_runs_for_the_job_that_its_message_belongs_to')),
     Case('messages_go_to_the_job_before', [(
         'executor/jobs.py', 'publication = Publication(time_ns(), ', """\
 before = globals().setdefault('BEFORE', {})

@@ -1,0 +1,250 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks, coroutines and futures: orders that rclpy's own tests rely on, with seven workers."""
+
+import inspect
+import threading
+import time
+
+import pytest
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.task import Future, Task
+from std_srvs.srv import Trigger
+
+from .conftest import Spinning, wait_for
+
+# --- like rclpy's executor -----------------------------------------------------------------------
+
+
+def test_tasks_created_before_spin_run_in_rclpys_order(make_executor, ros_context):
+    orders = []
+    for executor in make_executor(), SingleThreadedExecutor(context=ros_context):
+        order = []
+        orders.append(order)
+        for name in 'abc':
+            executor.create_task(order.append, name)
+        for _ in range(3):
+            executor.spin_once(timeout_sec=0)
+        executor.shutdown()
+    assert orders[0] == orders[1] and sorted(orders[0]) == ['a', 'b', 'c']
+
+
+def test_other_callbacks_of_an_awaited_future_run_where_rclpy_runs_them(
+        make_executor, ros_context):
+    """Since rclpy 7.1.9 in the executor, before that in the thread that completes the future."""
+    here = []
+    for executor in make_executor(), SingleThreadedExecutor(context=ros_context):
+        future = Future()
+        threads = []
+
+        async def wait(future=future):
+            await future
+
+        task = executor.create_task(wait)
+        executor.spin_once(timeout_sec=0)
+        future.add_done_callback(
+            lambda _, threads=threads: threads.append(threading.get_ident()))
+        completing = threading.Thread(target=future.set_result, args=(None,))
+        completing.start()
+        completing.join()
+        for _ in range(20):
+            if task.done() and threads:
+                break
+            executor.spin_once(timeout_sec=0.1)
+        here.append(threads == [threading.get_ident()])
+        executor.shutdown()
+    assert here[0] == here[1]
+
+
+# --- with the rclpy that is installed, and as since 7.1.9 ----------------------------------------
+
+# There a future that is awaited hands itself to the task, which goes on by itself when it is done;
+# and a coroutine that goes on before is told off.
+IS_NEWER = hasattr(Task, '_add_resume_callback')
+
+
+@pytest.fixture(params=['installed'] + ['newer'] * (not IS_NEWER))
+def each_rclpy(request, monkeypatch):
+    """Let futures and tasks do what they do now, and what they do since rclpy 7.1.9."""
+    if request.param == 'installed':
+        return
+    call_function = Task.__call__
+
+    def wait(self):
+        if self._pending():
+            yield self
+        if self._pending():
+            raise RuntimeError('it goes on before the future that it awaits is done')
+        return self.result()
+
+    def call(self):
+        if not inspect.iscoroutine(self._handler):
+            call_function(self)
+        elif self._pending():
+            step(self)
+
+    def step(task):
+        try:
+            yielded = task._handler.send(None)
+        except StopIteration as stop:
+            task.set_result(stop.value)
+        except Exception as error:
+            task.set_exception(error)
+        else:
+            if yielded is None:
+                task._executor()._call_task_in_next_spin(task)
+            else:
+                task._add_resume_callback(yielded, task._executor())
+
+    def resume(self, future, executor):
+        future.add_done_callback(lambda _: self())
+
+    monkeypatch.setattr(Future, '__await__', wait)
+    monkeypatch.setattr(Task, '__call__', call)
+    monkeypatch.setattr(Task, '_add_resume_callback', resume, raising=False)
+
+
+@pytest.mark.usefixtures('each_rclpy')
+def test_a_coroutine_goes_on_in_the_step_after_its_future_is_done(make_executor):
+    executor = make_executor()
+    future = Future(executor=executor)
+
+    async def wait(word, end):
+        return word + await future + end
+
+    task = executor.create_task(wait, 'it ', end='!')
+    executor.spin_once(timeout_sec=0)
+    assert not task.done()
+    future.set_result('is done')
+    executor.spin_once(timeout_sec=1)
+    assert task.done() and task.result() == 'it is done!'
+
+
+@pytest.mark.usefixtures('each_rclpy')
+def test_a_task_awaits_one_future_after_another(make_executor):
+    """The executor's or free ones, in coroutines or in a generator: none goes on before."""
+    executor = make_executor()
+
+    async def one_by_one(futures):
+        for future in futures:
+            yield await future
+
+    async def inner(future, got):
+        got.append(await future)
+
+    async def outer(futures, generates):
+        got = []
+        if generates:
+            async for value in one_by_one(futures):
+                got.append(value)
+        else:
+            for future in futures:
+                await inner(future, got)
+        return got
+
+    tasks, ways = [], []
+    for make in executor.create_future, Future:
+        for generates in False, True:
+            ways.append([make() for _ in range(20)])
+            tasks.append(executor.create_task(outer, ways[-1], generates))
+    with Spinning(executor):
+        for number, futures in enumerate(zip(*ways)):
+            time.sleep(0.003)
+            for future in futures:
+                future.set_result(number)
+        assert wait_for(lambda: all(task.done() for task in tasks))
+    assert [task.result() for task in tasks] == [[*range(20)]] * 4
+    # where rclpy's own executors keep tasks that are to go on, which nothing would take out here
+    assert not getattr(executor, '_ready_tasks', ())
+
+
+class Turn:
+    """What a coroutine may await as well: nothing that says when it is ready."""
+
+    def __await__(self):
+        yield
+
+
+@pytest.mark.usefixtures('each_rclpy')
+@pytest.mark.parametrize('stepwise', [False, True])
+def test_a_coroutine_that_awaits_something_unknown_is_asked_again(make_executor, stepwise):
+    executor, turns = make_executor(), []
+
+    async def work():
+        for turn in range(5):
+            await Turn()
+            turns.append(turn)
+        return 'done'
+
+    task = executor.create_task(work)
+    if stepwise:
+        for step in range(6):
+            executor.spin_once(0.1)
+            assert turns == [*range(step)]
+    else:
+        executor.spin_until_future_complete(task, 3.0)
+    assert task.done() and task.result() == 'done' and turns == [0, 1, 2, 3, 4]
+
+
+def fails():
+    raise KeyError('handled')
+
+
+async def fails_later():
+    fails()
+
+
+@pytest.mark.usefixtures('each_rclpy')
+def test_an_exception_that_is_handled_does_not_end_the_executor(make_executor):
+    """Whether the task fails before its maker awaits it or after (rclpy#1215, #1098)."""
+    executor = make_executor()
+
+    async def handle(kind, late):
+        handled = 0
+        for _ in range(10):
+            task = executor.create_task(kind)
+            if late:
+                assert wait_for(task.done)
+            try:
+                await task
+            except KeyError:
+                handled += 1
+        return handled
+
+    def look(kind):  # with rclpy's example, in a function
+        task = executor.create_task(kind)
+        assert wait_for(task.done)
+        with pytest.raises(KeyError, match='handled'):
+            task.result()
+        return 10
+
+    tasks = [executor.create_task(look, kind) for kind in (fails, fails_later)] + [
+        executor.create_task(handle, kind, late)
+        for kind in (fails, fails_later) for late in (False, True)]
+    with Spinning(executor):
+        assert wait_for(lambda: all(task.done() for task in tasks))
+        time.sleep(0.15)  # exceptions are checked every 100 ms
+    assert [task.result() for task in tasks] == [10] * 6
+
+
+@pytest.mark.usefixtures('each_rclpy')
+def test_coroutines_ask_and_answer(make_executor, make_node):
+    node, answers = make_node(), []
+
+    async def answer(request, response):
+        response.message = await executor.create_task(lambda a, b: a + b, 'y', b='es')
+        return response
+
+    async def ask():
+        answers.append((await client.call_async(Trigger.Request())).message)
+
+    node.create_service(Trigger, '/ask', answer)
+    client = node.create_client(Trigger, '/ask')
+    # a coroutine keeps its group while it waits
+    timer = node.create_timer(0.01, ask, MutuallyExclusiveCallbackGroup())
+    executor = make_executor(nodes=[node])
+    with Spinning(executor):
+        assert wait_for(lambda: len(answers) >= 3)
+        timer.cancel()
+    assert set(answers) == {'yes'}
