@@ -42,14 +42,43 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 import functools
 import math
-from typing import NamedTuple
 
 from msg_graph import Dag, Vertex
 
-from .dag_paths import laxity, reachable_sinks, ways_to
 
-Event = tuple[int, str, int, int, int, int]
-"""(tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job)."""
+def reachable_sinks(dag, index):
+    """Return the sinks that a vertex leads to, itself included."""
+    successors = dag.vertices[index].successors
+    if not successors:
+        return {index}
+    return set().union(*(reachable_sinks(dag, after) for after in successors))
+
+
+def paths(dag, index):
+    """Yield every path from a vertex to a sink."""
+    vertex = dag.vertices[index]
+    for after in vertex.successors:
+        for path in paths(dag, after):
+            yield [vertex, *path]
+    if not vertex.successors:
+        yield [vertex]
+
+
+def depth(dag, index):
+    """Return how many vertices are on the longest path from the source to a vertex."""
+    before = dag.vertices[index].predecessors
+    return 1 + max((depth(dag, one) for one in before), default=0)
+
+
+def mean(vertex):
+    declared = vertex.callback.execution_time
+    return 0 if declared is None else declared.mean_ns
+
+
+def laxity(dag, index, sink):
+    """Return the deadline of a sink less the mean times of the longest path to it, in ns."""
+    return (dag.vertices[sink].deadline_ns or 0) - max(
+        sum(map(mean, path)) for path in paths(dag, index) if path[-1].index == sink)
 
 
 @dataclass(eq=False)
@@ -77,35 +106,19 @@ class Execution:
     lowered: int | None = None  # its priority since it was demoted
 
 
-class Miss(NamedTuple):
-    """A missed deadline, ticks; ``completed`` is None where the sink never completed."""
-
-    dag: str
-    vertex: str
-    job: int
-    deadline: int
-    completed: int | None
-
-
 class BruteForce:
-    """One simulated run; ``events``, ``misses`` and ``result()`` tell what came out of it."""
+    """
+    One simulated run; ``misses`` and ``result()`` tell what came out of it.
 
-    def __init__(
-        self, task_set, ticks, *, tick, horizon,
-        workers, policy, preemptive, dispatch_overhead=0,
-        switch_overhead=0, judge='horizon', stop_at_first_miss=False,
-        last_release=None, on_late='continue',
-    ):
-        self.task_set = task_set
-        self.dags = task_set.dags
-        self.ticks = ticks
+    :ivar events: (tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job).
+    """
+
+    def __init__(self, case, horizon, tick, judge, stop, last_release):
+        self.case = case
+        self.dags = case.task_set.dags
+        self.policy = case.policy
         self.tick = tick
-        self.policy = policy
-        self.on_late = on_late
-        self.preemptive = preemptive
-        self.dispatch_overhead = dispatch_overhead
-        self.switch_overhead = switch_overhead
-        self.running = [None] * workers
+        self.running = [None] * case.workers
         self.waiting = []
         # by DAG and vertex: the demoted executions by arrival, and the arrival of the urged one
         self.demoted = {}
@@ -116,8 +129,8 @@ class BruteForce:
         self.events = []
         self.misses = []
         self.counts = {
-            (dag.index, sink): {'completed': 0, 'late': 0, 'overdue': 0, 'expired': 0,
-                                'failed': 0, 'aborted': 0, 'dropped': 0}
+            (dag.index, sink): dict.fromkeys(
+                ('completed', 'late', 'overdue', 'expired', 'failed', 'aborted', 'dropped'), 0)
             for dag in self.dags for sink in dag.sinks}
         self.responses = {key: [] for key in self.counts}
         # by DAG, vertex and sink that it leads to: the latest start, ns after the release
@@ -125,11 +138,11 @@ class BruteForce:
             (dag.index, v): {sink: laxity(dag, v, sink) for sink in reachable_sinks(dag, v)}
             for dag in self.dags for v in range(len(dag.vertices))}
         self.is_overloaded = sum(
-            self._mean(v) * 1_000_000 // dag.period_ns
-            for dag in self.dags for v in dag.vertices) > workers * 1_000_000
+            mean(v) * 1_000_000 // dag.period_ns
+            for dag in self.dags for v in dag.vertices) > case.workers * 1_000_000
         self.sequence = 0
         self.now = 0
-        self._simulate(horizon, stop_at_first_miss, last_release or horizon)
+        self._simulate(horizon, stop, last_release or horizon)
         if judge == 'horizon' and self.now == horizon:
             self._judge_open()
 
@@ -156,10 +169,6 @@ class BruteForce:
     def _period(self, dag):
         return dag.period_ns // self.tick
 
-    def _mean(self, vertex):
-        declared = vertex.callback.execution_time
-        return 0 if declared is None else declared.mean_ns
-
     def _deadline(self, job, sink):
         """Return the absolute deadline of a sink."""
         relative = job.dag.vertices[sink].deadline_ns
@@ -173,8 +182,7 @@ class BruteForce:
             execution, {*self.laxity[execution.job.dag.index, execution.vertex.index]})
 
     def _demotes(self, dag):
-        return ((dag.on_late or self.on_late) == 'demote'
-                and self.policy in ('rad', 'gedf', 'llf'))
+        return dag.on_late == 'demote' and self.policy in ('rad', 'gedf', 'llf')
 
     def _demote(self, execution):
         """Change a priority if the next execution is late or behind one; return whether it did."""
@@ -208,13 +216,13 @@ class BruteForce:
         """Return the priority by the deadlines within reach, or later if there is none."""
         job, vertex = execution.job, execution.vertex
         unit = 1 if self.policy == 'llf' else self.tick
-        done = (self.ticks[job.dag.index][vertex.index] - execution.left) * self.tick
+        done = (self.case.ticks[job.dag.index][vertex.index] - execution.left) * self.tick
         starts = self.laxity[job.dag.index, vertex.index]
         now = (self.now - job.release) * self.tick
         if execution.has_run:
             now -= done
         if older is not None and self.is_overloaded:
-            now += ahead * self._mean(vertex)
+            now += ahead * mean(vertex)
         within = {sink for sink, start in starts.items() if now <= start}
         lowest = self._priority(execution, within or {*starts})
         if not within and older is not None:
@@ -251,25 +259,19 @@ class BruteForce:
         return execution.arrival
 
     def _place(self, callback):
-        """Return the place of a callback in the wait set."""
-        waits_for_topics = ('subscription', 'sync')
-        timers = [c for c in self.task_set.callbacks if c.kind == 'timer']
-        others = [c for c in self.task_set.callbacks if c.kind in waits_for_topics]
-        return (timers + others).index(callback)
+        """Return the place of a callback in the wait set: timers come first."""
+        every = self.case.task_set.callbacks
+        return callback.kind != 'timer', every.index(callback)
 
     @functools.cache  # noqa: B019
     def _fixed_priorities(self):
         """Return the priority of each callback, by its name."""
-        order = []
-        for dag in self.dags:
-            for vertex in dag.vertices:
-                ahead = max(len(way) for way in ways_to(dag, vertex.index))
-                least = min(
-                    dag.vertices[s].deadline_ns or 0 for s in reachable_sinks(dag, vertex.index))
-                order.append((
-                    least, dag.period_ns, dag.index, -ahead, vertex.index, vertex.callback.key))
+        order = sorted(
+            (min(dag.vertices[s].deadline_ns for s in reachable_sinks(dag, v.index)),
+             dag.period_ns, dag.index, -depth(dag, v.index), v.index, v.callback.key)
+            for dag in self.dags for v in dag.vertices)
         first = {}
-        for place, entry in enumerate(sorted(order)):
+        for place, entry in enumerate(order):
             first.setdefault(entry[-1], place)
         return first
 
@@ -298,7 +300,7 @@ class BruteForce:
         self._ready(job, dag.vertices[dag.source])
 
     def _ready(self, job, vertex):
-        new = Execution(job, vertex, self.ticks[job.dag.index][vertex.index], self._arrival())
+        new = Execution(job, vertex, self.case.ticks[job.dag.index][vertex.index], self._arrival())
         self.waiting.append(new)
         waiting = [e for e in self.waiting if e.vertex is vertex and not e.has_run]
         newest = max(e.job.index for e in waiting)
@@ -353,9 +355,10 @@ class BruteForce:
             self.waiting = [e for e in self.waiting if e.job is not job or e.has_run]
 
     def _miss(self, job, sink, completed):
-        self.misses.append(Miss(
-            job.dag.name, job.dag.vertices[sink].name, job.index, self._deadline(job, sink),
-            completed))
+        self.misses.append({
+            'dag': job.dag.name, 'vertex': job.dag.vertices[sink].name, 'job': job.index,
+            'deadline_ns': self._deadline(job, sink) * self.tick,
+            'completed_ns': completed and completed * self.tick})
 
     def _judge_open(self):
         overdue = []
@@ -438,7 +441,7 @@ class BruteForce:
         if None in self.running:
             self._start(best, self.running.index(None))
             return True
-        if not self.preemptive:
+        if not self.case.preemptive:
             return False
         worst, worker = max(
             (self.priority(e), w) for w, e in enumerate(self.running) if e is not None)
@@ -447,7 +450,7 @@ class BruteForce:
         victim = self.running[worker]
         self._note('preempt', worker, victim)
         self._start(best, worker)
-        victim.left += self.switch_overhead
+        victim.left += self.case.switch_overhead
         victim.arrival = self._arrival()
         victim.lowered = None
         self.waiting.append(victim)
@@ -475,7 +478,7 @@ class BruteForce:
         if not execution.has_run:
             self.passed_on.pop((execution.job.dag.index, execution.vertex.index), None)
         execution.has_run = True
-        execution.left += self.dispatch_overhead
+        execution.left += self.case.dispatch_overhead
         self.running[worker] = execution
         self._note('start', worker, execution)
 
@@ -487,33 +490,26 @@ class BruteForce:
 
     def result(self):
         """Return the part of the result format that concerns jobs and sinks, times in ns."""
-        return {
-            dag.name: {
-                'jobs': sum(job.dag is dag for job in self.jobs),
-                'ends': {outcome: sum(job.dag is dag and job.outcome == outcome
-                                      for job in self.jobs)
-                         for outcome in ('completed', 'late', 'aborted', 'expired', 'failed',
-                                         'dropped')},
+        result = {}
+        for dag in self.dags:
+            outcomes = [job.outcome for job in self.jobs if job.dag is dag]
+            ends = ('completed', 'late', 'aborted', 'expired', 'failed', 'dropped')
+            result[dag.name] = {
+                'jobs': len(outcomes), 'ends': {end: outcomes.count(end) for end in ends},
                 'sinks': {dag.vertices[sink].name: self._sink(dag, sink) for sink in dag.sinks}}
-            for dag in self.dags}
+        return result
 
     def _sink(self, dag, sink):
         responses = sorted(self.responses[dag.index, sink])
-        response = None
-        if responses:
-            def rank(share):
-                return responses[math.ceil(share * len(responses)) - 1] * self.tick
 
-            response = {'min': responses[0] * self.tick, 'median': rank(Fraction(1, 2)),
-                        'p99': rank(Fraction(99, 100)), 'max': responses[-1] * self.tick}
+        def rank(share):
+            return responses[math.ceil(share * len(responses)) - 1] * self.tick
+
+        response = {'min': responses[0] * self.tick, 'median': rank(Fraction(1, 2)),
+                    'p99': rank(Fraction(99, 100)), 'max': rank(1)} if responses else None
         return {'relative_deadline_ns': dag.vertices[sink].deadline_ns,
                 **self.counts[dag.index, sink], 'response_ns': response}
 
     def first_miss(self):
         """Return the miss of the earliest deadline, in the result format."""
-        if not self.misses:
-            return None
-        first = min(self.misses, key=lambda miss: miss.deadline)
-        return {'dag': first.dag, 'vertex': first.vertex, 'job': first.job,
-                'deadline_ns': first.deadline * self.tick,
-                'completed_ns': None if first.completed is None else first.completed * self.tick}
+        return min(self.misses, key=lambda miss: miss['deadline_ns'], default=None)

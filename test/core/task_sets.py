@@ -11,15 +11,12 @@ from dataclasses import dataclass
 import json
 
 from hypothesis import strategies as st
-from mddag_executor.core import POLICIES
+from mddag_executor.core import POLICIES, Scheduler, Tables
 from mddag_executor.simulate import END, periodic_load, PREEMPT, Settings, simulate, START
 from msg_graph import loads, TaskSet
 
 TICK = 1_000
 KINDS = {START: 'start', END: 'end', PREEMPT: 'preempt'}
-
-Event = tuple[int, str, int, int, int, int]
-"""(tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job)."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +31,10 @@ class Case:
     dispatch_overhead: int = 0
     switch_overhead: int = 0
 
-    @property
-    def times_ns(self):
-        """Return the execution times as the simulator takes them."""
-        return [[tick * TICK for tick in row] for row in self.ticks]
-
     def load(self, ticks):
         """Return the periodic load of all releases before a time."""
-        return periodic_load(self.task_set, self.times_ns, ticks * TICK)
+        times_ns = [[tick * TICK for tick in row] for row in self.ticks]
+        return periodic_load(self.task_set, times_ns, ticks * TICK)
 
     def run(self, horizon, judge='horizon', stop=False, last_release=None):
         """Simulate it; times in ticks."""
@@ -60,15 +53,11 @@ class Case:
         return [(time // TICK, KINDS[kind], worker, dag, vertex - first[dag], job)
                 for time, kind, worker, dag, vertex, job in run.log]
 
-    def __repr__(self):
-        """Show what is needed to try it by hand."""
+    def _repr_pretty_(self, printer, cycle):
+        """Show in hypothesis' reports what is needed to try it by hand."""
         rest = (self.ticks, self.workers, self.policy, self.preemptive, self.dispatch_overhead,
                 self.switch_overhead)
-        return f'Case(loads({self.task_set.text!r}), {", ".join(map(repr, rest))})'
-
-    def _repr_pretty_(self, printer, cycle):
-        """Show the same in hypothesis' reports."""
-        printer.text(repr(self))
+        printer.text(f'Case(loads({self.task_set.text!r}), {", ".join(map(repr, rest))})')
 
 
 def declaration(callbacks):
@@ -83,6 +72,20 @@ def single(name, period, deadline=None, **more):
     """Declare a DAG of one callback; times in ticks."""
     return {'node': '/n', 'name': name, 'timer': f'{period}us',
             'deadline': f'{deadline or period}us', 'dag': name, **more}
+
+
+JOIN = declaration([
+    {'node': '/n', 'name': 's', 'timer': '100us', 'publishes': ['/s'], 'dag': 'd'},
+    {'node': '/n', 'name': 'x', 'subscription': '/s', 'publishes': ['/x']},
+    {'node': '/n', 'name': 'y', 'subscription': '/s', 'publishes': ['/y']},
+    {'node': '/n', 'name': 'join', 'sync': ['/x', '/y'], 'deadline': '50us'},
+])
+
+
+def live(task_set=JOIN, workers=2, policy_name='rad', **options):
+    """Return a scheduler as the live executor makes it."""
+    tables = Tables.build(task_set, legs=True, groups=False, **options)
+    return Scheduler(tables, workers, policy_name)
 
 
 def _ticks(draw, least, most):
