@@ -135,7 +135,7 @@ def pytest_runtest_setup(item):
 # these, which come first: most of their time they wait, so that both take what is left then.
 ROS = (
     'executor', 'hosting', 'benchmarks', 'launch', 'examples', 'hardening/test_misuse.py',
-    'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph_systems.py',
+    'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph.py',
     'test_docs.py')
 
 # One process compiles the core, which takes half a minute the first time.

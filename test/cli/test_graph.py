@@ -1,122 +1,46 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The verbs `graph check`, `place`, `analyse`, `draw`, `from-caret` and `schema`."""
+"""The verbs `graph …`: what `golden/` cannot show, such as Graphviz and runs of rclpy."""
 
 import json
 from pathlib import Path
+import re
 import shutil
 import sys
 
+from mddag_executor import MultiDeadlineExecutor, open_recording
 import msg_graph
 from msg_graph.language import schema
 import pytest
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from std_srvs.srv import Trigger
 
-CONFIG = Path(__file__).resolve().parents[2] / 'config'
-GRAPH = """\
-mddag: 1  # the robot
-nodes:
-  - node: /a
-    callbacks: [{name: t, timer: 100ms, deadline: 40ms, execution_time: 30ms}]
-  - node: /b
-    callbacks: [{name: t, timer: 100ms, deadline: 40ms, execution_time: 30ms}]
-  - node: /c
-    callbacks: [{name: t, timer: 100ms, deadline: 100ms, execution_time: 10ms}]
-"""
-
-
-def test_standard_input_and_output(call, monkeypatch):
-    monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)
-    text = msg_graph.load(CONFIG / 'autoware_multi.yaml').text
-    done = call('graph', 'check', '-', '--json', '-', stdin=text)
-    assert done.returncode == 0
-    warned = [line.partition(': its deadline is longer than its period, and ')[0]
-              for line in done.stderr.splitlines()]
-    assert warned == ['warning: perception', 'warning: planning']
-    result = json.loads(done.stdout)
-    assert len(result['dags']) == 11
-    control = result['dags']['control']
-    assert control['rad_offset_ns'] == [15_000_000, 30_000_000, *[15_000_000] * 3]
-    assert list(control['sinks'].values()) == [30_000_000, 15_000_000]
-    for workers, shown in (('', '0.100 of 7 workers'),
-                           ('workers: 2\n', '0.350 of 2 workers')):
-        done = call('graph', 'check', '-', stdin=GRAPH.replace('nodes:', f'{workers}nodes:'))
-        assert done.stdout.endswith(f', load 0.700, utilisation {shown}\n')
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ROOT / 'config'
+BAG = ROOT / 'bags' / 'demo_short.mcap'
 
 
 def test_utilisation_is_one_thing_in_all_commands(call, tmp_path):
     (tmp_path / 'g.yaml').write_text(
         'mddag: 1\nworkers: 2\nnodes:\n  - node: /n\n    callbacks:\n'
         '      - {name: t, timer: 10ms, deadline: 10ms, execution_time: 4ms}\n')
-    trace = ['simulate', 'g.yaml', '--duration', '1s', '--trace', 'g.mcap']
     for command in (
-            ['graph', 'check', 'g.yaml'], ['graph', 'analyse', 'g.yaml'], trace,
-            ['replay', 'g.mcap'], ['replay', 'g.mcap', '--reschedule']):
-        result = json.loads(call(*command, '--json', '-', cwd=tmp_path).stdout)
+            'graph check g.yaml', 'graph analyse g.yaml',
+            'simulate g.yaml --duration 1s --trace g.mcap', 'replay g.mcap',
+            'replay g.mcap --reschedule'):
+        result = call(*command.split(), '--json', '-', cwd=tmp_path).result
         assert result['utilisation'] == pytest.approx(0.2, abs=0.002), command
         assert result.get('load', 0.4) == 0.4
 
 
-@pytest.mark.parametrize(('text', 'workers', 'says'), [
-    ('deadline: 10ms, execution_time: 25ms', 4,
-     '/n:t: the longest path to it takes 25 ms, more than its deadline of 10 ms: no scheduler'),
-    ('deadline: 10s, execution_time: 5s', 7,
-     'g.yaml: a load of 250.000 is more than 7 workers can do: no scheduler can keep the deadlin'),
-    ('deadline: 10s, execution_time: 5s', 512,
-     'g.yaml: a load of 250.000 is more than the 2 CPUs of this machine can do, unless callbacks'),
-    ('deadline: 20ms, execution_time: 19ms', 1, None),
-    ('deadline: 10ms', 1, None)])
-def test_what_cannot_hold_is_warned_of(call, tmp_path, monkeypatch, text, workers, says):
-    monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 2)
-    (tmp_path / 'g.yaml').write_text(
-        f'mddag: 1\nworkers: {workers}\nnodes:\n'
-        f'  - {{node: /n, callbacks: [{{name: t, timer: 20ms, {text}}}]}}\n')
-    done = call('graph', 'check', 'g.yaml', '--json', '-', cwd=tmp_path)
-    assert done.returncode == 0
-    if says is None:
-        assert done.stderr == ''
-    else:
-        assert any(line.startswith(f'warning: {says}') for line in done.stderr.splitlines())
-    assert 'dags' in json.loads(done.stdout)
+def test_schema(call, tmp_path):
+    assert call('graph', 'schema').result == schema()
+    assert call('graph', 'schema', '-o', 's.json', cwd=tmp_path) == (0, '', '')
+    assert json.loads((tmp_path / 's.json').read_text()) == schema()
 
 
-def test_rules_of_the_user(graph, call):
-    place = ['graph', 'place', 'graph.yaml', '--processes', '2', '-o', 'placed.yaml']
-    assert call(*place, '--together', '/a, /b').returncode == 0
-    assert msg_graph.load('placed.yaml').process_of('/a') == msg_graph.load(
-        'placed.yaml').process_of('/b')
-    assert call(*place, '--apart', '/a,/c', '--apart', '/b,/c').returncode == 0
-    assert [p.nodes for p in msg_graph.load('placed.yaml').processes] == [('/a', '/b'), ('/c',)]
-
-
-def test_times_of_a_recorded_run(graph, call):
-    Path('times.json').write_text(json.dumps(
-        {f'/{n}': {f'/{n}:t': us} for n, us in (('a', 45_000), ('b', 5_000), ('c', 40_000))}))
-    recorded = call('simulate', 'graph.yaml', '--execution-times', 'times.json', '--trace',
-                    'run.mcap', '--duration', '1s')
-    assert recorded.returncode == 0, recorded.stderr
-    run = call('graph', 'place', 'graph.yaml', '--processes', '2', '--trace', 'run.mcap',
-               '-o', 'placed.yaml', '--json', 'out.json')
-    assert run.returncode == 0, run.stderr
-    result = json.loads(Path('out.json').read_text())
-    assert sorted(result['loads']) == pytest.approx([0.45, 0.45], abs=0.01)
-
-
-GRAPH_ANALYSE = """\
-mddag: 1
-workers: 2
-nodes:
-  - node: /n
-    callbacks:
-      - {name: t, timer: 10ms, deadline: 5ms, execution_time: {quantiles_us: [1000, 2000, 9000]}}
-"""
-
-
-def test_ci_learns_of_deadlines_that_cannot_hold(call):
-    for budget, status in (('mean', 0), ('max', 1)):
-        done = call('graph', 'analyse', '-', '--budget', budget, '--fail-on-unschedulable',
-                    stdin=GRAPH_ANALYSE)
-        assert (done.returncode, done.stderr) == (status, '')
-        assert ('no scheduler can keep' in done.stdout) == bool(status)
+# --- draw ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.needs('graphviz')
@@ -125,7 +49,7 @@ def test_ci_learns_of_deadlines_that_cannot_hold(call):
 def test_graphviz(call, tmp_path, ending, begin):
     text = (CONFIG / 'autoware.yaml').read_text()
     done = call('graph', 'draw', '-', '-o', f'o.{ending}', cwd=tmp_path, stdin=text)
-    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    assert done == (0, '', '')
     assert (tmp_path / f'o.{ending}').read_bytes().startswith(begin)
 
 
@@ -138,9 +62,8 @@ def test_a_large_graph(call, tmp_path):
         lines += [f'      - {{name: c{i}, subscription: /t{dag}, deadline: 20ms}}'
                   for i in range(20)]
     done = call('graph', 'draw', '-', '-o', 'o.svg', cwd=tmp_path, stdin='\n'.join(lines))
-    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
-    text = (tmp_path / 'o.svg').read_text()
-    assert text.count('class="edge"') == 60 * 20
+    assert done == (0, '', '')
+    assert (tmp_path / 'o.svg').read_text().count('class="edge"') == 60 * 20
 
 
 def test_a_dense_graph_is_drawn_quickly(call, tmp_path):
@@ -148,51 +71,126 @@ def test_a_dense_graph_is_drawn_quickly(call, tmp_path):
     lines = ['mddag: 1', 'nodes:',
              '  - {node: /n0, callbacks: [{name: c, timer: 1s, publishes: [/t0]}]}']
     for i in range(1, 30):
-        topics = [f'/t{j}' for j in range(i)]
-        starts = f'sync: [{", ".join(topics)}]' if i > 1 else 'subscription: /t0'
+        topics = ', '.join(f'/t{j}' for j in range(i))
+        starts = f'sync: [{topics}]' if i > 1 else 'subscription: /t0'
         ends = f'publishes: [/t{i}]' if i < 29 else 'deadline: 1s'
         lines.append(f'  - {{node: /n{i}, callbacks: [{{name: c, {starts}, {ends}}}]}}')
-    done = call('graph', 'draw', '-', '-o', 'o.dot', cwd=tmp_path, stdin='\n'.join(lines))
-    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    assert call('graph', 'draw', '-', '-o', 'o.dot', cwd=tmp_path, stdin='\n'.join(lines)) == (
+        0, '', '')
     assert 'nslimit' in (tmp_path / 'o.dot').read_text()
 
 
-def test_without_graphviz(call, tmp_path, monkeypatch):
-    monkeypatch.setenv('PATH', str(Path(sys.executable).parent))
-    if shutil.which('dot') is not None:
+@pytest.mark.parametrize(('dot', 'status', 'says'), [
+    (None, 2, "error: o.svg: this needs Graphviz, and its program 'dot' is not there: install it "
+     "with 'sudo apt install graphviz', or name an OUT.dot or OUT.mmd\n"),
+    ('cat >/dev/null\necho no fonts >&2\nexit 3\n', 2,
+     'error: o.svg: Graphviz failed (no fonts): '),
+    ('sleep 0.7\ncat\n', 0, 'warning: o.svg: Graphviz takes long')])
+def test_graphviz_that_is_missing_fails_or_is_slow(
+        call, tmp_path, monkeypatch, dot, status, says):
+    path = str(Path(sys.executable).parent)
+    if dot is not None:
+        (tmp_path / 'dot').write_text(f'#!/bin/sh\n{dot}')
+        (tmp_path / 'dot').chmod(0o755)
+        path = f'{tmp_path}:/usr/bin:/bin'
+    elif shutil.which('dot', path=path):
         pytest.skip('Graphviz is in the folder of Python')
-    done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr == (
-        "error: o.svg: this needs Graphviz, and its program 'dot' is not there: install it with "
-        "'sudo apt install graphviz', or name an OUT.dot or OUT.mmd\n")
-
-
-def test_graphviz_that_fails(call, tmp_path, monkeypatch):
-    program = tmp_path / 'dot'
-    program.write_text('#!/bin/sh\ncat >/dev/null\necho no fonts >&2\nexit 3\n')
-    program.chmod(0o755)
-    monkeypatch.setenv('PATH', f'{tmp_path}:/usr/bin:/bin')
-    done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith('error: o.svg: Graphviz failed (no fonts): ')
-    assert not (tmp_path / 'o.svg').exists()
-
-
-def test_a_slow_graphviz_is_reported(call, tmp_path, monkeypatch):
-    program = tmp_path / 'dot'
-    program.write_text('#!/bin/sh\nsleep 0.7\ncat\n')
-    program.chmod(0o755)
-    monkeypatch.setenv('PATH', f'{tmp_path}:/usr/bin:/bin')
+    monkeypatch.setenv('PATH', path)
     monkeypatch.setattr('mddag_executor.cli.text.SLOW_S', 0.0)
     done = call('graph', 'draw', CONFIG / 'autoware.yaml', '-o', 'o.svg', cwd=tmp_path)
-    assert done.returncode == 0 and (tmp_path / 'o.svg').exists()
-    assert done.stderr.startswith('warning: o.svg: Graphviz takes long')
-    assert done.stderr.count('\n') == 1
+    assert (done.returncode, done.stderr.count('\n')) == (status, 1)
+    assert done.stderr.startswith(says)
+    assert (tmp_path / 'o.svg').exists() == (status == 0)
 
 
-def test_schema(call, tmp_path):
-    assert call('graph', 'schema').result == schema()
-    done = call('graph', 'schema', '-o', 's.json', cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (0, '')
-    assert json.loads((tmp_path / 's.json').read_text()) == schema()
+# --- from recordings and from ROS ----------------------------------------------------------------
+
+
+def test_from_trace(call, tmp_path):
+    done = call('graph', 'from-trace', BAG, '-o', 'g.yaml', cwd=tmp_path)
+    assert done == (0, 'no blanks to fill in\n', '')
+    before, again = ([
+        (dag.name, dag.period_ns, dag.edges, [(v.name, v.deadline_ns) for v in dag.vertices])
+        for dag in task_set.dags] for task_set in (
+            open_recording(BAG).task_set, msg_graph.load(tmp_path / 'g.yaml')))
+    assert before == again and len(again) == 11
+    text = (tmp_path / 'g.yaml').read_text()
+    done = call('graph', 'from-trace', '-', stdin=BAG.read_bytes())
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.splitlines()[1:] == text.splitlines()[1:]
+    # What differs from it is reported.
+    assert call('replay', BAG, '--json', '-').result['drift'] == []
+    (tmp_path / 'h.yaml').write_text(text.replace('timer: 100ms', 'timer: 200ms'))
+    found = call('replay', BAG, tmp_path / 'h.yaml', '--json', '-').result['drift']
+    assert {each['kind'] for each in found} == {'rate'}
+
+
+def test_from_trace_keeps_what_was_declared(call, mddag, tmp_path):
+    (tmp_path / 'g.yaml').write_text(
+        'mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n      - {name: t, timer: 10ms, '
+        'publishes: [/x], on_late: abort, max_active_jobs: 900, holds_interpreter: false}\n'
+        '      - {name: s, subscription: /x, deadline: 5s}\n'
+        "paths: [{name: p, callbacks: ['/n:t', '/n:s']}]\n")
+    assert mddag('run', 'g.yaml', '--synthetic', 'sleep', '--duration', '0.3s', '--trace',
+                 'r.mcap', cwd=tmp_path).returncode == 0
+    done = call('graph', 'from-trace', 'r.mcap', '-o', 'again.yaml', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    again = msg_graph.load(tmp_path / 'again.yaml')
+    assert again.paths == (msg_graph.Path('p', ('/n:t', '/n:s')),)
+    callback = again.callbacks[0]
+    assert (callback.on_late, callback.max_active_jobs, callback.holds_interpreter) == (
+        'abort', 900, False)
+
+
+def test_a_coroutine_is_one_execution_however_often_it_is_resumed(call, tmp_path, ros_context):
+    node = Node('asking', context=ros_context)
+    group = ReentrantCallbackGroup()
+    answered = []
+
+    def inner(request, response):
+        return response
+
+    async def ask():
+        for _ in range(2):
+            await client.call_async(Trigger.Request())
+        answered.append(True)
+
+    node.create_service(Trigger, 'inner', inner, callback_group=group)
+    client = node.create_client(Trigger, 'inner', callback_group=group)
+    assert client.wait_for_service(10)
+    executor = MultiDeadlineExecutor(
+        None, trace=str(tmp_path / 'ask.mcap'), context=ros_context)
+    executor.add_node(node)
+    node.create_timer(0.05, ask)
+    while len(answered) < 5:
+        executor.spin_once(timeout_sec=1)
+    executor.shutdown()
+    node.destroy_node()
+    done = call('graph', 'from-trace', 'ask.mcap', cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    counts = re.findall(
+        r'name: (\w+)\n(?:(?!.*- name).*\n)*? *# measured in (\d+) ex', done.stdout)
+    assert sorted(counts) == [('ask', '5'), ('inner', '10')]
+
+
+def test_from_ros_where_nothing_runs(mddag, tmp_path):
+    done = mddag('graph', 'from-ros', '--timeout', '0.3', '-o', 'g.yaml', cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith('error: ROS graph: no node ')
+    assert not (tmp_path / 'g.yaml').exists()
+
+
+def test_a_trace_holds_what_its_declaration_includes(call, tmp_path):
+    (tmp_path / 'part.yaml').write_text(
+        'mddag: 1\narguments:\n  d:\nnodes:\n  - {node: /n, callbacks: '
+        '[{name: t, timer: 10ms, deadline: $(d)}]}\n')
+    top = tmp_path / 'top.yaml'
+    top.write_text('mddag: 1\ninclude:\n  - {file: part.yaml, namespace: /a, set: {d: 5ms}}\n'
+                   '  - {file: part.yaml, namespace: /b, set: {d: 6ms}}\n')
+    done = call('simulate', 'top.yaml', '--duration', '100ms', '--trace', 's.mcap',
+                '--execution-times', '-', cwd=tmp_path,
+                stdin='{"/a/n": {"/a/n:t": 10}, "/b/n": {"/b/n:t": 10}}')
+    assert (done.returncode, done.stderr) == (0, '')
+    top.unlink()
+    done = call('replay', 's.mcap', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
