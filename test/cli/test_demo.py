@@ -13,10 +13,10 @@ def test_the_main_job_end_to_end(tmp_path, mddag):
     assert process.returncode == 0, process.stderr
     # A busy machine skips periods, and that is said.
     assert all(line.startswith('[WARN] ') for line in process.stderr.splitlines())
-    live, recorded, rescheduled = (json.loads((tmp_path / f'{name}.json').read_text())
-                                   for name in ('run', 'recorded', 'rescheduled'))
+    live, recorded, rescheduled, every = (
+        json.loads((tmp_path / f'{name}.json').read_text())
+        for name in ('run', 'recorded', 'rescheduled', 'all'))
     assert len(live['dags']) == 11
-    every = json.loads((tmp_path / 'all.json').read_text())
     assert every['live'] == live and every['baseline']['sink_jobs_due'] > 100
     # What the replayer counts is exactly what the executor counted.
     assert 'counts what the executor counted, for 18 of 18 sinks.' in process.stdout

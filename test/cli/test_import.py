@@ -11,37 +11,26 @@ from ..trace.ctf_session import session
 
 HELPER = """\
 import json
-rows = [['ready'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']]],
-        ['event', 0, 5, 1, 2, 'p', [3]], [{last!r}]]
-for row in rows:
+for row in (['ready'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']]],
+            ['event', 0, 5, 1, 2, 'p', [3]], ['nothing']):
     print(json.dumps(row))
 """
 
 
-@pytest.fixture
-def recording(tmp_path, monkeypatch):
-    """Give a folder that looks like a session, read by a stand-in for babeltrace2."""
-    folder = tmp_path / 'session'
-    folder.mkdir()
-    (folder / 'metadata').write_text('/* CTF 1.8 */')
-    helper = tmp_path / 'helper.py'
-    helper.write_text(HELPER.format(last='end'))
+def test_what_was_there_stays_when_the_import_fails(tmp_path, monkeypatch, call):
+    """A folder that looks like a session, read by a stand-in for babeltrace2."""
+    recording, helper, out = (tmp_path / name for name in ('session', 'helper.py', 'out.mcap'))
+    recording.mkdir()
+    (recording / 'metadata').write_text('/* CTF 1.8 */')
+    helper.write_text(HELPER)
     monkeypatch.setattr(ctf, '_HELPER', helper)
     monkeypatch.setattr(ctf, 'interpreters', lambda: [sys.executable])
-    return folder
-
-
-def test_what_was_there_stays_when_the_import_fails(recording, call):
-    out = recording.with_name('out.mcap')
     out.write_text('precious')
-    recording.with_name('helper.py').write_text(HELPER.format(last='nothing'))
-    before = sorted(recording.parent.iterdir())
+    before = sorted(tmp_path.iterdir())
     status, text, errors = call('import', 'ctf', recording, '-o', out, '--overwrite')
-    assert (status, text) == (2, '')
+    assert (status, text, errors.count('\n')) == (2, '', 1)
     assert errors.startswith(f'error: {recording}: babeltrace2 gave up')
-    assert errors.count('\n') == 1
-    assert out.read_text() == 'precious'
-    assert sorted(recording.parent.iterdir()) == before
+    assert out.read_text() == 'precious' and sorted(tmp_path.iterdir()) == before
 
 
 def of_session(folder, name, made, host='robot', callback=1):

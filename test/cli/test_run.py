@@ -17,7 +17,7 @@ from mddag_executor.trace import read_events, TraceError, TraceReader
 from msg_graph import load
 import pytest
 
-from ..conftest import wait_for_run
+from ..conftest import run_program, wait_for_run
 from . import golden
 
 GRAPH = """\
@@ -96,20 +96,10 @@ class Detector(Node):
 """
 
 
-def test_runs_of_undeclared_callbacks_are_those_that_are_listed(folder, mddag):
-    slow = ROBOT.replace('pass\n', 'time.sleep(0.05)\n')    # so that most images are dropped
-    Path('robot.py').write_text(f'import time\n{slow}')
-    done = mddag('run', '--node', 'robot:Camera', '--node', 'robot:Detector', '--duration', '1s')
-    assert done.returncode == 0, done.stderr
-    dropped, = re.findall(r'^(\d+) dropped', done.stdout, re.MULTILINE)
-    every, = re.findall(r'^(\d+) runs of undeclared callbacks: (.*)', done.stdout, re.MULTILINE)
-    assert int(dropped) > 10
-    assert int(every[0]) == sum(map(int, re.findall(r' (\d+)(?:,|$)', every[1])))
-
-
 def test_three_commands_from_a_robot_to_a_verdict(folder, mddag):
     """Recorded without a declaration, which then comes from the recording."""
-    Path('robot.py').write_text(ROBOT)
+    slow = ROBOT.replace('pass\n', 'time.sleep(0.05)\n')    # so that most images are dropped
+    Path('robot.py').write_text(f'import time\n{slow}')
     done = mddag('run', '--node', 'robot:Camera', '--node', 'robot:Detector', '--duration', '1s',
                  '--trace', 'a.mcap')
     assert done.returncode == 0, done.stderr
@@ -117,17 +107,20 @@ def test_three_commands_from_a_robot_to_a_verdict(folder, mddag):
     assert lines[0] == 'no declaration was given, so no deadline was judged'
     assert lines[-1] == ('to judge it: mddag graph from-trace a.mcap --accept -o graph.yaml, then '
                          'mddag replay a.mcap graph.yaml')
+    dropped, = re.findall(r'^(\d+) dropped', done.stdout, re.MULTILINE)
+    every, = re.findall(r'^(\d+) runs of undeclared callbacks: (.*)', done.stdout, re.MULTILINE)
+    assert int(dropped) > 10
+    assert int(every[0]) == sum(map(int, re.findall(r' (\d+)(?:,|$)', every[1])))
     done = mddag('graph', 'from-trace', 'a.mcap', '--accept', '-o', 'g.yaml')
     assert (done.returncode, done.stderr) == (0, '')
     dag, = load('g.yaml').dags
     assert [vertex.callback.key for vertex in dag.vertices] == [
         '/camera:capture', '/detector:detect']
     assert (dag.period_ns, dag.vertices[1].deadline_ns) == (20_000_000, 20_000_000)
-    done = mddag('replay', 'a.mcap', 'g.yaml', '--json', 'r.json')
-    assert done.returncode == 0, done.stderr
-    ran = int(re.findall(r'/detector: detect \(subscription /image\) (\d+)', '\n'.join(lines))[0])
-    sink = json.loads(Path('r.json').read_text())['dags']['/camera']['sinks']['/detector:detect']
-    assert sink['completed'] == ran > 0  # on a busy machine the last one may not get to run
+    result = mddag('replay', 'a.mcap', 'g.yaml', '--json', '-').result
+    ran = int(re.findall(r'/detector: detect \(subscription /image\) (\d+)', every[1])[0])
+    sink = result['dags']['/camera']['sinks']['/detector:detect']
+    assert sink['completed'] == ran > 0
 
 
 @pytest.mark.parametrize(('tolerate', 'status', 'processes'), [
@@ -170,32 +163,12 @@ def releases():
     return []
 
 
-def recorded_ns():
-    """Return from which release to which the trace has got."""
-    found = releases()
-    return found[-1] - found[0] if found else 0
-
-
-@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_a_synthetic_run(graph, number):
-    with started(graph) as process:
-        # The window begins after the warm-up of 1 s.
-        wait_for_run(process, lambda: recorded_ns() > 2 * 10 ** 9)
-        process.send_signal(number)
-        out, err = process.communicate(timeout=60)
-    assert process.returncode == 0
-    assert 'Traceback' not in err
-    result = json.loads(Path('result.json').read_text())
-    assert result['measured']['window_ns'] > 0
-    assert result['dags']['main']['sinks']['/slow:cb']['completed'] >= len(releases()) > 0
-    assert 'results due' in out
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_that_comes_twice_is_one(graph, number):
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_run_also_if_it_comes_twice(graph, number):
     """Who ends a process group sends one, and `ros2 launch` sends its own, too."""
     with started(graph) as process:
-        wait_for_run(process, lambda: bool(releases()))
+        # The window begins after the warm-up of 1 s.
+        wait_for_run(process, lambda: max(found := releases() or [0]) - found[0] > 2 * 10 ** 9)
         begin = time.monotonic()
         while process.poll() is None and time.monotonic() < begin + 0.3:  # on to its very end
             process.send_signal(number)
@@ -203,6 +176,9 @@ def test_a_signal_that_comes_twice_is_one(graph, number):
         out, err = process.communicate(timeout=60)
     assert process.returncode == 0 and 'Traceback' not in err, err
     assert 'results due' in out and 'trace: ' in out
+    result = json.loads(Path('result.json').read_text())
+    assert result['measured']['window_ns'] > 0
+    assert result['dags']['main']['sinks']['/slow:cb']['completed'] >= len(releases()) > 0
     assert [event['_name'] for event in read_events('out.mcap')].count('mddag:task_set') == 1
 
 
@@ -234,24 +210,22 @@ def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph):
 # --- tables --------------------------------------------------------------------------------------
 
 
-def sink(completed, late=0, **more):
-    return {
-        'relative_deadline_ns': 30_000_000, 'completed': completed, 'late': late, 'expired': 0,
-        'response_ns': {'min': 1, 'median': 2_000_000, 'p99': 3_000_000, 'max': 4_000_000}, **more}
-
-
 def test_what_missed_most_comes_first_and_is_red_on_a_terminal(monkeypatch):
-    dags = {'one': {'sinks': {'/n:good': sink(10), '/n:some': sink(10, 2)}},
-            'two': {'sinks': {'/n:most': sink(10, 9)}}}
+    def sink(late):
+        response = {'min': 1, 'median': 2_000_000, 'p99': 3_000_000, 'max': 4_000_000}
+        return {'relative_deadline_ns': 30_000_000, 'completed': 10, 'late': late, 'expired': 0,
+                'response_ns': response}
+
+    dags = {'one': {'sinks': {'/n:good': sink(0), '/n:some': sink(2)}},
+            'two': {'sinks': {'/n:most': sink(9)}}}
     plain = sink_table(dags)
     assert [line.split()[:2] for line in plain.splitlines()[1:]] == [
         ['two', 'n:most'], ['one', 'n:some'], ['n:good', '10']]
     monkeypatch.setattr(sys.stdout, 'isatty', lambda: True)
     monkeypatch.setenv('TERM', 'xterm')
     monkeypatch.delenv('NO_COLOR', raising=False)
-    lines = sink_table(dags).splitlines()
-    assert [line.startswith('\x1b[31m') and line.endswith('\x1b[0m') for line in lines] == [
-        False, True, True, False]
+    assert [line.startswith('\x1b[31m') and line.endswith('\x1b[0m')
+            for line in sink_table(dags).splitlines()] == [False, True, True, False]
     for name, value in (('TERM', 'dumb'), ('NO_COLOR', '1')):
         with monkeypatch.context() as here:
             here.setenv(name, value)
@@ -267,8 +241,15 @@ def test_a_share_is_never_rounded_to_all_or_nothing(part, whole, text):
 
 # --- what a node raises --------------------------------------------------------------------------
 
+ONE_TIMER = """\
+mddag: 1
+nodes:
+  - {node: /n, callbacks: [{name: tick, timer: 20ms, deadline: 10ms, execution_time: 1ms}]}
+"""
 BAD_NODES = """\
+import os
 from rclpy.node import Node
+start = os.getcwd()
 
 
 class Calibrated(Node):
@@ -289,26 +270,47 @@ class Uncalibrated(Node):
 
 def main():
     open('/calibration/lidar.yaml')
-"""
-ONE_TIMER = """\
-mddag: 1
-nodes:
-  - {node: /n, callbacks: [{name: tick, timer: 20ms, deadline: 10ms, execution_time: 1ms}]}
+
+
+class Odd(BaseException):
+
+    def __str__(self):
+        raise ValueError('it has no text')
+
+
+class Talker(Calibrated):
+
+    def __init__(self):
+        super().__init__()
+        os.chdir('elsewhere')
+
+    def tick(self):
+        raise Odd
+
+
+def odd():
+    os.chdir('elsewhere')
+    raise Odd
+
+
+def leave():
+    import shutil
+    os.chdir('../other/deep')
+    shutil.rmtree(start)
+    return Node('n')
 """
 
 
 @pytest.mark.parametrize(('verb', 'spec'), [
     ('run', 'bad:Calibrated'), ('run', 'bad:Uncalibrated'), ('run', 'bad:main'),
     ('run', 'bad_module:main'), ('rerun', 'bad:Calibrated'), ('rerun', 'bad:main')])
-def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(folder, mddag, verb, spec):
+def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(
+        folder, call, mddag, verb, spec):
     Path('n.yaml').write_text(ONE_TIMER)
     Path('bad.py').write_text(BAD_NODES)
     Path('bad_module.py').write_text("open('/calibration/lidar.yaml')\n")
-    recording = []
-    if verb == 'rerun':
-        recording = ['drive.mcap']
-        assert mddag(
-            'simulate', 'n.yaml', '--duration', '100ms', '--trace', 'drive.mcap').returncode == 0
+    recording = ['drive.mcap'] * (verb == 'rerun')
+    assert call('simulate', 'n.yaml', '--duration', '100ms', '--trace', 'drive.mcap')[0] == 0
     done = mddag(verb, *recording, 'n.yaml', '--node', spec)
     assert done.returncode == 70, done.stderr
     lines = done.stderr.splitlines()
@@ -319,85 +321,35 @@ def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(folder, mddag,
     assert lines[-1].startswith(f'error: {place} ') and 'FileNotFoundError' in lines[-1]
 
 
-ODD_NODES = """\
-import os
-from rclpy.node import Node
-
-
-class Odd(BaseException):
-
-    def __str__(self):
-        raise ValueError('it has no text')
-
-
-class Talker(Node):
-
-    def __init__(self):
-        super().__init__('n')
-        os.chdir('elsewhere')
-        self.create_timer(0.02, self.tick)
-
-    def tick(self):
-        raise Odd
-
-
-def main():
-    os.chdir('elsewhere')
-    raise Odd
-"""
-
-
-@pytest.mark.parametrize('spec', ['odd:Talker', 'odd:main'])
+@pytest.mark.parametrize('spec', ['bad:Talker', 'bad:odd'])
 def test_nodes_that_change_the_folder_and_raise_what_has_no_text(folder, mddag, spec):
     Path('n.yaml').write_text(ONE_TIMER)
-    Path('odd.py').write_text(ODD_NODES)
+    Path('bad.py').write_text(BAD_NODES)
     Path('elsewhere').mkdir()
     Path('elsewhere', 'out.mcap').touch()
     done = mddag('run', 'n.yaml', '--node', spec, '--trace', 'out.mcap', '--json', 'result.json')
-    ran = spec == 'odd:Talker'
-    assert done.returncode == 70, done.stderr
-    assert 'Odd: <' in done.stderr.splitlines()[-1]
+    ran = spec == 'bad:Talker'
+    assert done.returncode == 70 and 'Odd: <' in done.stderr.splitlines()[-1], done.stderr
     assert os.listdir('elsewhere') == ['out.mcap']
     assert [Path(name).exists() for name in ('out.mcap', 'result.json')] == [ran, ran]
-
-
-LEAVES = """\
-import os, shutil
-from rclpy.node import Node
-start = os.getcwd()
-os.chdir('../other/deep')
-
-
-def leave():
-    shutil.rmtree(start)
-    return Node('n')
-"""
 
 
 def test_a_node_may_remove_the_folder_in_which_the_run_began(folder, mddag):
     """The trace is where it was named, and the summary is printed."""
     Path('start').mkdir()
     Path('other/deep').mkdir(parents=True)
-    Path('start/leaves.py').write_text(LEAVES)
-    done = mddag('run', '--node', 'leaves:leave', '--duration', '100ms', '--trace', '../out.mcap',
+    Path('start/bad.py').write_text(BAD_NODES)
+    done = mddag('run', '--node', 'bad:leave', '--duration', '100ms', '--trace', '../out.mcap',
                  cwd='start')
     assert done.returncode == 0, done.stderr
     assert 'graph from-trace ../out.mcap ' in done.stdout
     assert sorted(os.listdir()) == ['other', 'out.mcap'] and os.listdir('other') == ['deep']
 
 
-STUCK = """\
-import sys
-from mddag_executor.cli import main, run
-run.STUCK_S = 0.5
-sys.exit(main.main(sys.argv[1:]))
-"""
-
-
 def test_an_end_that_takes_too_long_shows_the_stack_of_each_thread(folder):
     Path('slow.py').write_text(ROBOT.replace('pass\n', '__import__("time").sleep(3)\n'))
-    done = subprocess.run(
-        [sys.executable, '-c', STUCK, 'run', '--node', 'slow:Camera', '--node', 'slow:Detector',
-         '--duration', '500ms'], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stderr.count('Timeout') == 1
-    assert done.stderr.count(' in detect') == 1
+    code = ('import sys; from mddag_executor.cli import main, run; run.STUCK_S = 0.5\n'
+            'sys.exit(main.main(sys.argv[1:]))')
+    _, err = run_program(code, 'run', '--node', 'slow:Camera', '--node', 'slow:Detector',
+                         '--duration', '500ms')
+    assert (err.count('Timeout'), err.count(' in detect')) == (1, 1)

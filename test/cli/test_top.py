@@ -1,6 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 
+from contextlib import suppress
 import json
 import os
 from pathlib import Path
@@ -37,32 +38,21 @@ DAG = {'window_missed_ratio': '0', 'jobs': '7', 'period_ms': '20.000'}
 POOL = {'idle_workers': '5', 'callbacks_per_s': '12.5', 'busy_ratio': '0.250'}
 
 
-# --- what is shown -------------------------------------------------------------------------------
-
-
-def test_a_process_that_says_nothing_any_more_is_gone():
+def test_a_board():
     now = [0.0]
     board = Board(lambda: now[0])
+    board.take(array(('a/1', 'mddag: workers', 0, POOL)))
+    assert tables(board.statuses(), 120).split()[0] == 'workers'    # no table of DAGs
     board.take(array(('a/1', 'mddag: x', 0, DAG)))
     now[0] = GONE_AFTER_S
     assert board.statuses()[0].level == 'OK'
     now[0] += 1
     assert (board.statuses()[0].level, board.statuses()[0].message) == (
         'GONE', 'nothing heard for 6 s')
-
-
-def test_names_cannot_command_the_terminal():
-    board = Board()
+    # Names cannot command the terminal.
     board.take(array((EVIL, EVIL, 1, {**DAG, 'jobs': EVIL}), (EVIL + 'b', EVIL, 9, POOL)))
     for text in (tables(board.statuses()), tables(board.statuses(), 400)):
-        assert '\x1b' not in text and '\x07' not in text
-        assert '\\x1b]0;owned' in text
-
-
-def test_without_declaration_there_is_no_table_of_dags():
-    board = Board()
-    board.take(array(('a/1', 'mddag: workers', 0, POOL)))
-    assert tables(board.statuses(), 120).split()[0] == 'workers'
+        assert '\x1b' not in text and '\x07' not in text and '\\x1b]0;owned' in text
 
 
 def board_of_autoware(*processes):
@@ -103,9 +93,6 @@ def test_names_and_verdicts_are_whole_in_every_terminal(width, processes):
         golden.compare(f'top_{width}', tables(statuses, width))
 
 
-# --- over ROS ------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def running(tmp_path):
     """Run a graph in another process; its diagnostics come every 0.2 s."""
@@ -141,27 +128,20 @@ def test_live_in_a_terminal_until_the_user_ends_it(running):
     if pid == 0:
         os.environ.update(TERM='xterm-256color', COLUMNS='80', LINES='40')
         os.execv(sys.executable, [sys.executable, '-m', 'mddag_executor', 'top'])
-    shown = b''
+    shown, ended = b'', False
     end = time.monotonic() + 30
-    ended = False
-    while time.monotonic() < end:
-        if select.select([terminal], [], [], 0.2)[0]:
-            try:
-                data = os.read(terminal, 65536)
-            except OSError:
-                break  # how Linux says that the other side is closed
-            if not data:
-                break
-            shown += data
-        if shown.count(b'mddag: main') >= 3 and not ended:
-            ended = True
-            os.kill(pid, signal.SIGINT)
+    with suppress(OSError):     # how Linux says that the other side is closed
+        while time.monotonic() < end:
+            if select.select([terminal], [], [], 0.2)[0]:
+                shown += os.read(terminal, 65536)
+            if shown.count(b'mddag: main') >= 3 and not ended:
+                ended = True
+                os.kill(pid, signal.SIGINT)
     _, status = os.waitpid(pid, 0)
     os.close(terminal)
     assert os.waitstatus_to_exitcode(status) == 0
     text = shown.decode()
-    assert '\x1b[H\x1b[J' in text
-    assert 'workers of' in text and 'Traceback' not in text
+    assert '\x1b[H\x1b[J' in text and 'workers of' in text and 'Traceback' not in text
 
 
 def test_no_process_to_hear(call):
