@@ -1,15 +1,13 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Drafts of the system that runs now: what a graph gives, and a real one."""
+"""Drafts of the system that runs now."""
 
 import re
-import threading
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.hosting.graph_probe import draft_of, probe, Seen
 from msg_graph import loads
 from msg_graph.draft import declaration_of, MARK
-import pytest
 from std_msgs.msg import Empty, String
 
 from ..executor.conftest import Spinning, wait_for
@@ -24,34 +22,19 @@ def test_lost_messages_of_one_publisher_are_known_by_their_numbers():
     assert (seen.interval_ns(1), seen.interval_ns(2)) == (10 * MS, 20 * MS)
 
 
-@pytest.fixture
-def system(make_node):
-    """Give a camera at 50 Hz, what works on its images, and a topic of a type that is nowhere."""
+def test_a_real_system(make_node, ros_context):
+    """A camera at 50 Hz, what works on its images, and our own nodes, which are left out."""
     camera, worker = make_node('camera'), make_node('worker', namespace='/deep')
-    images = camera.create_publisher(String, '/image', 10)
-    results = worker.create_publisher(Empty, '/result', 10)
-    worker.create_subscription(String, '/image', lambda _: None, 10)
-    worker.create_publisher(Empty, '/never', 10)
-    end = threading.Event()
-
-    def run():
-        while not end.wait(0.02):
-            images.publish(String(data='x'))
-            results.publish(Empty())
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        end.set()
-        thread.join()
-
-
-def test_a_real_system(system, make_node, ros_context):
-    ticks = []
     watcher = make_node('watcher')
-    with Spinning(MultiDeadlineExecutor(diagnostics_period='100ms', context=ros_context)):
+    images = camera.create_publisher(String, '/image', 10)
+    camera.create_timer(0.02, lambda: images.publish(String()))
+    worker.create_subscription(String, '/image', lambda _: None, 10)
+    for topic in ('/result', '/never'):
+        worker.create_publisher(Empty, topic, 10)
+    executor = MultiDeadlineExecutor(diagnostics_period='100ms', context=ros_context)
+    executor.add_node(camera)
+    ticks = []
+    with Spinning(executor):
         assert wait_for(lambda: [
             name for name in watcher.get_node_names() if 'mddag_diagnostics' in name])
         for seconds in (2.5, 10.0, 30.0):   # a busy machine discovers late

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unmodified programs on our executor, each a real `mddag run --node`; how they are found."""
 
-from contextlib import suppress
 import json
 import os
 from pathlib import Path
@@ -15,7 +14,6 @@ import time
 
 from mddag_executor.hosting.host import Host
 from mddag_executor.hosting.loading import LoadingError, Program, resolve
-from mddag_executor.trace import TraceError, TraceReader
 import pytest
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
@@ -32,152 +30,102 @@ def world(tmp_path, monkeypatch):
     return make_workspace(tmp_path, monkeypatch)
 
 
-def run(*specs, until=None, number=signal.SIGINT):
-    """
-    Run programs until something is true, which a signal ends then, or until they end.
-
-    Return the result, and what they printed.
-    """
-    nodes = [argument for spec in specs for argument in ('--node', spec)]
-    with open('out.txt', 'w') as out, subprocess.Popen(
-        [sys.executable, '-m', 'mddag_executor', 'run', 'graph.yaml', *nodes, '--json',
-         'result.json', '--trace', 'out.mcap'], stdout=out, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, 'PYTHONUNBUFFERED': '1'},
-    ) as process:
-        try:
-            if until is not None:
-                assert wait_for(until, 60.0), (process.poll(), Path('out.txt').read_text())
-                process.send_signal(number)
-            _, err = process.communicate(timeout=60)
-        finally:
-            process.kill()
-    assert process.returncode == 0, err
-    # A busy machine skips releases and misses deadlines, and this is said; nodes of one name, too.
-    expected = 'cannot keep its rate', 'Publisher already registered'
-    assert [line for line in err.splitlines() if not any(text in line for text in expected)
-            and not re.search(r'\d deadlines? missed', line)] == []
-    result = json.loads(Path('result.json').read_text())
-    return result, Path('out.txt').read_text()
-
-
-def has_heard():
-    """Tell whether the trace has the listener's callback, the second of the graph, ten times."""
-    with suppress(OSError, TraceError):
-        complete = TraceReader('out.mcap').events({'mddag:complete'})
-        return sum(event[6] == 1 for event in complete) > 10
-    return False
-
-
 def heard(result):
     sink = result['dags']['/talker']['sinks']['/listener:heard']
     return int(sink['completed'])
 
 
-@pytest.mark.parametrize(('listener', 'said'), [
-    ('chat:main', 'listener ended after its spin'),
-    ('chat:two', ''),
-    ('chat:own_executor', 'own executor ended'),
-    ('chat:events_executor', ''),
-    ('chat:spins_once_for_ever', 'no longer ok'),
-    ('chat:catches_signals', 'read the settings again'),
-])
-def test_unmodified_programs_run_on_our_executor(world, listener, said):
-    result, output = run('chat_nodes/talker', listener, until=has_heard)
-    assert heard(result) > 5
-    assert result['never_ran'] == []
-    assert result['callbacks']['/talker:tick']['ran'] >= heard(result)
-    # Every message was attributed to a job of the talker's timer.
-    assert result['undeclared'] <= 2
-    assert said in output
-
-
-@pytest.mark.parametrize(('specs', 'lines'), [
-    ('chat:spins_in_thread chat:calls_a_service chat:steps', [
-        'heard five', 'thread joined', 'answer: forty-two', '30 steps']),
-    ('chat:spins_once chat:ends_in_a_thread', ['heard enough', 'over']),
-    ('chat:handles_a_signal', [
+# What each program prints until it only waits; what it prints when the run ends.
+GOES_ON = {
+    'two': ['first heard five'],
+    'own_executor': ['own heard five'],
+    'events_executor': ['events heard five'],
+    'spins_in_thread': ['in_thread heard five', 'thread joined'],
+    'spins_once': ['once heard five', 'once ended'],
+    'spins_once_for_ever': ['for_ever heard five'],
+    'steps': ['30 steps'],
+    'calls_a_service': ['answer: forty-two'],
+    'ends_in_a_thread': ['timed, ok: False'],
+    'catches_signals': ['catcher heard five', 'read the settings again'],
+    'handles_a_signal': [
         f'while it worked: signal {signal.SIGUSR1:d}', f'while it spun: signal {signal.SIGUSR1:d}',
-        'one handler: True']),
-    ('chat:handles_its_exceptions', ['<lambda> raised odd', 'spin raised odd']),
-    ('chat:spins_in_callbacks', [
-        'of the node forty-two', 'of rclpy forty-two', 'step by step forty-two',
-        'step by step of rclpy forty-two']),
-])
-def test_programs_go_on_while_their_callbacks_run(world, specs, lines):
-    run('chat_nodes/talker', *specs.split(),
-        until=lambda: set(lines) <= set(Path('out.txt').read_text().splitlines()))
+        'one handler: True'],
+    'handles_its_exceptions': ['rclpy raised odd', 'executor raised odd'],
+    'spins_in_callbacks': [
+        f'{way} forty-two' for way in (
+            'of the node', 'of rclpy', 'step by step', 'step by step of rclpy')],
+    'main': ['listener heard five'],
+}
+AT_THE_END = ['listener ended after its spin', 'own executor ended', 'no longer ok']
 
 
-def test_the_run_ends_when_a_callback_shuts_rclpy_down(world):
-    _, output = run('chat_nodes/talker', 'chat:shuts_down_in_a_callback')
-    assert 'shut down' in output
+def test_unmodified_programs_run_on_our_executor(world):
+    """All side by side."""
+    def missing(lines):
+        said = Path('out.txt').read_text()
+        return [line for line in lines if line not in said]  # threads may share a line
+
+    lines = [line for some in GOES_ON.values() for line in some]
+    nodes = [word for name in ('chat_nodes/talker', *(f'chat:{name}' for name in GOES_ON))
+             for word in ('--node', name)]
+    with open('out.txt', 'w') as out, subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', 'run', 'graph.yaml', *nodes, '--json',
+         'result.json'], stdout=out, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, 'PYTHONUNBUFFERED': '1'},
+    ) as process:
+        try:
+            wait_for(lambda: not missing(lines), 60.0)
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 0, err
+    assert missing(lines + AT_THE_END) == []
+    # A busy machine skips releases and misses deadlines, and this is said.
+    assert [line for line in err.splitlines() if 'cannot keep its rate' not in line
+            and not re.search(r'\d deadlines? missed', line)] == []
+    result = json.loads(Path('result.json').read_text())
+    assert result['never_ran'] == []
+    assert result['callbacks']['/talker:tick']['ran'] >= heard(result) > 0
+    # Every message was attributed to a job of the talker's timer.
+    assert result['callbacks']['/listener:heard']['unattributed'] <= 2
 
 
-def test_the_run_ends_when_all_programs_have_ended(world):
-    _, output = run('chat:never_spins')
-    assert 'typed w' in output.splitlines()
+def test_a_run_ends_with_its_last_program(world, mddag):
+    done = mddag('run', 'graph.yaml', '--node', 'chat:never_spins')
+    assert done.returncode == 0, done.stderr
+    assert 'typed w' in done.stdout.splitlines()
 
 
-@pytest.mark.parametrize(('spec', 'message'), [
-    ('chat:exits', 'it failed while starting (SystemExit: 3'),
-    ('chat:own_context', 'node /alone has a context of its own: let it use the default context'),
-    ('chat:other_domain', 'it asks for ROS domain 7, and this process is in another: set '),
-    ('chat:returns_text', 'it returned a str, which is no rclpy node'),
-    ('chat:returns_nothing', 'it ended and neither returned a node nor initialised rclpy'),
-])
-def test_a_program_that_cannot_start_ends_the_run_with_one_line(world, mddag, spec, message):
-    process = mddag('run', 'graph.yaml', '--node', spec, '--trace', 'out.mcap')
-    assert process.returncode == 2
-    assert process.stderr.startswith(f'error: --node {spec}: {message}')
-    assert process.stderr.count('\n') == 1
-    assert not Path('out.mcap').exists()
+@pytest.mark.parametrize(('names', 'lines'), [
+    (['no_longer_spins'], ['results due']),     # no spin waits for what its callback raises
+    (['raises_in_a_callback', 'shuts_down_in_a_callback'], [
+        '--node chat:raises_in_a_callback: its main has raised ZeroDivisionError',
+        'its nodes run no more', 'shut down', 'results due'])])
+def test_exceptions_come_out_behind_the_summary(world, mddag, names, lines):
+    """A callback that shuts rclpy down ends the run, one that raises ends its program."""
+    done = mddag('run', 'graph.yaml', '--duration', '50s', *(
+        word for name in names for word in ('--node', f'chat:{name}')))
+    assert done.returncode == 70
+    assert 'ZeroDivisionError' in done.stderr.splitlines()[-1]
+    for line in lines:
+        assert line in done.stdout + done.stderr
 
 
-def test_an_exception_during_the_run_comes_out_behind_the_summary(world, mddag):
-    spec, message = 'chat:raises_in_a_callback', 'ZeroDivisionError'
-    process = mddag(
-        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '2s')
-    assert process.returncode == 70
-    assert message in process.stderr.splitlines()[-1]
-    assert f'--node {spec}: its main has raised {message}' in process.stderr
-    assert 'its nodes run no more' in process.stderr
-    assert 'results due' in process.stdout
-
-
-def test_exceptions_that_no_spin_waits_for_end_the_run(world, mddag):
-    process = mddag('run', 'graph.yaml', '--node', 'chat:no_longer_spins', '--duration', '50s')
-    assert process.returncode == 70
-    assert 'ZeroDivisionError' in process.stderr.splitlines()[-1]
-    assert 'results due' in process.stdout
-
-
-@pytest.mark.parametrize(('spec', 'warning'), [
-    ('chat:leaves_a_thread', 'threads that nodes started still run and are left behind: stubborn'),
-    ('chat:never_ends', '--node chat:never_ends: its main() has not ended in time'),
-    ('chat:blocks_in_a_callback', 'a callback has not ended in time; it is left behind'),
-])
-def test_what_does_not_end_is_left_behind(world, mddag, spec, warning):
-    process = mddag(
-        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', spec, '--duration', '1s')
-    assert process.returncode == 0
-    assert warning in process.stderr
-    assert 'results due' in process.stdout
-
-
-def test_what_nodes_print_stays_out_of_the_json(world, mddag):
-    process = mddag('run', 'graph.yaml', '--node', 'chat:prints', '--duration', '0.2s',
-                    '--json', '-')
-    assert json.loads(process.stdout)['nodes'] == ['chat:prints']
-    assert 'not JSON' in process.stderr
-
-
-def test_ros_arguments_reach_the_nodes(world, mddag):
+def test_what_does_not_end_is_left_behind(world, mddag):
+    """ROS arguments reach all nodes, and what they print stays out of the JSON."""
     (world / 'graph.yaml').write_text(GRAPH.replace('/chatter', '/talk'))
-    process = mddag(
-        'run', 'graph.yaml', '--node', 'chat_nodes/talker', '--node', 'chat:Listener',
-        '--duration', '1s', '--json', '-', '--ros-args', '-r', 'chatter:=talk')
-    assert process.returncode == 0, process.stderr
-    assert heard(json.loads(process.stdout)) >= 3
+    specs = ('chat_nodes/talker', 'chat:Listener', 'chat:leaves_a_thread', 'chat:never_ends',
+             'chat:blocks_in_a_callback')
+    done = mddag('run', 'graph.yaml', *(word for spec in specs for word in ('--node', spec)),
+                 '--duration', '1s', '--json', '-', '--ros-args', '-r', 'chatter:=talk')
+    assert heard(done.result) >= 3 and done.result['nodes'] == [*specs]
+    for line in (
+        'not JSON', 'warning: a callback has not ended in time; it is left behind',
+        'warning: --node chat:never_ends: its main() has not ended in time; it is left behind',
+        'warning: threads that nodes started still run and are left behind: stubborn',
+    ):
+        assert line in done.stderr.splitlines()
 
 
 @pytest.fixture
@@ -218,27 +166,24 @@ def test_rclpy_is_as_before_when_the_host_is_left(default_context):
     host.executor.shutdown()
 
 
-@pytest.mark.parametrize('ends', [False, True])
-def test_a_hangup_ends_the_run_unless_a_running_program_handles_it(
-        default_context, monkeypatch, ends):
+def test_a_hangup_ends_the_run_unless_a_running_program_handles_it(default_context):
     """Programs that have ended handle nothing."""
     got = []
 
     def main():
         rclpy.init()
         signal.signal(signal.SIGHUP, lambda *_: got.append('program'))
-        if ends:
-            rclpy.shutdown()
-            return None
         return Node('node')
 
     before = signal.signal(signal.SIGHUP, lambda *_: got.append('run'))
     try:
         with Host() as host:
             host.start(SingleThreadedExecutor(), [Program('main', 'main', main)])
-            assert wait_for(lambda: host.guests[0].ended == ends)
             os.kill(os.getpid(), signal.SIGHUP)
-            assert wait_for(lambda: got == ['run' if ends else 'program'])
+            assert wait_for(lambda: got == ['program'])
+            host.program_ended(host.guests[0])
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert wait_for(lambda: got == ['program', 'run'])
     finally:
         signal.signal(signal.SIGHUP, before)
     host.executor.shutdown()
@@ -269,14 +214,24 @@ def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host, kind):
     assert host.executor.get_nodes() == []
 
 
-@pytest.mark.parametrize(('spec', 'argv0'), [
-    ('chat_nodes/talker', '{world}/ws/lib/chat_nodes/talker'),
-    ('chat:main', 'chat'),
-    ('chat:Listener', 'chat'),
+@pytest.mark.parametrize(('spec', 'message'), [
+    ('chat:exits', 'it failed while starting (SystemExit: 3'),
+    ('chat:own_context', 'node /alone has a context of its own: let it use the default context'),
+    ('chat:other_domain', 'it asks for ROS domain 7, and this process is in another: set '),
+    ('chat:returns_text', 'it returned a str, which is no rclpy node'),
+    ('chat:returns_nothing', 'it ended and neither returned a node nor initialised rclpy'),
 ])
-def test_what_exists_is_found(world, spec, argv0):
-    program = resolve(spec)
-    assert (program.spec, program.argv0) == (spec, argv0.format(world=world))
+def test_a_program_that_cannot_start(world, default_context, spec, message):
+    with Host() as host, pytest.raises(LoadingError) as error:
+        host.start(SingleThreadedExecutor(), host.load([spec]))
+    assert str(error.value).startswith(f'--node {spec}: {message}')
+    host.executor.shutdown()
+
+
+def test_a_program_that_cannot_start_ends_the_run_with_one_line(world, mddag):
+    done = mddag('run', 'graph.yaml', '--node', 'chat:exits', '--trace', 'out.mcap')
+    assert (done.returncode, done.stderr.count('\n')) == (2, 1)
+    assert not Path('out.mcap').exists()
 
 
 def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(world, monkeypatch):
@@ -288,6 +243,8 @@ def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(world, mon
     seen = sys.modules.pop('mine_argv').seen
     assert seen == ['mine_argv', '--rate', '2 Hz', '--ros-args', '-r', 'a:=b']
     assert program.arguments == ('--rate', '2 Hz') and sys.argv is before
+    assert (program.spec, program.argv0) == ("mine_argv:main --rate '2 Hz'", 'mine_argv')
+    assert resolve('chat_nodes/talker').argv0 == f'{world}/ws/lib/chat_nodes/talker'
 
 
 def test_what_does_not_exist_is_said_on_one_line(world):

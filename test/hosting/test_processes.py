@@ -13,12 +13,14 @@ import sys
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
 from mddag_executor.hosting import processes
+from mddag_executor.hosting.session import Session
 from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
 
 from ..conftest import wait_for_run
+from .test_supervisor import Idle
 from .workspace import TWO_PROCESSES
 
 GUESTS = Path(__file__).resolve().parent / 'guests'
@@ -44,35 +46,10 @@ NODES = [argument for name in ('sensor', 'first', 'second', 'last')
 @pytest.fixture
 def world(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
-        [str(GUESTS), *filter(None, [os.environ.get('PYTHONPATH')])]))
+    monkeypatch.setenv('PYTHONPATH', str(GUESTS), prepend=os.pathsep)
     monkeypatch.setenv('RELAY_MARK', str(tmp_path / 'enough'))
-    (tmp_path / 'chain.yaml').write_text(CHAIN)
     (tmp_path / 'graph.yaml').write_text(CHAIN + PROCESSES)
     return tmp_path
-
-
-class Running:
-    """A run that goes on; its processes by name."""
-
-    def __init__(self, process):
-        self.process = process
-
-    def pids(self):
-        """Return the processes of the run that there are now."""
-        found = {}
-        children = Path(f'/proc/{self.process.pid}/task/{self.process.pid}/children')
-        for pid in children.read_text().split():
-            words = Path(f'/proc/{pid}/cmdline').read_bytes().decode().split('\0')
-            if '--process' in words:
-                found[words[words.index('--process') + 1]] = int(pid)
-        return found
-
-    def end(self):
-        """Wait for its end; return the result, and what it printed."""
-        out, err = self.process.communicate(timeout=60)
-        assert Path('result.json').exists(), err
-        return json.loads(Path('result.json').read_text()), out, err
 
 
 @contextmanager
@@ -82,9 +59,27 @@ def running(*arguments):
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:
         try:
-            yield Running(process)
+            yield process
         finally:
             process.kill()  # its processes end with it
+
+
+def pids(process):
+    """Return the processes of a run that there are now, by name."""
+    found = {}
+    children = Path(f'/proc/{process.pid}/task/{process.pid}/children')
+    for pid in children.read_text().split():
+        words = Path(f'/proc/{pid}/cmdline').read_bytes().decode().split('\0')
+        if '--process' in words:
+            found[words[words.index('--process') + 1]] = int(pid)
+    return found
+
+
+def end(process):
+    """Wait for the end of a run; return the result, and what it printed."""
+    out, err = process.communicate(timeout=60)
+    assert Path('result.json').exists(), err
+    return json.loads(Path('result.json').read_text()), out, err
 
 
 def test_synthetic_nodes_in_two_processes_are_one_run(world, mddag):
@@ -119,55 +114,50 @@ def test_a_process_by_itself_does_not_judge_the_jobs_of_others(world, mddag):
     assert result['callbacks']['/a:t']['ran'] > 0 and result['measured'] is None
 
 
-class Beside:
-    """A session in which, at each wait, the next thing happens in the other process."""
-
-    def __init__(self, *happens):
-        self.happens = list(happens)
-        self.waited = 0.0
-
-    def wait(self, seconds):
-        if self.happens:
-            self.happens.pop(0)()
-        else:
-            self.waited = seconds
-        return False
-
-    def wait_until_matched(self, unmatched, patience_s):
-        while unmatched():
-            self.wait(0.02)
-
-
 def test_processes_start_together(tmp_path, monkeypatch):
     """However late another process is: it is waited for until its nodes are made, and ready."""
     processes.Part.make(str(tmp_path), CHAIN, {})
     monkeypatch.setattr(processes.time, 'monotonic_ns', lambda: 5 * 10 ** 9)
-    unmatched = ['/half']
-    seen = []
+    part = processes.Part.read(str(tmp_path))
+    session = Session(Idle())
+    unmatched, seen, waits = ['/half'], [], []
 
     def note(step, at):
-        def write():
-            seen.append([path.name for path in tmp_path.glob('first.*')])
-            (tmp_path / f'second.{step}').write_text(str(at))
-        return write
+        seen.append(sorted(path.name for path in tmp_path.glob('first.*')))
+        (tmp_path / f'second.{step}').write_text(str(at))
 
-    session = Beside(note('made', 6 * 10 ** 9), unmatched.clear, note('ready', 7 * 10 ** 9))
-    processes.Part.read(str(tmp_path)).start_together(
-        'first', ['first', 'second'], session, lambda: unmatched)
-    assert sorted(seen[0]) == ['first.made'] and 'first.ready' in seen[1]
-    assert session.waited == 2 + processes.LEAD_NS / 1e9
+    happens = [lambda: note('made', 6 * 10 ** 9), unmatched.clear,
+               lambda: note('ready', 7 * 10 ** 9)]
+
+    def wait(seconds):
+        (happens.pop(0) if happens else lambda: waits.append(seconds))()
+        return False
+
+    monkeypatch.setattr(session, 'wait', wait)
+    at = part.start_together('first', ['first', 'second'], session, lambda: unmatched)
+    assert seen == [['first.made'], ['first.made', 'first.ready']]
+    assert at == 7 * 10 ** 9 + processes.LEAD_NS and waits == [2 + processes.LEAD_NS / 1e9]
 
 
-def test_what_is_lost_until_processes_have_met_is_of_no_job(world):
+def test_programs_run_in_the_process_of_their_nodes(world):
+    """What is lost until the processes have met, one of which starts late, is of no job."""
     (world / 'slow.py').write_text(
         'import time\ntime.sleep(1)\nfrom relay import last, second\n')
     (world / 'graph.yaml').write_text(PROCESSES + CHAIN.replace('60s', '1s').replace(
         ',\n                 release_from: header_stamp', ''))
     nodes = ['--node', 'up=relay:sensor', *NODES[2:4], '--node', 'down=slow:second', '--node',
              'down=slow:last']
-    with running('graph.yaml', *nodes, '--trace', '.', '--duration', '2s') as run:
-        result, _, errors = run.end()
-    assert run.process.returncode == 0, errors
+    with running('graph.yaml', *nodes, '--trace', '.') as run:
+        wait_for_run(run, (world / 'enough').exists)
+        run.send_signal(signal.SIGINT)
+        result, _, errors = end(run)
+    assert run.returncode == 0, errors
+    assert {p['name']: p['nodes'] for p in result['processes']} == {
+        'up': ['/sensor', '/first'], 'down': ['/second', '/last']}
+    assert result['callbacks']['/sensor:tick']['ran'] >= 60
+    assert result['never_ran'] == [] and not any(p['died'] for p in result['processes'])
+    for name in ('up', 'down'):
+        assert {e['dag'] for e in read_events(f'{name}.mcap', {'mddag:complete'})} == {0}
     live, replayed = (counts(dags['chain']['sinks']['/last:sink']) for dags in (
         result['dags'], replay(['up.mcap', 'down.mcap']).result()['dags']))
     # in addition to what waited 0.1 s for its announcement, as on a busy machine
@@ -175,30 +165,14 @@ def test_what_is_lost_until_processes_have_met_is_of_no_job(world):
     assert live.due > 0
 
 
-def test_programs_run_in_the_process_of_their_nodes(world):
-    with running('graph.yaml', *NODES, '--trace', '.') as run:
-        wait_for_run(run.process, (world / 'enough').exists)
-        run.process.send_signal(signal.SIGINT)
-        result, _, errors = run.end()
-    assert run.process.returncode == 0, errors
-    assert {p['name']: p['nodes'] for p in result['processes']} == {
-        'up': ['/sensor', '/first'], 'down': ['/second', '/last']}
-    assert result['dags']['chain']['sinks']['/last:sink']['completed'] > 0
-    assert result['callbacks']['/sensor:tick']['ran'] >= 60
-    assert result['never_ran'] == [] and not any(p['died'] for p in result['processes'])
-    ran = {name: {e['dag'] for e in read_events(f'{name}.mcap') if e['_name'] == 'mddag:complete'}
-           for name in ('up', 'down')}
-    assert ran == {'up': {0}, 'down': {0}}
-
-
 def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
     with running('graph.yaml', *NODES, '--on-exit', 'continue', '--trace', 'out.mcap') as run:
-        wait_for_run(run.process, (world / 'enough').exists)
-        os.kill(run.pids()['up'], signal.SIGKILL)
-        wait_for_run(run.process, lambda: 'up' not in run.pids())
-        run.process.send_signal(signal.SIGTERM)
-        result, out, errors = run.end()
-    assert run.process.returncode == 70
+        wait_for_run(run, (world / 'enough').exists)
+        os.kill(pids(run)['up'], signal.SIGKILL)
+        wait_for_run(run, lambda: 'up' not in pids(run))
+        run.send_signal(signal.SIGTERM)
+        result, out, errors = end(run)
+    assert run.returncode == 70
     assert 'process up was ended by signal 9 (Killed)' in errors
     up, down = result['processes']
     assert (up['died'], up['how'], down['died']) == (True, 'was ended by signal 9 (Killed)', False)
@@ -223,10 +197,10 @@ def test_an_exception_in_one_ends_the_run_with_its_status(world):
         '    def fail(): raise ValueError("boom")\n'
         '    node.create_timer(0.05, fail)\n'
         '    return node\n')
-    nodes = ['--node', 'up=bad:sensor', *NODES[2:]]
+    nodes = ('--node', 'up=bad:sensor', '--node', 'down=relay:last')
     with running('graph.yaml', *nodes) as run:
-        result, _, errors = run.end()
-    assert run.process.returncode == 70
+        result, _, errors = end(run)
+    assert run.returncode == 70
     assert ('warning: process up ended with status 70: error: /sensor: fail (timer 50ms): '
             'it raised ValueError: boom, ') in errors
     assert '[up] Traceback' in errors

@@ -1,64 +1,63 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""How the processes of a run end, and how a session does, with programs that only pretend."""
+"""How processes, functions in a process of their own, and a session end; all only pretend."""
 
 import io
 import signal
 import subprocess
 import sys
 import threading
-import time
 
 from mddag_executor.hosting import processes as module
+from mddag_executor.hosting.child import ChildError, CrashError, run_child
 from mddag_executor.hosting.processes import Supervisor
 from mddag_executor.hosting.session import Session
 import pytest
 
 from .conftest import has_ended, wait_for
 
+# Ready for SIGTERM, a program notes that in a file, whose name replaces MARK; others wait for it.
 WAITS = """
-import signal, sys, threading
+import pathlib, signal, threading
 end = threading.Event()
 signal.signal(signal.SIGTERM, lambda *_: end.set())
-print('waits')
+pathlib.Path('MARK').touch()
 end.wait(60)
 print('ends')
+"""
+DEAF = WAITS.replace('lambda *_: end.set()', 'signal.SIG_IGN')
+OBEYS = WAITS.replace('lambda *_: end.set()', 'signal.SIG_DFL')
+ENDS = """
+import os, time
+while not os.path.exists('MARK'):
+    time.sleep(0.01)
 """
 
 
 class Case:
     """A supervisor of programs by name."""
 
-    def __init__(self, goes_on=False, **programs):
+    def __init__(self, folder, goes_on=False, **programs):
         self.out, self.err = io.StringIO(), io.StringIO()
         self.died = []
+        self.mark = folder / 'mark'
         self.programs = programs
         self.supervisor = Supervisor(self.command, goes_on, self.out, self.err, self.ended)
 
     def ended(self, run):
         if run.died:
-            self.died.append(run)
+            self.died.append((run.name, run.how))
 
     def command(self, name):
-        return [sys.executable, '-c', self.programs[name]]
+        return [sys.executable, '-c', self.programs[name].replace('MARK', str(self.mark))]
 
     def run(self, seconds=None):
         self.supervisor.run(list(self.programs), seconds)
         return [(run.name, run.status) for run in self.supervisor.runs]
 
-    def stop_when(self, wanted):
-        """Ask for the end as soon as something has been printed."""
-        def wait():
-            end = time.monotonic() + 60
-            while wanted not in self.out.getvalue() and time.monotonic() < end:
-                time.sleep(0.01)
-            self.supervisor.stop()
 
-        threading.Thread(target=wait, daemon=True).start()
-
-
-def test_output_has_the_name_of_the_process_before_each_line():
-    case = Case(True, a='print("one"); print("two", end="")',
+def test_output_has_the_name_of_the_process_before_each_line(tmp_path):
+    case = Case(tmp_path, True, a='print("one"); print("two", end="")',
                 b='import sys; print("three", file=sys.stderr)')
     assert case.run() == [('a', 0), ('b', 0)]
     assert case.out.getvalue() == '[a] one\n[a] two\n'
@@ -67,52 +66,65 @@ def test_output_has_the_name_of_the_process_before_each_line():
 
 
 def test_the_end_of_one_ends_all(tmp_path):
-    mark = tmp_path / 'waits'
-    waits = WAITS.replace("print('waits')", f'open({str(mark)!r}, "w").close()')
-    ends = f'import os, time\nwhile not os.path.exists({str(mark)!r}): time.sleep(0.01)'
-    case = Case(a=waits, b=ends)
+    case = Case(tmp_path, a=WAITS, b=ENDS)
     assert case.run() == [('a', 0), ('b', 0)]
     assert case.out.getvalue() == '[a] ends\n' and not case.died
 
 
-def test_all_end_when_asked_and_who_does_not_is_killed(monkeypatch):
+@pytest.mark.parametrize(('program', 'status', 'is_asked'), [
+    (DEAF, -signal.SIGKILL, True), (DEAF, -signal.SIGKILL, False),
+    (OBEYS, -signal.SIGTERM, False)])
+def test_a_process_that_does_not_end_is_asked_then_killed(
+        monkeypatch, tmp_path, program, status, is_asked):
+    """When the run is asked to end, or when it is over and another process has ended."""
     monkeypatch.setattr(module, 'END_TIMEOUT_S', 0.1)
-    deaf = WAITS.replace('lambda *_: end.set()', 'signal.SIG_IGN')
-    case = Case(a=deaf)
-    case.stop_when('[a] waits')
-    assert case.run() == [('a', -signal.SIGKILL)]
-    assert [run.how for run in case.died] == ['was ended by signal 9 (Killed)']
-    assert case.err.getvalue() == (
-        'warning: process a has not ended within 0.1 s: it is killed\n')
+    case = Case(tmp_path, a=program, **({} if is_asked else {'b': ENDS}))
+    if is_asked:
+        threading.Thread(
+            target=lambda: wait_for(case.mark.exists, 60.0) and case.supervisor.stop()).start()
+    assert case.run(None if is_asked else 0.0)[0] == ('a', status)
+    is_killed = status == -signal.SIGKILL
+    assert case.died == [('a', 'was ended by signal 9 (Killed)')] * is_killed
+    assert case.err.getvalue().splitlines() == [
+        *['warning: process a has not ended with the others: it is asked to'] * (not is_asked),
+        *['warning: process a has not ended within 0.1 s: it is killed'] * is_killed]
 
 
-@pytest.mark.parametrize('is_deaf', [False, True])
-def test_who_does_not_end_when_the_run_is_over_is_asked_then_killed(
-        monkeypatch, tmp_path, is_deaf):
-    monkeypatch.setattr(module, 'END_TIMEOUT_S', 0.1)
-    mark = tmp_path / 'goes on'
-    how = 'signal.SIG_IGN' if is_deaf else 'signal.SIG_DFL'
-    goes_on = (f'import signal, time\nsignal.signal(signal.SIGTERM, {how})\n'
-               f'open({str(mark)!r}, "w").close()\nwhile True: time.sleep(60)')
-    ends = f'import os, time\nwhile not os.path.exists({str(mark)!r}): time.sleep(0.01)'
-    case = Case(a=goes_on, b=ends)
-    assert case.run(seconds=0.0) == [('a', -signal.SIGKILL if is_deaf else -signal.SIGTERM),
-                                     ('b', 0)]
-    assert [run.name for run in case.died] == ['a'] * is_deaf
-    said = case.err.getvalue().splitlines()
-    assert said[0] == 'warning: process a has not ended with the others: it is asked to'
-    assert said[1:] == ['warning: process a has not ended within 0.1 s: it is killed'] * is_deaf
+# --- a function in a process of its own ----------------------------------------------------------
 
 
-def test_it_ends_with_who_started_it(tmp_path):
+@pytest.mark.parametrize(('function', 'argument', 'says'), [
+    ('builtins:int', 'boom', "ValueError: invalid literal for int.. with base 10: 'boom'$"),
+    ('signal:raise_signal', 11, 'it crashed with signal 11 and gave no result$'),
+    ('os:_exit', 3, 'it ended with status 3 and gave no result$'),
+    ('time:sleep', 60, 'it did not end within 1 s and was killed$')])
+def test_a_crash_says_how(function, argument, says):
+    with pytest.raises(CrashError, match=f'^it: {says}'):
+        run_child(function, (argument,), 'it', 1.0 if function == 'time:sleep' else 60.0)
+
+
+def test_what_the_child_refuses_is_its_message_and_its_output_is_not_shown(capfd):
+    with pytest.raises(ChildError, match="^policy 'x': ") as raised:
+        run_child('mddag_executor.core:policy', ('x',), 'it', 60.0)
+    assert not isinstance(raised.value, CrashError)
+    expression = '(__import__("os").write(1, b"said"), {2: None})'
+    assert run_child('builtins:eval', (expression,), 'it', 60.0) == (4, {2: None})
+    assert capfd.readouterr() == ('', '')
+
+
+@pytest.mark.parametrize('code', [
+    'from mddag_executor.hosting.child import run_child; '
+    'run_child("builtins:exec", ({body!r},), "it", 60.0)',
+    'import subprocess, sys; subprocess.run([sys.executable, "-c", "import os; from '
+    'mddag_executor.hosting.processes import belong_to_parent; belong_to_parent(os.getppid());" '
+    '+ {body!r}])'])
+def test_a_child_does_not_outlive_who_started_it(tmp_path, code):
     mark = tmp_path / 'pid'
-    child = ('import os, sys; from mddag_executor.hosting.processes import belong_to_parent; '
-             'belong_to_parent(int(sys.argv[1])); from pathlib import Path; '
-             f'Path({str(mark)!r} + "x").write_text(str(os.getpid())); '
-             f'os.rename({str(mark)!r} + "x", {str(mark)!r}); import time; time.sleep(60)')
-    parent = subprocess.Popen([sys.executable, '-c', (
-        'import os, subprocess, sys; '
-        f'subprocess.run([sys.executable, "-c", {child!r}, str(os.getpid())])')])
+    body = (f'import ctypes, os, pathlib; pathlib.Path({str(mark)!r} + "x").write_text('
+            f'str(os.getpid())); os.rename({str(mark)!r} + "x", {str(mark)!r}); ')
+    # with the interpreter: none of it runs any more
+    body += 'ctypes.PyDLL(None).pause()' if 'run_child' in code else 'ctypes.CDLL(None).pause()'
+    parent = subprocess.Popen([sys.executable, '-c', code.format(body=body)])
     try:
         assert wait_for(mark.exists, 60.0)
     finally:
@@ -121,8 +133,7 @@ def test_it_ends_with_who_started_it(tmp_path):
     assert wait_for(lambda: has_ended(int(mark.read_text())), 60.0)
 
 
-DEEPEST = 60
-"""So many steps of the interpreter are in `wait` and below before it sleeps, and some more."""
+# --- a session -----------------------------------------------------------------------------------
 
 
 class Idle:
@@ -139,42 +150,30 @@ class Idle:
         return True
 
 
-def stop_after(session, steps):
-    """Return a trace function that stops the session, as a signal's handler would, at a step."""
-    left = steps
-
-    def trace(frame, event, _):
-        nonlocal left
-        frame.f_trace_opcodes = True
-        if event == 'opcode':
-            left -= 1
-            if left == 0:
-                session.stop(hurried=True)
-        return trace
-
-    return trace
-
-
 def test_a_signal_stops_a_session_wherever_it_interrupts_the_wait():
-    for steps in range(1, DEEPEST):
-        stop_at(steps)
+    """A trace function stops it, as a signal's handler would."""
+    def wait(session, left, answers):
+        def trace(frame, event, _):
+            nonlocal left
+            frame.f_trace_opcodes = True
+            if event == 'opcode':
+                left -= 1
+                if left == 0:
+                    session.stop(hurried=True)
+            return trace
 
-
-def stop_at(steps):
-    session = Session(Idle())
-    answers = []
-
-    def wait():
-        sys.settrace(stop_after(session, steps))
+        sys.settrace(trace)
         answers.append(session.wait(0.01))
         sys.settrace(None)
         session.end()
 
-    session.__enter__()
-    # A daemon, and no `with`: where one waits for ever, the tests are to end all the same.
-    thread = threading.Thread(target=wait, daemon=True)
-    thread.start()
-    thread.join(5.0)
-    assert not thread.is_alive(), 'the handler waits for what it has interrupted'
-    assert session.clean
-    assert len(answers) == 1
+    # So many steps of the interpreter are in `wait` and below before it sleeps, and some more.
+    for step in range(1, 60):
+        session, answers = Session(Idle()), []
+        session.__enter__()
+        # A daemon, and no `with`: where one waits for ever, the tests are to end all the same.
+        thread = threading.Thread(target=wait, args=(session, step, answers), daemon=True)
+        thread.start()
+        thread.join(5.0)
+        assert not thread.is_alive(), 'the handler waits for what it has interrupted'
+        assert session.clean and len(answers) == 1

@@ -2,20 +2,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unmodified programs of many kinds; none knows of this executor."""
 
+import os
+import signal
+import threading
+import time
+
 import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 
 class Listener(Node):
+    """Says when it has heard five messages."""
 
-    def __init__(self):
-        super().__init__('listener')
+    def __init__(self, name='listener'):
+        super().__init__(name)
         self.create_subscription(String, 'chatter', self.heard, 10)
         self.n = 0
 
     def heard(self, message):
         self.n += 1
+        if self.n == 5:
+            print(f'{self.get_name()} heard five')
+
+    def serve(self, **more):
+        """Return a client of a service of the node itself."""
+        def answer(request, response):
+            response.message = 'forty-two'
+            return response
+
+        self.create_service(Trigger, '~/own', answer, **more)
+        return self.create_client(Trigger, '~/own', **more)
 
 
 def main():
@@ -28,13 +48,12 @@ def main():
 
 
 def two():
-    return [Listener(), Node('idle')]
+    return [Listener('first'), Node('idle')]
 
 
 def own_executor():
-    from rclpy.executors import MultiThreadedExecutor
     rclpy.init()
-    node = Listener()
+    node = Listener('own')
     executor = MultiThreadedExecutor(num_threads=4)
     executor.add_node(node)
     try:
@@ -48,23 +67,21 @@ def own_executor():
 
 def events_executor():
     from rclpy.experimental.events_executor import EventsExecutor
-    with rclpy.init() or __import__('contextlib').nullcontext():
-        executor = EventsExecutor()
-        executor.add_node(Listener())
-        executor.spin()
+    rclpy.init()
+    executor = EventsExecutor()
+    executor.add_node(Listener('events'))
+    executor.spin()
 
 
 def spins_in_thread():
-    import threading
     rclpy.init()
-    executor = rclpy.executors.SingleThreadedExecutor()
-    node = Listener()
+    executor = SingleThreadedExecutor()
+    node = Listener('in_thread')
     executor.add_node(node)
     thread = threading.Thread(target=executor.spin)
     thread.start()
     while rclpy.ok() and node.n < 5:
-        __import__('time').sleep(0.01)
-    print('heard five')
+        time.sleep(0.01)
     rclpy.shutdown()
     thread.join()
     print('thread joined')
@@ -72,68 +89,64 @@ def spins_in_thread():
 
 def spins_once():
     rclpy.init()
-    node = Listener()
+    node = Listener('once')
     while rclpy.ok() and node.n < 5:
         rclpy.spin_once(node, timeout_sec=0.1)
-    print('heard', 'enough' if node.n >= 5 else 'too little')
     node.destroy_node()
     rclpy.shutdown()
+    print('once ended')
 
 
 def spins_once_for_ever():
     rclpy.init()
-    node = Listener()
+    node = Listener('for_ever')
     while rclpy.ok():
         rclpy.spin_once(node)
     print('no longer ok')
 
 
-def calls_a_service():
-    from std_srvs.srv import Trigger
+def steps():
     rclpy.init()
-    node = Listener()
-    node.create_service(Trigger, 'own', answer)
-    client = node.create_client(Trigger, 'own')
+    node = Listener('steps')
+    node.create_timer(0.02, lambda: None)
+    for _ in range(30):
+        rclpy.spin_once(node, timeout_sec=600.0)
+    print('30 steps')
+    rclpy.spin(node)
+
+
+def calls_a_service():
+    rclpy.init()
+    node = Listener('caller')
+    client = node.serve()
     assert client.wait_for_service(5.0)
     future = client.call_async(Trigger.Request())
     rclpy.spin_until_future_complete(node, future, timeout_sec=5.0)
-    print('answer:', future.result().message)
+    print(f'answer: {future.result().message}')
 
 
-def answer(request, response):
-    response.message = 'forty-two'
-    return response
-
-
-def shuts_down_in_a_callback():
+def ends_in_a_thread():
     rclpy.init()
-    node = Listener()
-    node.create_timer(0.3, lambda: rclpy.shutdown())
+    node = Listener('timed')
+    threading.Timer(0.3, rclpy.shutdown).start()
     rclpy.spin(node)
-    print('shut down')
+    print(f'timed, ok: {rclpy.ok()}')
 
 
 def catches_signals():
-    import os
-    import signal
     rclpy.init()
     signal.signal(signal.SIGTERM, lambda *_: None)
     signal.signal(signal.SIGHUP, lambda *_: print('read the settings again'))
     os.kill(os.getpid(), signal.SIGHUP)
-    rclpy.spin(Listener())
+    rclpy.spin(Listener('catcher'))
 
 
 def handles_a_signal():
-    import os
-    import signal
-    import threading
-    import time
-
     def timed_out(number, frame):
         raise TimeoutError(f'signal {number}')
 
     rclpy.init()
-    node = Listener()
+    node = Listener('handler')
     before = signal.getsignal(signal.SIGUSR1)
     signal.signal(signal.SIGUSR1, timed_out)
     try:
@@ -141,19 +154,19 @@ def handles_a_signal():
         while True:
             time.sleep(0.01)
     except TimeoutError as error:
-        print('while it worked:', error)
+        print(f'while it worked: {error}')
     threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGUSR1)).start()
     try:
         rclpy.spin(node)
     except TimeoutError as error:
-        print('while it spun:', error)
-    print('one handler:', signal.signal(signal.SIGUSR1, before) is timed_out)
+        print(f'while it spun: {error}')
+    print(f'one handler: {signal.signal(signal.SIGUSR1, before) is timed_out}')
     rclpy.spin(node)
 
 
 def handles_its_exceptions():
     rclpy.init()
-    node = Listener()
+    node = Listener('careful')
     n = iter(range(1000))
 
     def tick():
@@ -161,27 +174,24 @@ def handles_its_exceptions():
             raise ValueError('odd')
 
     timer = node.create_timer(0.02, tick)
-    executor = rclpy.executors.SingleThreadedExecutor()
-    executor.add_node(node)
-    for spin in (lambda: rclpy.spin(node), executor.spin):
-        executor.add_node(node) if spin == executor.spin else None
+    executor = SingleThreadedExecutor()
+    for name, spin in (('rclpy', lambda: rclpy.spin(node)), ('executor', executor.spin)):
+        if name == 'executor':
+            executor.add_node(node)
         for _ in range(3):
             try:
                 spin()
             except ValueError as error:
-                print(spin.__name__, 'raised', error)
+                print(f'{name} raised {error}')
     timer.cancel()
     rclpy.spin(node)
 
 
 def spins_in_callbacks():
-    from rclpy.callback_groups import ReentrantCallbackGroup
-    from std_srvs.srv import Trigger
     rclpy.init()
-    node = Listener()
+    node = Listener('nested')
     group = ReentrantCallbackGroup()
-    node.create_service(Trigger, 'own', answer, callback_group=group)
-    client = node.create_client(Trigger, 'own', callback_group=group)
+    client = node.serve(callback_group=group)
     ways = {
         'of the node': lambda future: node.executor.spin_until_future_complete(future),
         'of rclpy': lambda future: rclpy.spin_until_future_complete(node, future),
@@ -189,30 +199,35 @@ def spins_in_callbacks():
         'step by step of rclpy': lambda future: step_until(future, lambda: rclpy.spin_once(node)),
     }
 
+    def step_until(future, step):
+        while not future.done():
+            step()
+
     def tick():
         timer.cancel()
         for way, spin in ways.items():
             future = client.call_async(Trigger.Request())
             spin(future)
-            print(way, future.result().message)
+            print(f'{way} {future.result().message}')
 
     timer = node.create_timer(0.1, tick, callback_group=group)
     rclpy.spin(node)
 
 
-def step_until(future, step):
-    while not future.done():
-        step()
+# --- how a run ends ------------------------------------------------------------------------------
 
 
-def steps():
+def after_a_while(callback, seconds=0.2):
+    """Spin a node that calls something again and again."""
     rclpy.init()
-    node = Listener()
-    node.create_timer(0.02, lambda: None)
-    for _ in range(30):
-        rclpy.spin_once(node, timeout_sec=600.0)
-    print('30 steps')
+    node = Node('ending')
+    node.create_timer(seconds, callback)
     rclpy.spin(node)
+
+
+def shuts_down_in_a_callback():
+    after_a_while(lambda: rclpy.shutdown(), 0.6)
+    print('shut down')
 
 
 def never_spins():
@@ -224,59 +239,37 @@ def never_spins():
     print('typed w')
 
 
-def ends_in_a_thread():
-    import threading
-    rclpy.init()
-    node = Listener()
-    threading.Timer(0.3, rclpy.shutdown).start()
-    rclpy.spin(node)
-    print('over' if not rclpy.ok() else 'it goes on')
-
-
 def leaves_a_thread():
-    import threading
-    import time
     threading.Thread(target=time.sleep, args=(60,), name='stubborn', daemon=False).start()
-    main()
+    print('not JSON')
+    after_a_while(lambda: None)
 
 
 def never_ends():
-    main()
-    __import__('time').sleep(60)
-
-
-def prints():
-    print('not JSON')
-    main()
+    after_a_while(lambda: None)
+    time.sleep(60)
 
 
 def blocks_in_a_callback():
-    rclpy.init()
-    node = Listener()
-    node.create_timer(0.2, lambda: __import__('time').sleep(60))
-    rclpy.spin(node)
+    after_a_while(lambda: time.sleep(60))
+
+
+def raises_in_a_callback():
+    after_a_while(lambda: 1 / 0)
+
+
+def no_longer_spins():
+    try:
+        after_a_while(lambda: 1 / 0, 0.01)
+    except ZeroDivisionError:
+        time.sleep(60)
+
+
+# --- what cannot start ---------------------------------------------------------------------------
 
 
 def exits():
     raise SystemExit(3)
-
-
-def raises_in_a_callback():
-    rclpy.init()
-    node = Listener()
-    node.create_timer(0.2, lambda: 1 / 0)
-    rclpy.spin(node)
-
-
-def no_longer_spins():
-    import time
-    rclpy.init()
-    node = Listener()
-    node.create_timer(0.01, lambda: 1 / 0)
-    try:
-        rclpy.spin(node)
-    except ZeroDivisionError:
-        time.sleep(60)
 
 
 def own_context():
