@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag, a graph for it, and a node that notes what it sees."""
 
-from typing import Any
-
 from mcap.writer import Writer
 from mddag_executor.rerun import rerun
 from mddag_executor.rerun.message_types import definition, type_name
@@ -33,24 +31,21 @@ nodes:
 
 
 def write_bag(path, messages):
-    """Write messages (ns after `START`, topic, message or its bytes) as rosbag2 does."""
+    """Write messages (ms after `START`, topic, message), in order of time, as rosbag2 does."""
     with open(path, 'wb') as file:
         writer = Writer(file)
         writer.start(profile='ros2')
         channels = {}
-        for time, topic, message in messages:
-            kind, data = message if isinstance(message, tuple) else (
-                type(message), serialize_message(message))
+        for ms, topic, message in sorted(messages, key=lambda each: each[0]):
             if topic not in channels:
+                kind = type(message)
                 schema = writer.register_schema(
                     type_name(kind), 'ros2msg', definition(kind).encode())
                 channels[topic] = writer.register_channel(topic, 'cdr', schema)
-            writer.add_message(channels[topic], START + time, data, START + time)
+            at = START + ms * MS
+            writer.add_message(channels[topic], at, serialize_message(message), at)
         writer.finish()
     return str(path)
-
-
-Seen = list[tuple[float, Any]]
 
 
 class Filter(Node):

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes run again from a bag: what they see, what they publish, and when."""
 
-from functools import partial
-import os
+from functools import cached_property, partial
 import random
 import threading
 import uuid
@@ -30,6 +29,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
+from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64, Header, String
 import yaml
 
@@ -43,8 +43,11 @@ class Filter(Node):
 
     def __init__(self):
         super().__init__('filter')
-        self.publisher = self.create_publisher(Header, '/filtered', 10)
         self.create_subscription(Header, '/points', self.take, 10)
+
+    @cached_property
+    def publisher(self):  # made late, as by lifecycle nodes, which are configured by a request
+        return self.create_publisher(Header, '/filtered', 10)
 
     def take(self, message):
         now = self.get_clock().now()
@@ -79,28 +82,27 @@ def test_nodes_run_in_virtual_time(bag, graph):
         (100.0 * i + 15, 2.0 * i) for i in range(20)]
     sink = result.result()['dags']['main']['sinks']['/sink:take']
     assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (20, 0, 15 * MS)
+    assert rerun(bag, graph, [Filter, Sink], workers=7).digest == result.digest
 
 
-def test_the_same_again_and_with_other_workers(bag, graph):
-    first = rerun(bag, graph, [Filter, Sink])
-    assert rerun(bag, graph, [Filter, Sink]).digest == first.digest
-    assert rerun(bag, graph, [Filter, Sink], workers=7).digest == first.digest
-
-
-def test_publishers_may_be_made_later(bag, graph):
-    """As those of lifecycle nodes, which are configured by a request."""
-    class Late(Node):
-
-        def __init__(self):
-            super().__init__('filter')
-            self.create_subscription(Header, '/points', self.take, 10)
-
-        def take(self, message):
-            if not hasattr(self, 'publisher'):
-                self.publisher = self.create_publisher(Header, '/filtered', 10)
-            self.publisher.publish(message)
-
-    assert len(published(rerun(bag, graph, [Late, Sink]), '/out')) == 20
+def test_a_changed_constant_is_found_in_the_outputs(bag, graph, tmp_path, monkeypatch):
+    """They are a bag that others read."""
+    out = tmp_path / 'out.mcap'
+    result = rerun(bag, graph, [Filter, Sink], output=out)
+    with AnyReader([out]) as reader:
+        found = [(time, reader.deserialize(data, connection.msgtype).data)
+                 for connection, time, data in reader.messages() if connection.topic == '/out']
+    assert found == [(each.time, 2.0 * i) for i, each in enumerate(
+        each for each in result.outputs if each.topic == '/out')]
+    assert_same(result, out)
+    monkeypatch.setattr(f'{__name__}.GAIN', 2.0001)
+    result = rerun(bag, graph, [Filter, Sink])
+    difference, = compare(result, out)
+    assert difference.line() == (
+        '/out: content, first in message 1 at 0.115000 s: data is 2.0001, expected 2.0')
+    assert not compare(result, out, 1e-3)
+    with pytest.raises(AssertionError, match='/out: content, first in message 1'):
+        assert_same(result, out)
 
 
 def test_processes_share_one_interpreter(bag, graph):
@@ -139,9 +141,9 @@ nodes:
 def test_refused_work_runs_when_what_it_waits_for_does_not_come(tmp_path, graph):
     """The worker is reserved for a job that must start by 610 ms; its message is lost."""
     graph.write_text(RESERVED)
-    bag = write_bag(tmp_path / 'in.mcap', sorted([
-        *((i * 100 * MS, '/points', Header()) for i in range(6)),
-        *((time * MS, '/others', String()) for time in (565, 2000))], key=lambda each: each[0]))
+    bag = write_bag(tmp_path / 'in.mcap', [
+        *((i * 100, '/points', Header()) for i in range(6)),
+        *((ms, '/others', String()) for ms in (565, 2000))])
 
     def node():
         made = rclpy.create_node('filter')
@@ -154,19 +156,7 @@ def test_refused_work_runs_when_what_it_waits_for_does_not_come(tmp_path, graph)
     assert [round(time) for time, _ in done] == [680, 2070]
 
 
-def test_outputs_are_a_bag_that_others_read(bag, graph, tmp_path):
-    from rosbags.highlevel import AnyReader
-    out = tmp_path / 'out.mcap'
-    result = rerun(bag, graph, [Filter, Sink], output=out)
-    with AnyReader([out]) as reader:
-        found = [(time, reader.deserialize(data, connection.msgtype).data)
-                 for connection, time, data in reader.messages() if connection.topic == '/out']
-    assert found == [(each.time, 2.0 * i) for i, each in enumerate(
-        each for each in result.outputs if each.topic == '/out')]
-    assert_same(result, out)
-
-
-def test_the_trace_replays(bag, graph, tmp_path):
+def test_the_trace_replays_and_gives_the_times(bag, graph, tmp_path):
     trace = tmp_path / 'run.mcap'
     result = rerun(bag, graph, [Filter, Sink], trace=trace)
     again = replay(trace)
@@ -180,6 +170,10 @@ def test_the_trace_replays(bag, graph, tmp_path):
         name: {handle for _, _, _, _, handle, *_ in TraceReader(trace).events({name})}
         for name in ('ros2:rcl_publisher_init', 'ros2:rclcpp_publish')}
     assert len(handles['ros2:rclcpp_publish'] & handles['ros2:rcl_publisher_init']) == 2
+    graph.write_text(GRAPH.replace('10ms', '30ms'))
+    result = rerun(bag, graph, [Filter, Sink], times=trace)
+    assert [time for time, _ in published(result, '/filtered')] == [
+        100.0 * i + 10 for i in range(20)]
 
 
 @pytest.mark.parametrize('takes', [', execution_time: 10ms', ''])
@@ -192,15 +186,6 @@ def test_recorded_publications_belong_to_their_executions(bag, graph, tmp_path, 
     run = open_recording(trace)
     by = [run.task_set.vertices[v].name for v in run.publications['vertex'].tolist() if v >= 0]
     assert by == 20 * ['/filter:take', '/sink:take']
-
-
-def test_recorded_times_come_from_a_trace(bag, graph, tmp_path):
-    trace = tmp_path / 'run.mcap'
-    rerun(bag, graph, [Filter, Sink], trace=trace)
-    graph.write_text(GRAPH.replace('10ms', '30ms'))
-    result = rerun(bag, graph, [Filter, Sink], times=trace)
-    assert [time for time, _ in published(result, '/filtered')] == [
-        100.0 * i + 10 for i in range(20)]
 
 
 @pytest.mark.parametrize(('delay_ms', 'out_ms'), [(4, 24), (-4, 20)])
@@ -236,7 +221,7 @@ def make_node(declared):
     return node
 
 
-@pytest.mark.parametrize('seed', range(9))
+@pytest.mark.parametrize('seed', range(6))
 def test_callbacks_start_and_end_as_in_the_simulator(tmp_path, monkeypatch, seed):
     cpus, workers = (None, 1, 2)[seed % 3], 1 + seed % 2
     declared = yaml.safe_load(generate(Options(
@@ -249,7 +234,7 @@ def test_callbacks_start_and_end_as_in_the_simulator(tmp_path, monkeypatch, seed
         task_set, periodic_load(task_set, draw_execution_times(task_set, 0), 1000 * MS),
         SimulatorSettings('rad', workers, 1000 * MS, cpus=cpus, on_late='demote'),
         log=True).log
-    bag = write_bag(tmp_path / 'in.mcap', [(t * MS, '/unused', String()) for t in (0, 1000)])
+    bag = write_bag(tmp_path / 'in.mcap', [(ms, '/unused', String()) for ms in (0, 1000)])
     monkeypatch.setattr(Durations, 'first_release', lambda times, dag: START)
     trace = str(tmp_path / 'run.mcap')
     Rerun(*open_input(bag, task_set), task_set, workers=workers, cpus=cpus, trace=trace).run(
@@ -259,8 +244,6 @@ def test_callbacks_start_and_end_as_in_the_simulator(tmp_path, monkeypatch, seed
     assert sorted(each for each in found if each[0] < 1000 * MS) == sorted(
         (time, vertex, job) for time, _, _, _, vertex, job in simulated if time < 1000 * MS)
 
-
-# --- timers, seeds, what is kept -----------------------------------------------------------------
 
 def test_timers_fire_at_their_virtual_times(bag, graph):
     def fill(node):
@@ -279,35 +262,29 @@ def test_timers_fire_at_their_virtual_times(bag, graph):
         (time, 'second') for time in (920, 1220, 1520, 1820)]
 
 
-def seeded(function):
-    function()
-    return random.random()
+def draw():
+    """Return random numbers from all that makes any."""
+    numbers = [random.random(), random.Random().random(), numpy.random.default_rng().random(),
+               numpy.random.RandomState().random_sample(), uuid.uuid4()]
+    random.seed()
+    return [*numbers, random.random()]
 
 
-@pytest.mark.parametrize('draw', [
-    random.random,
-    lambda: random.Random().random(),
-    lambda: seeded(random.seed),
-    lambda: numpy.random.default_rng().random(),
-    lambda: numpy.random.RandomState().random_sample(),
-    uuid.uuid4,
-])
-def test_random_numbers_are_those_of_the_seed(bag, graph, draw):
+def test_random_numbers_are_those_of_the_seed(bag, graph):
     seen = []
     for seed in (1, 1, 2):
         run_filter(bag, graph, lambda node, number: seen.append(draw()), seed=seed)
-    assert len({*seen[:20]}) == 20
-    assert seen[:20] == seen[20:40]
-    assert not {*seen[:20]} & {*seen[40:]}
-    assert draw() not in seen  # it is as before
+    for first, again, other in zip(*(zip(*seen[i:i + 20]) for i in (0, 20, 40))):
+        assert len({*first}) == 20 and first == again and not {*first} & {*other}
+    assert not {*draw()} & {each for some in seen for each in some}  # it is as before
 
 
 def test_nothing_happens_in_a_pause_of_the_recording(tmp_path, graph):
     """The machine got its time when the robot was running already, 300 days later."""
     later = 300 * 24 * 3600 * 1000
     bag = write_bag(tmp_path / 'in.mcap', [
-        (time * MS, '/points', Header(frame_id=str(time)))
-        for time in (0, 100, later + 7, later + 107)])
+        (ms, '/points', Header(frame_id=str(ms))) for ms in (0, 100, later + 7, later + 107)])
+
     def fill(node):
         def sleep():
             for _ in range(3):
@@ -329,7 +306,7 @@ def test_nothing_happens_in_a_pause_of_the_recording(tmp_path, graph):
 def test_no_wait_is_none_in_a_pause_either(tmp_path, graph):
     """A callback that begins late in a pause polls, and ends at once."""
     bag = write_bag(tmp_path / 'in.mcap', [
-        (time * 1000 * MS, '/points', Header(frame_id=str(time))) for time in (0, 200)])
+        (ms, '/points', Header(frame_id=str(ms))) for ms in (0, 200_000)])
     graph.write_text(GRAPH.replace('execution_time: 10ms', 'execution_time: 15s'))
 
     class Polls(Sink):
@@ -343,17 +320,26 @@ def test_no_wait_is_none_in_a_pause_either(tmp_path, graph):
 
 
 def test_a_message_is_as_it_was_published(bag, graph):
-    """Who publishes may change a message afterwards, and who receives it has one of his own."""
+    """
+    Who publishes may change a message afterwards, and who receives it has one of his own.
+
+    Late subscriptions get what is latched.
+    """
     received = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
     def fill(node):
         node.names = node.create_publisher(String, '/names', 10)
         node.message = String()
+        node.create_publisher(String, '/map', latched).publish(String(data='a map'))
 
     def take(node, number):
         node.message.data = str(number)
         node.names.publish(node.message)
         node.message.data = 'changed'
+        if number == 3:
+            node.create_subscription(String, '/map', lambda m: node.note(m.data), latched)
+            node.create_subscription(String, '/map', lambda m: node.note('?'), 10)
 
     def other():
         def take(message):
@@ -365,41 +351,10 @@ def test_a_message_is_as_it_was_published(bag, graph):
         node.create_subscription(String, '/names', take, 10)
         return node
 
-    run_filter(bag, graph, take, other, fill=fill)
+    seen, _ = run_filter(bag, graph, take, other, fill=fill)
     assert received == [str(i) for i in range(20) for _ in range(2)]
-
-
-def test_late_subscriptions_get_what_is_latched(bag, graph):
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-    def take(node, number):
-        if number == 3:
-            node.create_subscription(String, '/map', lambda m: node.note(m.data), latched)
-            node.create_subscription(String, '/map', lambda m: node.note('?'), 10)
-
-    seen, _ = run_filter(
-        bag, graph, take,
-        fill=lambda node: node.create_publisher(String, '/map', latched).publish(
-            String(data='a map')))
     assert [what for _, what in seen] == ['a map']
 
-
-# --- comparing -----------------------------------------------------------------------------------
-
-def test_a_changed_constant_is_found(bag, graph, tmp_path, monkeypatch):
-    out = tmp_path / 'out.mcap'
-    rerun(bag, graph, [Filter, Sink], output=out)
-    monkeypatch.setattr(f'{__name__}.GAIN', 2.0001)
-    result = rerun(bag, graph, [Filter, Sink])
-    difference, = compare(result, out)
-    assert difference.line() == (
-        '/out: content, first in message 1 at 0.115000 s: data is 2.0001, expected 2.0')
-    assert not compare(result, out, 1e-3)
-    with pytest.raises(AssertionError, match='/out: content, first in message 1'):
-        assert_same(result, out)
-
-
-# --- what goes wrong -----------------------------------------------------------------------------
 
 def test_a_failed_run_leaves_the_files_of_before(bag, graph, tmp_path):
     files = {name: tmp_path / f'{name}.mcap' for name in ('output', 'trace')}
@@ -408,17 +363,6 @@ def test_a_failed_run_leaves_the_files_of_before(bag, graph, tmp_path):
     with pytest.raises(CallbackFailed, match='it raised ZeroDivisionError: .* at 0.000000 s'):
         run_filter(bag, graph, lambda node, number: 1 / number, overwrite=True, **files)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_links_and_devices_stay(bag, graph, tmp_path):
-    link, pipe = tmp_path / 'link.mcap', tmp_path / 'pipe'
-    link.symlink_to('target.mcap')
-    run_filter(bag, graph, output=link)
-    assert link.is_symlink() and (tmp_path / 'target.mcap').stat().st_size
-    os.mkfifo(pipe)
-    with open(os.open(pipe, os.O_RDWR), 'rb', buffering=0), pytest.raises(OSError, match='seek'):
-        run_filter(bag, graph, output=pipe)  # as little as any MCAP file
-    assert pipe.is_fifo()
 
 
 def test_a_callback_destroys_its_node(bag, graph):
@@ -443,7 +387,9 @@ def test_what_a_callback_raises_after_the_end_is_a_warning(bag, graph):
         '/filter:take: after the end of the run it raised ValueError: woken too early, ')
 
 
-def test_a_circle_that_takes_no_time(bag, graph):
+def test_a_circle_that_takes_no_time(bag, graph, monkeypatch):
+    monkeypatch.setattr('mddag_executor.rerun.loop.MOST_AT_ONCE', 500)
+
     def fill(node):
         node.round = node.create_publisher(Header, '/round', 10)
         node.create_subscription(Header, '/round', node.round.publish, 10)

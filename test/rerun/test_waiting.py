@@ -4,9 +4,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-import inspect
 import queue
-import socket
 import subprocess
 import sys
 import threading
@@ -31,13 +29,12 @@ from test_msgs.action import Fibonacci
 from .helpers import Filter, GRAPH, MS, run_filter, write_bag
 
 
-def server(answers_after_ms=None):
-    """Return a node with a service, which takes its time with a rate."""
+def server(answers_after_ms=0):
+    """Return a node with a service, which takes its time."""
     node = rclpy.create_node('server')
 
     def answer(request, response):
-        if answers_after_ms is not None:
-            node.get_clock().sleep_for(Duration(nanoseconds=round(answers_after_ms * MS)))
+        node.get_clock().sleep_for(Duration(nanoseconds=answers_after_ms * MS))
         response.message = 'hello'
         return response
 
@@ -46,16 +43,23 @@ def server(answers_after_ms=None):
 
 
 def test_a_service_answers_in_virtual_time(bag, graph):
+    """A synchronous call lends its worker."""
     def take(node, number):
+        client = node.client
         if number == 3:
-            client = node.create_client(Trigger, '/greet')
             assert client.wait_for_service(timeout_sec=1.0)
             future = client.call_async(Trigger.Request())
             future.add_done_callback(lambda done: node.note(done.result().message))
+        elif number == 5:
+            node.note(client.call(Trigger.Request()).message)
 
-    seen, _ = run_filter(bag, graph, take, lambda: server(7))
-    # The request leaves with the end of the callback, after 10 ms.
-    assert seen == [(317.0, 'hello')]
+    def fill(node):
+        node.client = node.create_client(Trigger, '/greet')
+
+    seen, result = run_filter(bag, graph, take, lambda: server(20), workers=1, fill=fill)
+    # The asynchronous request leaves with the end of the callback, after 10 ms.
+    assert seen == [(330.0, 'hello'), (520.0, 'hello')]
+    assert not result.warnings
 
 
 def test_services_of_later_programs_are_waited_for_without_delay(bag, graph):
@@ -80,17 +84,6 @@ def test_services_of_later_programs_are_waited_for_without_delay(bag, graph):
 def test_a_callback_that_still_waits_is_named(bag, graph, wait, what):
     _, result = run_filter(bag, graph, lambda node, number: number == 3 and wait(node))
     assert result.warnings == [f'/filter:take: it still waits (for {what})']
-
-
-def test_a_synchronous_call_lends_its_worker(bag, graph):
-    def take(node, number):
-        if number == 3:
-            client = node.create_client(Trigger, '/greet')
-            node.note(client.call(Trigger.Request()).message)
-
-    seen, result = run_filter(bag, graph, take, lambda: server(20), workers=1)
-    assert seen == [(320.0, 'hello')]
-    assert not result.warnings
 
 
 def test_ros_arguments(bag, graph):
@@ -121,22 +114,13 @@ def test_coroutines(bag, graph):
     assert seen == [(460.0, 'hello 3'), (610.0, 'hello 4')]
 
 
-def test_rates_and_clocks_sleep_in_virtual_time(bag, graph):
-    def take(node, number):
-        if number == 2:
-            rate = node.create_rate(100.0)
-            rate.sleep()
-            node.note('rate')
-            node.get_clock().sleep_for(Duration(seconds=0.5))
-            node.note('clock')
-
-    seen, _ = run_filter(bag, graph, take)
-    assert seen == [(210.0, 'rate'), (710.0, 'clock')]
-
-
 def test_timeouts_of_python_and_rclpy_take_virtual_time(bag, graph):
     def take(node, number):
         if number == 2:
+            node.create_rate(100.0).sleep()
+            node.note('rate')
+            node.get_clock().sleep_for(Duration(seconds=0.5))
+            node.note('clock')
             with suppress(queue.Empty):
                 queue.Queue().get(timeout=0.05)
             node.note('queue')
@@ -148,7 +132,8 @@ def test_timeouts_of_python_and_rclpy_take_virtual_time(bag, graph):
     seen, _ = run_filter(bag, graph, take)
     # seconds since the epoch are floats with a resolution of 0.2 us
     assert [(round(time, 2), what) for time, what in seen] == [
-        (250.0, 'queue'), (300.0, 'semaphore'), (800.0, 'services')]
+        (210.0, 'rate'), (710.0, 'clock'), (760.0, 'queue'), (810.0, 'semaphore'),
+        (1310.0, 'services')]
 
 
 def test_threads_of_nodes_are_in_virtual_time_too(bag, graph):
@@ -178,8 +163,6 @@ def test_threads_of_nodes_are_in_virtual_time_too(bag, graph):
     assert result.counts['/doubled'] == 5
     assert not result.warnings
 
-
-# --- actions -------------------------------------------------------------------------------------
 
 def fibonacci(**more):
     """Return a node with an action that feeds back each 10 ms, and may be cancelled."""
@@ -217,12 +200,11 @@ def test_an_action(bag, graph):
     def fill(node):
         node.client = ActionClient(node, Fibonacci, 'fibonacci')
 
-    for _ in range(2):
-        seen, result = run_filter(bag, graph, take, fibonacci, fill=fill)
-        assert seen == [
-            (310.0, True), (320.0, [0, 1, 1]), (330.0, [0, 1, 1, 2]), (340.0, [0, 1, 1, 2, 3]),
-            (340.0, (GoalStatus.STATUS_SUCCEEDED, [0, 1, 1, 2, 3]))]
-        assert not result.warnings
+    seen, result = run_filter(bag, graph, take, fibonacci, fill=fill)
+    assert seen == [
+        (310.0, True), (320.0, [0, 1, 1]), (330.0, [0, 1, 1, 2]), (340.0, [0, 1, 1, 2, 3]),
+        (340.0, (GoalStatus.STATUS_SUCCEEDED, [0, 1, 1, 2, 3]))]
+    assert not result.warnings
 
 
 def test_results_of_actions_expire(bag, graph):
@@ -245,8 +227,6 @@ def test_results_of_actions_expire(bag, graph):
     assert [status for _, status in seen] == (
         [GoalStatus.STATUS_SUCCEEDED] * 4 + [GoalStatus.STATUS_UNKNOWN] * 2)
 
-
-# --- programs ------------------------------------------------------------------------------------
 
 def test_a_program_with_a_loop_of_its_own(bag, graph):
     seen = []
@@ -297,9 +277,6 @@ def test_a_program_ends_while_its_callback_waits(bag, graph, use):
     assert 'after the end of its node it raised InvalidHandle' in result.warnings[-1]
 
 
-# --- clocks --------------------------------------------------------------------------------------
-
-
 def test_who_waits_by_looking_at_the_time_all_the_time(bag, graph):
     def take(node, number):
         if number == 2:
@@ -330,11 +307,9 @@ def test_what_is_not_the_same_each_time_is_warned_of(bag, graph):
 
 def test_simulated_time_is_that_of_the_recording(tmp_path, graph):
     """The clock of the simulator went half as fast as real time."""
-    messages = sorted([
-        *((i * 100 * MS, '/points', Header(frame_id=str(i))) for i in range(10)),
-        *((i * 20 * MS, '/clock', Clock(clock=Time(sec=5, nanosec=i * 10 * MS)))
-          for i in range(48))], key=lambda each: each[0])
-    bag = write_bag(tmp_path / 'in.mcap', messages)
+    bag = write_bag(tmp_path / 'in.mcap', [
+        *((i * 100, '/points', Header(frame_id=str(i))) for i in range(10)),
+        *((i * 20, '/clock', Clock(clock=Time(sec=5, nanosec=i * 10 * MS))) for i in range(48))])
     seen = []
 
     def make():
@@ -372,48 +347,55 @@ def test_who_is_there_is_known_at_once(bag, graph):
     assert warning.startswith('/filter: get_node_names asks the middleware')
 
 
-# --- what blocks ---------------------------------------------------------------------------------
+STALLS = """\
+from contextlib import suppress
+import socket
+import sys
+import threading
+
+from mddag_executor.rerun import rerun, RerunError, run_threads
+import rclpy
 
 
-def read_for_ever():
+def reads():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         device.bind(('127.0.0.1', 0))
         device.settimeout(0.01)
         while True:
             with suppress(TimeoutError):
-                device.recv(1)  # the line that is named
+                device.recv(1)  # reads is named
 
 
-def pass_on_for_ever():
-    numbers = queue.Queue[int](maxsize=1)
-    threading.Thread(target=lambda: list(iter(numbers.get, None))).start()
-    while True:
-        time.sleep(0.01)  # the line that is named
-        numbers.put(1)
+def computes():
+    any(number for number in iter(int, 1))  # computes is named
 
 
-def compute_for_ever():
-    any(number for number in iter(int, 1))  # the line that is named
+def make():
+    node = rclpy.create_node('filter')
+    threading.Thread(target=globals()[sys.argv[3]]).start()
+    return node
+
+
+run_threads._COMPUTES = 2
+try:
+    rerun(*sys.argv[1:3], [make], patience_s=0.5)
+except RerunError as error:
+    print(error)
+"""
 
 
 @pytest.mark.parametrize(('function', 'words'), [
-    (read_for_ever, ['blocking']), (pass_on_for_ever, ['blocking']),
+    ('reads', ['blocking']),
     # on a busy machine it gets so little CPU time that it seems to wait
-    (compute_for_ever, ['computing', 'blocking'])])
+    ('computes', ['computing', 'blocking'])])
 def test_a_thread_that_keeps_virtual_time_from_passing_is_named(
         tmp_path, bag, graph, function, words):
     """In a process of its own: the thread never ends."""
-    text = '\n'.join((
-        'from contextlib import suppress', 'import queue', 'import socket', 'import threading',
-        'import time', 'import rclpy', 'from mddag_executor.rerun import rerun, RerunError',
-        inspect.getsource(function), 'def make():', "    node = rclpy.create_node('filter')",
-        f'    threading.Thread(target={function.__name__}).start()', '    return node',
-        'try:', f'    rerun({bag!r}, {str(graph)!r}, [make], patience_s=0.5)',
-        'except RerunError as error:', '    print(error)'))
-    (tmp_path / 'driver.py').write_text(text)
-    line = text.partition('# the line')[0].count('\n') + 1
+    (tmp_path / 'driver.py').write_text(STALLS)
     done = subprocess.run(
-        [sys.executable, 'driver.py'], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        [sys.executable, 'driver.py', bag, graph, function], cwd=tmp_path, capture_output=True,
+        text=True, timeout=60)
+    line = STALLS.partition(f'# {function} is')[0].count('\n') + 1
     where = f' at {tmp_path}/driver.py:{line} for'
     assert any(f'it has been {word}{where}' in done.stdout for word in words), done.stderr
     assert done.stdout.startswith('thread Thread-')
