@@ -372,10 +372,11 @@ def computes():
 
 def make():
     node = rclpy.create_node('filter')
-    threading.Thread(target=globals()[sys.argv[3]]).start()
+    threading.Thread(target=function).start()
     return node
 
 
+function = globals()[sys.argv[3]]  # a program has arguments of its own
 run_threads._COMPUTES = 2
 try:
     rerun(*sys.argv[1:3], [make], patience_s=0.5)
