@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes made of a declaration, whose callbacks note what they run for."""
+"""Declarations, and nodes made of them, whose callbacks note what they run for."""
 
 from functools import partial
 from inspect import iscoroutinefunction
@@ -16,6 +16,15 @@ from std_msgs.msg import Header
 from .conftest import wait_for
 
 
+def graph(**nodes):
+    """Return the YAML of nodes: the keys of each callback, one callback a line."""
+    text = 'mddag: 1\nnodes:\n'
+    for node, callbacks in nodes.items():
+        text += f'  - node: /{node}\n    callbacks:\n' + ''.join(
+            f'      - {{{line.strip()}}}\n' for line in callbacks.strip().splitlines())
+    return text
+
+
 class Ran(NamedTuple):
     """An execution: the number and stamp of its message, and the job that it runs for."""
 
@@ -29,13 +38,13 @@ class Declared:
     """
     The nodes of a declaration; a callback publishes the message that it gets on its topics.
 
-    A timer's callback publishes a numbered message, and starts with ``start``.
+    A timer's callback publishes a numbered message, and starts with ``start``. ``ran`` has the
+    executions by the name of the callback.
 
     :param bodies: by the name of a callback, the function or coroutine function that it calls
         before it publishes.
-    :param reentrant: whether all callbacks may run at once, or one of each node; a timer's never
-        runs twice at once.
-    :ivar ran: the executions by the name of the callback.
+    :param reentrant: whether all callbacks may run at once (but no timer's with itself), or one
+        of each node.
     """
 
     def __init__(self, make_node, text, bodies=None, reentrant=True):

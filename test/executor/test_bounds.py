@@ -17,6 +17,7 @@ from std_srvs.srv import Trigger
 
 from ..conftest import run_program
 from .conftest import is_idle, matched, Spinning, wait_for
+from .declared import graph
 
 # --- descriptors ---------------------------------------------------------------------------------
 
@@ -207,14 +208,10 @@ while not executor._is_shutdown:
 thread.join()
 rclpy.shutdown()
 """
-IDLE_GRAPH = """
-mddag: 1
-nodes:
-  - node: /node
-    callbacks:
-      - {name: tick, timer: 5ms, publishes: [/a]}
-      - {name: hear, subscription: /a, deadline: 1s}
-"""
+IDLE_GRAPH = graph(
+    node="""
+        name: tick, timer: 5ms, publishes: [/a]
+        name: hear, subscription: /a, deadline: 1s""")
 
 
 @pytest.mark.parametrize('way', ['spin', 'spin_once'])

@@ -3,7 +3,6 @@
 """What rclpy promises of executors: contexts, several executors, forks, kinds of nodes."""
 
 import multiprocessing
-import re
 import signal
 import threading
 import time
@@ -26,7 +25,6 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
-from ..conftest import run_program
 from .conftest import is_idle, matched, Spinning, wait_for
 
 DEPTH = 1000
@@ -105,52 +103,6 @@ def test_several_contexts_in_one_process(make_executor, make_node, ros_context):
             ended.join()
         assert ros_context.ok() and goes_on(of_near)
     assert handlers == (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM))
-
-
-CONTEXTS = """
-import sys, threading
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException
-from mddag_executor import MultiDeadlineExecutor
-
-
-def spin(name, executor):
-    try:
-        rclpy.spin(nodes[name], executor) if name == 'own' else executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException) as end:
-        ends.append((name, type(end).__name__))
-
-ends, executors, nodes, events = [], {}, {}, []
-rclpy.init()
-other = Context()
-rclpy.init(context=other)
-for name, context in ('own', None), ('other', other):
-    node = nodes[name] = rclpy.create_node(name, context=context)
-    executor = executors[name] = MultiDeadlineExecutor(context=context)
-    executor.add_node(node)
-    ran = threading.Event()
-    events.append(ran)
-    node.create_timer(0.01, ran.set)
-threading.Thread(target=lambda: [e.wait() for e in events] and print('ready', flush=True)).start()
-thread = threading.Thread(target=spin, args=('other', executors['other']))
-thread.start()
-spin('own', executors['own'])
-thread.join()
-for executor in executors.values():
-    executor.shutdown()
-print(sorted(ends), [t.name for t in threading.enumerate() if t.name.startswith('mddag')])
-"""
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_executors_of_all_contexts(number):
-    """And no thread goes on."""
-    out, err = run_program(CONTEXTS, send=number)
-    own = r"('KeyboardInterrupt'|'ExternalShutdownException')"
-    assert re.fullmatch(
-        rf"\[\('other', 'ExternalShutdownException'\), \('own', {own}\)\] \[\]\n", out), out
-    assert 'Traceback' not in err  # a busy machine skips periods of the timers, which is logged
 
 
 def test_one_of_rclpys_executors_in_the_same_process(make_executor, make_node, ros_context):

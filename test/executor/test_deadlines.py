@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declared DAGs on real rclpy nodes: which job, in which order, judged how; what fails."""
 
-from collections import Counter
-import subprocess
-import sys
 import threading
 import time
 
@@ -18,20 +15,14 @@ from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Header
 
 from .conftest import is_idle, matched, Spinning, wait_for
-from .declared import Declared
+from .declared import Declared, graph
 
-CHAIN = """
-mddag: 1
-nodes:
-  - node: /source
-    callbacks: [{name: tick, timer: 20ms, publishes: [/a], dag: chain}]
-  - node: /middle
-    callbacks:
-      - {name: relay, subscription: /a, publishes: [/b]}
-      - {name: early, subscription: /a, deadline: 10ms}
-  - node: /sink
-    callbacks: [{name: last, subscription: /b, deadline: 50ms}]
-"""
+CHAIN = graph(
+    source='name: tick, timer: 20ms, publishes: [/a], dag: chain',
+    middle="""
+        name: relay, subscription: /a, publishes: [/b]
+        name: early, subscription: /a, deadline: 10ms""",
+    sink='name: last, subscription: /b, deadline: 50ms')
 
 
 def sinks(executor):
@@ -82,71 +73,15 @@ def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executo
     assert statistics['never_ran'] == []
 
 
-FOREIGN = """
-import time, rclpy
-from std_msgs.msg import Header
-rclpy.init()
-publisher = rclpy.create_node('foreign').create_publisher(Header, '/a', 10)
-while rclpy.ok():
-    publisher.publish(Header(frame_id='foreign'))
-    time.sleep(0.0001)
-"""
-SHARED = """
-mddag: 1
-nodes:
-  - node: /own
-    callbacks:
-      - {name: tick, timer: 5ms, publishes: [/a], dag: own}
-      - {name: sink, subscription: /a, deadline: 1s}
-"""
-
-
-def test_messages_of_another_process_in_the_same_microseconds_are_told_apart(
-        make_executor, make_node):
-    """Many of them lie in the window of a publication here, and have other numbers."""
-    counts = Counter[str]()
-    node, group = make_node('own'), ReentrantCallbackGroup()
-    publisher = node.create_publisher(Header, '/a', 10)
-
-    def sink(message):
-        job = 'no job' if current_job() is None else 'a job'
-        counts[f'{message.frame_id or "own"}: {job}'] += 1
-
-    timer = node.create_timer(0.005, lambda: publisher.publish(Header()), group, autostart=False)
-    node.create_subscription(Header, '/a', sink, 1000, callback_group=group)
-    # On a busy machine there are too many foreign ones: they have time, and no job ends before.
-    executor = make_executor(
-        loads(SHARED), num_workers=2, nodes=[node], default_deadline='10s', max_active_jobs=1000)
-    foreign = subprocess.Popen([sys.executable, '-c', FOREIGN])
-    try:
-        with Spinning(executor):
-            # its numbers are larger from then on
-            assert wait_for(lambda: counts['foreign: no job'] >= 500)
-            timer.reset()
-            executor.wake()
-            assert wait_for(lambda: counts['own: a job'] + counts['own: no job'] >= 150)
-    finally:
-        foreign.terminate()
-        foreign.wait()
-    assert counts['foreign: a job'] == counts['own: no job'] == 0, counts
-
-
-TWO_TO_ONE = """
-mddag: 1
-nodes:
-  - node: /left
-    callbacks: [{name: fork, timer: 20ms, publishes: [/a, /left], dag: fork}]
-  - node: /worker
-    callbacks:
-      - {name: one, subscription: /left, publishes: [/x]}
-      - {name: two, subscription: /left, publishes: [/y]}
-  - node: /join
-    callbacks:
-      - {name: both, sync: [/x, /y], deadline: 50ms}
-      - {name: any, subscription: /a, deadline: 50ms}
-  - node: /right
-    callbacks: [{name: other, timer: 30ms, publishes: [/a], dag: other}]
-"""
+TWO_TO_ONE = graph(
+    left='name: fork, timer: 20ms, publishes: [/a, /left], dag: fork',
+    worker="""
+        name: one, subscription: /left, publishes: [/x]
+        name: two, subscription: /left, publishes: [/y]""",
+    join="""
+        name: both, sync: [/x, /y], deadline: 50ms
+        name: any, subscription: /a, deadline: 50ms""",
+    right='name: other, timer: 30ms, publishes: [/a], dag: other')
 
 
 def test_sync_completes_with_the_last_leg_and_or_tells_publishers_apart(make_executor, make_node):
@@ -178,17 +113,12 @@ def test_sync_completes_with_the_last_leg_and_or_tells_publishers_apart(make_exe
     assert statistics['undeclared'] == 0
 
 
-ORDER = """
-mddag: 1
-nodes:
-  - node: /source
-    callbacks: [{name: tick, timer: 10s, publishes: [/c, /a, /b], dag: race}]
-  - node: /racer
-    callbacks:
-      - {name: c, subscription: /c, deadline: 300ms}
-      - {name: a, subscription: /a, deadline: 100ms}
-      - {name: b, subscription: /b, deadline: 200ms}
-"""
+ORDER = graph(
+    source='name: tick, timer: 10s, publishes: [/c, /a, /b], dag: race',
+    racer="""
+        name: c, subscription: /c, deadline: 300ms
+        name: a, subscription: /a, deadline: 100ms
+        name: b, subscription: /b, deadline: 200ms""")
 
 
 @pytest.mark.parametrize('policy, expected', [('rad', 'abc'), ('gedf', 'cab')])
@@ -354,14 +284,10 @@ def test_what_had_been_published_before_still_runs(make_executor, make_node, tmp
     timer = node.create_timer(0.02, tick, autostart=False)
     sink.create_subscription(Header, '/a', came.append, 10)
     trace = tmp_path / 'run.mcap'
-    executor = make_executor(loads("""
-mddag: 1
-nodes:
-  - node: /source
-    callbacks: [{name: tick, timer: 20ms, publishes: [/a], dag: chain}]
-  - node: /sink
-    callbacks: [{name: last, subscription: /a, deadline: 5s, execution_time: 1ms}]
-"""), num_workers=1, trace=trace, nodes=[node, sink])
+    executor = make_executor(loads(graph(
+        source='name: tick, timer: 20ms, publishes: [/a], dag: chain',
+        sink='name: last, subscription: /a, deadline: 5s, execution_time: 1ms')),
+        num_workers=1, trace=trace, nodes=[node, sink])
     matched(publisher)
     timer.reset()
     caught = spin_until(executor, lambda: len(came) >= 5)

@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages between callbacks of one process: taken by who publishes, and none is lost."""
 
+import itertools
 import subprocess
 import sys
 import threading
 import time
 
-from mddag_executor.executor import compat
+from mddag_executor.executor import compat, current_job
+from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
@@ -15,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from .conftest import matched, Spinning, wait_for
+from .declared import graph
 
 
 def in_threads(function, *arguments):
@@ -81,12 +84,12 @@ import time, rclpy
 from std_msgs.msg import Header
 rclpy.init()
 node = rclpy.create_node('foreign')
-publisher = node.create_publisher(Header, '/a', 1000)
+publisher = node.create_publisher(Header, '/a', 5000)
 while not publisher.get_subscription_count():
     time.sleep(0.01)
-for number in range(200):
+for number in range(2000):
     publisher.publish(Header(frame_id=f'foreign:{number}'))
-    time.sleep(0.001)
+    time.sleep(0.0001)
 publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=10))
 rclpy.shutdown()
 """
@@ -94,29 +97,42 @@ rclpy.shutdown()
 
 def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
         make_executor, make_node):
-    """Also while other publishers come and go."""
-    node, other, got = make_node('here'), make_node('elsewhere'), []
-    node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 5000)
+    """
+    Also while other publishers come and go; and those of the other process belong to no job.
+
+    Many of them lie in the window of a publication here, and have other numbers.
+    """
+    node, plain, other, got, declared = *map(make_node, ('here', 'plain', 'other')), [], []
     publisher = node.create_publisher(Header, '/a', 5000)
-    executor = make_executor(nodes=[node])
+    count = itertools.count()
+    timer = node.create_timer(
+        0.002, lambda: publisher.publish(Header(frame_id=f'here:{next(count)}')), autostart=False)
+    node.create_subscription(
+        Header, '/a', lambda m: declared.append((m.frame_id[:4], current_job() is None)), 5000)
+    plain.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 5000)
+    # On a busy machine there are too many foreign ones: they have time, and no job ends before.
+    executor = make_executor(loads(graph(here="""
+        name: tick, timer: 2ms, publishes: [/a]
+        name: hear, subscription: /a, deadline: 10s""")), num_workers=2, nodes=[node, plain],
+        default_deadline='10s', max_active_jobs=5000)
     with Spinning(executor):
-        matched(publisher)
+        matched(publisher, count=2)
         with subprocess.Popen([sys.executable, '-c', FOREIGN]) as foreign:
-            number = 0
-            while foreign.poll() is None:
-                # in the end only the other one publishes: no thread here receives for it then
-                if 'foreign:100' not in got:
-                    if number % 30 == 0:
-                        brief = other.create_publisher(Header, '/a', 10)
-                    publisher.publish(Header(frame_id=f'here:{number}'))
-                    if number % 30 == 15:
-                        other.destroy_publisher(brief)
-                    number += 1
-                time.sleep(0.001)
+            assert wait_for(lambda: 'foreign:200' in got)  # its numbers are larger from then on
+            timer.reset()
+            executor.wake()
+            while 'foreign:1500' not in got:
+                brief = other.create_publisher(Header, '/a', 10)
+                time.sleep(0.015)
+                other.destroy_publisher(brief)
+                time.sleep(0.015)
+            timer.cancel()  # only the other one publishes: no thread here receives for it then
         assert foreign.returncode == 0
-        assert wait_for(lambda: len(got) >= number + 200), len(got)
+        number = next(count)
+        assert wait_for(lambda: len(got) == len(declared) == number + 2000), len(got)
     assert numbers(got, 'here') == list(range(number))
-    assert numbers(got, 'foreign') == list(range(200))
+    assert numbers(got, 'foreign') == list(range(2000))
+    assert {*declared} == {('fore', True), ('here', False)}
 
 
 def numbers(got, name):

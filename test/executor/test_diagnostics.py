@@ -1,5 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
+"""What a live run says: diagnostics, statistics, drift, wrong names, a QoS that does not match."""
 
 import os
 import time
@@ -7,18 +8,25 @@ from types import NoneType, UnionType
 from typing import get_args, get_origin, get_type_hints, is_typeddict, Union
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.core import Tables, Tally
 from mddag_executor.core.state import SINK_EXPIRED, SINK_IN_TIME, SINK_LATE
 from mddag_executor.errors import UsageError
 from mddag_executor.executor.diagnostics import DagWatch, ERROR, OK, STALE, WARN
 from mddag_executor.executor.settings import Thresholds
+from mddag_executor.executor.statistics import Watch
 from mddag_executor.executor.statistics_types import Statistics
+from mddag_executor.replay import open_recording
+from mddag_executor.replay.drift import drift_of
+from mddag_executor.report.live_runs import live_lines
 from msg_graph import loads
 import pytest
+from rclpy.executors import ExternalShutdownException
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from std_msgs.msg import Empty, String
 
 from .conftest import Spinning, wait_for
-from .declared import Declared
+from .declared import Declared, graph
 from .test_deadlines import CHAIN
 
 SECOND = 1_000_000_000
@@ -28,7 +36,7 @@ SECOND = 1_000_000_000
 
 
 class Watched:
-    """Diagnostics of a live run, and the types of its statistics."""
+    """A tally, and the diagnostics of its only DAG."""
 
     def __init__(self, **thresholds):
         task_set = loads(CHAIN)
@@ -146,21 +154,16 @@ def test_statuses_are_published_from_ok_to_stale(make_executor, make_node):
 
 def test_a_shutdown_of_the_context_ends_it_quietly(make_executor, make_node, ros_context, capfd):
     executor = make_executor(diagnostics_period='20ms', nodes=[make_node()])
-    spinning = Spinning(executor)
-    spinning._thread.start()
-    assert wait_for(lambda: executor._diagnostics._thread is not None)
-    time.sleep(0.1)
-    ros_context.try_shutdown()
-    spinning.join()
-    assert wait_for(lambda: not executor._diagnostics._thread.is_alive())
+    with Spinning(executor, raises=ExternalShutdownException) as spinning:
+        assert wait_for(lambda: executor._diagnostics._thread is not None)
+        time.sleep(0.1)
+        ros_context.try_shutdown()
+        spinning.join()
+        assert wait_for(lambda: not executor._diagnostics._thread.is_alive())
     assert 'diagnostics' not in capfd.readouterr().err
 
 
-GRAPH = """\
-mddag: 1
-nodes:
-  - {node: /n, callbacks: [{name: t, timer: 20ms, deadline: 1us}]}
-"""
+# --- statistics ----------------------------------------------------------------------------------
 
 
 def check(value, hint, place):
@@ -186,21 +189,107 @@ def check(value, hint, place):
         assert isinstance(value, hint), f'{place}: {value!r}'
 
 
-def test_statistics_have_the_declared_types(ros_context, make_node, tmp_path):
+def test_statistics_have_the_declared_types(make_executor, make_node, tmp_path):
     trace = tmp_path / 'run.mcap'
-    with MultiDeadlineExecutor(
-            loads(GRAPH), context=ros_context, trace=trace,
-            worker_cpus=list(os.sched_getaffinity(0))) as executor:
-        assert isinstance(executor, MultiDeadlineExecutor)
-        check(executor.statistics(), Statistics, 'statistics')
-        node = make_node('n')
-        node.create_timer(0.02, lambda: time.sleep(0.001))
-        node.create_timer(0.01, lambda: None)
-        executor.add_node(node)
-        with Spinning(executor):
-            assert wait_for(lambda: executor.statistics()['first_miss'] is not None)
-        found = executor.statistics()
+    node = make_node('n')
+    node.create_timer(0.02, lambda: time.sleep(0.001))
+    node.create_timer(0.01, lambda: None)
+    executor = make_executor(loads("""\
+mddag: 1
+nodes:
+  - {node: /n, callbacks: [{name: t, timer: 20ms, deadline: 1us}]}
+"""), trace=trace, worker_cpus=list(os.sched_getaffinity(0)))
+    check(executor.statistics(), Statistics, 'statistics')
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: executor.statistics()['first_miss'] is not None)
+    found = executor.statistics()
     check(found, Statistics, 'statistics')
     assert found['trace'] == {'path': str(trace), 'lost': 0, 'error': None}
     assert found['dags']['/n']['sinks']['/n:t']['response_ns'] is not None
     assert {'/n:t'} < set(found['callbacks'])
+
+
+# --- what does not match -------------------------------------------------------------------------
+
+
+def test_a_sync_that_never_got_one_of_its_topics(make_executor, make_node, tmp_path):
+    task_set = loads(graph(
+        camera='name: grab, timer: 20ms, publishes: [/image, /info]',
+        eye='name: see, sync: [/image, /info], deadline: 20ms'))
+    path = str(tmp_path / 'run.mcap')
+    executor = make_executor(task_set, num_workers=2, trace=path)
+    watch = Watch(executor, task_set)
+    camera, eye, seen = make_node('camera'), make_node('eye'), []
+    image = camera.create_publisher(Empty, 'image', 10)
+    for topic in ('image', 'inf'):
+        eye.create_subscription(Empty, topic, seen.append, 10)
+    camera.create_timer(0.02, lambda: image.publish(Empty()))
+    executor.add_node(camera)
+    executor.add_node(eye)
+    with Spinning(executor):
+        assert wait_for(lambda: len(seen) > 8)
+    live = watch.drift(executor.statistics())
+    for text in (live[0].text, drift_of(open_recording(path))[0].text):
+        assert text.startswith('/eye:see never got a message of /info in ')
+        assert text.endswith(": did you mean the topic '/inf'?")
+
+
+CAMERA = graph(
+    camera='name: capture, timer: 50ms, publishes: [/image], dag: vision',
+    detector='name: detect, subscription: /image, deadline: 50ms')
+
+
+@pytest.mark.parametrize(('node', 'topic', 'expected'), [
+    ('camera', 'image', None),
+    ('kamera', 'image', '1 declared callback was found in no node: /camera:capture '
+     "(did you mean the node '/kamera'?); undeclared callbacks that ran: "
+     '/kamera: tick (timer 50ms): '),
+    ('camera', 'robot/image', '1 declared callback was found in no node: /detector:detect '
+     "(did you mean the topic '/robot/image'?); undeclared callbacks that ran: /detector: hear "
+     '(subscription /robot/image): ')])
+def test_a_wrong_name_is_warned_of_once(
+        make_executor, make_node, capfd, monkeypatch, node, topic, expected):
+    monkeypatch.setattr('mddag_executor.executor.name_check.LEAST_S', 0.3)
+    camera, detector, heard = make_node(node), make_node('detector'), []
+    publisher = camera.create_publisher(String, topic, 10)
+
+    def tick():
+        publisher.publish(String())
+
+    def hear(message):
+        heard.append(message)
+
+    camera.create_timer(0.05, tick)
+    detector.create_subscription(String, topic, hear, 10)
+    executor = make_executor(loads(CAMERA, 'camera.yaml'), nodes=[camera, detector])
+    executor.spin_until_future_complete(Future(), 1.1)
+    executor.shutdown()
+    assert heard
+    warned = [line for line in capfd.readouterr().err.splitlines() if 'found in no node' in line]
+    if expected is None:
+        assert warned == []
+    else:
+        line, = warned
+        assert f'camera.yaml: {expected}' in line
+
+
+def test_a_subscription_that_gets_nothing_for_its_qos_is_named(make_executor, make_node):
+    camera, detector = make_node('camera'), make_node('detector')
+    publisher = camera.create_publisher(
+        String, '/image', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    camera.create_timer(0.05, lambda: publisher.publish(String()))
+    detector.create_subscription(String, '/image', print, 10)
+    executor = make_executor(loads(CAMERA), nodes=[camera, detector])
+
+    def incompatible():
+        return {name: each['incompatible_qos']
+                for name, each in executor.statistics()['callbacks'].items()}
+
+    with Spinning(executor):
+        assert wait_for(lambda: incompatible().get('/detector:detect'))
+    assert incompatible()['/detector:detect'] == 'RELIABILITY'
+    assert incompatible()['/camera:capture'] is None
+    lines = list(live_lines({**executor.statistics(), 'measured': None}))
+    assert ('1 callback without messages, as a publisher has an incompatible QoS: '
+            '/detector:detect (RELIABILITY)') in lines

@@ -2,18 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Callbacks that hold the GIL: one at a time, most urgent first, and never a deadlock."""
 
+import os
+import random
 import sys
 import threading
 import time
 
 from mddag_executor.executor import publishing
-import msg_graph
+from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
+from std_srvs.srv import Trigger
 
-from .conftest import Spinning, wait_for
-from .declared import Declared
+from .conftest import matched, Spinning, wait_for
+from .declared import Declared, graph
 
 MS = 1_000_000
 
@@ -25,30 +28,38 @@ def compute(ms):
         pass
 
 
+def declare(*callbacks):
+    """Declare callbacks of one node: name, and keys in YAML."""
+    return graph(node='\n'.join(f'name: {name}, dag: {name}, {keys}' for name, keys in callbacks))
+
+
 @pytest.mark.parametrize('holds, most', [('true', 1), ('false', 4)])
 def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, holds, most):
-    node, gate = make_node('publishes'), threading.Barrier(most)
-    running, at_once = list[int](), list[int]()
+    """And the interpreter switches between them sooner, as long as the executor spins."""
+    gate = threading.Barrier(most)
+    running, at_once, intervals = [], [], set()
 
     def body():
         running.append(1)
         at_once.append(len(running))
         gate.wait(20.0)  # passes only when so many are there
         compute(5)
+        intervals.add(sys.getswitchinterval())
         running.pop()
 
-    text = 'mddag: 1\nnodes:\n  - node: /node\n    callbacks:\n' + ''.join(
-        f'      - {{name: {name}, subscription: /{name}, dag: {name}, period: 100ms, '
-        f'deadline: 50ms, holds_interpreter: {holds}}}\n' for name in 'abcd')
+    text = declare(*((
+        name, f'subscription: /{name}, period: 100ms, deadline: 50ms, holds_interpreter: {holds}')
+        for name in 'abcd'))
     nodes = Declared(make_node, text, dict.fromkeys('abcd', body))
-    publishers = [node.create_publisher(Header, f'/{name}', 10) for name in 'abcd']
-    executor = make_executor(msg_graph.loads(text), nodes=nodes.nodes.values())
-    with Spinning(executor):
-        assert wait_for(lambda: all(each.get_subscription_count() for each in publishers))
+    publishers = [make_node('p').create_publisher(Header, f'/{name}', 10) for name in 'abcd']
+    before = sys.getswitchinterval()
+    with Spinning(make_executor(loads(text), nodes=nodes.nodes.values())):
+        matched(*publishers)
         for publisher in publishers:
             publisher.publish(Header())
         assert wait_for(lambda: len(at_once) == 4 and not running, 20.0)
     assert max(at_once) == most
+    assert [*intervals] == [pytest.approx(0.001)] and sys.getswitchinterval() == before
 
 
 def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_node):
@@ -68,12 +79,9 @@ def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_
         seen.append(len(ticks) - before)
 
     node.create_timer(0.1, capture, callback_group=group)
-    executor = make_executor(msg_graph.loads(
-        'mddag: 1\nnodes:\n  - node: /node\n    callbacks:\n'
-        '      - {name: step, timer: 1ms, dag: step, deadline: 1ms, holds_interpreter: true}\n'
-        '      - {name: capture, timer: 100ms, dag: camera, deadline: 60s, '
-        'holds_interpreter: true}\n',
-        'g.yaml'), nodes=[node])
+    executor = make_executor(loads(declare(
+        ('step', 'timer: 1ms, deadline: 1ms, holds_interpreter: true'),
+        ('capture', 'timer: 100ms, deadline: 60s, holds_interpreter: true'))), nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(seen) >= 3, 160.0)
     assert min(seen[:3]) >= 3
@@ -113,9 +121,8 @@ def test_what_a_callback_needs_when_nothing_disturbs_it(make_executor, make_node
     for name, body in zip('abcd', (
             lambda: time.sleep(0.02), lambda: compute(20), lambda: None, lends)):
         node.create_timer(0.1, lambda name=name, body=body: (body(), ran.append(name)), group)
-    executor = make_executor(msg_graph.loads('mddag: 1\nnodes:\n  - node: /node\n    callbacks:\n'
-        + ''.join(f'      - {{name: {name}, timer: 100ms, dag: {name}, deadline: 1s}}\n'
-                  for name in 'abcd'), 'g.yaml'), nodes=[node])
+    executor = make_executor(loads(declare(*(
+        (name, 'timer: 100ms, deadline: 1s') for name in 'abcd'))), nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: all(ran.count(name) > 12 for name in 'abcd'), 30.0)
     sleeps, computes, empty, lent = executor._engine.scheduler.state.mean[:4]
@@ -123,30 +130,11 @@ def test_what_a_callback_needs_when_nothing_disturbs_it(make_executor, make_node
     assert empty < 20 * MS and lent < 20 * MS
 
 
-def test_the_switch_interval_is_given_back(make_executor, make_node):
-    node, seen = make_node(), []
-    node.create_timer(0.001, lambda: seen.append(sys.getswitchinterval()))
-    executor = make_executor(nodes=[node])
-    before = sys.getswitchinterval()
-    with Spinning(executor):
-        assert wait_for(lambda: seen)
-    assert seen[0] == pytest.approx(0.001) and sys.getswitchinterval() == before
-
-
 # --- what arrives next to a callback that computes for long --------------------------------------
 
-COMPUTING = """
-mddag: 1
-nodes:
-  - node: /node
-    callbacks:
-      - {name: long, subscription: /long, dag: long, period: 1s, deadline: 60s,
-         holds_interpreter: true}
-      - {name: urgent, subscription: /urgent, dag: urgent, period: 1s, deadline: 10ms,
-         holds_interpreter: true}
-      - {name: patient, subscription: /patient, dag: patient, period: 1s, deadline: 120s,
-         holds_interpreter: true}
-"""
+COMPUTING = declare(*(
+    (name, f'subscription: /{name}, period: 1s, deadline: {deadline}, holds_interpreter: true')
+    for name, deadline in (('long', '60s'), ('urgent', '10ms'), ('patient', '120s'))))
 
 
 class Computing:
@@ -164,13 +152,11 @@ class Computing:
         nodes = Declared(make_node, COMPUTING, {
             'long': self._long, 'urgent': lambda: self.ran.append('urgent'),
             'patient': lambda: self.ran.append('patient')})
-        self.executor = make_executor(
-            msg_graph.loads(COMPUTING, 'g.yaml'), nodes=nodes.nodes.values())
+        self.executor = make_executor(loads(COMPUTING), nodes=nodes.nodes.values())
         other = make_node('publishes')
         self.publishers = {
             name: other.create_publisher(Header, f'/{name}', 10) for name in nodes.ran}
-        assert wait_for(lambda: all(
-            p.get_subscription_count() == 1 for p in self.publishers.values()))
+        matched(*self.publishers.values())
 
     def publish(self, name):
         self.publishers[name].publish(Header())
@@ -215,28 +201,21 @@ def computing(request, make_executor, make_node, monkeypatch):
         yield found
 
 
-def test_it_does_so_at_once(computing):
-    """The long one does not wait for it, however long it usually takes."""
-    computing.meanwhile = lambda: 'urgent' in computing.ran
-    computing.habit.mean_ns = 20_000 * MS
-    assert computing.order('urgent') == ['begins', 'urgent', 'ends']
-
-
-def test_an_arrival_with_a_later_deadline_is_collected_after_a_long_callback(computing):
+def test_arrivals_with_an_earlier_deadline_overtake_and_others_wait(computing):
     """
-    Its callback never begins before the long one has ended.
+    The long one does not wait for an urgent one, however long it usually takes.
 
-    As no thread is woken for it, it may only be taken then; so it must not be overlooked.
+    A patient one never begins before the long one has ended. As no thread is woken for it, it may
+    only be taken then; so it must not be overlooked.
     """
     for _ in range(3):
         assert computing.order('patient') == ['begins', 'ends', 'patient']
-    assert computing.executor.statistics()['dropped'] == {}
-
-
-def test_of_two_arrivals_during_a_long_callback_one_overtakes(computing):
     computing.meanwhile = lambda: 'urgent' in computing.ran
     for names in (('patient', 'urgent'), ('urgent', 'patient')):
         assert computing.order(*names) == ['begins', 'urgent', 'ends', 'patient']
+    computing.habit.mean_ns = 20_000 * MS
+    assert computing.order('urgent') == ['begins', 'urgent', 'ends']
+    assert computing.executor.statistics()['dropped'] == {}
 
 
 @pytest.mark.parametrize('computing', ['elsewhere'], indirect=True)
@@ -265,3 +244,97 @@ def test_what_cannot_start_is_left_in_the_middleware(computing):
         if queued[-1] == 0:
             break
     assert queued[-1] == 0
+
+
+# --- at random -----------------------------------------------------------------------------------
+
+NAMES = tuple('abcdef')
+SEED = int(os.environ.get('FUZZ_SEED', '1'))
+ROUNDS = int(os.environ.get('FUZZ_ROUNDS', '25'))
+PATIENCE_S = 60.0
+
+
+def scripts(seed):
+    """Return what each does in a round; it waits only for those after it in the alphabet."""
+    draw = random.Random(seed)
+    found = {}
+    for place, name in enumerate(NAMES):
+        steps = [('set', place)]
+        for _ in range(draw.randint(1, 4)):
+            kind = draw.choice(('compute', 'sleep', 'call', 'wait', 'wait', 'lock'))
+            if kind == 'wait' and place + 1 < len(NAMES):
+                steps.append((kind, draw.randrange(place + 1, len(NAMES))))
+            elif kind != 'wait':
+                steps.append((kind, draw.choice((20, 300, 3000))))
+        draw.shuffle(steps)
+        found[name] = steps
+    return found
+
+
+class Robot:
+    """A node whose callbacks do what the script of the round says, and note what they did."""
+
+    def __init__(self, node):
+        self.done = {}
+        self._scripts = {}
+        self._events = []
+        self._lock = threading.Lock()
+        group = ReentrantCallbackGroup()
+        self._publishers = {
+            name: node.create_publisher(Header, f'/{name}', 10) for name in NAMES}
+        for name in NAMES:
+            node.create_subscription(
+                Header, f'/{name}', lambda message, name=name: self._run(name), 10,
+                callback_group=group)
+        node.create_service(
+            Trigger, '/serve', lambda request, response: response, callback_group=group)
+        self.client = node.create_client(Trigger, '/serve', callback_group=group)
+
+    def start(self, seed):
+        self._scripts = scripts(seed)
+        self._events = [threading.Event() for _ in NAMES]
+        self.done = {}
+        for name in random.Random(seed).sample(NAMES, len(NAMES)):
+            self._publishers[name].publish(Header())
+
+    def _run(self, name):
+        done = []
+        for kind, number in self._scripts[name]:
+            if kind == 'compute':
+                compute(number / 1e3)
+            elif kind == 'sleep':
+                time.sleep(number / 1e6)
+            elif kind == 'call':
+                assert self.client.call(Trigger.Request()) is not None
+            elif kind == 'wait':
+                assert self._events[number].wait(PATIENCE_S)
+            elif kind == 'lock':
+                with self._lock:
+                    time.sleep(number / 1e7)
+            else:
+                self._events[number].set()
+            done.append((kind, number))
+        self.done[name] = done
+
+
+def test_all_end_whatever_was_declared(make_executor, make_node):
+    """
+    They wait for one another, compute, sleep and call services, at random.
+
+    They are declared to hold the interpreter, or not to, or nothing is said. FUZZ_ROUNDS is how
+    many rounds are run, from FUZZ_SEED on.
+    """
+    draw = random.Random(SEED)
+    text = declare(*((
+        name, f'subscription: /{name}, period: 100ms, deadline: {draw.randint(5, 50)}ms'
+        + draw.choice((', holds_interpreter: true', ', holds_interpreter: false', '')))
+        for name in NAMES))
+    node = make_node()
+    robot = Robot(node)
+    with Spinning(make_executor(
+            loads(text), num_workers=len(NAMES) + 1, nodes=[node])):
+        assert robot.client.wait_for_service(PATIENCE_S)
+        for seed in range(SEED, SEED + ROUNDS):
+            robot.start(seed)
+            assert wait_for(lambda: len(robot.done) == len(NAMES), PATIENCE_S), robot.done
+            assert robot.done == scripts(seed)

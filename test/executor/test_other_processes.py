@@ -1,33 +1,66 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
+"""Which publication a message comes from, and which job: within a process, and over several."""
 
+from contextlib import ExitStack
 import time
 
-from mddag_executor.executor.jobs import header_stamp
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.executor.jobs import (
+    Announced,
+    header_stamp,
+    Jobs,
+    Origin,
+    Publication,
+    PublisherNumbers,
+    PublisherState,
+    ROUNDING_NS,
+)
 from msg_graph import loads
 import pytest
-from std_msgs.msg import Header
+from std_msgs.msg import Header, UInt8MultiArray
 
-from .conftest import is_idle, Spinning, wait_for
-from .declared import Declared
+from .conftest import is_idle, matched, Spinning, wait_for
+from .declared import Declared, graph
 
-CHAIN = """
-mddag: 1
-nodes:
-  - node: /sensor
-    callbacks: [{name: tick, timer: 20ms, publishes: [/raw], dag: chain,
-                 release_from: header_stamp}]
-  - node: /first
-    callbacks: [{name: first, subscription: /raw, publishes: [/half]}]
-  - node: /second
-    callbacks: [{name: second, subscription: /half, publishes: [/whole]}]
-  - node: /last
-    callbacks: [{name: sink, subscription: /whole, deadline: 100ms}]
-"""
 MS = 1_000_000
 
 
-# --- stamps --------------------------------------------------------------------------------------
+def run_in(make_executor, make_node, text, processes, named=True):
+    """Run 20 jobs or more over several executors, as in processes; return nodes and executors."""
+    nodes = Declared(make_node, text, reentrant=False)
+    if named:
+        text += 'processes:\n' + ''.join(
+            f'  {name}: [{", ".join("/" + node for node in here.split())}]\n'
+            for name, here in processes.items())
+    executors = []
+    for name, here in processes.items():
+        executors.append(make_executor(
+            loads(text), nodes=[nodes.nodes[node] for node in here.split()],
+            **({'process': name} if named else {})))
+    legs = 2 if named else 1
+    with ExitStack() as stack:
+        for executor in executors:
+            stack.enter_context(Spinning(executor))
+        assert wait_for(lambda: nodes.connected() and not any(e.unmatched() for e in executors))
+        nodes.start(*executors)
+        assert wait_for(lambda: len(nodes.ran['sink']) >= legs * 20)
+        nodes.cancel()
+        assert wait_for(lambda: len(nodes.ran['sink']) == legs * len(nodes.ran['tick'])
+                        and all(map(is_idle, executors)))
+    for executor in executors:
+        assert executor.statistics()['undeclared'] == 0
+    return nodes, executors
+
+
+# --- by stamps -----------------------------------------------------------------------------------
+
+CHAIN = graph(
+    sensor='name: tick, timer: 20ms, publishes: [/raw], dag: chain, release_from: header_stamp',
+    first='name: first, subscription: /raw, publishes: [/half]',
+    second='name: second, subscription: /half, publishes: [/whole]',
+    last='name: sink, subscription: /whole, deadline: 60s')
 
 
 class Thing:
@@ -44,28 +77,15 @@ def test_no_stamp(message):
     assert header_stamp(message) == -1
 
 
+def stamped(nanoseconds):
+    message = Header()
+    message.stamp.sec, message.stamp.nanosec = divmod(nanoseconds, 1_000_000_000)
+    return message
+
+
 def test_stamps_of_a_header_and_of_a_message_that_has_one():
-    header = Header()
-    header.stamp.sec, header.stamp.nanosec = 3, 7
+    header = stamped(3_000_000_007)
     assert header_stamp(header) == header_stamp(Thing(header=header)) == 3_000_000_007
-
-
-# --- two executors are as two processes ----------------------------------------------------------
-
-
-def in_two(make_executor, make_node, text, elsewhere=('second', 'last')):
-    """Run 20 jobs of the chain, some of its nodes in a second executor; return both."""
-    nodes = Declared(make_node, text, reentrant=False)
-    here, there = make_executor(loads(text)), make_executor(loads(text))
-    for name, node in nodes.nodes.items():
-        (there if name in elsewhere else here).add_node(node)
-    with Spinning(here), Spinning(there):
-        nodes.start(here, there)
-        assert wait_for(lambda: len(nodes.ran['sink']) >= 20)
-        nodes.cancel()
-        assert wait_for(lambda: len(nodes.ran['sink']) == len(nodes.ran['tick'])
-                        and is_idle(here) and is_idle(there))
-    return nodes, here, there
 
 
 def ends(executor):
@@ -73,7 +93,8 @@ def ends(executor):
 
 
 def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_executor, make_node):
-    nodes, up, down = in_two(make_executor, make_node, CHAIN.replace('100ms', '60s'))
+    nodes, (up, down) = run_in(
+        make_executor, make_node, CHAIN, {'up': 'sensor first', 'down': 'second last'}, False)
     n = len(nodes.ran['tick'])
     for name in ('second', 'sink'):
         assert [each.job.job for each in nodes.ran[name]] == list(range(n))
@@ -82,8 +103,7 @@ def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_execut
     assert nodes.jobs_of_numbers('first') == nodes.jobs_of_numbers('tick')
     skipped = up.statistics()['callbacks']['/sensor:tick']['skipped']  # on a busy machine
     for executor, expired in ((up, skipped), (down, 0)):
-        statistics = executor.statistics()
-        assert statistics['undeclared'] == 0 and statistics['never_ran'] == []
+        assert executor.statistics()['never_ran'] == []
         assert ends(executor) == {
             'completed': n, 'late': 0, 'aborted': 0, 'expired': expired, 'failed': 0, 'dropped': 0}
     assert up.statistics()['dags']['chain']['sinks'] == {}
@@ -93,9 +113,8 @@ def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_execut
 
 
 def test_a_dag_leaves_and_comes_back_to_the_same_job(make_executor, make_node):
-    # nothing is late on a busy machine
-    nodes, outer, inner = in_two(
-        make_executor, make_node, CHAIN.replace('100ms', '60s'), elsewhere=('second',))
+    nodes, (outer, inner) = run_in(
+        make_executor, make_node, CHAIN, {'outer': 'sensor first last', 'inner': 'second'}, False)
     n = len(nodes.ran['tick'])
     # at home the release is the timer's due time, not the stamp
     assert nodes.jobs('sink') == nodes.jobs('first')
@@ -104,51 +123,212 @@ def test_a_dag_leaves_and_comes_back_to_the_same_job(make_executor, make_node):
     skipped = outer.statistics()['callbacks']['/sensor:tick']['skipped']
     assert outer.statistics()['dags']['chain']['jobs'] == n + skipped
     assert ends(outer)['completed'] == ends(inner)['completed'] == n
-    assert outer.statistics()['undeclared'] == inner.statistics()['undeclared'] == 0
 
 
-@pytest.fixture
-def lone(make_executor, make_node):
-    """Give a spinning executor that has the last two nodes, a publisher on /half, and jobs."""
+def test_messages_without_a_stamp_for_a_second_time_and_of_the_future(make_executor, make_node):
     nodes = Declared(make_node, CHAIN)
-    executor = make_executor(loads(CHAIN))
-    for name in ('second', 'last'):
-        executor.add_node(nodes.nodes[name])
+    executor = make_executor(
+        loads(CHAIN), nodes=[nodes.nodes[name] for name in ('second', 'last')])
     half = make_node('elsewhere').create_publisher(Header, '/half', 50)
+
+    def publish(message):
+        """Return the jobs for which both callbacks run then."""
+        count = len(nodes.ran['sink']) + 1
+        half.publish(message)
+        assert wait_for(lambda: len(nodes.ran['sink']) == count and is_idle(executor))
+        return nodes.jobs('second')[-1], nodes.jobs('sink')[-1]
+
     with Spinning(executor):
-        assert wait_for(lambda: half.get_subscription_count() == 1)
+        matched(half)
         assert wait_for(nodes.connected)
-        yield executor, half, nodes
+        assert publish(Header()) == (None, None)
+        assert executor.statistics()['callbacks']['/second:second']['unattributed'] == 1
+        stamp = time.time_ns()
+        assert None not in publish(stamped(stamp))
+        assert publish(stamped(stamp))[0] is None  # its job has ended
+        assert executor.statistics()['dags']['chain']['jobs'] == 1
+        # a stamp of the future is no release before now
+        before = time.time_ns()
+        _, job = publish(stamped(before + 10_000 * MS))
+        assert abs(job.release_ns - before) < 1000 * MS
 
 
-def stamped(nanoseconds):
-    message = Header()
-    message.stamp.sec, message.stamp.nanosec = divmod(nanoseconds, 1_000_000_000)
-    return message
+# --- by announcements ----------------------------------------------------------------------------
+
+GRAPH = graph(
+    one='name: tick, timer: 20ms, publishes: [/left, /right], dag: main',
+    two='name: two, subscription: /left, publishes: [/join_left]',
+    three='name: three, subscription: /right, publishes: [/join_right]',
+    four="""
+        name: take, subscription: /join_left, publishes: [/end]
+        name: take_too, subscription: /join_right, publishes: [/end]""",
+    five='name: sink, subscription: /end, deadline: 60s')
 
 
-def test_a_message_without_a_stamp_is_undeclared(lone):
-    executor, half, nodes = lone
-    half.publish(Header())
-    assert wait_for(lambda: len(nodes.ran['sink']) == 1)
-    assert nodes.jobs('second') == nodes.jobs('sink') == [None]
-    assert executor.statistics()['callbacks']['/second:second']['unattributed'] == 1
+def test_every_job_is_found_by_its_number(make_executor, make_node):
+    """One leg leaves and comes back, one is here; the rest is elsewhere."""
+    nodes, executors = run_in(
+        make_executor, make_node, GRAPH, {'p1': 'one two four', 'p2': 'three', 'p3': 'five'})
+    releases = {number: job.release_ns for number, job in nodes.jobs_of_numbers('tick').items()}
+    for name, ran in nodes.ran.items():
+        for each in ran:
+            assert each.job is not None, (name, each)
+            # each process has a trace clock of its own
+            assert abs(each.job.release_ns - releases[each.number]) < 10 * MS, (name, each)
+    for executor in executors:
+        assert executor.statistics()['unattributed'] == {'unknown': 0, 'doubtful': 0}
+    last = executors[-1].statistics()['dags']['main']
+    assert sum(sink['completed'] for sink in last['sinks'].values()) == 2 * len(releases)
 
 
-def test_a_second_message_of_a_job_that_has_ended_is_undeclared(lone):
-    executor, half, nodes = lone
-    stamp = time.time_ns()
-    half.publish(stamped(stamp))
-    assert wait_for(lambda: sum(ends(executor).values()) == 1)
-    half.publish(stamped(stamp))
-    assert wait_for(lambda: len(nodes.ran['sink']) == 2)
-    assert [job is None for job in nodes.jobs('second')] == [False, True]
-    assert executor.statistics()['dags']['chain']['jobs'] == 1
+def test_messages_without_announcement_wait_for_a_while_and_are_counted(make_executor, make_node):
+    """Those of a stranger; and those on a topic on which two processes publish are a doubt."""
+    text = GRAPH.replace('publishes: [/join_right]', 'publishes: [/join_left]').replace(
+        '      - {name: take_too, subscription: /join_right, publishes: [/end]}\n', '')
+    nodes = Declared(make_node, text)
+    text += 'processes: {p1: [/one], p2: [/two, /four, /five], p3: [/three]}'
+    executor = make_executor(
+        loads(text), process='p2', nodes=[nodes.nodes[name] for name in ('two', 'four', 'five')])
+    other = make_node('stranger')
+    stranger, doubt = (other.create_publisher(Header, t, 10) for t in ('/left', '/join_left'))
+    noise = other.create_publisher(
+        UInt8MultiArray, executor._announcements.subscriptions[0].topic_name, 10)
+    with Spinning(executor):
+        matched(stranger, doubt, noise)
+        for rubbish in (b'', b'x' * 3, b'\xff' * 80, b'\0' * 80):
+            noise.publish(UInt8MultiArray(data=rubbish))
+        doubt.publish(Header(frame_id='2'))
+        assert wait_for(lambda: nodes.ran['take'])
+        assert executor.statistics()['unattributed'] == {'unknown': 0, 'doubtful': 1}
+        stranger.publish(Header(frame_id='1'))
+        assert wait_for(lambda: nodes.ran['two'])
+    assert nodes.jobs_of_numbers('take')[2] is None
+    assert nodes.jobs_of_numbers('two') == {1: None}
+    statistics = executor.statistics()
+    assert statistics['callbacks']['/two:two']['unattributed'] == 1
+    assert statistics['unattributed']['unknown'] == 1
 
 
-def test_a_stamp_of_the_future_is_no_release_before_now(lone):
-    executor, half, nodes = lone
-    before = time.time_ns()
-    half.publish(stamped(before + 10_000 * MS))
-    assert wait_for(lambda: len(nodes.ran['sink']) == 1)
-    assert abs(nodes.jobs('sink')[0].release_ns - before) < 1000 * MS
+# --- the windows of publications, and the numbers of publishers ----------------------------------
+
+TOPIC = '/topic'
+ONE_TOPIC = graph(
+    n="""
+        name: tick, timer: 10ms, publishes: [/topic]
+        name: end, subscription: /topic, deadline: 5ms""")
+
+
+class Bench:
+    """Jobs whose publications are given, with a publisher or two."""
+
+    def __init__(self):
+        self.jobs = Jobs(loads(ONE_TOPIC, 'g.yaml'))
+        self.topic = self.jobs.topics[TOPIC]
+        self.publishers = [PublisherState(TOPIC), PublisherState(TOPIC)]
+
+    def published(self, begin, end, job, publisher=0):
+        state = self.publishers[publisher]
+        state.count += 1
+        publication = Publication(begin, state.numbers, Origin(0, 0, job, publisher), state.count)
+        self.topic.publications.append(publication)
+        if end is not None:
+            publication.end = end
+
+    def job(self, stamp, sequence=None):
+        origin = self.jobs.find(TOPIC, stamp, sequence)
+        return None if origin is None else origin.job
+
+
+def test_the_sequence_number_decides_between_publishers():
+    bench = Bench()
+    bench.published(0, 10, 1, publisher=0)
+    bench.published(1000, 1010, 2, publisher=1)
+    bench.published(2000, 2010, 3, publisher=1)
+    bench.published(3000, 3100, 4, publisher=0)
+    bench.published(3050, 3150, 5, publisher=1)
+    assert bench.job(3080) is None, 'without a number the job is unknown'
+    assert bench.jobs.doubtful == 1
+    assert bench.job(3080, 2) == 4
+    assert bench.job(3080, 3) == 5
+    assert bench.job(3080, 9) is None
+    assert bench.jobs.doubtful == 2
+
+
+def test_publications_before_the_count_began_are_learnt():
+    """The middleware counts 100 more than we do for publisher 0; two messages in a row show it."""
+    bench = Bench()
+    bench.published(0, 10, 1, publisher=0)
+    assert bench.job(5, 101) is None
+    assert bench.job(5, 101) is None, 'the same one'
+    bench.published(20, 30, 2, publisher=0)
+    assert bench.job(25, 102) == 2
+    bench.published(100, 200, 3, publisher=0)
+    bench.published(110, 210, 4, publisher=1)
+    assert bench.job(150, 103) == 3
+    assert bench.job(150, 1) == 4
+
+
+def test_messages_of_a_stranger_in_the_window_belong_to_no_job():
+    """Whatever its numbers are, and however often they differ alike."""
+    bench = Bench()
+    for job in range(1, 100):
+        bench.published(job * 1000, job * 1000 + 10, job)
+        for number in (job + 7, 3 * job + 1):  # as fast, and faster
+            assert bench.job(job * 1000 + 5, number) is None
+        assert bench.job(job * 1000 + 6, job) == job
+        assert bench.job(job * 1000 + 7, job + 7) is None, 'two within two publications'
+    assert bench.jobs.unknown == 297
+
+
+@given(st.lists(st.tuples(st.integers(1, 50), st.integers(0, 40)), min_size=1, max_size=60),
+       st.data())
+def test_it_never_guesses(steps, data):
+    """Against the definition: the answer is the only window with the stamp, or none."""
+    bench = Bench()
+    windows = []
+    now = 0
+    for job, (gap, length) in enumerate(steps):
+        now += gap
+        windows.append((now, now + length))
+        bench.published(now, now + length, job, publisher=job % 2)
+    stamp = data.draw(st.integers(0, now + 60))
+    holds = [job for job, (begin, end) in enumerate(windows)
+             if begin - ROUNDING_NS <= stamp <= end + ROUNDING_NS]
+    assert bench.job(stamp) == (holds[0] if len(holds) == 1 else None)
+
+
+def announced(bench, begin, end, number, sequence, publisher):
+    bench.jobs.take_in(TOPIC, Publication(
+        begin, publisher, Announced((1, number), 0, 0, 0), sequence, end))
+
+
+def number(bench, stamp, sequence=None):
+    found = bench.jobs.find(TOPIC, stamp, sequence, counted=False)
+    return found.name[1] if isinstance(found, Announced) else None
+
+
+def test_a_publication_here_and_one_elsewhere_at_once_are_a_doubt_if_their_numbers_agree():
+    bench, other = Bench(), PublisherNumbers()
+    bench.published(0, 10, 5)
+    announced(bench, 5, 15, 1, 9, other)
+    assert bench.job(7, 1) == 5 and number(bench, 7, 9) == 1
+    announced(bench, 5, 15, 1, 1, PublisherNumbers())
+    assert bench.jobs.find(TOPIC, 7, 1) is None and bench.jobs.doubtful == 1
+
+
+def test_publications_that_overlap_are_announced_together_when_all_have_returned():
+    bench = Bench()
+    announced_to = []
+    bench.jobs.announce = lambda send, topic, several: announced_to.append(
+        [each.origin.job for each in several])
+    bench.jobs.announce_on({TOPIC})
+
+    def publish(job, publisher, send=lambda: None):
+        bench.jobs.publish(lambda *_: send(), None, None, bench.publishers[publisher],
+                           bench.topic, Origin(0, 0, job, publisher))
+
+    publish(1, 0)
+    publish(2, 0, lambda: publish(3, 1))
+    bench.jobs.announce_on(set())
+    publish(4, 0)
+    assert announced_to == [[1], [3, 2]]

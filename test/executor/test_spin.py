@@ -95,50 +95,6 @@ def test_spin_once_runs_one_callback_and_has_finished_it(make_executor, make_nod
     assert set(calls) == {threading.get_ident()}
 
 
-@pytest.mark.parametrize('what', ['task', 'node', 'entity'])
-def test_what_is_new_wakes_a_spin_once_that_waits(make_executor, make_node, what):
-    executor, ran = make_executor(), threading.Event()
-    node = make_node()
-    if what == 'entity':
-        executor.add_node(node)
-    waiting = threading.Thread(target=executor.spin_once, args=(4.0,))
-    waiting.start()
-    time.sleep(0.2)
-    if what == 'task':
-        executor.create_task(ran.set)
-    else:
-        node.create_timer(0.001, ran.set)
-        executor.add_node(node)
-    try:
-        assert ran.wait(3.0)
-    finally:
-        waiting.join()
-
-
-def test_every_task_wakes_a_loop_of_spin_once_and_a_spin_after_it(make_executor):
-    """Not only the first one: what wakes has to be ready to wake again."""
-    executor, ran, done = make_executor(), [threading.Event() for _ in range(20)], Future()
-
-    def loop():
-        while not ran[9].is_set():
-            executor.spin_once()
-        executor.spin_until_future_complete(done, 30.0)
-
-    thread = threading.Thread(target=loop)
-    thread.start()
-    try:
-        for event in ran:
-            time.sleep(0.01)  # it waits
-            executor.create_task(event.set)
-            assert event.wait(5.0)
-    finally:
-        done.set_result(None)
-        while thread.is_alive():  # where it waits for ever, it may do so for each of them
-            executor.wake()
-            ran[9].set()
-            thread.join(0.1)
-
-
 def test_wait_for_message_while_another_thread_spins(make_executor, make_node):
     node = make_node()
     publisher = node.create_publisher(Header, '/topic', 10)

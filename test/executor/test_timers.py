@@ -15,21 +15,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Header
 
-from .conftest import is_idle, Spinning, wait_for
+from .conftest import is_idle, matched, Spinning, wait_for
+from .declared import graph
 
 MS = 1_000_000
-STAMPED = """
-mddag: 1
-nodes:
-  - node: /node
-    callbacks:
-      - name: heard
-        subscription: /topic
-        period: 10ms
-        release_from: {}
-        execution_time: 1us
-        deadline: 1s
-"""
 
 
 def waits_for_no_timer(executor):
@@ -94,53 +83,38 @@ def test_a_timer_that_left_while_its_arrival_was_handled_is_not_asked_again(
 def test_timers_of_each_clock_run(make_executor, make_node, kind):
     node, ran = make_node(), []
     node.create_timer(0.01, lambda: ran.append(1), clock=Clock(clock_type=kind))
-    executor = make_executor(nodes=[node])
-    with Spinning(executor):
+    with Spinning(make_executor(nodes=[node])):
         assert wait_for(lambda: len(ran) >= 5)
 
 
 # --- simulated time ------------------------------------------------------------------------------
 
 
-class Simulation:
-    """A node with simulated time, and a publisher of that time."""
+class Simulated:
+    """A node with simulated time, a timer that notes it, a publisher of it, and an executor."""
 
-    def __init__(self, make_node):
+    def __init__(self, make_executor, make_node):
+        self.now = 100 * 10**9
+        self.ran = []
         self.node = make_node(
             'simulated', parameter_overrides=[Parameter('use_sim_time', value=True)])
+        self._clock = self.node.get_clock()
         self._publisher = make_node('clock').create_publisher(
             ClockMessage, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+        self.executor = make_executor(nodes=[self.node])
 
-    def matched(self):
-        return wait_for(lambda: self._publisher.get_subscription_count() == 1)
-
-    def set_clock(self, now):
-        """Publish the time until the node has it."""
-        message = ClockMessage(clock=TimeMessage(sec=now // 10**9, nanosec=now % 10**9))
-        clock = self.node.get_clock()
-        return any(
-            self._publisher.publish(message)
-            or wait_for(lambda: clock.now().nanoseconds == now, 0.1) for _ in range(20))
-
-
-class Simulated(Simulation):
-    """Simulated time, with an executor and a timer that notes its clock's time."""
-
-    def __init__(self, make_executor, make_node, start=100 * 10**9):
-        super().__init__(make_node)
-        self.now = start
-        self.ran = []
-        self.executor = make_executor()
-        self.executor.add_node(self.node)
-
-    def timer(self, period_s, **kwargs):
-        clock = self.node.get_clock()
-        return self.node.create_timer(
-            period_s, lambda: self.ran.append(clock.now().nanoseconds), **kwargs)
+    def start(self, period_s):
+        self.step(0)
+        self.node.create_timer(period_s, lambda: self.ran.append(self._clock.now().nanoseconds))
+        assert self.is_idle() and not self.ran
 
     def step(self, ns):
+        """Publish a later time until the node has it."""
+        matched(self._publisher)
         self.now += ns
-        assert self.set_clock(self.now)
+        message = ClockMessage(clock=TimeMessage(sec=self.now // 10**9, nanosec=self.now % 10**9))
+        assert wait_for(lambda: self._publisher.publish(message) or wait_for(
+            lambda: self._clock.now().nanoseconds == self.now, 0.1))
 
     def is_idle(self):
         """Tell whether all that has to do with the present time is done."""
@@ -149,121 +123,95 @@ class Simulated(Simulation):
         return quiet.wait(15.0) and wait_for(
             lambda: self.executor._pool.is_current and is_idle(self.executor))
 
-    def until(self, done):
-        assert wait_for(done), self.ran
-
 
 def test_a_timer_runs_by_simulated_time_and_by_nothing_else(make_executor, make_node):
     simulated = Simulated(make_executor, make_node)
     with Spinning(simulated.executor):
-        assert simulated.matched()
-        simulated.step(0)
-        simulated.timer(1.0)
-        assert simulated.is_idle()
+        simulated.start(1.0)
         start = simulated.now
         for second in range(1, 6):
             simulated.step(999 * MS)
             assert simulated.is_idle() and len(simulated.ran) == second - 1
             simulated.step(1 * MS)
-            simulated.until(lambda n=second: len(simulated.ran) == n)
+            assert wait_for(lambda n=second: len(simulated.ran) == n)
     assert simulated.ran == [start + second * 10**9 for second in range(1, 6)]
 
 
 def test_a_node_may_turn_to_simulated_time_and_back(make_executor, make_node):
-    from rclpy.parameter import Parameter
     simulated = Simulated(make_executor, make_node)
-    node = simulated.node
+    ran, node = simulated.ran, simulated.node
     with Spinning(simulated.executor):
-        assert simulated.matched()
-        simulated.step(0)
-        simulated.timer(0.01)
-        assert simulated.is_idle() and not simulated.ran
+        simulated.start(0.01)
         node.set_parameters([Parameter('use_sim_time', value=False)])
-        simulated.until(lambda: len(simulated.ran) >= 3)
+        assert wait_for(lambda: len(ran) >= 3)
         node.set_parameters([Parameter('use_sim_time', value=True)])
-        assert simulated.matched()
         simulated.step(3600 * 10**9)
         assert simulated.is_idle()
-        count = len(simulated.ran)
+        count = len(ran)
         simulated.step(20 * MS)
-        simulated.until(lambda: len(simulated.ran) > count)
+        assert wait_for(lambda: len(ran) > count)
 
 
-GRAPH = """
-mddag: 1
-nodes:
-  - node: /node
-    callbacks:
-      - name: tick
-        timer: 10ms
-        publishes: [/topic]
-        execution_time: 1us
-      - name: heard
-        subscription: /topic
-        execution_time: 1us
-        deadline: 10s
-"""
+# --- what is due or arrives before it is noticed -------------------------------------------------
+
+GRAPH = graph(
+    node="""
+        name: tick, timer: 10ms, publishes: [/other], deadline: 10s
+        name: heard, subscription: /topic, period: 10ms, release_from: STAMP, deadline: 1s""")
+
+
+class Released:
+    """A node with a topic, and an executor whose releases are noted by DAG."""
+
+    def __init__(self, make_executor, make_node, stamp='source_timestamp', tick=None):
+        self.node = make_node()
+        self.publisher = self.node.create_publisher(Header, '/topic', 10)
+        self.got = []
+        self.subscription = self.node.create_subscription(
+            Header, '/topic', lambda message, info: self.got.append(info['source_timestamp']), 10)
+        matched(self.publisher)
+        if tick is not None:
+            self.node.create_timer(0.01, tick)
+        self.executor = make_executor(loads(GRAPH.replace('STAMP', stamp)), nodes=[self.node])
+        self.releases = []
+        self.executor._engine.verdicts.on_release = (
+            lambda dag, release: self.releases.append(release))
+
+    def publish(self):
+        now = self.node.get_clock().now()
+        self.publisher.publish(Header(stamp=now.to_msg()))
+        return now.nanoseconds
 
 
 def test_periods_before_the_spin_are_no_jobs_and_no_misses(make_executor, make_node):
-    node, ran = make_node(), []
-    publisher = node.create_publisher(Header, '/topic', 10)
-    node.create_subscription(Header, '/topic', lambda m: None, 10)
-
-    def tick():
-        ran.append(1)
-        publisher.publish(Header())
-
-    node.create_timer(0.01, tick)
-    executor = make_executor(loads(GRAPH), nodes=[node])
-    releases = []
-    executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
+    ran = []
+    released = Released(make_executor, make_node, tick=lambda: ran.append(1))
     time.sleep(0.3)
-    begin = executor._trace_clock.now()
-    with Spinning(executor):
+    begin = released.executor._trace_clock.now()
+    with Spinning(released.executor):
         assert wait_for(lambda: len(ran) > 5)
-    assert min(releases) >= begin
-    assert executor.statistics()['callbacks']['/node:tick']['skipped'] < 25
+    assert min(released.releases) >= begin
+    assert released.executor.statistics()['callbacks']['/node:tick']['skipped'] < 25
 
 
 @pytest.mark.parametrize('stamp', ['source_timestamp', 'header_stamp'])
 def test_a_message_from_before_the_spin_is_released_when_it_begins(
         make_executor, make_node, stamp):
-    node, got = make_node(), []
-    publisher = node.create_publisher(Header, '/topic', 10)
-    node.create_subscription(Header, '/topic', got.append, 10)
-    assert wait_for(publisher.get_subscription_count)
-    executor = make_executor(loads(STAMPED.format(stamp)), nodes=[node])
-    releases = []
-    executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
-    publisher.publish(Header(stamp=node.get_clock().now().to_msg()))
+    """And a pause while a later one is taken does not move its release."""
+    released = Released(make_executor, make_node, stamp)
+    executor, got = released.executor, released.got
+    released.publish()
     time.sleep(0.2)
     begin = executor._trace_clock.now()
     with Spinning(executor):
-        assert wait_for(lambda: got)
-    assert len(releases) == 1 and releases[0] >= begin
-
-
-@pytest.mark.parametrize('stamp', ['source_timestamp', 'header_stamp'])
-def test_a_pause_while_a_message_is_taken_does_not_move_its_release(
-        make_executor, make_node, stamp):
-    node, got = make_node(), []
-    publisher = node.create_publisher(Header, '/topic', 10)
-    subscription = node.create_subscription(
-        Header, '/topic', lambda message, info: got.append(info['source_timestamp']), 10)
-    assert wait_for(publisher.get_subscription_count)
-    executor = make_executor(loads(STAMPED.format(stamp)), nodes=[node])
-    releases = []
-    executor._engine.verdicts.on_release = lambda dag, release: releases.append(release)
-    with Spinning(executor):
-        assert wait_for(lambda: executor._pool.is_current)
-        source = executor._upkeep._sources[executor._registry.by_id[id(subscription)]]
+        assert wait_for(lambda: got and executor._pool.is_current)
+        assert len(released.releases) == 1 and released.releases[0] >= begin
+        source = executor._upkeep._sources[executor._registry.by_id[id(released.subscription)]]
         take = source._take
         source._take = lambda: (take(), time.sleep(0.1))[0]
         time.sleep(0.2)  # no release is before the spin
-        sent = node.get_clock().now()
-        publisher.publish(Header(stamp=sent.to_msg()))
-        assert wait_for(lambda: got)
-    expected = got[0] if stamp == 'source_timestamp' else sent.nanoseconds
-    assert len(releases) == 1
-    assert abs(releases[0] - executor._trace_clock.of_system(expected)) < MS
+        sent = released.publish()
+        assert wait_for(lambda: len(got) == 2)
+    expected = got[1] if stamp == 'source_timestamp' else sent
+    assert len(released.releases) == 2
+    assert abs(released.releases[1] - executor._trace_clock.of_system(expected)) < MS

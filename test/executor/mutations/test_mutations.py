@@ -78,7 +78,7 @@ def step(self, must_check: bool = True) -> Any:
         ('executor/executor.py', """\
 may not check
             self._at_once.ring()""", 'may not check\n            pass')], of(
-        'test_spin.py', 'test_what_is_new_wakes_a_spin_once_that_waits[task]')),
+        'test_executor.py', 'test_tasks_nodes_and_entities_wake_an_idle_executor[spin_once]')),
     Case('shutdown_leaves_wait_set', [(
         'executor/waitables.py', '"""End the thread."""', 'return')], of(
         'test_spin.py', 'test_no_thread_goes_on_though_the_context_does[shutdown]')),
@@ -134,7 +134,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         of('test_spin.py', 'test_an_exception_comes_out_of_spin[take]'), at_once=True),
     Case('create_task_does_not_wake_workers', [(
         'executor/executor.py', 'self._pool.report(self._engine.ready, work)', UNNOTICED)], of(
-        'test_executor.py', 'test_tasks_and_nodes_wake_an_idle_executor')),
+        'test_executor.py', 'test_tasks_nodes_and_entities_wake_an_idle_executor[spin]')),
     Case('rest_not_collected', [(
         'executor/sources.py', 'entity.collect_more = partial(self.collect, MANY)', 'pass')], of(
         'test_bounds.py', 'test_few_requests_wait_in_python_and_none_is_lost')),
@@ -162,7 +162,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         'test_gil.py', 'test_an_urgent_arrival_is_not_left_in_the_middleware[elsewhere]')),
     Case('add_node_does_not_wake', [(
         'executor/executor.py', 'if added:\n            self.wake()', 'if added:\n            pass'
-        )], of('test_executor.py', 'test_tasks_and_nodes_wake_an_idle_executor')),
+        )], of('test_executor.py', 'test_tasks_nodes_and_entities_wake_an_idle_executor[spin]')),
     Case('release_is_when_noticed', [(
         'executor/timers.py', 'yield fired', 'yield (fired[0], _now(), *fired[2:])')], of(
         'test_deadlines.py',
@@ -187,11 +187,11 @@ before = globals().setdefault('BEFORE', {})
         'test_each_callback_runs_for_the_job_that_its_message_belongs_to')),
     Case('late_sinks_counted_in_time', [(
         'core/tally.py', 'self.late += late', 'pass')], of(
-        'test_misses.py', 'test_what_was_reported_is_what_a_replay_judges')),
+        'test_live_replay.py', 'test_replay_counts_what_the_executor_counted')),
     Case('late_jobs_counted_in_time', [(
         'core/tally.py', 'self.ends[dag][deadline] += 1',
         'self.ends[dag][COMPLETED if deadline == LATE else deadline] += 1')], of(
-        'test_misses.py', 'test_what_was_reported_is_what_a_replay_judges')),
+        'test_live_replay.py', 'test_replay_counts_what_the_executor_counted')),
 ]
 
 
