@@ -28,10 +28,11 @@ nodes:
 
 
 def call(*arguments):
+    """Run a benchmark, not compiled, and without the checks for debugging."""
     return subprocess.run(
         [sys.executable, '-m', 'benchmarks', *map(str, arguments)], cwd=TOP,
         capture_output=True, text=True, check=False, timeout=150,
-        env={**os.environ, 'NUMBA_DISABLE_JIT': '1'})     # not compiled
+        env={**os.environ, 'NUMBA_DISABLE_JIT': '1', 'MDDAG_DEBUG': ''})
 
 
 def result_of(*arguments):
@@ -100,6 +101,7 @@ def test_a_wrong_command_line_is_one_line():
 
 
 def test_the_ledgers_of_several_processes_are_that_of_one_run():
+    """A source from 100 to 300 ms, and its sink, of whose jobs some are late, from 150."""
     task_set = loads("""
 mddag: 1
 nodes:
@@ -107,21 +109,14 @@ nodes:
   - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 5ms, execution_time: 1ms}]}
 """)
     ms = 1_000_000
-    parts = []
-    for vertex, (begin, end) in enumerate(((100, 300), (150, 350))):
-        ledger = Ledger(task_set)
-        if vertex == 0:
-            ledger.first_release['/a'] = 0
-        for job in range(40):
-            ledger.durations[('/a:t', '/b:s')[vertex]].append(ms)
-            if vertex == 1:
-                ledger.completions['/b:s'].append((job * 10 * ms, (job * 10 + job % 8) * ms))
-        bodies = [0, 0]
-        bodies[vertex] = 20
-        ledger.window = Reading(begin * ms, 0, (0, 0)), Reading(end * ms, 8 * ms, bodies)
-        parts.append(vars(ledger))
+    source, sink = Ledger(task_set), Ledger(task_set)
+    source.first_release['/a'] = 0
+    source.durations['/a:t'] = sink.durations['/b:s'] = [ms] * 40
+    sink.completions['/b:s'] = [(10 * ms * job, (10 * job + job % 8) * ms) for job in range(40)]
+    source.window = Reading(100 * ms, 0, (0, 0)), Reading(300 * ms, 8 * ms, (20, 0))
+    sink.window = Reading(150 * ms, 0, (0, 0)), Reading(350 * ms, 8 * ms, (0, 20))
     from benchmarks.loads import ledger_of_processes
-    whole = ledger_of_processes(task_set, parts)
+    whole = ledger_of_processes(task_set, [vars(source), vars(sink)])
     assert [reading.at_ns for reading in whole.window] == [150 * ms, 300 * ms]
     result = measure(whole, ExecutionPlan(task_set, mode='spin'))
     assert (result['sink_jobs_due'], result['on_time'], result['missing']) == (15, 12, 0)

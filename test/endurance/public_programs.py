@@ -23,7 +23,6 @@ starting with the first message.  The two runs are the same if
 
 import argparse
 from collections import Counter
-from dataclasses import dataclass
 from importlib import import_module
 import os
 from pathlib import Path
@@ -32,7 +31,7 @@ import signal
 import subprocess
 import sys
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from geometry_msgs.msg import Twist, Vector3
 import rclpy
@@ -46,7 +45,6 @@ TOLERANCE, FEW = 0.25, 3
 """Counts that differ by this part, or by so many messages, are the same."""
 START_S, END_S = 10.0, 15.0
 """How long a program may take to publish first, and to end after SIGINT."""
-IGNORED = ('/rosout', '/parameter_events')
 
 # for subscriptions of either durability
 _KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -55,24 +53,15 @@ URDF = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="
 <parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>"""
 
 
-@dataclass(frozen=True)
-class Program:
-    """
-    A program to compare.
-
-    :ivar spec: its module and function.
-    :ivar folders: where its packages are, in the folder of sources.
-    :ivar inputs: a message for each of some topics, published at 20 Hz while it runs.
-    :ivar constant: the topics whose last message must be the same.
-    :ivar parameters: ROS parameters, ``name:=value``.
-    """
+class Program(NamedTuple):
+    """A program to compare."""
 
     name: str
-    spec: str
-    folders: tuple[str, ...]
-    inputs: tuple[tuple[str, Any], ...] = ()
-    constant: tuple[str, ...] = ()
-    parameters: tuple[str, ...] = ()
+    spec: str  # its module and function
+    folders: tuple[str, ...]  # where its packages are, in the folder of sources
+    inputs: tuple[tuple[str, Any], ...] = ()  # messages by topic, published at 20 Hz
+    constant: tuple[str, ...] = ()  # the topics whose last message must be the same
+    parameters: tuple[str, ...] = ()  # ROS parameters, ``name:=value``
 
 
 _DEMOS = ('demos/demo_nodes_py',)
@@ -113,11 +102,9 @@ class Probe:
     """A node that publishes a program's inputs and counts what the program publishes."""
 
     def __init__(self, program):
-        self.counts = Counter()
-        self.types = {}
-        self.last = {}
+        self.counts, self.types, self.last = Counter(), {}, {}
         self.node = Node('public_programs_probe')
-        self._inputs = {topic for topic, _ in program.inputs}
+        self._ignored = {'/rosout', '/parameter_events', *(topic for topic, _ in program.inputs)}
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         for topic, message in program.inputs:
@@ -127,9 +114,8 @@ class Probe:
 
     def _look(self):
         for topic, types in self.node.get_topic_names_and_types():
-            if topic in self.types or topic in IGNORED or topic in self._inputs:
-                continue
-            if not self.node.get_publishers_info_by_topic(topic):
+            if topic in self.types or topic in self._ignored or not (
+                    self.node.get_publishers_info_by_topic(topic)):
                 continue
             self.types[topic] = types[0]
             package, _, name = types[0].split('/')
@@ -149,13 +135,11 @@ class Probe:
             self._executor.spin_once(0.05)
 
     def close(self):
-        """Destroy the node."""
         self._executor.shutdown()
         self.node.destroy_node()
 
 
-@dataclass
-class Run:
+class Run(NamedTuple):
     """What a program did."""
 
     types: dict[str, str]
@@ -168,8 +152,7 @@ class Run:
 
 def observe(program, path, hosted, seconds):
     """Run a program under one of the executors; return what it did."""
-    domain = str(random.randrange(1, 40))  # the tests use those from 40 on
-    os.environ['ROS_DOMAIN_ID'] = domain  # of this process's context, too
+    os.environ['ROS_DOMAIN_ID'] = str(random.randrange(1, 40))  # the tests use those from 40 on
     module, function = program.spec.split(':')
     command = ['-c', f'import sys; sys.argv[0] = {module!r}; import {module} as m; m.{function}()']
     if hosted:
@@ -201,17 +184,12 @@ def observe(program, path, hosted, seconds):
 
 def differences(theirs, ours):
     """Return in what two runs differ."""
-    found = []
-    if theirs.types != ours.types:
-        found.append(f'topics {theirs.types} and {ours.types}')
+    found = [f'{name} {one} and {other}' for name, one, other in zip(Run._fields, theirs, ours)
+             if one != other and name in ('types', 'constant', 'end')]
     for topic in {*theirs.counts, *ours.counts}:
         one, other = theirs.counts[topic], ours.counts[topic]
         if abs(one - other) > max(FEW, TOLERANCE * max(one, other)):
             found.append(f'{topic}: {one} and {other} messages')
-    if theirs.constant != ours.constant:
-        found.append(f'messages {theirs.constant} and {ours.constant}')
-    if theirs.end != ours.end:
-        found.append(f'ended {theirs.end} and {ours.end}')
     if ours.status and not theirs.status:
         found.append(f'exit status {ours.status}: {ours.said.strip()[-500:]}')
     return found
@@ -228,6 +206,21 @@ def missing(program, path):
     return done.stderr.strip().splitlines()[-1] if done.returncode else ''
 
 
+def compare(program, path, seconds):
+    """Run a program twice; return why it cannot be compared, or in what the runs differ."""
+    why = missing(program, path)
+    if why:
+        return f'skipped: {why}', False
+    theirs, ours = (observe(program, path, hosted, seconds) for hosted in (False, True))
+    if theirs.end == 'by itself' and theirs.status:  # it compares nothing
+        return f'skipped: {(theirs.said.strip().splitlines() or ["it ends at once"])[-1]}', False
+    found = differences(theirs, ours)
+    counts = ', '.join(f'{topic} {theirs.counts[topic]}/{ours.counts[topic]}'
+                       for topic in sorted({*theirs.counts, *ours.counts}))
+    return (f'{"; ".join(found) or "same"} ({counts or "no messages"}, ended {theirs.end})',
+            bool(found))
+
+
 def main():
     """Compare the programs; return 1 if one differs."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
@@ -237,28 +230,14 @@ def main():
     options = parser.parse_args()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     before = [os.environ['PYTHONPATH']] if os.environ.get('PYTHONPATH') else []
-    n_different = n_ran = 0
+    n_different = 0
     for program in PROGRAMS:
-        if options.only not in (None, program.name):
-            continue
-        path = [str((options.sources / each).resolve()) for each in program.folders] + before
-        why = missing(program, path)
-        if why:
-            print(f'{program.name}: skipped: {why}', flush=True)
-            continue
-        theirs, ours = (observe(program, path, hosted, options.seconds)
-                        for hosted in (False, True))
-        if theirs.end == 'by itself' and theirs.status:  # it compares nothing
-            why = (theirs.said.strip().splitlines() or ['it ends at once'])[-1]
-            print(f'{program.name}: skipped: {why}', flush=True)
-            continue
-        found = differences(theirs, ours)
-        n_ran, n_different = n_ran + 1, n_different + bool(found)
-        counts = ', '.join(f'{topic} {theirs.counts[topic]}/{ours.counts[topic]}'
-                           for topic in sorted({*theirs.counts, *ours.counts}))
-        print(f'{program.name}: {"; ".join(found) or "same"} ({counts or "no messages"}, '
-              f'ended {theirs.end})', flush=True)
-    print(f'{n_ran} programs compared, {n_different} differ')
+        if options.only in (None, program.name):
+            path = [str((options.sources / each).resolve()) for each in program.folders] + before
+            said, differs = compare(program, path, options.seconds)
+            n_different += differs
+            print(f'{program.name}: {said}', flush=True)
+    print(f'{n_different} programs differ')
     return 1 if n_different else 0
 
 

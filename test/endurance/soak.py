@@ -27,7 +27,6 @@ the machine stopped: another process, which only sleeps, was woken more than ``S
 """
 
 import argparse
-from bisect import bisect_right
 from collections import deque
 import ctypes
 from dataclasses import asdict
@@ -41,14 +40,18 @@ import sys
 import threading
 import time
 
+from mddag_executor.executor import current_job
 from mddag_executor.executor.executor import MultiDeadlineExecutor
+from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.hosting.measure import ExecutionPlan
+from mddag_executor.hosting.synthetic import SyntheticWorkload
 from msg_graph import load
 from msg_graph.model import path_lengths
 import rclpy
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import try_shutdown
-from soak_nodes import SimulatedTime, SoakFault, SoakNodes
+from rosgraph_msgs.msg import Clock as ClockMessage
 
 FAULTS = ('destroy', 'raise', 'stop', 'burst', 'clock')
 FAULT_S, RECOVERY_S, BACKLOG_S, CLEAN_S = 1.0, 1.0, 5.0, 1.5
@@ -77,22 +80,99 @@ class StallWatch:
         self.stalls = []
         self._process = subprocess.Popen(
             [sys.executable, '-c', _SLEEPER], stdout=subprocess.PIPE, text=True)
-        self._thread = threading.Thread(target=self._read, daemon=True, name='soak-stalls')
+        self._thread = threading.Thread(
+            target=lambda: self.stalls.extend(map(int, self._process.stdout)), daemon=True)
         self._thread.start()
 
-    def _read(self):
-        for line in self._process.stdout:
-            self.stalls.append(int(line))
-
-    def within(self, start, end):
-        """Return whether one was noted between two times."""
-        return any(start <= stall < end for stall in self.stalls)
-
     def stop(self):
-        """End the process."""
         self._process.kill()
         self._process.wait()
         self._thread.join()
+
+
+class SoakFault(Exception):
+    """What a callback raises on purpose."""
+
+
+class SoakNodes:
+    """The synthetic nodes of a declaration; each can be destroyed and made again."""
+
+    def __init__(self, task_set, plan):
+        self.workload = SyntheticWorkload(task_set, plan, current_job=current_job)
+        self.started = 0  # callbacks
+        self.raise_next = False  # lets the next one raise
+        self.cut_off = 0  # those whose node was destroyed while they ran: they could not publish
+        self._lock = threading.Lock()
+        self.nodes = {node.get_fully_qualified_name(): node for node in self.workload.nodes}
+        for node in self.workload.nodes:
+            self._watch(node)
+
+    def make_again(self, name):
+        """Make a node that was destroyed, and start its timers."""
+        node = self.nodes[name] = self.workload.make(name)
+        self._watch(node)
+        for dag, timer in self.workload.timers.items():
+            if timer in node.timers:
+                self.workload.start_timer(dag)
+        return node
+
+    def _watch(self, node):
+        for entity in (*node.timers, *node.subscriptions):
+            entity.callback = self._watched(entity.callback)
+
+    def _watched(self, callback):
+        def timer():
+            run()
+
+        def subscription(message):
+            run(message)
+
+        def run(*message):
+            with self._lock:
+                self.started += 1
+                raises, self.raise_next = self.raise_next, False
+            if raises:
+                raise SoakFault('on purpose')
+            try:
+                callback(*message)
+            except InvalidHandle:
+                self.cut_off += 1
+
+        return timer if callback.__code__.co_argcount == 0 else subscription
+
+
+class SimulatedTime:
+    """A node with a timer that follows simulated time, and a thread that publishes that."""
+
+    def __init__(self):
+        self.node = quiet_node('/soak_simulated', use_sim_time=True)
+        self._sender = quiet_node('/soak_clock')
+        self._publisher = self._sender.create_publisher(ClockMessage, '/clock', 10)
+        self.ticks = 0
+        self.node.create_timer(0.1, self._tick)
+        self._now_ns = 1_000_000_000_000
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True, name='soak-clock')
+        self._thread.start()
+
+    def _tick(self):
+        self.ticks += 1
+
+    def _run(self):
+        while not self._ending.wait(0.02):
+            self._now_ns += 20_000_000
+            message = ClockMessage()
+            message.clock.sec, message.clock.nanosec = divmod(self._now_ns, 1_000_000_000)
+            self._publisher.publish(message)
+
+    def jump(self, nanoseconds):
+        self._now_ns = max(1_000_000_000, self._now_ns + nanoseconds)
+
+    def stop(self):
+        self._ending.set()
+        self._thread.join()
+        self._sender.destroy_node()
+        self.node.destroy_node()
 
 
 def usage():
@@ -115,21 +195,15 @@ def unjudged_sinks(plan):
     found = []
     for dag in plan.task_set.dags:
         paths = path_lengths(dag, [plan.execution_ns(vertex) for vertex in dag.vertices])
-        sinks = [dag.vertices[sink] for sink in dag.sinks]
-        found += [sink.name for sink in sinks
-                  if paths[sink.index] > (1 - LEAST_SLACK) * (sink.deadline_ns or 0)]
+        found += [sink.name for sink in map(dag.vertices.__getitem__, dag.sinks)
+                  if paths[sink.index] > (1 - LEAST_SLACK) * sink.deadline_ns]
     return sorted(found)
 
 
 class Soak:
-    """
-    One endurance run.
+    """One endurance run; ``say`` receives what happens, one line each."""
 
-    :param say: receives what happens, one line each.
-    """
-
-    def __init__(
-            self, task_set, seconds, *, utilisation=0.8, workers=7, seed=0, say=lambda text: None):
+    def __init__(self, task_set, seconds, utilisation, workers, seed, say):
         self._seconds = seconds
         self._say = say
         self._random = random.Random(seed)
@@ -137,8 +211,7 @@ class Soak:
         self._unjudged = unjudged_sinks(plan)
         self._missed = deque()
         self._clean_missed = []
-        deadlines = [v.deadline_ns or 0 for v in task_set.vertices]
-        self._settle_s = min(2.0, max(deadlines) / 1e9)
+        self._settle_s = min(2.0, max(v.deadline_ns or 0 for v in task_set.vertices) / 1e9)
         self.executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, on_deadline_miss=self._on_miss)
         self.nodes = SoakNodes(task_set, plan)
@@ -146,8 +219,7 @@ class Soak:
         self._stalls = StallWatch()
         self.counts = dict.fromkeys((*FAULTS, 'raised'), 0)
         self._errors = []
-        # start, end, and the fault before
-        self._clean = []
+        self._clean = []  # start, end, and the fault before
         self._ending = False
         self._thread = threading.Thread(target=self._spin, name='soak-spin', daemon=True)
 
@@ -156,15 +228,11 @@ class Soak:
             self._missed.append(miss)
 
     def _sort_out(self):
-        """Keep of the misses only those in clean windows; return how many have come to these."""
-        starts = [start for start, _, _ in self._clean]
-        before = len(self._clean_missed)
+        """Keep of the misses only those in clean windows."""
         while self._missed:  # others append meanwhile
             miss = self._missed.popleft()
-            place = bisect_right(starts, miss.release_ns) - 1
-            if place >= 0 and miss.release_ns < self._clean[place][1]:
-                self._clean_missed.append((self._clean[place][2], miss))
-        return len(self._clean_missed) - before
+            self._clean_missed += [(fault, miss) for start, end, fault in self._clean
+                                   if start <= miss.release_ns < end]
 
     def _spin(self):
         while not self._ending:
@@ -225,10 +293,10 @@ class Soak:
         time.sleep(CLEAN_S)
         self._clean.append((start, time.time_ns(), fault))
         time.sleep(self._settle_s)  # the last jobs end before the next fault
-        self._say(f'{fault}: {self._sort_out()} misses in the clean window')
+        self._sort_out()
+        self._say(f'{fault}: {len(self._clean_missed)} misses in clean windows up to now')
 
     def _has_backlog(self):
-        """Return whether several messages wait for one callback."""
         callbacks = self.executor.statistics()['callbacks'].values()
         return any(counts['waiting'] > 1 for counts in callbacks)
 
@@ -286,8 +354,8 @@ class Soak:
         self.nodes.workload.destroy()
         self._stalls.stop()
         # what is released last in a window runs on beyond it, and may wait for what was before
-        judged = [(start, stop) for start, stop, _ in self._clean if not self._stalls.within(
-            start - 500_000_000, stop + 200_000_000)]
+        judged = [(start, stop) for start, stop, _ in self._clean if not any(
+            start - 500_000_000 <= stall < stop + 200_000_000 for stall in self._stalls.stalls)]
         self._sort_out()
         clean_misses = [
             (fault, miss) for fault, miss in self._clean_missed
@@ -295,22 +363,19 @@ class Soak:
         result = {
             'seconds': elapsed, 'faults': self.counts, 'before': before, 'after': after,
             'jobs': sum(d['jobs'] for d in statistics['dags'].values()),
-            'executions': _sum(statistics, 'ready'), 'ran': _sum(statistics, 'ran'),
-            'dropped': _sum(statistics, 'dropped'), 'skipped': _sum(statistics, 'skipped'),
-            'unattributed': _sum(statistics, 'unattributed'),
+            **{key: sum(counts[key] for counts in statistics['callbacks'].values())
+               for key in ('ready', 'ran', 'dropped', 'skipped', 'unattributed')},
             'cut_off': self.nodes.cut_off, 'clean_windows': len(self._clean),
             'disturbed_windows': len(self._clean) - len(judged),
             'stalls': len(self._stalls.stalls), 'clean_misses': len(clean_misses),
-            'clean_missed_sinks': sorted({miss.vertex for _, miss in clean_misses}),
             'clean_missed': [
                 {'after': fault, **asdict(miss)} for fault, miss in clean_misses[:MOST_LISTED]],
             'unjudged_sinks': self._unjudged, 'simulated_ticks': ticks}
-        result['failed'] = [*self._failures(result, statistics, n_open)]
+        result['failed'] = [*self._failures(result, statistics, n_open), *self._errors]
         if not simulated_goes_on:
             result['failed'].append('the timer on simulated time has stopped')
         if not ended or self._thread.is_alive():
             result['failed'].append('the executor did not end')
-        result['failed'] += self._errors
         return result
 
     def _failures(self, result, statistics, n_open):
@@ -333,17 +398,14 @@ class Soak:
             if dag['jobs'] != sum(dag['ends'].values()) + still_open:
                 failed.append(f'{name}: {dag["jobs"]} jobs, {dag["ends"]}, {still_open} open')
         if result['clean_misses']:
+            sinks = sorted({miss['vertex'] for miss in result['clean_missed']})
             failed.append(
                 f'{result["clean_misses"]} deadlines missed in clean windows, more than '
-                f'{RECOVERY_S:g} s after the fault: {", ".join(result["clean_missed_sinks"][:5])}')
+                f'{RECOVERY_S:g} s after the fault: {", ".join(sinks[:5])}')
         return failed
 
 
-def _sum(statistics, key):
-    return sum(counts[key] for counts in statistics['callbacks'].values())
-
-
-def main(arguments=None):
+def main():
     """Run from the command line; return 1 when something does not hold."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
     parser.add_argument('graph', help='the declaration')
@@ -351,12 +413,12 @@ def main(arguments=None):
     parser.add_argument('--utilisation', type=float, default=0.8)
     parser.add_argument('--workers', type=int, default=7)
     parser.add_argument('--seed', type=int, default=2)
-    args = parser.parse_args(arguments)
+    args = parser.parse_args()
     rclpy.init(args=[])
     try:
         result = Soak(
-            load(args.graph), args.seconds, utilisation=args.utilisation, workers=args.workers,
-            seed=args.seed, say=lambda text: print(text, file=sys.stderr, flush=True)).run()
+            load(args.graph), args.seconds, args.utilisation, args.workers, args.seed,
+            lambda text: print(text, file=sys.stderr, flush=True)).run()
     finally:
         try_shutdown()
     print(json.dumps(result, indent=1))

@@ -9,12 +9,10 @@ import re
 import subprocess
 import sys
 
-import msg_graph
-import pytest
-
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
-NAMES = sorted(path.name for path in EXAMPLES.iterdir() if path.is_dir())
+README = (EXAMPLES / 'README.md').read_text(encoding='utf-8')
 COMMAND = re.compile(r'^\| \[(\w+)\]\((\S+)\) \| `(python|sh) examples/(\S+)` \|', re.MULTILINE)
+COMMANDS = {name: (program, file) for name, _, program, file in COMMAND.findall(README)}
 
 
 def run(example, *arguments):
@@ -36,21 +34,12 @@ def result(example, tmp_path):
     return json.loads((tmp_path / 'result.json').read_text())
 
 
-COMMANDS = {name: (program, file) for name, _, program, file in COMMAND.findall(
-    (EXAMPLES / 'README.md').read_text(encoding='utf-8'))}
-
-
 def test_the_readme_has_every_example():
-    assert sorted(COMMANDS) == NAMES
+    assert sorted(COMMANDS) == sorted(path.name for path in EXAMPLES.iterdir() if path.is_dir())
     for program, file in COMMANDS.values():
         assert (EXAMPLES / file).suffix == {'python': '.py', 'sh': '.sh'}[program]
-    links = re.findall(r'\]\(([^)]+)\)', (EXAMPLES / 'README.md').read_text(encoding='utf-8'))
+    links = re.findall(r'\]\(([^)]+)\)', README)
     assert [link for link in links if not (EXAMPLES / link).is_file()] == []
-
-
-@pytest.mark.parametrize('name', NAMES)
-def test_every_declaration_is_right(name):
-    assert msg_graph.load(EXAMPLES / name / 'graph.yaml').dags
 
 
 def test_hello_deadline():

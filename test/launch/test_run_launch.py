@@ -29,11 +29,8 @@ def command(launch_file, **given):
     return launch_file.command({**dict.fromkeys(launch_file.ARGUMENTS, ''), **given})
 
 
-def test_nothing_given_leaves_all_options_out(launch_file):
-    assert command(launch_file) == ['run']
-
-
 def test_nodes_and_ros_arguments_are_words(launch_file):
+    assert command(launch_file) == ['run']
     made = command(launch_file, nodes="a/b 'c/d --rate 2'", ros_args='-r x:=y', workers='3')
     assert made == ['run', '--node', 'a/b', '--node', 'c/d --rate 2', '--workers', '3',
                     '--ros-args', '-r', 'x:=y']
