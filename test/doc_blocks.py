@@ -36,14 +36,8 @@ import msg_graph
 import yaml
 
 TOP = Path(__file__).resolve().parent.parent
-REASONS = (
-    'an excerpt',
-    'needs an installed ROS',
-    'needs root',
-    'needs a recorded drive',
-    'needs another machine',
-    'takes minutes',
-)
+REASONS = ('an excerpt', 'needs an installed ROS', 'needs root', 'needs a recorded drive',
+           'needs another machine', 'takes minutes')
 _BLOCK = re.compile(
     r'(?P<marks>(?:^[ ]*<!-- [^\n]* -->\n+)*)'
     r'^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$',
@@ -65,11 +59,6 @@ class Block:
     @property
     def place(self):
         return f'{self.page}:{self.line}'
-
-    @property
-    def reason(self):
-        """Return why it is not run, None if it is."""
-        return self.mark('not run')
 
     def mark(self, kind):
         return self.marks.get(kind, [None])[0]
@@ -93,21 +82,19 @@ def pages():
     return [path.relative_to(TOP).as_posix() for path in found if path.exists()]
 
 
-def blocks(page, text=None):
+def blocks(page):
     """Return the code blocks of a page."""
-    if text is None:
-        text = (TOP / page).read_text(encoding='utf-8')
+    text = (TOP / page).read_text(encoding='utf-8')
     found = []
     for match in _BLOCK.finditer(text):
         marks = {}
         for kind, value in _MARK.findall(match['marks']):
             marks.setdefault(kind, []).append(value)
         assert len(marks.get('not run', [])) < 2, f'{page}: a block is marked twice'
-        indent = match['indent']
         lines = match['text'].splitlines(keepends=True)
         found.append(Block(
             page, text.count('\n', 0, match.start('language')) + 1, match['language'],
-            ''.join(line.removeprefix(indent) for line in lines), marks))
+            ''.join(line.removeprefix(match['indent']) for line in lines), marks))
     return found
 
 
@@ -154,43 +141,41 @@ class Folder:
     def try_all(self, found):
         """Try blocks, one after the other; those that are files are there from the first on."""
         for block in found:
-            name = block.mark('file')
-            if name is not None:
-                self.write(name, block.text)
+            if block.mark('file') is not None:
+                self.write(block.mark('file'), block.text)
         for block in found:
             self.try_one(block)
 
     def try_one(self, block):
         """Try a block; an AssertionError says what is wrong with it."""
+        name, reason = block.mark('file'), block.mark('not run')
         assert block.language, f'{block.place}: a block has no language'
-        if block.reason is not None:
-            assert block.reason in REASONS, f'{block.place}: no known reason: {block.reason}'
-            self._look_at(block)
+        if reason is not None:
+            assert reason in REASONS, f'{block.place}: no known reason: {reason}'
         elif block.language == 'sh':
-            self._run(block, ['bash', '-eo', 'pipefail', '-c', block.to_try])
-        elif block.language == 'python' and block.mark('file') is None:
+            return self._run(block, ['bash', '-eo', 'pipefail', '-c', block.to_try])
+        elif block.language == 'python' and name is None:
             self.write('example.py', block.to_try)
-            self._run(block, [sys.executable, 'example.py'])
-        elif block.language == 'text' and block.mark('file') is None:
+            return self._run(block, [sys.executable, 'example.py'])
+        elif block.language == 'text' and name is None:
             expected = re.escape(block.text.rstrip()).replace('…', '.*?')
             actual = '\n'.join(line.rstrip() for line in self.output.rstrip().splitlines())
             assert re.fullmatch(expected, actual, re.DOTALL), (
                 f'{block.place}: the output is not\n{block.text}\nbut\n{actual}')
+            return
         elif block.language == 'yaml':
-            name = block.mark('file')
-            if name is not None and 'arguments:' in block.text:
-                return  # a part, which what includes it shows
-            msg_graph.load(self.write(name or 'block.yaml', block.text))
-        elif block.mark('file') is None or block.language == 'python':
-            self._look_at(block)
-
-    def _look_at(self, block):
+            # A part is shown by what includes it.
+            if name is None or 'arguments:' not in block.text:
+                msg_graph.load(self.write(name or 'block.yaml', block.text))
+            return
+        elif name is not None and block.language != 'python':
+            return
         if block.language == 'python':
             compile(block.text, block.place, 'exec')
         elif block.language == 'yaml':
             yaml.safe_load(block.text)
         else:
-            assert block.reason is not None, (
+            assert reason is not None, (
                 f'{block.place}: {block.language!r} cannot be tried: mark it')
 
     def _run(self, block, command):

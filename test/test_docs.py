@@ -11,7 +11,6 @@ import subprocess
 import sys
 
 from mddag_executor.cli import main as program
-from mddag_executor.errors import UsageError
 import pytest
 
 from .doc_blocks import blocks, Folder, pages, TOP
@@ -48,71 +47,55 @@ EXTRAS = {
 
 
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize('page', [page for page in PAGES if blocks(page)])
+@pytest.mark.parametrize('page', PAGES)
 def test_what_a_page_shows_works(page, tmp_path):
     for name in EXTRAS.get(page, ()):
         pytest.importorskip(name)
-    Folder(tmp_path, FILES.get(page)).try_all(blocks(page))
-
-
-def test_no_block_is_overlooked():
-    for page in PAGES:
-        fences = re.findall(r'^ *```', (TOP / page).read_text(encoding='utf-8'), re.MULTILINE)
-        assert len(fences) == 2 * len(blocks(page)), page
+    found = blocks(page)
+    fences = re.findall(r'^ *```', (TOP / page).read_text(encoding='utf-8'), re.MULTILINE)
+    assert len(fences) == 2 * len(found), 'a block is overlooked'
+    Folder(tmp_path, FILES.get(page)).try_all(found)
 
 
 # --- commands ------------------------------------------------------------------------------------
 
 
-def command_lines():
-    """Return every command line of `mddag` in blocks and between backquotes, and its page."""
-    found = []
-    for page in PAGES:
-        if page == 'CHANGELOG.md':
-            continue
-        text = (TOP / page).read_text(encoding='utf-8')
-        for block in blocks(page):
-            if block.language == 'sh':
-                lines = block.text.replace('\\\n', ' ').splitlines()
-                found += [(page, part.strip()) for line in lines
-                          for part in re.split(r'&&|\|\|?|;', line.partition(' #')[0])]
-        text = re.sub(r'^ *```.*?^ *```$', '', text, flags=re.MULTILINE | re.DOTALL)
-        found += [(page, line.replace('\n', ' ')) for line in re.findall(r'`([^`]+)`', text)]
-    lines = [(page, re.sub(r'^.*?\bmddag ', '', line))
-             for page, line in found
-             if re.match(r'(\S+=\S+ |chrt \S+ \S+ |ros2 )*(\.venv/bin/)?mddag ', line)]
-    return sorted(set(lines))
+def command_lines(page):
+    """Return every command line of `mddag` in blocks and between backquotes."""
+    text, found = (TOP / page).read_text(encoding='utf-8'), []
+    for block in blocks(page):
+        if block.language == 'sh':
+            lines = block.text.replace('\\\n', ' ').splitlines()
+            found += [part.strip() for line in lines
+                      for part in re.split(r'&&|\|\|?|;', line.partition(' #')[0])]
+    text = re.sub(r'^ *```.*?^ *```$', '', text, flags=re.MULTILINE | re.DOTALL)
+    found += [line.replace('\n', ' ') for line in re.findall(r'`([^`]+)`', text)]
+    return {re.sub(r'^.*?\bmddag ', '', line) for line in found
+            if re.match(r'(\S+=\S+ |chrt \S+ \S+ |ros2 )*(\.venv/bin/)?mddag ', line)}
 
 
 def known_options(words):
-    """Return the help of the verb that a command line names, and its options."""
-    verbs = [word for word in words[:2] if re.fullmatch(r'[a-z-]+', word)]
-    for count in range(len(verbs), 0, -1):
-        out = io.StringIO()
-        try:
-            with contextlib.redirect_stdout(out):
-                program.run([*verbs[:count], '--help'])
-        except SystemExit:
-            if count == 1 and len(verbs) == 2 and 'VERB …' in out.getvalue():
-                break
-            return out.getvalue(), set(re.findall(r'(?<![\w-])--?[a-z][\w-]*', out.getvalue()))
-        except UsageError:
-            continue
-    raise AssertionError(f'there is no such verb: {" ".join(words[:2])}')
+    """Return the options of the verb that a command line names."""
+    line = ' '.join([*words, ''])
+    verb = next((verb for verb in program.VERBS if line.startswith(f'{verb} ')), None)
+    assert verb is not None, f'there is no such verb: {" ".join(words[:2])}'
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        program.run([*verb.split(), '--help'])
+    return set(re.findall(r'(?<![\w-])--?[a-z][\w-]*', out.getvalue()))
 
 
-@pytest.mark.parametrize(('page', 'line'), command_lines())
-def test_commands_and_options_exist(page, line):
-    line = re.split(r' [|>] ?', line)[0]
-    words = shlex.split(line.replace('…', ' '), comments=True)
-    if words[0].startswith('-') or words[0].isupper():
-        return  # mddag --help, mddag VERB --help
-    _, options = known_options(words)
-    used = {word.partition('=')[0].strip('[]') for word in words
-            if re.match(r'\[?--?[a-z]', word)}
-    if '--ros-args' in used:
-        used = {word for word in used if word != '-r'}
-    assert used - options - {'--help'} == set(), f'{page}: {line}'
+@pytest.mark.parametrize('page', [page for page in PAGES if page != 'CHANGELOG.md'])
+def test_commands_and_options_exist(page):
+    for line in command_lines(page):
+        words = shlex.split(re.split(r' [|>] ?', line)[0].replace('…', ' '), comments=True)
+        if words[0].startswith('-') or words[0].isupper():
+            continue  # mddag --help, mddag VERB --help
+        used = {word.partition('=')[0].strip('[]') for word in words
+                if re.match(r'\[?--?[a-z]', word)}
+        if '--ros-args' in used:
+            used.discard('-r')
+        assert used - known_options(words) - {'--help'} == set(), line
 
 
 def test_every_verb_is_on_the_page_of_commands():
@@ -146,15 +129,11 @@ def test_the_site_builds_without_warnings_and_needs_no_network(tmp_path):
         assert f'{name}' in api
 
 
-def test_images_are_small_and_used():
-    texts = ''.join((TOP / page).read_text(encoding='utf-8') for page in PAGES)
+def test_images_and_links():
+    texts = {page: (TOP / page).read_text(encoding='utf-8') for page in PAGES}
     for path in (TOP / 'docs' / 'images').iterdir():
         assert path.stat().st_size <= LARGEST_IMAGE, f'{path.name} is too large'
-        assert path.name in texts, f'{path.name} is on no page'
-
-
-@pytest.mark.parametrize('page', [page for page in PAGES if not page.startswith('docs/')])
-def test_links_of_other_pages_lead_somewhere(page):
-    text = (TOP / page).read_text(encoding='utf-8')
-    for name in re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', text):
-        assert (TOP / page).parent.joinpath(name).exists(), name
+        assert path.name in ''.join(texts.values()), f'{path.name} is on no page'
+    for page, text in texts.items():
+        for name in re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', text):
+            assert page.startswith('docs/') or (TOP / page).parent.joinpath(name).exists(), name

@@ -18,27 +18,17 @@ import pytest
 pytestmark = pytest.mark.linter
 TOP = Path(__file__).resolve().parent.parent
 
-LEVELS = {
-    'msg_graph': 0,
-    'mddag_executor.errors': 1,
-    'mddag_executor.memory': 1,
-    'mddag_executor.defaults': 1,
-    'mddag_executor.text': 1,
-    'mddag_executor.resources': 2,
-    'mddag_executor': 3,  # its __init__.py, to those who want the version
-    'mddag_executor.core': 4,
-    'mddag_executor.trace': 4,
-    'mddag_executor.recording': 5,
-    'mddag_executor.simulate': 5,  # below replay, which reschedules with its engine
-    'mddag_executor.laboratory': 6,
-    'mddag_executor.executor': 6,
-    'mddag_executor.replay': 6,
-    'mddag_executor.report': 7,
-    'mddag_executor.hosting': 7,
-    'mddag_executor.rerun': 8,
-    'mddag_executor.cli': 9,
-    'mddag_executor.__main__': 10,
-}
+LEVELS = {part: level for level, parts in enumerate((
+    ('msg_graph',), ('mddag_executor.errors', 'mddag_executor.memory', 'mddag_executor.defaults',
+                     'mddag_executor.text'),
+    ('mddag_executor.resources',),
+    ('mddag_executor',),  # its __init__.py, to those who want the version
+    ('mddag_executor.core', 'mddag_executor.trace'),
+    # simulate is below replay, which reschedules with its engine
+    ('mddag_executor.recording', 'mddag_executor.simulate'),
+    ('mddag_executor.laboratory', 'mddag_executor.executor', 'mddag_executor.replay'),
+    ('mddag_executor.report', 'mddag_executor.hosting'), ('mddag_executor.rerun',),
+    ('mddag_executor.cli',), ('mddag_executor.__main__',))) for part in parts}
 # What mddag_executor/__init__.py passes on belongs to the part that it comes from.
 PASSED_ON = {'mddag_executor.DeadlineMiss': 'mddag_executor.executor',
              'mddag_executor.MultiDeadlineExecutor': 'mddag_executor.executor',
@@ -65,45 +55,36 @@ def part_of(module):
     return part if part in LEVELS else names[0]
 
 
-def imports(module, text, is_package):
-    """Yield line and full name of what a module imports."""
-    package = module.split('.') if is_package else module.split('.')[:-1]
-    for node in ast.walk(ast.parse(text)):
+def imports(path):
+    """Yield the module of a file, and line and full name of each of its imports."""
+    package = path.relative_to(TOP).parts[:-1]
+    module = '.'.join(package if path.stem == '__init__' else (*package, path.stem))
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
         if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
+            yield from ((module, node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            base = package[:len(package) - node.level + 1] if node.level else []
+            base = package[:len(package) - node.level + 1] if node.level else ()
             name = '.'.join([*base, *filter(None, [node.module])])
-            yield from ((node.lineno, f'{name}.{alias.name}') for alias in node.names)
+            yield from ((module, node.lineno, f'{name}.{alias.name}') for alias in node.names)
 
 
-def violations(module, text, is_package=False):
-    """Yield what a module imports and must not."""
-    mine = part_of(module)
-    for line, name in imports(module, text, is_package):
-        theirs = part_of(name)
-        foreign = name.split('.')[0]
-        passed_on = module == 'mddag_executor' and f'{module}.{name.split(".")[-1]}' in PASSED_ON
-        if theirs not in (None, mine) and LEVELS[theirs] >= LEVELS[mine] and not passed_on:
-            yield f'{module}:{line} imports {name}: {theirs} is no part below {mine}'
-        if mine == 'mddag_executor.core' and foreign in NOT_IN_CORE:
-            yield f'{module}:{line} imports {name}: the core knows no clock and no thread'
-        if foreign in ROS and mine not in MAY_USE_ROS:
-            yield f'{module}:{line} imports {name}: {mine} works without ROS'
-
-
-def modules():
-    """Yield name and text of each module, and whether it is a package."""
-    for package in ('msg_graph', 'mddag_executor'):
-        for path in sorted((TOP / package).rglob('*.py')):
-            names = path.relative_to(TOP).with_suffix('').parts
-            is_package = names[-1] == '__init__'
-            yield ('.'.join(names[:-1] if is_package else names),
-                   path.read_text(encoding='utf-8'), is_package)
+def violations():
+    """Yield what modules import and must not."""
+    for path in sorted([*(TOP / 'msg_graph').rglob('*.py'),
+                        *(TOP / 'mddag_executor').rglob('*.py')]):
+        for module, line, name in imports(path):
+            mine, theirs, foreign = part_of(module), part_of(name), name.split('.')[0]
+            passed_on = f'{module}.{name.split(".")[-1]}' in PASSED_ON
+            if theirs not in (None, mine) and LEVELS[theirs] >= LEVELS[mine] and not passed_on:
+                yield f'{module}:{line} imports {name}: {theirs} is no part below {mine}'
+            if mine == 'mddag_executor.core' and foreign in NOT_IN_CORE:
+                yield f'{module}:{line} imports {name}: the core knows no clock and no thread'
+            if foreign in ROS and mine not in MAY_USE_ROS:
+                yield f'{module}:{line} imports {name}: {mine} works without ROS'
 
 
 def test_imports_point_one_way():
     folders = {f'mddag_executor.{path.parent.name}'
                for path in (TOP / 'mddag_executor').glob('*/__init__.py')}
     assert folders and folders - set(LEVELS) == set()
-    assert [line for module in modules() for line in violations(*module)] == []
+    assert list(violations()) == []

@@ -21,43 +21,22 @@ ROOTS = [name for name in NAMES if (TOP / name).exists()]
 SOURCES = sorted(path for root in ROOTS
                  for path in ((TOP / root).rglob('*.py') if (TOP / root).is_dir()
                               else [TOP / root]))
-HEADER = re.compile(
-    r'# Copyright 20\d\d The mddag_executor developers\n'
-    r'# SPDX-License-Identifier: Apache-2\.0\n')
+HEADER = re.compile(r'# Copyright 20\d\d The mddag_executor developers\n'
+                    r'# SPDX-License-Identifier: Apache-2\.0\n')
 
 # What the packages import, with the key in package.xml and the name in setup.py that bring it.
-# None in setup.py: the extra `ros` does. None in package.xml: another key does.
+# None in setup.py: the extra `ros` does. None in package.xml: another key does, or it is an extra.
 THIRD_PARTY = {
-    'ament_index_python': ('ament_index_python', None),
-    'action_msgs': ('action_msgs', None),
-    'argcomplete': ('python3-argcomplete', 'argcomplete'),
-    'bokeh': (None, 'bokeh'),  # of the extra `report`
-    'builtin_interfaces': ('builtin_interfaces', None),
-    'diagnostic_msgs': ('diagnostic_msgs', None),
-    'dask': (None, 'distributed'),
-    'distributed': (None, 'distributed'),  # Dask has no rosdep key; it is an extra
-    'geometry_msgs': ('geometry_msgs', None),
-    'launch': ('launch', None),
-    'launch_ros': ('launch_ros', None),
-    'llvmlite': (None, 'numba'),  # of the extra `batch`
-    'lz4': ('mcap-ros2-support', 'lz4'),
-    'mcap': ('mcap-ros2-support', 'mcap'),
-    'matplotlib': (None, 'matplotlib'),  # of the extra `batch`
-    'nav_msgs': ('nav_msgs', None),
-    'numba': (None, 'numba'),  # of the extra `batch`
-    'numpy': ('python3-numpy', 'numpy'),
-    'pandas': (None, 'pandas'),  # `to_pandas` only
-    'pyarrow': (None, 'pyarrow'),  # of the extra `export`
-    'rcl_interfaces': ('rcl_interfaces', None),
-    'rclpy': ('rclpy', None),
-    'ros2cli': ('ros2cli', None),
-    'rosbags': ('python3-rosbags-pip', 'rosbags'),
-    'rosgraph_msgs': ('rosgraph_msgs', None),
-    'rosidl_parser': ('rosidl_parser', None),
-    'sensor_msgs': ('sensor_msgs', None),
-    'std_msgs': ('std_msgs', None),
-    'yaml': ('python3-yaml', 'PyYAML'),
-    'zstandard': ('mcap-ros2-support', 'zstandard'),
+    **{name: (name, None) for name in (
+        'ament_index_python', 'action_msgs', 'builtin_interfaces', 'diagnostic_msgs',
+        'geometry_msgs', 'launch', 'launch_ros', 'nav_msgs', 'rcl_interfaces', 'rclpy', 'ros2cli',
+        'rosgraph_msgs', 'rosidl_parser', 'sensor_msgs', 'std_msgs')},
+    **{name: (None, name) for name in (
+        'bokeh', 'distributed', 'matplotlib', 'numba', 'pandas', 'pyarrow')},
+    **{name: ('mcap-ros2-support', name) for name in ('lz4', 'mcap', 'zstandard')},
+    'argcomplete': ('python3-argcomplete', 'argcomplete'), 'dask': (None, 'distributed'),
+    'llvmlite': (None, 'numba'), 'numpy': ('python3-numpy', 'numpy'),
+    'rosbags': ('python3-rosbags-pip', 'rosbags'), 'yaml': ('python3-yaml', 'PyYAML'),
 }
 
 
@@ -105,11 +84,8 @@ def test_names_and_versions_agree():
 def run_nodes(node):
     """Yield all nodes but those that only type checkers read."""
     yield node
-    if isinstance(node, ast.If) and ast.unparse(node.test).endswith('TYPE_CHECKING'):
-        children = list(node.orelse)
-    else:
-        children = list(ast.iter_child_nodes(node))
-    for child in children:
+    only_types = isinstance(node, ast.If) and ast.unparse(node.test).endswith('TYPE_CHECKING')
+    for child in node.orelse if only_types else ast.iter_child_nodes(node):
         yield from run_nodes(child)
 
 
@@ -121,12 +97,9 @@ def test_what_is_imported_is_declared():
                 parts[:2] != ('examples', 'robot')):    # it is installed, too
             continue
         for node in run_nodes(ast.parse(path.read_text(encoding='utf-8'))):
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.level == 0:
                 names = [node.module or '']
-            else:
-                continue
             for name in names:
                 imported.setdefault(name.split('.')[0], str(path.relative_to(TOP)))
     foreign = set(imported) - set(sys.stdlib_module_names) - {'mddag_executor', 'msg_graph'}

@@ -15,10 +15,6 @@ TOP = Path(__file__).resolve().parent.parent
 
 def test_a_checkout_has_its_own_files():
     assert resources.find('package.xml') == TOP / 'package.xml'
-    assert resources.find('config/autoware.yaml') == TOP / 'config' / 'autoware.yaml'
-
-
-def test_what_is_nowhere_is_one_line():
     with pytest.raises(InputError, match=r'^config/none\.yaml: not found among .*: install'):
         resources.find('config/none.yaml')
 

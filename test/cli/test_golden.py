@@ -43,11 +43,13 @@ COMMANDS = {
     'place_json': (
         'graph place graph.yaml --processes 2 --cpus 2 --duration 200ms --json - -o out.yaml'),
     'place_rules': (
-        'graph place graph.yaml --processes 2 --together /camera,/wheels --duration 1s -o -; '
-        'graph place graph.yaml --processes 2 --apart /camera,/detector -q -o out.yaml'),
+        'graph place graph.yaml --processes 2 --together /camera,/wheels --duration 200ms -o -; '
+        'graph place graph.yaml --processes 2 --apart /camera,/detector --duration 200ms '
+        '-q -o out.yaml'),
     'place_trace': (
         'simulate graph.yaml --execution-times times.json --trace own.mcap --duration 1s -q; '
-        'graph place graph.yaml --processes 2 --trace own.mcap --duration 1s -o out.yaml'),
+        'graph place graph.yaml --processes 2 --trace own.mcap --duration 200ms '
+        '-o out.yaml'),
     'generate': 'generate --dags 2 --vertices 3:5 --sinks 2 --or-share 0.5 --seed 4',
     'simulate': 'simulate graph.yaml --duration 200ms',
     'simulate_options': '; '.join(f'simulate graph.yaml --duration 200ms {how}' for how in (

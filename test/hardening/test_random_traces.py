@@ -66,8 +66,7 @@ def runs(tmp_path_factory):
 
 def rows_of(path, most):
     """Return the events of a trace, up to so many that jobs consist of."""
-    found = []
-    at_work = 0
+    found, at_work = [], 0
     for event in read_events(path):
         kind = EVENTS[event['_name']]
         at_work += kind.name in ('dispatch', 'job_release', 'complete', 'rclcpp_publish')
@@ -98,10 +97,10 @@ def changed(rows, dice):
             values = [lie(kind, dice) for _, kind in EVENTS[name].fields]
             rows.insert(at, (name, time, dice.choice((pid, 0, -1)), tid, values))
         elif EVENTS[name].fields:
-            place = dice.randrange(len(values))
-            values = [*values]
+            place, values = dice.randrange(len(values)), [*values]
+            # what it cannot say, or what another event of the kind says there
             values[place] = lie(EVENTS[name].fields[place][1], dice) if how < 7 else \
-                other(rows, name, place, dice)
+                dice.choice([row[4][place] for row in rows if row[0] == name])
             rows[at] = (name, time, pid, tid, values)
     return rows
 
@@ -118,11 +117,6 @@ def lie(kind, dice):
         return min(high, max(low, dice.choice(NUMBERS)))
     assert FieldType.parse(kind) and kind.startswith('float'), kind
     return dice.choice((0.0, float('nan'), float('inf'), -1e308))
-
-
-def other(rows, name, place, dice):
-    """Return what another event of the kind says there."""
-    return dice.choice([row[4][place] for row in rows if row[0] == name])
 
 
 def give(rows, seed):
