@@ -62,14 +62,13 @@ def in_workspace(place, command, folder=Path('/')):
 def test_what_was_built_is_what_runs(workspace):
     installed = workspace / 'install' / NAME
     share = installed / 'share'
-    assert (share / 'ament_index/resource_index/packages' / NAME).is_file()
-    for name in ('package.xml', 'launch/run.launch.py'):
-        assert (share / NAME / name).is_file()
-    program = installed / 'lib' / NAME / 'mddag'  # where `ros2 run` looks
+    for name in (f'ament_index/resource_index/packages/{NAME}', f'{NAME}/package.xml',
+                 f'{NAME}/launch/run.launch.py'):
+        assert (share / name).is_file()
     done = in_workspace(
         workspace, f'"{sys.executable}" -c "import {NAME}; print({NAME}.__file__)" && '
-        'mddag --version && command -v mddag && '
-        f'"{program}" graph check "{share}/{NAME}/config/autoware.yaml"')
+        'mddag --version && command -v mddag && '       # and where `ros2 run` looks:
+        f'"{installed}/lib/{NAME}/mddag" graph check "{share}/{NAME}/config/autoware.yaml"')
     assert done.returncode == 0 and 'perception' in done.stdout, done.stderr
     assert done.stdout.startswith(str(installed))
     assert f'\n{installed / "bin" / "mddag"}\n' in done.stdout
@@ -136,28 +135,22 @@ def test_a_signal_ends_ros2_launch_and_the_run(workspace, tmp_path, number, to_a
             env={**os.environ, 'COLCON_TRACE': '', 'PYTHONUNBUFFERED': '1'}) as process:
         pid = int(re.search(r'process started with pid \[(\d+)\]', next(
             line for line in process.stdout if 'process started' in line))[1])
-        trace = tmp_path / 'out.mcap'
-        wait_until(lambda: trace.exists() and trace.stat().st_size > 0)
-        head = trace.stat().st_size
-        wait_until(lambda: trace.stat().st_size > head + 1000)     # some jobs more
+        trace, sizes = tmp_path / 'out.mcap', []
+        while len(sizes) < 2 or sizes[-1] <= sizes[0] + 1000:       # until some jobs have run
+            time.sleep(0.05)
+            sizes += [trace.stat().st_size] if trace.exists() and trace.stat().st_size else []
         if to_all:
             os.killpg(process.pid, number)
         else:
             process.send_signal(number)
         said = process.stdout.read()    # to its end: the run has it, too
-    wait_until(lambda: not Path(f'/proc/{pid}').exists())
+    while Path(f'/proc/{pid}').exists():
+        time.sleep(0.05)
     if number == signal.SIGINT:
         assert 'results due' in said and 'process has finished cleanly' in said
     assert 'Traceback' not in said.replace('see debug for traceback', '')
     replayed = in_workspace(workspace, 'ros2 mddag replay out.mcap', tmp_path)
     assert (replayed.returncode, replayed.stderr) == (0, ''), replayed.stdout
-
-
-def wait_until(condition):
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 def test_colcon_test_runs_the_tests(workspace):

@@ -22,5 +22,4 @@ def test_public_names_are_those_of_the_live_executor():
 def test_texts_for_messages():
     assert [counted(n, 'DAG') for n in (0, 1, 2)] == ['0 DAGs', '1 DAG', '2 DAGs']
     assert [counted(n, 'vertex', 'vertices') for n in (1, 2)] == ['1 vertex', '2 vertices']
-    assert listed(['a', 'b']) == 'a, b' and listed([]) == ''
-    assert listed({'a': 1, 'b': 2, 'c': 3}, 2) == 'a, b, … (1 more)'
+    assert (listed(['a', 'b']), listed([]), listed('abc', 2)) == ('a, b', '', 'a, b, … (1 more)')
