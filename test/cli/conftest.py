@@ -4,6 +4,8 @@
 
 import pytest
 
+from . import golden
+
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
@@ -13,6 +15,8 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def graph(folder, graph):
-    """Give the same in the working directory."""
-    return graph
+def graph(folder, request):
+    """Give the declaration `GRAPH` of the test's module, or that in golden/, as graph.yaml."""
+    text = getattr(request.module, 'GRAPH', None)
+    (folder / 'graph.yaml').write_text(text or (golden.FOLDER / 'graph.yaml').read_text())
+    return folder / 'graph.yaml'

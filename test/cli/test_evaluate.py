@@ -15,20 +15,6 @@ import pytest
 
 from ..conftest import wait_for_run
 
-GRAPH = """\
-mddag: 1
-workers: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: a, timer: 10ms, dag: a, deadline: 5ms, execution_time: 2500us}
-      - name: b
-        timer: 20ms
-        dag: b
-        deadline: 20ms
-        execution_time: {quantiles_us: [10000, 10000, 14000, 14000], percent: [0, 50, 50.01, 100]}
-"""
-
 
 @pytest.mark.parametrize(('ending', 'start'), [
     ('png', b'\x89PNG'), ('svg', b'<?xml'), ('pdf', b'%PDF')])

@@ -27,7 +27,8 @@ COMMANDS = {
     'check_json': 'graph check graph.yaml --json -',
     'check_stdin': (
         'graph check - < ROOT/config/autoware.yaml; '
-        'graph check - < ROOT/config/autoware_multi.yaml'),
+        'graph check - < ROOT/config/autoware_multi.yaml; '
+        'graph check - < ROOT/config/reference_system.yaml'),
     'check_warnings': '; '.join(f'graph check {name}.yaml' for name in (
         'hopeless', 'overloaded', 'many_workers', 'timed')),
     'analyse': 'graph analyse graph.yaml --budget mean',
@@ -64,6 +65,7 @@ COMMANDS = {
         '--jobs 1 --json -'),
     'draw_dot': 'graph draw picture.yaml -o out.dot',
     'draw_mermaid': 'graph draw picture.yaml -o out.mmd',
+    'draw_autoware': 'graph draw - -o out.mmd < ROOT/config/autoware.yaml',
     'from_caret': 'graph from-caret architecture.yaml -o out.yaml',
     'from_trace': 'graph from-trace drive.mcap -o out.yaml',
     'from_trace_accept': 'graph from-trace drive.mcap --accept -o out.yaml',

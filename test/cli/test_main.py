@@ -22,7 +22,7 @@ from hypothesis import given, strategies
 from mddag_executor import __version__
 from mddag_executor.cli import main as program
 from mddag_executor.cli.text import format_ns, one_line, printable, Progress
-from mddag_executor.errors import InputError, MddagError, UsageError
+from mddag_executor.errors import InputError, MddagError
 from mddag_executor.simulate import Settings
 from mddag_executor.simulate.run import check
 from msg_graph import errors, GraphError
@@ -59,32 +59,21 @@ def fail_with(error):
 
 
 @pytest.mark.parametrize(('error', 'line'), [
-    (InputError('a.yaml', 'no source', 'add a timer', line=3),
-     'error: a.yaml:3: no source: add a timer'),
-    (UsageError('--x: impossible: leave it'), 'error: --x: impossible: leave it'),
-    (MddagError('a\n  b\tc\x1b[31m\u202e'), 'error: a b c\\x1b[31m\\u202e'),
-    (FileNotFoundError(2, 'No such file or directory', 'gone.yaml'),
-     'error: gone.yaml: no such file or directory: check the path'),
-    (IsADirectoryError(21, 'Is a directory', 'folder'),
-     'error: folder: is a directory: name a file'),
+    (InputError('a.yaml', 'no source', 'add a timer', line=3), 'a.yaml:3: no source: add a timer'),
+    (MddagError('a\n  b\tc\x1b[31m\u202e'), 'a b c\\x1b[31m\\u202e'),
     (PermissionError(13, 'Permission denied', 'a', None, 'b'),
-     'error: b: permission denied: change its permissions or name another file'),
-    (OSError(28, 'No space left on device', 'out.json'),
-     'error: out.json: no space left on device: free space, or name another file'),
+     'b: permission denied: change its permissions or name another file'),
     (FileNotFoundError(2, 'No such file or directory'),
-     'error: working directory: no such file or directory: check the path'),
+     'working directory: no such file or directory: check the path'),
     (OSError(24, 'Too many open files'),
-     "error: this process: too many open files: allow more with 'ulimit -n'"),
+     "this process: too many open files: allow more with 'ulimit -n'"),
     (OSError(5, 'Input/output error', 'out.json'),
-     'error: out.json: input/output error: check the path and what it lies on'),
-    (ModuleNotFoundError("No module named 'rclpy'", name='rclpy'),
-     'error: rclpy: ROS 2 is not there: source the setup file of your ROS 2, '
-     "or install 'mddag_executor[ros]' with pip"),
+     'out.json: input/output error: check the path and what it lies on'),
 ])
 def test_bad_input_is_one_line(verb, capsys, error, line):
     verb(fail_with(error))
     assert program.main(['probe']) == 2
-    assert capsys.readouterr() == ('', line + '\n')
+    assert capsys.readouterr() == ('', f'error: {line}\n')
 
 
 @pytest.mark.parametrize('error', [
@@ -291,17 +280,13 @@ def ros2(monkeypatch):
     return SimpleNamespace(main=main, summary=extension.__doc__)
 
 
-def test_it_is_the_same_program(ros2, graph, capsys):
+def test_it_is_the_same_program(ros2, graph, capsys, monkeypatch):
     assert ros2.main('graph', 'check', str(graph)) == 0
     assert 'deadline' in capsys.readouterr().out
     assert ros2.main('simulate', '--duration', '100ms', '--', str(graph)) == 0
-    assert ros2.main('graph', 'check', 'none.yaml') == 2
-    assert capsys.readouterr().err.startswith('error: none.yaml: ')
-    assert ros2.main() == 2
-    assert capsys.readouterr().err.startswith('error: mddag: ')
-
-
-def test_completion_is_that_of_mddag(ros2, monkeypatch):
+    for words, place in (('graph', 'check', 'none.yaml'), 'none.yaml'), ((), 'mddag'):
+        assert ros2.main(*words) == 2
+        assert capsys.readouterr().err.startswith(f'error: {place}: ')
     asked = []
     monkeypatch.setattr('mddag_executor.cli.completion.complete', lambda: asked.append(
         (os.environ['COMP_LINE'], os.environ['COMP_POINT'])))

@@ -18,15 +18,6 @@ from mddag_executor.rerun import rerun
 from mddag_executor.trace import TraceFile, TraceWriter
 import pytest
 
-GRAPH = """\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: t, timer: 10ms, publishes: [/a], execution_time: 2ms}
-      - {name: s, subscription: /a, deadline: 5ms, execution_time: 4ms}
-"""
-
 
 def test_what_is_replaced(graph, call):
     simulate = ['simulate', 'graph.yaml', '--duration', '50ms', '--trace', 'run.mcap']

@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes of the text of a declaration: deadlines and processes, where all else stays."""
 
-from msg_graph import GraphError, loads, Process
+from dataclasses import replace
+from pathlib import Path
+
+from msg_graph import GraphError, load, loads, Process
 from msg_graph.edit import (
     deadlines_in_text,
     load_processes,
@@ -12,6 +15,8 @@ from msg_graph.edit import (
     without_lines,
 )
 import pytest
+
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
 
 TEXT = """\
 # At the top.
@@ -63,6 +68,18 @@ def test_missing_deadlines():
                            (text.replace('timer: 20ms', 'timer: 20'), "'20' has no unit")):
         with pytest.raises(GraphError, match=problem):
             load_with_or_without_deadlines(wrong, 'g.yaml')
+
+
+def test_autoware_with_other_deadlines():
+    """`golden/check_stdin.txt` and `draw_autoware.txt` of `test/cli` have what is in it."""
+    autoware, multi = (load(CONFIG / f'{name}.yaml') for name in ('autoware', 'autoware_multi'))
+    deadlines = {callback.key: callback.deadline_ns for callback in multi.callbacks
+                 if callback.deadline_ns is not None}
+    assert without_lines(multi) == replace(
+        without_lines(with_deadlines(autoware, deadlines)), file=multi.file)
+    assert {one.name for one, dag in zip(autoware.dags, multi.dags) if any(
+        v.deadline_ns != w.deadline_ns for v, w in zip(one.vertices, dag.vertices))} == {
+            'control', 'imu', 'perception', 'vehicle'}
 
 
 HEAD = """\
