@@ -7,20 +7,15 @@ from dataclasses import dataclass, field
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core import queues, Tables
-from mddag_executor.errors import UsageError
 from mddag_executor.simulate import (
-    draw_execution_times,
     END,
     engine,
     Load,
     machine,
-    periodic_load,
     schedule,
     Settings,
-    simulate,
     START,
 )
-from msg_graph import loads
 import pytest
 
 from ..conftest import examples
@@ -71,25 +66,13 @@ def times(jobs, workers, cpus=None, python=False, preemptive=False, divided=Fals
     return found
 
 
-def of_ms(*jobs):
-    for job in jobs:
-        job.release, job.deadline, job.cost = job.release * MS, job.deadline * MS, job.cost * MS
-        job.cpu = None if job.cpu is None else job.cpu * MS
-    return list(jobs)
-
-
 def in_ms(found):
     return [(start / MS, end / MS) for start, end in found]
 
 
-def test_one_after_the_other_where_none_is_more_urgent():
-    jobs = of_ms(Job(0, 50, 4, True), Job(0, 50, 3, True), Job(1, 90, 2, True), Job(1, 99, 2))
-    assert in_ms(times(jobs, 4)) == [(0, 4), (4, 7), (7, 9), (1, 3)]
-
-
 def test_one_that_is_more_urgent_overtakes_and_they_take_turns():
     """It starts at 2, has the lock from 3 to 4, 5 to 6 and 7 to 8; the other one meanwhile."""
-    jobs = of_ms(Job(0, 100, 10, True), Job(2, 16, 3, True))
+    jobs = [Job(0, 100 * MS, 10 * MS, True), Job(2 * MS, 16 * MS, 3 * MS, True)]
     assert in_ms(times(jobs, 2)) == [(0, 13), (2, 8)]
     # with one worker it waits; where it takes the worker, the other one does
     assert in_ms(times(jobs, 1)) == [(0, 10), (10, 13)]
@@ -97,31 +80,6 @@ def test_one_that_is_more_urgent_overtakes_and_they_take_turns():
     # where it has time enough for that, it waits for the 8 ms
     jobs[1].deadline = 17 * MS
     assert in_ms(times(jobs, 2)) == [(0, 10), (10, 13)]
-
-
-HOLDERS = """\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: a, timer: 20ms, deadline: 20ms, dag: a, execution_time: 6ms, holds_interpreter: H}
-      - {name: b, timer: 20ms, deadline: 20ms, dag: b, execution_time: 6ms, holds_interpreter: H}
-"""
-
-
-def test_declared_holders_in_the_simulator():
-    worst = []
-    for holds, cpus in (('false', None), ('true', None), ('false', 1)):
-        task_set = loads(HOLDERS.replace('H', holds), 'g.yaml')
-        load = periodic_load(task_set, draw_execution_times(task_set, 0), 40 * MS)
-        result = simulate(task_set, load, Settings(workers=2, duration_ns=40 * MS, cpus=cpus)
-                          ).result()
-        worst.append([result['dags'][name]['sinks'][f'/n:{name}']['response_ns']['max'] // MS
-                      for name in 'ab'])
-        assert result.get('cpus') == cpus
-    assert worst == [[6, 6], [6, 12], [9, 12]]
-    with pytest.raises(UsageError, match='cpus: 0 is too few'):
-        simulate(task_set, load, Settings(workers=2, duration_ns=40 * MS, cpus=0))
 
 
 # --- a model that goes by ticks ------------------------------------------------------------------

@@ -9,7 +9,8 @@ import tempfile
 
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
-from mddag_executor.errors import InputError, UsageError
+from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
+from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import (
@@ -42,6 +43,60 @@ def two_dags(**more):
          'execution_time': '1us'}])
 
 
+AUTOWARE = Path(__file__).resolve().parents[2] / 'config' / 'autoware.yaml'
+
+# What the paper's own program (github.com/atsushi421/2024_RTSS_WiP_Evaluation) gave on 2026-11-22
+# for draws of this project, by seed and policy: when the first late sink completed, and the worst
+# response time of each sink until then, DAG by DAG, us.
+PAPER = {
+    (2, 'rad'): (None, [
+        5998, 5967, 1995, 2216, 34988, 250, 251, 4401, 140938, 231479, 122722, 212577, 188155, 669,
+        2889, 79032, 316, 314]),
+    (2, 'rm'): (None, [
+        5998, 5967, 1995, 2216, 47589, 250, 251, 42276, 154585, 253775, 136369, 238556, 193595,
+        40455, 42176, 95793, 316, 314]),
+    (2, 'wc'): (246381, [
+        27427, 28065, 46381, 19384, 1022, 7070, 7068, 24540, 137314, 221830, 115863, 204491,
+        175345, 23881, 24440, 79020, 7076, 7072]),
+    (3, 'rad'): (None, [
+        2410, 2439, 444, 757, 42939, 331, 331, 2330, 139084, 243956, 102674, 214008, 174158, 637,
+        2433, 93197, 1488, 1488]),
+    (3, 'rm'): (301085, [
+        2410, 2439, 444, 757, 5711, 331, 331, 32706, 137484, 235300, 99541, 205538, 166578, 32527,
+        33954, 101085, 1488, 1488]),
+    (3, 'wc'): (239240, [
+        28420, 28516, 39240, 9888, 783, 7349, 7346, 35902, 137351, 235723, 98151, 209200, 165680,
+        32024, 36002, 92988, 10060, 10058]),
+    (4, 'rad'): (None, [
+        2388, 2420, 1394, 1643, 2161, 220, 220, 2663, 118909, 201827, 97510, 189373, 94850, 620,
+        2081, 99630, 376, 378]),
+    (4, 'rm'): (400823, [
+        2388, 2420, 1394, 1643, 2120, 220, 220, 3670, 121794, 203706, 99454, 191252, 93678, 3419,
+        3618, 100823, 376, 378]),
+    (4, 'wc'): (None, [
+        8526, 8606, 4260, 4509, 881, 6876, 6874, 2932, 121704, 203706, 99454, 191252, 93387, 1785,
+        2638, 99654, 7878, 7876]),
+}
+
+
+@pytest.mark.parametrize(('seed', 'policy'), PAPER)
+def test_autoware_runs_as_in_the_paper_s_program(seed, policy):
+    task_set = load(AUTOWARE)
+    times = [[-(-time // 1000) * 1000 for time in row]
+             for row in draw_execution_times(task_set, seed)]
+    run = simulate(task_set, periodic_load(task_set, times, 3 * 10 ** 9), Settings(
+        policy=policy, workers=7, duration_ns=3 * 10 ** 9, preemptive=None,
+        judge='completions', stop_at_first_miss=True))
+    worst = {}
+    first_miss = None
+    for kind, dag, vertex, job, _, time in run.decisions:
+        if kind in SINK_COMPLETED and first_miss is None:
+            response = (time - job * task_set.dags[dag].period_ns) // 1000
+            worst[vertex] = max(response, worst.get(vertex, 0))
+            first_miss = time // 1000 if kind == SINK_LATE else None
+    assert (first_miss, [worst[vertex] for vertex in sorted(worst)]) == PAPER[seed, policy]
+
+
 # --- loads ---------------------------------------------------------------------------------------
 
 
@@ -63,31 +118,25 @@ def test_a_bound_for_all_dags_and_one_of_its_own():
     task_set = two_dags(max_active_jobs=3)
     load = periodic_load(task_set, [[1, 900 * US], [900 * US, 1]], 100 * US)
     settings = Settings(workers=2, duration_ns=100 * US)
-    ends = {name: dag['ends']['expired'] for name, dag in simulate(
-        task_set, load, settings, max_active_jobs=2).result()['dags'].items()}
-    assert ends == {'a': 10 - 3, 'b': 25 - 2}
-    ends = {name: dag['ends']['expired']
-            for name, dag in simulate(task_set, load, settings).result()['dags'].items()}
-    assert ends == {'a': 10 - 3, 'b': 0}
+    for more, expired in (({'max_active_jobs': 2}, [10 - 3, 25 - 2]), ({}, [10 - 3, 0])):
+        dags = simulate(task_set, load, settings, **more).result()['dags']
+        assert [dags[name]['ends']['expired'] for name in 'ab'] == expired
 
 
 # --- settings ------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(('setting', 'says'), [
     ({'workers': 0}, 'workers: 0 is out of range: give 1 to 4096'),
-    ({'workers': -1}, 'workers: -1 is out of range'),
     ({'duration_ns': 0}, 'duration: 0 ns is too short'),
     ({'judge': 'me'}, "judge 'me': .*: choose one of horizon, completions"),
-    ({'policy': 'edf'}, "policy 'edf': .*: choose one of rad, rm"),
     ({'policy': 'ros2', 'preemptive': True}, "policy 'ros2': .* preempts no callback: run it"),
+    ({'cpus': 0}, 'cpus: 0 is too few'),
     ({'dispatch_overhead_ns': -1}, 'overhead'), ({'switch_overhead_ns': -1}, 'overhead'),
 ])
 def test_settings_that_make_no_sense(setting, says):
-    from mddag_executor.errors import MddagError
     load = periodic_load(two_dags(), [[1, 1], [1, 1]], US)
-    with pytest.raises(MddagError, match=says) as error:
+    with pytest.raises(MddagError, match=says):
         simulate(two_dags(), load, replace(Settings(), **setting))
-    assert '\n' not in str(error.value)
 
 
 @pytest.mark.parametrize(('policy', 'own'), [
@@ -106,14 +155,6 @@ def test_a_seed_draws_the_same_for_ever():
     """The draw is part of results that people publish: it must not change."""
     assert draw_execution_times(two_dags(), 1) == [[2_000, 2_695], [2_528, 1_000]]
     assert draw_execution_times(two_dags(), 2) == [[2_000, 2_896], [1_113, 1_000]]
-
-
-def test_a_callback_without_a_time_is_named_with_its_own_file(tmp_path):
-    (tmp_path / 'part.yaml').write_text(
-        'mddag: 1\nnodes:\n- node: /n\n  callbacks:\n  - {name: t, timer: 1ms, deadline: 1ms}\n')
-    (tmp_path / 'top.yaml').write_text('mddag: 1\ninclude: [part.yaml]\n')
-    with pytest.raises(InputError, match='part.yaml:5: /n:t declares no execution_time: add one'):
-        draw_execution_times(load(tmp_path / 'top.yaml'), 0)
 
 
 def test_utilisation_and_its_scaling():
