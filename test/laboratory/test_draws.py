@@ -51,30 +51,20 @@ def npz(**arrays):
     return file.getvalue()
 
 
-def npy(array):
-    file = io.BytesIO()
-    np.save(file, np.asarray(array), allow_pickle=True)
-    return file.getvalue()
-
-
 GOOD = {'/n:a': [1], '/n:b': [1], '/n:c': [1]}
 UNFIT = ([], [[1]], ['x'], np.array([{}]), [1, -1], [1, float('nan')], [10 ** 18])
 
 
 @pytest.mark.parametrize(('content', 'problem'), [
-    *((content, 'this is no .npz file')
-      for content in (b'', b'mddag: 1', npz(**GOOD)[:-30], npy([1, 2]))),
-    (npz(**{'/n:a': [1], '/n:b': [1]}), 'no values for /n:c: add an array of that name'),
+    (b'', 'this is no .npz file'), (npz(**GOOD)[:-30], 'this is no .npz file'),
     *((npz(**{**GOOD, '/n:b': values}), 'the values of /n:b are damaged, or no list of ns')
       for values in UNFIT),
 ])
 def test_bad_samples(task_set, tmp_path, content, problem):
     path = tmp_path / 'samples.npz'
     path.write_bytes(content)
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=f'samples.npz: {problem}'):
         read_samples(task_set, path, 'samples.npz')
-    assert str(caught.value).startswith(f'samples.npz: {problem}')
-    assert '\n' not in str(caught.value)
 
 
 def test_utilisation_and_bound(task_set):
@@ -98,11 +88,10 @@ def test_bound_by_demand():
     assert feasible(task_set, times, 2, 100 * ms).tolist() == [True, True, False]
 
 
-@pytest.mark.parametrize(('utilisation', 'centre'), [
-    (0.0, 0.5), (0.5, 0.5), (0.52499, 0.5), (0.5251, 0.55), (0.5749, 0.55), (0.5751, 0.6),
-    (0.7, 0.7), (0.92501, 0.95), (0.97499, 0.95), (0.97501, 1.0), (1.0, 1.0), (3.0, 1.0)])
-def test_bins(utilisation, centre):
-    assert BINS[bins_of(np.array([utilisation]))[0]] == centre
+def test_bins():
+    edges = [0.0, 0.52499, 0.5251, 0.5749, 0.5751, 0.92501, 0.97499, 0.97501, 3.0]
+    assert [BINS[place] for place in bins_of(np.array(edges))] == [
+        0.5, 0.5, 0.55, 0.55, 0.6, 0.95, 0.95, 1.0, 1.0]
 
 
 def test_wilson_covers_the_truth():
@@ -122,10 +111,12 @@ def test_acceptance():
     assert found.total == 0.5
 
 
-LIMITS = st.lists(st.floats(0.01, 2.0), min_size=1, max_size=30)
-
-
-@given(limits=LIMITS, part=st.floats(0.0, 1.0), seed=st.integers(0, 10 ** 6))
+@given(limits=st.lists(st.floats(0.01, 2.0), min_size=1, max_size=30),
+       part=st.floats(0.0, 1.0), seed=st.integers(0, 10 ** 6))
+@example(limits=[1.0, 0.0, 1.0], part=1.0, seed=0)
+@example(limits=[1.0, 1e-12, 1.0], part=0.49, seed=1)
+@example(limits=[0.0, 0.5], part=0.9, seed=2)
+@example(limits=[1.0, 1e-5], part=0.1, seed=3)
 @example(limits=[0.375, 0.390625, 0.5, 0.5, 0.5, 0.015625], part=0.5, seed=42)
 def test_dirichlet_rescale_keeps_sum_and_bounds(limits, part, seed):
     total = sum(limits) * part
@@ -135,7 +126,7 @@ def test_dirichlet_rescale_keeps_sum_and_bounds(limits, part, seed):
         assert 0.0 <= share <= limit * (1 + 1e-9)
 
 
-@pytest.mark.parametrize('total', [0.7, 1.2, 1.5, 1.9, 2.6])
+@pytest.mark.parametrize('total', [0.7, 1.5, 2.6])
 def test_dirichlet_rescale_is_as_uniform_as_throwing_away(total):
     """Quantiles of the largest of three shares are those of UUniFast-Discard."""
     dice = Dice('uniform')
@@ -158,13 +149,3 @@ def test_dirichlet_rescale_is_as_uniform_as_throwing_away(total):
             theirs += 1
         gap = max(gap, abs(ours - theirs))
     assert gap / count < 0.043
-
-
-@pytest.mark.parametrize('limits', [[1.0, 0.0, 1.0], [1.0, 1e-12, 1.0], [0.0, 0.5], [1.0, 1e-5]])
-@pytest.mark.parametrize('part', [0.1, 0.49, 0.9, 1.0])
-def test_dirichlet_rescale_with_no_room_for_one(limits, part):
-    total = part * sum(limits)
-    for seed in range(10):
-        shares = dirichlet_rescale(Dice(str(seed)), total, limits)
-        assert sum(shares) == pytest.approx(total)
-        assert all(0 <= share <= limit for share, limit in zip(shares, limits))

@@ -28,7 +28,6 @@ import numpy as np
 import pytest
 import yaml
 
-CONFIG = Path(__file__).parents[2] / 'config'
 NEEDS_NUMBA = pytest.mark.skipif(not compiled.available(), reason='numba is not there')
 
 REFERENCE_COUNTS = (8, 122, 472, 907, 1166, 992, 657, 388, 177, 71, 40)
@@ -56,7 +55,7 @@ nodes:
 @pytest.fixture(scope='module')
 def autoware():
     """Give the paper's workload."""
-    return load(CONFIG / 'autoware.yaml')
+    return load(Path(__file__).parents[2] / 'config' / 'autoware.yaml')
 
 
 @pytest.fixture
@@ -149,13 +148,6 @@ def same(first, second):
                for name in ('done', 'accepted', 'possible', 'utilisation'))
 
 
-def test_processes_change_nothing(autoware):
-    experiment = Experiment(autoware, ('rad', 'fifo'), duration_ns=300_000_000, seed=5)
-    alone = evaluate(experiment, 24, compiled=False)
-    assert same(alone, evaluate(experiment, 24, jobs=3, compiled=False))
-    assert not same(alone, evaluate(replace(experiment, seed=6), 24, compiled=False))
-
-
 def test_several_task_sets(small):
     """Each has its own draws and workers; chunks may reach over several; processes, too."""
     base = Experiment(small, ('rad', 'fifo'), workers=1, duration_ns=200_000_000, seed=1)
@@ -168,7 +160,6 @@ def test_several_task_sets(small):
     assert (outcome.accepted[:, :20] == alone.accepted).all()
     assert (outcome.utilisation[:20] == alone.utilisation).all()
     # With twice the workers the same runs would have half the utilisation: these are others.
-    assert (outcome.utilisation[20:40] <= 0.525).all()
     assert (outcome.utilisation[20:40] * 2 != outcome.utilisation[:20]).any()
     again = evaluate(experiments, 30)  # more runs of each: the first ones stay
     assert (again.utilisation.reshape(3, 30)[:, :20] == outcome.utilisation.reshape(3, 20)).all()
@@ -209,16 +200,6 @@ def test_interrupted_by_a_signal_to_all_processes(small):
     assert outcome.interrupted and 0 < outcome.runs < 100_000
 
 
-@pytest.mark.parametrize(('runs', 'first', 'problem'), [
-    (10 ** 12, 0, 'runs: 1000000000000 is too many: give at most 10000000, and evaluate more'),
-    (1, 2 ** 40, 'first run: 1099511627776 is out of range'),
-])
-def test_bad_input(small, runs, first, problem):
-    with pytest.raises(UsageError) as caught:
-        evaluate(Experiment(small), runs, first_run=first)
-    assert str(caught.value).startswith(problem)
-
-
 def test_ranges_of_runs_make_up_the_whole(small):
     experiments = [Experiment(small, ('rad', 'fifo'), workers=1, duration_ns=200_000_000, seed=s)
                    for s in (1, 2)]
@@ -227,22 +208,19 @@ def test_ranges_of_runs_make_up_the_whole(small):
              for first, runs in ((0, 11), (11, 19))]
     assert [part['first_run'] for part in parts] == [0, 11]
 
-    def total(of):
-        return [sum(each) for each in zip(*(part['policies'][of]['accepted'] for part in parts))]
+    def add_up(figures):
+        return [sum(each) for each in zip(*map(figures, parts))] == figures(whole)
 
-    assert {name: total(name) for name in ('rad', 'fifo')} == {
-        name: whole['policies'][name]['accepted'] for name in ('rad', 'fifo')}
-    assert [sum(each) for each in zip(*(part['counts'] for part in parts))] == whole['counts']
-    for number, graph in enumerate(whole['graphs']):
-        assert graph['accepted'] == {name: sum(
-            part['graphs'][number]['accepted'][name] for part in parts)
-            for name in ('rad', 'fifo')}
+    assert add_up(lambda result: result['counts'])
+    for name in ('rad', 'fifo'):
+        assert add_up(lambda result: result['policies'][name]['accepted'])  # noqa: B023
+        assert add_up(lambda result: [
+            graph['accepted'][name] for graph in result['graphs']])  # noqa: B023
+    with pytest.raises(UsageError, match='first run: 1099511627776 is out of range'):
+        evaluate(experiments, 1, first_run=2 ** 40)
 
 
 distributed = pytest.importorskip('distributed', reason='the extra dask is not installed')
-EXPERIMENT = Experiment(
-    load(Path(__file__).parents[2] / 'config' / 'autoware.yaml'), ('rad', 'fifo'),
-    duration_ns=200_000_000)
 
 
 @pytest.fixture(scope='module')
@@ -257,7 +235,7 @@ def cluster(tmp_path_factory):
 
 
 @pytest.mark.timeout(120)
-def test_the_outcome_is_that_of_this_machine(cluster):
+def test_the_outcome_is_that_of_this_machine(cluster, autoware):
     """Also if a worker is killed: its runs are made again."""
     victim = next(iter(cluster.workers.values())).process.pid
     killed = []
@@ -267,16 +245,9 @@ def test_the_outcome_is_that_of_this_machine(cluster):
             killed.append(victim)
             os.kill(victim, signal.SIGKILL)
 
+    experiment = Experiment(autoware, ('rad', 'fifo'), duration_ns=200_000_000)
     found = evaluate(
-        EXPERIMENT, 300, first_run=7, compiled=False, dask=cluster.scheduler_address,
+        experiment, 300, first_run=7, compiled=False, dask=cluster.scheduler_address,
         progress=kill)
     assert killed and same(found, evaluate(
-        EXPERIMENT, 300, first_run=7, compiled=False, jobs=2))
-
-
-def test_an_address_without_a_scheduler():
-    for address in ('tcp://127.0.0.1:1', 'nonsense'):
-        with pytest.raises(UsageError) as caught:
-            evaluate(EXPERIMENT, 2, dask=address)
-        assert str(caught.value).startswith(f'--dask {address}: ')
-        assert ': check the address, and that the scheduler and workers with ' in str(caught.value)
+        experiment, 300, first_run=7, compiled=False, jobs=2))

@@ -1,13 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Random task sets, and deadlines by critical path."""
+"""Random task sets."""
 
 from dataclasses import replace
 
 from hypothesis import given
 import hypothesis.strategies as st
 from mddag_executor.errors import UsageError
-from mddag_executor.laboratory.assign_deadlines import proportional
 from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.laboratory.shapes import draw_shape, MOST_COPIES
 from mddag_executor.laboratory.shares import Dice
@@ -16,7 +15,6 @@ from msg_graph.model import load_of
 import pytest
 
 from ..conftest import examples
-from .graphs import GRAPH, SHARED
 
 
 def pairs(low, high):
@@ -43,24 +41,16 @@ def any_options(draw):
         seed=draw(st.integers(0, 2 ** 70)))
 
 
-def made(options):
-    """Return a task set; None if there is none, as the error says."""
+@examples(150)
+@given(options=any_options())
+def test_every_task_set_is_what_was_asked_for(options):
     try:
         text = generate(options, 3)
     except UsageError as error:
         assert 'less than 1 us' in str(error)
-        return None
-    return text, loads(text, 'random.yaml')
-
-
-@examples(150)
-@given(options=any_options())
-def test_every_task_set_is_what_was_asked_for(options):
-    found = made(options)
-    if found is None:
         return
-    text, task_set = found
     assert generate(options, 3) == text
+    task_set = loads(text, 'random.yaml')
     assert task_set.workers == options.workers
     assert options.dags[0] <= len(task_set.dags) <= options.dags[1]
     each = [load_of(dag) or 0.0 for dag in task_set.dags]
@@ -97,7 +87,6 @@ def test_shapes(count, part, edges, ors, seed):
 
 
 @pytest.mark.parametrize(('change', 'problem'), [
-    ({'sinks': (9, 9), 'vertices': (9, 9)}, '--sinks 9: a DAG of 9 vertices has at most 8: '),
     ({'dags': (0, 3)}, '--dags 0: it is out of range: give 1 to 1000'),
     ({'dags': (5, 3)}, '--dags 5:3: the first is larger: write the smaller one first'),
     ({'tightness': (0.0, 1.0)}, '--tightness 0: it is out of range: give above 0 to 1000'),
@@ -109,17 +98,3 @@ def test_impossible(change, problem):
     with pytest.raises(UsageError) as caught:
         generate(replace(Options(), **change))
     assert str(caught.value).startswith(problem)
-
-
-def test_proportional():
-    task_set = loads(GRAPH)
-    # To x it is 2 ms, to y 1 ms + 9 ms.
-    assert proportional(task_set, 'max') == {
-        '/n:x': 4_000_000, '/n:y': 20_000_000, '/n:z': 10_000_000}
-    assert proportional(task_set, 'mean')['/n:x'] == 8_000_000
-    with pytest.raises(Exception, match='no such budget'):
-        proportional(task_set, 'median')
-
-
-def test_a_callback_that_is_several_sinks():
-    assert proportional(loads(SHARED), 'max') == {'/n:s': 20_000_000}

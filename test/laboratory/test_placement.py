@@ -23,24 +23,23 @@ import pytest
 MS = 1_000_000
 
 
-def workload(*milliseconds, holds=''):
-    """Return independent nodes /n0, /n1, … that compute so long of each 100 ms."""
-    lines = ['mddag: 1', 'nodes:']
-    for i, _ in enumerate(milliseconds):
-        lines += [f'  - node: /n{i}', f'    callbacks: [{{name: t, timer: 100ms, '
-                  f'deadline: 100ms{holds if i == 0 else ""}}}]']
-    return loads('\n'.join(lines))
+def several(n, urgent=0):
+    """Return independent nodes /n0, /n1, …; the first ones are urgent."""
+    return loads('mddag: 1\nnodes:\n' + ''.join(
+        f'  - {{node: /n{i}, callbacks: [{{name: t, timer: 100ms, '
+        f'deadline: {40 if i < urgent else 100}ms}}]}}\n' for i in range(n)))
 
 
-def placed(task_set, n, *milliseconds, **rules):
-    placing = Placing(task_set, n, [[round(ms * MS)] for ms in milliseconds],
+def placed(n, *milliseconds, **rules):
+    """Return the nodes of each process, if each node computes so long of each 100 ms."""
+    placing = Placing(several(len(milliseconds)), n, [[round(ms * MS)] for ms in milliseconds],
                       **rules)
     return [set(process.nodes) for process in placing.processes(placing.place())]
 
 
 def test_the_largest_load_is_the_least_there_can_be():
     times = (30, 25, 20, 18, 12, 9, 7)
-    found = placed(workload(*times), 2, *times)
+    found = placed(2, *times)
     loads_ = [sum(times[int(node[2:])] for node in nodes) for nodes in found]
     best = min(max(sum(t for t, p in zip(times, places) if p == 0),
                    sum(t for t, p in zip(times, places) if p == 1))
@@ -48,29 +47,26 @@ def test_the_largest_load_is_the_least_there_can_be():
     assert max(loads_) == best
 
 
-def test_nodes_that_exchange_many_messages_stay_together():
-    tasks = loads("""
+@pytest.mark.parametrize(('text', 'times', 'expected'), [
+    ("""
 mddag: 1
 nodes:
   - {node: /a, callbacks: [{name: t, timer: 1ms, publishes: [/x]}]}
   - {node: /b, callbacks: [{name: t, timer: 1ms, publishes: [/y]}]}
   - {node: /c, callbacks: [{name: s, subscription: /x, deadline: 1ms}]}
   - {node: /d, callbacks: [{name: s, subscription: /y, deadline: 1ms}]}
-""")
-    placing = Placing(tasks, 2, [[100_000, 100_000], [100_000, 100_000]])
-    assert [p.nodes for p in placing.processes(placing.place())] == [('/a', '/c'), ('/b', '/d')]
-
-
-def test_nodes_that_publish_one_topic_stay_together():
-    tasks = loads("""
+""", [[100_000, 100_000], [100_000, 100_000]], [('/a', '/c'), ('/b', '/d')]),
+    ("""
 mddag: 1
 nodes:
   - {node: /a, callbacks: [{name: t, timer: 10ms, publishes: [/x]}]}
   - {node: /b, callbacks: [{name: t, timer: 10ms, publishes: [/x]}]}
   - {node: /c, callbacks: [{name: s, subscription: /x, deadline: 10ms}]}
-""")
-    placing = Placing(tasks, 2, [[4 * MS, MS], [4 * MS, MS]])
-    assert [p.nodes for p in placing.processes(placing.place())] == [('/a', '/b'), ('/c',)]
+""", [[4 * MS, MS], [4 * MS, MS]], [('/a', '/b'), ('/c',)])], ids=['messages', 'one topic'])
+def test_nodes_stay_together_that_exchange_many_messages_or_publish_one_topic(
+        text, times, expected):
+    placing = Placing(loads(text), 2, times)
+    assert [p.nodes for p in placing.processes(placing.place())] == expected
 
 
 TWO = """
@@ -112,16 +108,9 @@ def test_what_leaves_its_process_takes_longer():
     assert response(EACH) == response(ALL) + SEND_NS + RECEIVE_NS
 
 
-def several(*times):
-    """Return nodes that compute so many ms of each 100 ms; the first are urgent."""
-    lines = [f'  - {{node: /n{i}, callbacks: [{{name: t, timer: 100ms, '
-             f'deadline: {40 if i < 2 else 100}ms}}]}}' for i, _ in enumerate(times)]
-    return loads('mddag: 1\nnodes:\n' + '\n'.join(lines)), [[ms * MS] for ms in times]
-
-
 def test_simulation_finds_what_loads_do_not_show():
     # by load alone the two urgent ones may well share a process
-    task_set, times = several(30, 30, 30, 30)
+    task_set, times = several(4, urgent=2), [[30 * MS]] * 4
     placing = Placing(task_set, 2, times)
     predictor = Predictor(task_set, 7, 2, 'rad', 1000 * MS)
     bad = {0: 0, 1: 0, 2: 1, 3: 1}
@@ -134,7 +123,7 @@ def test_simulation_finds_what_loads_do_not_show():
 
 
 def test_a_few_tries_are_enough_to_stop():
-    task_set, times = several(90, 90, 90, 90)
+    task_set, times = several(4), [[90 * MS]] * 4
     placing = Placing(task_set, 2, times)
     predictor = Predictor(task_set, 7, 2, 'rad', 300 * MS)
     _, tried = improve(
@@ -144,21 +133,14 @@ def test_a_few_tries_are_enough_to_stop():
 
 def test_together_and_apart():
     times = (50, 50, 10, 10)
-    tasks = workload(*times)
-    assert {'/n0', '/n1'} <= placed(tasks, 2, *times, together=[('/n0', '/n1')])[0]
-    first, second = placed(tasks, 2, *times, apart=[('/n2', '/n3')])
+    assert {'/n0', '/n1'} <= placed(2, *times, together=[('/n0', '/n1')])[0]
+    first, second = placed(2, *times, apart=[('/n2', '/n3')])
     assert ('/n2' in first) != ('/n3' in first)
     with pytest.raises(UsageError, match='together'):
-        placed(tasks, 2, *times, together=[('/n0', '/n1'), ('/n1', '/n2')],
+        placed(2, *times, together=[('/n0', '/n1'), ('/n1', '/n2')],
                apart=[('/n0', '/n2')])
-    with pytest.raises(UsageError, match='/n0,/n1,/n2: these are 3 nodes for 2 processes'):
-        placed(tasks, 2, *times, apart=[('/n0', '/n1', '/n2')])
     with pytest.raises(UsageError, match='cannot keep'):
-        placed(tasks, 2, *times, apart=[('/n0', '/n1'), ('/n1', '/n2'), ('/n0', '/n2')])
-    with pytest.raises(UsageError, match='does not declare'):
-        placed(tasks, 2, *times, together=[('/n0', '/n9')])
-    with pytest.raises(UsageError, match='only 4 nodes'):
-        placed(tasks, 5, *times)
+        placed(2, *times, apart=[('/n0', '/n1'), ('/n1', '/n2'), ('/n0', '/n2')])
 
 
 def test_one_node_too_many_to_keep_apart_is_found_at_once(monkeypatch):
@@ -176,5 +158,5 @@ def test_one_node_too_many_to_keep_apart_is_found_at_once(monkeypatch):
     monkeypatch.setattr(Placing, '_cost', counted)
     pairs = list(combinations([f'/n{i}' for i in range(11)], 2))
     with pytest.raises(UsageError, match='10 processes cannot keep all these nodes apart'):
-        placed(workload(*times), 10, *times, apart=pairs)
-    assert len(placed(workload(*times), 11, *times, apart=pairs)) == 11
+        placed(10, *times, apart=pairs)
+    assert len(placed(11, *times, apart=pairs)) == 11
