@@ -39,7 +39,6 @@ def test_parquet_and_csv_hold_the_same(jobs):
     parquet = pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
     table = parquet.read_table(io.BytesIO(exported(DEMO, 'parquet', jobs)))
     rows = read_csv(exported(DEMO, 'csv', jobs))
-    assert table.column_names == list(rows[0])
     assert table.num_rows == len(rows) > 500
 
     def plain(value):
@@ -49,8 +48,8 @@ def test_parquet_and_csv_hold_the_same(jobs):
             return f'{value:.9f}'
         return '' if value is None else str(value)
 
-    for ours, theirs in zip(table.to_pylist(), rows):
-        assert {key: plain(value) for key, value in ours.items()} == theirs
+    assert [{key: plain(value) for key, value in row.items()}
+            for row in table.to_pylist()] == rows
 
 
 def test_the_rows_are_those_of_the_replay():

@@ -31,10 +31,9 @@ class Slice(NamedTuple):
 
 class Trace:
     """
-    What the viewer shows of an exported recording.
+    What the viewer shows of a recording: slices, instants, and what each arrow connects.
 
-    :ivar slices: all slices and instants.
-    :ivar flows: names of the slices at both ends of each arrow, and their starts.
+    :ivar flows: names of the slices at both ends, and their starts.
     """
 
     def __init__(self, path):
