@@ -118,14 +118,13 @@ def make_node(ros_context):
 
 
 class Pulse(Waitable):
-    """A waitable that consists of a guard condition."""
+    """A waitable of a user's own, which consists of a guard condition."""
 
     def __init__(self, node, group):
         super().__init__(group)
         self.guard = node.create_guard_condition(lambda: None)
         node._guards.remove(self.guard)
         self._index = None
-        self.order = []
 
     def __enter__(self):
         self.guard.handle.__enter__()
@@ -134,14 +133,10 @@ class Pulse(Waitable):
         self.guard.handle.__exit__(None, None, None)
 
     def is_ready(self, wait_set):
-        ready = bool(wait_set.is_ready('guard_condition', self._index))
-        if ready:
-            self.order.append('ready')
-        return ready
+        return bool(wait_set.is_ready('guard_condition', self._index))
 
     def take_data(self):
-        self.order.append('take')
-        return len(self.order)
+        return None
 
     async def execute(self, taken_data):
         pass

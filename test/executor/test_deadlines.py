@@ -2,15 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declared DAGs on real rclpy nodes: which job, in which order, judged how; what fails."""
 
+from functools import partial
 import threading
 import time
 
 from mddag_executor.executor import current_job
-from mddag_executor.executor.work import Work
 from mddag_executor.replay import replay, reschedule
 from msg_graph import loads
 import pytest
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Header
 
@@ -114,7 +113,7 @@ def test_sync_completes_with_the_last_leg_and_or_tells_publishers_apart(make_exe
 
 
 ORDER = graph(
-    source='name: tick, timer: 10s, publishes: [/c, /a, /b], dag: race',
+    source='name: begin, subscription: /start, period: 10s, publishes: [/c, /a, /b], dag: race',
     racer="""
         name: c, subscription: /c, deadline: 300ms
         name: a, subscription: /a, deadline: 100ms
@@ -123,35 +122,17 @@ ORDER = graph(
 
 @pytest.mark.parametrize('policy, expected', [('rad', 'abc'), ('gedf', 'cab')])
 def test_ready_callbacks_run_in_the_policys_order(make_executor, make_node, policy, expected):
-    """One worker is kept busy until all three are ready; gedf knows but one deadline a DAG."""
-    source, racer = make_node('source'), make_node('racer')
+    """The only worker publishes for all three; gedf knows but one deadline a DAG."""
     ran = []
-    group = ReentrantCallbackGroup()
-    publishers = [source.create_publisher(Header, f'/{name}', 10) for name in 'cab']
-
-    def tick():
-        for ready, publisher in enumerate(publishers, 1):  # they become ready one after the other
-            publisher.publish(Header())
-            assert wait_for(lambda n=ready: executor.statistics()['queue'] == n)
-
-    timer = source.create_timer(10.0, tick, group)
-    for name in 'cab':
-        racer.create_subscription(
-            Header, f'/{name}', lambda m, n=name: ran.append(n), 10, callback_group=group)
-    executor = make_executor(loads(ORDER), num_workers=1, policy=policy, nodes=[source, racer])
-    with Spinning(executor):
-        matched(*publishers)
-        timer.timer_period_ns = 10_000_000_000
-        executor.create_task(tick_as_timer, executor, timer, tick)
+    nodes = Declared(make_node, ORDER, {name: partial(ran.append, name) for name in 'abc'})
+    start = make_node('other').create_publisher(Header, '/start', 10)
+    with Spinning(make_executor(
+            loads(ORDER), num_workers=1, policy=policy, nodes=nodes.nodes.values())):
+        matched(start)
+        assert wait_for(nodes.connected)
+        start.publish(Header())
         assert wait_for(lambda: len(ran) == 3)
     assert ''.join(ran) == expected
-
-
-def tick_as_timer(executor, timer, tick):
-    """Have the engine told that the timer is due, instead of waiting ten seconds."""
-    entity = executor._registry.by_id[id(timer)]
-    executor._pool.report(
-        lambda now: executor._engine.timer_due(Work(entity, timer.callback), now, now))
 
 
 def test_a_lost_message_expires_its_job(make_executor, make_node):

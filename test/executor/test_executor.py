@@ -96,18 +96,13 @@ def of_guards(executor, node, call):
 
 
 def of_waitables(executor, node, call):
-    class Empty(Pulse):
-
-        def take_data(self):
-            return None
-
-        async def execute(self, taken_data):
-            assert taken_data is None
-            self.ran()
-
     def make(ran):
+        class Empty(Pulse):
+            async def execute(self, taken_data):
+                assert taken_data is None
+                ran()
+
         pulse = Empty(node, node.default_callback_group)
-        pulse.ran = ran
         node.add_waitable(pulse)
         return pulse.guard.trigger
     one_by_one(make, call)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Callbacks that hold the GIL: one at a time, most urgent first, and never a deadlock."""
 
+from functools import partial
 import os
 import random
 import sys
@@ -271,52 +272,6 @@ def scripts(seed):
     return found
 
 
-class Robot:
-    """A node whose callbacks do what the script of the round says, and note what they did."""
-
-    def __init__(self, node):
-        self.done = {}
-        self._scripts = {}
-        self._events = []
-        self._lock = threading.Lock()
-        group = ReentrantCallbackGroup()
-        self._publishers = {
-            name: node.create_publisher(Header, f'/{name}', 10) for name in NAMES}
-        for name in NAMES:
-            node.create_subscription(
-                Header, f'/{name}', lambda message, name=name: self._run(name), 10,
-                callback_group=group)
-        node.create_service(
-            Trigger, '/serve', lambda request, response: response, callback_group=group)
-        self.client = node.create_client(Trigger, '/serve', callback_group=group)
-
-    def start(self, seed):
-        self._scripts = scripts(seed)
-        self._events = [threading.Event() for _ in NAMES]
-        self.done = {}
-        for name in random.Random(seed).sample(NAMES, len(NAMES)):
-            self._publishers[name].publish(Header())
-
-    def _run(self, name):
-        done = []
-        for kind, number in self._scripts[name]:
-            if kind == 'compute':
-                compute(number / 1e3)
-            elif kind == 'sleep':
-                time.sleep(number / 1e6)
-            elif kind == 'call':
-                assert self.client.call(Trigger.Request()) is not None
-            elif kind == 'wait':
-                assert self._events[number].wait(PATIENCE_S)
-            elif kind == 'lock':
-                with self._lock:
-                    time.sleep(number / 1e7)
-            else:
-                self._events[number].set()
-            done.append((kind, number))
-        self.done[name] = done
-
-
 def test_all_end_whatever_was_declared(make_executor, make_node):
     """
     They wait for one another, compute, sleep and call services, at random.
@@ -329,12 +284,41 @@ def test_all_end_whatever_was_declared(make_executor, make_node):
         name, f'subscription: /{name}, period: 100ms, deadline: {draw.randint(5, 50)}ms'
         + draw.choice((', holds_interpreter: true', ', holds_interpreter: false', '')))
         for name in NAMES))
-    node = make_node()
-    robot = Robot(node)
+    other, group, lock = make_node('other'), ReentrantCallbackGroup(), threading.Lock()
+    other.create_service(
+        Trigger, '/serve', lambda request, response: response, callback_group=group)
+    client = other.create_client(Trigger, '/serve', callback_group=group)
+    publishers = {name: other.create_publisher(Header, f'/{name}', 10) for name in NAMES}
+    done = {}
+
+    def run(name):
+        steps = []
+        for kind, number in todo[name]:
+            if kind == 'compute':
+                compute(number / 1e3)
+            elif kind == 'sleep':
+                time.sleep(number / 1e6)
+            elif kind == 'call':
+                assert client.call(Trigger.Request()) is not None
+            elif kind == 'wait':
+                assert events[number].wait(PATIENCE_S)
+            elif kind == 'lock':
+                with lock:
+                    time.sleep(number / 1e7)
+            else:
+                events[number].set()
+            steps.append((kind, number))
+        done[name] = steps
+
+    nodes = Declared(make_node, text, {name: partial(run, name) for name in NAMES})
     with Spinning(make_executor(
-            loads(text), num_workers=len(NAMES) + 1, nodes=[node])):
-        assert robot.client.wait_for_service(PATIENCE_S)
+            loads(text), num_workers=len(NAMES) + 1, nodes=[other, *nodes.nodes.values()])):
+        matched(*publishers.values())
+        assert client.wait_for_service(PATIENCE_S)
         for seed in range(SEED, SEED + ROUNDS):
-            robot.start(seed)
-            assert wait_for(lambda: len(robot.done) == len(NAMES), PATIENCE_S), robot.done
-            assert robot.done == scripts(seed)
+            todo, events = scripts(seed), [threading.Event() for _ in NAMES]
+            done.clear()
+            for name in random.Random(seed).sample(NAMES, len(NAMES)):
+                publishers[name].publish(Header())
+            assert wait_for(lambda: len(done) == len(NAMES), PATIENCE_S), done
+            assert done == todo

@@ -43,13 +43,14 @@ class Handler:
     def __init__(self, does, node):
         self.misses, self.heard, self.served = [], [], []
         self.group = ReentrantCallbackGroup()
-        self._node = node
-        self._then = getattr(self, f'_{does}', None) or (lambda: time.sleep(float(does) / 1e3))
-        self._publisher = node.create_publisher(Header, '/alarm', 10)
+        publisher = node.create_publisher(Header, '/alarm', 10)
+        self._publish = lambda: publisher.publish(Header())
         node.create_subscription(
             Header, '/alarm', self.heard.append, 10, callback_group=self.group)
         self._client = node.create_client(Empty, '/stop', callback_group=self.group)
         node.create_service(Empty, '/stop', self._serve, callback_group=self.group)
+        self._log = lambda: node.get_logger().warning('a deadline was missed')
+        self._then = getattr(self, f'_{does}', lambda: time.sleep(float(does) / 1e3))
 
     def __call__(self, miss):
         self.misses.append(miss)
@@ -64,12 +65,6 @@ class Handler:
 
     def _exit(self):
         sys.exit('a deadline was missed')
-
-    def _log(self):
-        self._node.get_logger().warning('a deadline was missed')
-
-    def _publish(self):
-        self._publisher.publish(Header())
 
     def _call(self):
         done = threading.Event()

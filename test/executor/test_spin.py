@@ -24,6 +24,7 @@ from std_srvs.srv import Trigger
 
 from ..conftest import run_program
 from .conftest import Pulse, Spinning, wait_for
+from .declared import graph
 
 # --- what comes out ------------------------------------------------------------------------------
 
@@ -156,36 +157,17 @@ def test_a_callback_of_spin_once_may_shut_down(make_executor, make_node):
     assert done == [True]
 
 
-@pytest.mark.parametrize('end', ['shutdown', 'future'])
-def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros_context, end):
+def test_no_thread_goes_on_though_the_context_does(make_executor, make_node, ros_context):
     before = set(threading.enumerate())
-    node, calls, done = make_node(), [], Future()
-
-    def tick():
-        calls.append(1)
-        if len(calls) > 10 and not done.done():
-            done.set_result(None)
-
-    node.create_timer(0.001, tick)
-    node.create_subscription(Header, '/topic', calls.append, 10)
-    node.create_guard_condition(lambda: calls.append(2)).trigger()
+    node, calls, heard = make_node(), [], []
+    node.create_timer(0.001, lambda: calls.append(publisher.publish(Header())))
+    node.create_subscription(Header, '/topic', heard.append, 10)
     publisher = node.create_publisher(Header, '/topic', 10)
     executor = make_executor(nodes=[node])
-    if end == 'shutdown':
-        with Spinning(executor):
-            assert wait_for(lambda: publisher.get_subscription_count() and done.done())
-            publisher.publish(Header())
-    else:
-        executor.spin_until_future_complete(done, 5.0)
-    assert done.done() and ros_context.ok()
-
-    def left():
-        names = {thread.name for thread in set(threading.enumerate()) - before}
-        if end == 'shutdown':
-            return names
-        # between two spins these wait for the next one
-        return {name for name in names if 'worker' not in name and 'wait-set' not in name}
-    assert wait_for(lambda: not left()), left()
+    with Spinning(executor):
+        assert wait_for(lambda: len(calls) > 10 and heard)
+    assert ros_context.ok()
+    assert wait_for(lambda: not set(threading.enumerate()) - before), threading.enumerate()
 
 
 # --- the end of a context ------------------------------------------------------------------------
@@ -287,7 +269,7 @@ def test_no_interrupt_gets_lost_where_something_of_a_context_dies(ros_context, m
 
 
 PROGRAM = """
-import os, sys, threading, time
+import os, threading, time
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
@@ -310,9 +292,8 @@ def spin():
 rclpy.init()
 node = rclpy.create_node('node')
 ran = threading.Event()
-group = ReentrantCallbackGroup()
 for _ in range(7):
-    node.create_timer(0.005, {callback}, callback_group=group)
+    node.create_timer(0.005, {callback}, callback_group=ReentrantCallbackGroup())
 executor = MultiDeadlineExecutor()
 executor.add_node(node)
 threading.Thread(target=spin, daemon=True).start()
@@ -321,7 +302,6 @@ time.sleep(0.1)
 {end}
 print('end', flush=True)
 """
-
 SPIN = 'executor.spin()'
 # threads of a spin are parked then
 SPUN_BEFORE = """executor.spin_until_future_complete(rclpy.Future(), 0.1)
@@ -340,15 +320,15 @@ assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
 
 
 @pytest.mark.parametrize('parts', [
-    {'spin': SPIN},
+    {'end': 'executor.shutdown(0)'},
     {'spin': 'while rclpy.ok(): executor.spin_once(timeout_sec=0.005)'},
     {'spin': SPUN_BEFORE},
-    {'spin': SPIN, 'callback': 'block'},
-    {'spin': SPIN, 'end': 'executor.shutdown(0)'},
-    {'spin': SPIN, 'callback': 'ran.set', 'end': FORK},
-], ids=['spin', 'steps', 'spun before', 'never ends', 'shut down', 'forked'])
+    {'callback': 'block'},
+    {'callback': 'ran.set', 'end': FORK},
+], ids=['shut down', 'steps', 'spun before', 'never ends', 'forked'])
 def test_a_program_may_end_while_a_daemon_thread_spins(parts):
-    out, err = run_program(PROGRAM.format(**{'callback': 'sleep', 'end': '', **parts}))
+    out, err = run_program(
+        PROGRAM.format(**{'spin': SPIN, 'callback': 'sleep', 'end': '', **parts}))
     assert out.splitlines()[-1] == 'end'
     expected = 'cannot keep its rate', 'use of fork() may lead to deadlocks'
     assert [line for line in err.splitlines()
@@ -356,29 +336,20 @@ def test_a_program_may_end_while_a_daemon_thread_spins(parts):
 
 
 PUBLISHES = """
-import faulthandler, signal, sys, threading, time
+import signal, sys, threading, time
 import rclpy
 from std_msgs.msg import String
 from mddag_executor import MultiDeadlineExecutor
 from msg_graph import loads
 
-faulthandler.dump_traceback_later(40, exit=True)
 rclpy.init()
 node = rclpy.create_node('node')
 publisher = node.create_publisher(String, '/command', 10)
 heard = []
 node.create_subscription(String, '/command', lambda message: heard.append(message.data), 10000)
 timer = node.create_timer(0.001, lambda: publisher.publish(String(data='job')))
-executor = MultiDeadlineExecutor(loads('''
-mddag: 1
-nodes:
-  - node: /node
-    callbacks:
-      - {name: tick, timer: 1ms, publishes: [/command]}
-      - {name: obey, subscription: /command, deadline: 1s}
-'''))
+executor = MultiDeadlineExecutor(loads(sys.argv[2]))
 executor.add_node(node)
-where = sys.argv[1]
 stops = 0
 
 
@@ -396,13 +367,12 @@ signal.setitimer(signal.ITIMER_REAL, 0.001)
 def done():
     return stops == 200 and heard.count('stop') >= 200
 
-if where == 'spin':
-    thread = threading.Thread(target=lambda: [time.sleep(0.01) for _ in iter(done, True)])
-    thread.start()
+if sys.argv[1] == 'spin':
     future = rclpy.Future()
-    threading.Thread(target=lambda: (thread.join(), future.set_result(None))).start()
+    threading.Thread(target=lambda: (
+        [time.sleep(0.01) for _ in iter(done, True)], future.set_result(None))).start()
     executor.spin_until_future_complete(future)
-elif where == 'spin_once':
+elif sys.argv[1] == 'spin_once':
     while not done():
         executor.spin_once(0.1)
 else:
@@ -421,4 +391,7 @@ print(stops, heard.count('stop'))
 @pytest.mark.parametrize('where', ['spin', 'spin_once', 'other thread'])
 def test_a_signal_s_handler_may_publish(where):
     """Whatever the main thread does when the signal comes: it holds locks now and then."""
-    assert run_program(PUBLISHES, where)[0] == '200 200\n'
+    text = graph(node="""
+        name: tick, timer: 1ms, publishes: [/command]
+        name: obey, subscription: /command, deadline: 1s""")
+    assert run_program(PUBLISHES, where, text)[0] == '200 200\n'

@@ -3,24 +3,27 @@
 """
 The tests must fail for an executor that is broken: it is broken once in each way that matters.
 
-Each mutation (see ``mddag_mutations``) gets a run of its own, in a child process, of a few quick
-tests of this project.  One of them has to fail.  That a run hangs until its time is over is no way
-to find a mistake: it does not count, and is told apart.
+Each mutation gets a run of its own, in a child process, of a few quick tests of this project.  One
+of them has to fail.  That a run hangs until its time is over is no way to find a mistake: it does
+not count, and is told apart.
+
+In a child this file is a plugin of pytest: MDDAG_MUTATION has the changes as JSON, which are made
+when a file is imported.
 """
 
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 from dataclasses import dataclass, field
+from importlib.machinery import SourceFileLoader
 import json
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
+from xml.etree import ElementTree
 
 import pytest
-
-from .mddag_mutations import changed
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
@@ -36,6 +39,27 @@ AT_ONCE_S = 4.0
 """A test that has failed sooner has not waited for one of its own time-outs, which are 5 s."""
 
 
+def changed(path, changes):
+    """Return a file's text with some texts replaced, each of which it must contain."""
+    text = path.read_text(encoding='utf-8')
+    for old, new in changes:
+        assert old in text, f'{path} has no longer: {old}'
+        text = text.replace(old, new)
+    return text
+
+
+def get_code(self, name, get=SourceFileLoader.get_code):
+    file = '/'.join(name.split('.')[1:]) + '.py'
+    changes = [(old, new) for each, old, new in CHANGES if each == file]
+    if not name.startswith('mddag_executor.') or not changes:
+        return get(self, name)
+    return compile(changed(Path(self.path), changes), self.path, 'exec')
+
+
+if CHANGES := json.loads(os.environ.get('MDDAG_MUTATION', '[]')):
+    SourceFileLoader.get_code = get_code
+
+
 @dataclass(frozen=True)
 class Case:
     """
@@ -43,7 +67,7 @@ class Case:
 
     :ivar changes: file in ``mddag_executor``, old and new text of each.
     :ivar every: each of them must notice it, else one of them.
-    :ivar at_once: and by an assertion, before any time-out of the test's own.
+    :ivar at_once: and before any time-out of the test's own.
     """
 
     mutation: str
@@ -81,10 +105,10 @@ may not check
         'test_executor.py', 'test_tasks_nodes_and_entities_wake_an_idle_executor[spin_once]')),
     Case('shutdown_leaves_wait_set', [(
         'executor/waitables.py', '"""End the thread."""', 'return')], of(
-        'test_spin.py', 'test_no_thread_goes_on_though_the_context_does[shutdown]')),
+        'test_spin.py', 'test_no_thread_goes_on_though_the_context_does')),
     Case('shutdown_leaves_workers', [(
         'executor/workers.py', 'self._closed = True', 'return True')], of(
-        'test_spin.py', 'test_no_thread_goes_on_though_the_context_does[shutdown]')),
+        'test_spin.py', 'test_no_thread_goes_on_though_the_context_does')),
     Case('unknown_waits_not_resumed', [
         ('executor/workers.py', 'self._of_next_step.append(work)', 'pass'),
         ('executor/workers.py',
@@ -197,50 +221,45 @@ before = globals().setdefault('BEFORE', {})
 
 @dataclass
 class Result:
-    """What came of each test of a child: its outcome, and after how many seconds."""
+    """What came of each test of a child: its failures' messages, and after how many seconds."""
 
     tests: dict[str, tuple[str, float]]
     output: str
 
-    def of(self, *outcomes):
-        return {test for test, (outcome, _) in self.tests.items() if outcome in outcomes}
+    def failed(self):
+        return {test for test, (message, _) in self.tests.items() if message} - self.hung()
+
+    def hung(self):
+        return {test for test, (message, _) in self.tests.items() if 'Timeout' in message}
 
 
 def run(folder, name, changes, tests, *options):
     """Run tests with a changed executor, in a process of their own."""
-    report = folder / f'{name}.jsonl'
+    report = folder / f'{name}.xml'
     environment = {
         key: value for key, value in os.environ.items() if not key.startswith('PYTEST_')}
     environment.update(
         PYTEST_DISABLE_PLUGIN_AUTOLOAD='1', OPENBLAS_NUM_THREADS='1', TMPDIR=str(folder),
-        PYTHONPATH=str(HERE), MDDAG_MUTATION=json.dumps(changes),
-        MDDAG_MUTATION_REPORT=str(report))
+        PYTHONPATH=str(HERE), MDDAG_MUTATION=json.dumps(changes))
     child = subprocess.Popen(
-        [sys.executable, '-m', 'pytest', '-q', '-p', 'pytest_timeout', '-p', 'mddag_mutations',
-         '-p', 'no:cacheprovider', f'--timeout={HUNG_S}', *options,
-         *(str(TESTS / test) for test in tests)],
+        [sys.executable, '-m', 'pytest', '-q', '-p', 'pytest_timeout', '-p', 'test_mutations',
+         '-p', 'no:cacheprovider', f'--timeout={HUNG_S}', '--timeout-method=signal',
+         f'--junitxml={report}', *options, *(str(TESTS / test) for test in tests)],
         cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         start_new_session=True)
     output = ''
     try:
         output, _ = child.communicate(timeout=RUN_S)
     except subprocess.TimeoutExpired:
-        pass  # what hung is in the report
+        return Result(dict.fromkeys(tests, ('Timeout', RUN_S)), '')
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)  # and what it may have left
-    return result(report, output)
-
-
-def result(report, output):
     found = {}
-    for line in report.read_text().splitlines() if report.exists() else ():
-        what = json.loads(line)
-        test = Path(what['test']).relative_to(TESTS).as_posix()
-        if what['outcome'] == 'begun':
-            found[test] = 'hung', 0.0
-        elif found[test][0] in ('hung', 'passed'):  # of a test's failures the first one tells
-            found[test] = what['outcome'], what['seconds']
+    for case in ElementTree.parse(report).iter('testcase'):
+        test = f'{case.get("classname").rpartition(".")[2]}.py::{case.get("name")}'
+        messages = [each.get('message') or 'failed' for each in case]
+        found[test] = ' '.join(messages), float(case.get('time'))
     return Result(found, output[-6000:])
 
 
@@ -268,7 +287,7 @@ def test_each_mutation_changes_the_present_executor():
 def test_all_of_them_pass_while_nothing_is_broken(tmp_path):
     tests = list(dict.fromkeys(test for case in CASES for test in case.tests))
     result = run(tmp_path, 'unbroken', [], tests)
-    assert result.of('passed') == set(result.tests) == set(tests), result.output
+    assert set(result.tests) == set(tests) and not result.failed() | result.hung(), result.output
 
 
 @pytest.mark.nightly
@@ -276,11 +295,9 @@ def test_all_of_them_pass_while_nothing_is_broken(tmp_path):
 @pytest.mark.parametrize('case', CASES, ids=lambda case: case.mutation)
 def test_a_broken_executor_is_noticed(case, results):
     result = results[case.mutation]
-    noticed = result.of('assertion') if case.at_once else result.of('assertion', 'error')
-    hung = result.of('hung')
+    noticed = result.failed()
     what = f'{case.mutation} was noticed'
-    assert noticed or not hung, f'{what} by a time-out only: {hung}\n{result.output}'
-    assert noticed, f'{what} by no test\n{result.output}'
+    assert noticed, f'{what} by no test, or a time-out only: {result.hung()}\n{result.output}'
     if case.every:
         assert noticed == set(case.tests), f'{what} by some tests only\n{result.output}'
     if case.at_once:
