@@ -8,8 +8,10 @@ that arrive late or never, coroutines, drops, undeclared callbacks), and records
 records, in the order in which it does: what a thread ran only when it has run.
 """
 
+from collections import Counter
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
+from itertools import count
 from pathlib import Path
 import random
 
@@ -118,31 +120,43 @@ def legs_to(task_set, tables):
     return found
 
 
-def begin_trace(path, declaration, workers=1):
-    """Begin the trace of a run that goes by a declaration."""
-    file = TraceFile(path)
-    file.add('task_set', START_TIME, 1, 1, declaration, 'g.yaml', 'rad', workers, 100 * MS, 64,
-             False, 2)
-    return file
+def ns(ms):
+    """Return a time, ns, of ms since `START_TIME`."""
+    return START_TIME + round(ms * MS)
 
 
-def end_trace(file, time):
-    """End a run, and its trace."""
-    file.add('shutdown', time, 1, 1, time)
-    file.finish()
+class Written:
+    """A trace of this executor written by hand; times are ms since `START_TIME`."""
 
+    def __init__(self, path, declaration, workers=1, policy='rad', cpus=0, name='g.yaml'):
+        self.path, self.file = path, TraceFile(path, overwrite=True)
+        self.add('task_set', 0, declaration, name, policy, workers, 100 * MS, 64, False, cpus)
 
-def add_execution(
-    file, start, end, dag, vertex, job, worker=0, *,
-    ready=None, vpid=1, thread=10, address=9,
-    computed=(),
-):
-    """Record an execution that completes its vertex; without `ready` it has not waited."""
-    file.add('dispatch', start, vpid, thread, address, dag, vertex, job, worker,
-             start if ready is None else ready, 0)
-    file.add('callback_start', start, vpid, thread, address, False)
-    file.add('callback_end', end, vpid, thread, address)
-    file.add('complete', end, vpid, thread, address, dag, vertex, job, True, end, 0, *computed)
+    def add(self, event, at, *fields, thread=1):
+        self.file.add(event, ns(at), 1, thread, *fields)
+
+    def release(self, dag, job, at, noticed=None):
+        self.add('job_release', at if noticed is None else noticed, dag, job, ns(at))
+
+    def piece(self, dag, vertex, job, start, end, *, ready=None, worker=0, thread=None):
+        """Run a piece of an execution; without `ready` it has not waited."""
+        thread, address = 10 + worker if thread is None else thread, 1000 + 100 * dag + vertex
+        self.add('dispatch', start, address, dag, vertex, job, worker,
+                 ns(start if ready is None else ready), 0, thread=thread)
+        self.add('callback_start', start, address, False, thread=thread)
+        self.add('callback_end', end, address, thread=thread)
+        return thread, address
+
+    def run(self, dag, vertex, job, start, end, *, leg=0, whole=True, computed=(), **more):
+        """Run an execution; `computed`: its CPU time and whether it held the interpreter."""
+        thread, address = self.piece(dag, vertex, job, start, end, **more)
+        self.add('complete', end, address, dag, vertex, job, whole, ns(end), leg, *computed,
+                 thread=thread)
+
+    def end(self, at):
+        self.add('shutdown', at, ns(at))
+        self.file.finish()
+        return self.path
 
 
 @dataclass
@@ -181,42 +195,31 @@ class VirtualRun:
     policy: str = 'rad'
     duration: int = 300 * MS
     longest: int = 8 * MS
-    max_active_jobs: int = 3
-    expire_after: int = 20 * MS
     chances: Chances = field(default_factory=Chances)
     shut_down: bool = True
-    finish_file: bool = True
     flush_every: int = 40
 
     def __post_init__(self):
         """Run."""
         self.random = random.Random(self.seed)
         self.tables = Tables.build(
-            self.task_set, legs=True, groups=False, max_active_jobs=self.max_active_jobs,
-            expire_after=self.expire_after)
+            self.task_set, legs=True, groups=False, max_active_jobs=3, expire_after=20 * MS)
         self.scheduler = Scheduler(self.tables, self.workers, self.policy)
         self.tally = Tally(self.task_set, self.tables)
-        self.executions = {}
-        self.busy = {}
-        self.waited = {}
+        self.executions, self.busy, self.waited = Counter(), Counter(), Counter()
         self.undeclared_runs = 0
         self.responses = []
-        self.drops = 0
         self._targets = legs_to(self.task_set, self.tables)
-        self._queue = []
-        self._order = 0
-        self._waiting = {}
-        self._aborted = set()
+        self._queue, self._order = [], count()
+        self._waiting, self._aborted = {}, set()
         self._jobs = [0] * self.tables.n_dags
-        self._events = 0
+        self._events = self.drops = 0
         self.file = TraceFile(self.path, overwrite=True)
         self._run()
 
-    # --- the run ---------------------------------------------------------------------------------
-
     def _run(self):
         self.record('task_set', START_TIME, 1, self.task_set.text, self.task_set.file, self.policy,
-                    self.workers, 100 * MS, self.max_active_jobs, False)
+                    self.workers, 100 * MS, 3, False)
         end = START_TIME + self.duration
         for dag in self.task_set.dags:
             for k in range(self.duration // dag.period_ns):
@@ -235,11 +238,7 @@ class VirtualRun:
             self.scheduler.finish(end)
             self.decided(end)
             self.record('shutdown', end, 1, end)
-        if self.finish_file:
-            self.file.finish()
-        else:
-            self.file.flush()
-            self.file.abandon()
+        self.file.finish()
 
     # --- what a test may change ------------------------------------------------------------------
 
@@ -260,8 +259,7 @@ class VirtualRun:
         return self.random.randrange(MS)
 
     def _at(self, time, action):
-        self._order += 1
-        heappush(self._queue, (time, self._order, action))
+        heappush(self._queue, (time, next(self._order), action))
 
     def record(self, event, timestamp, vtid, *fields):
         """Record an event; now and then a chunk is written."""
@@ -290,16 +288,15 @@ class VirtualRun:
         self.scheduler.ready(x, now)
         self._waiting[x] = _Execution(x, vertex, leg, slot, dag, job, now)
         if self.random.random() < self.chances.dropped:
-            self.drop(x, 'qos_depth', now)
+            self._waiting.pop(x)
+            self.scheduler.drop(x, now)
+            self._record_drop(vertex, dag, job, 'qos_depth', now)
+            self.decided(now)
 
-    def drop(self, x, reason, now):
-        """Drop a waiting execution."""
-        work = self._waiting.pop(x)
-        self.scheduler.drop(x, now)
-        self.record('drop', now, 2, self._address(work.vertex), work.dag,
-                    self.tables.index_in_dag[work.vertex], work.job, reason)
+    def _record_drop(self, vertex, dag, job, reason, now):
+        self.record('drop', now, 2, self._address(vertex), dag,
+                    self.tables.index_in_dag[vertex], job, reason)
         self.drops += 1
-        self.decided(now)
 
     def _undeclared(self, now):
         self.undeclared_runs += 1
@@ -312,9 +309,7 @@ class VirtualRun:
             if (state.job_dag[slot] != dag or state.job_index[slot] != job
                     or state.job_state[slot] != OPEN):
                 if (dag, job) in self._aborted:
-                    self.record('drop', now, 2, self._address(vertex), dag,
-                                self.tables.index_in_dag[vertex], job, 'aborted')
-                    self.drops += 1
+                    self._record_drop(vertex, dag, job, 'aborted', now)
                 else:
                     self._undeclared(now)
             elif state.x_state[self.scheduler.execution(slot, vertex, leg)] != IDLE:
@@ -357,9 +352,9 @@ class VirtualRun:
         self.record('callback_end', end, vtid, address)
         if declared:
             key = self.task_set.vertices[work.vertex].callback.key
-            self.busy[key] = self.busy.get(key, 0) + end - start
+            self.busy[key] += end - start
             if work.pieces == 1:
-                self.waited[key] = self.waited.get(key, 0) + start - work.ready
+                self.waited[key] += start - work.ready
         if declared and self.random.random() < self.chances.coroutine:
             self.scheduler.suspend(work.x)
             self._at(now + self.random.randrange(MS), lambda later: self._resume(work))
@@ -369,7 +364,7 @@ class VirtualRun:
             self.record('fail', now, vtid, work.dag, vertex, work.job)
         whole = self.scheduler.complete(work.x, end)
         if declared:
-            self.executions[key] = self.executions.get(key, 0) + 1
+            self.executions[key] += 1
             self.record('complete', now, vtid, address, work.dag, vertex, work.job, whole, end,
                         work.leg, *self.cpu(work, end - start))
         self.decided(now)
@@ -391,9 +386,7 @@ class VirtualRun:
             if kind == DROP:
                 work = self._waiting.pop(deadline, None)
                 if work is not None:
-                    self.record('drop', now, 2, self._address(work.vertex), work.dag,
-                                self.tables.index_in_dag[work.vertex], work.job, 'aborted')
-                    self.drops += 1
+                    self._record_drop(work.vertex, work.dag, work.job, 'aborted', now)
             elif kind == JOB_END:
                 if deadline == ABORTED:
                     self._aborted.add((dag, job))

@@ -10,10 +10,8 @@ BEGIN = 1_655_782_980_000_000_000
 CAMERA = """\
 mddag: 1
 nodes:
-  - node: /camera
-    callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]
-  - node: /detect
-    callbacks: [{name: run, subscription: /image, deadline: 10ms}]
+  - {node: /camera, callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]}
+  - {node: /detect, callbacks: [{name: run, subscription: /image, deadline: 10ms}]}
 """
 _MORE = {
     'ros2:dispatch_subscription_callback': (

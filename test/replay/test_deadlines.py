@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import DROP, JOB_END
 from mddag_executor.recording.tables import ABORTED, EXPIRED, FAILED, WITHDRAWN
-from mddag_executor.replay import open_recording, Replay, replay, ReplayError, reschedule
-from mddag_executor.replay.bags_reschedule import reschedule_bag
+from mddag_executor.replay import open_recording, Replay, ReplayError
 from mddag_executor.replay.deadlines import Judged
 from msg_graph import loads
 import numpy as np
@@ -22,9 +21,8 @@ import pytest
 from ..conftest import examples
 from .helpers import Chances, declarations, MS, PATHS, SMALL, VirtualRun
 from .oracle import Oracle
-from .test_ordinary_bags import GRAPH, write_bag
 
-BAGS = Path(__file__).resolve().parents[2] / 'bags'
+DEMO = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
 
 
 def check(recording, skip=0):
@@ -33,28 +31,6 @@ def check(recording, skip=0):
     expected = [each for each in oracle.decisions if each[0] not in (JOB_END, DROP)]
     columns = ('kind', 'dag', 'sink', 'job', 'deadline', 'completed')
     assert judged.verdicts[list(columns)].tolist() == expected
-
-
-@given(declarations(), st.integers(0, 2**32), st.integers(1, 4), st.integers(1, 25),
-       st.sampled_from([0, 70 * MS]))
-@examples(60)
-@example(SMALL, 1, 2, 8, 0)
-def test_verdicts_of_any_run(text, seed, workers, longest, skip):
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, 'run.mcap')
-        VirtualRun(path, loads(text, 'g.yaml'), seed, workers, longest=longest * MS,
-                   shut_down=seed % 3 > 0)
-        check(open_recording(path), skip)
-        try:
-            other = open_recording(path, loads(SMALL, 'other.yaml'))
-        except Exception as error:
-            assert 'none of the callbacks' in str(error)
-        else:
-            check(other, skip)
-
-
-def test_verdicts_of_a_bag():
-    check(open_recording(BAGS / 'demo_short.mcap'))
 
 
 @given(st.integers(0, 2**32), st.data())
@@ -95,11 +71,9 @@ def test_verdicts_of_any_tables(seed, data):
     check(changed)
 
 
-COLUMNS = ['kind', 'dag', 'sink', 'job', 'release', 'deadline', 'completed']
-
-
 def verdicts(replay):
-    return sorted(replay.judged.verdicts[COLUMNS].tolist())
+    columns = ['kind', 'dag', 'sink', 'job', 'release', 'deadline', 'completed']
+    return sorted(replay.judged.verdicts[columns].tolist())
 
 
 def links(table, column, other, *names):
@@ -152,30 +126,35 @@ def check_rows(whole, part, begin, end):
 
 
 @given(declarations(), st.integers(0, 2**32), st.integers(1, 4), st.integers(1, 25),
-       st.lists(st.integers(1, 150), max_size=3, unique=True))
-@examples(40)
-@example(SMALL + PATHS, 1, 2, 20, [40, 90])
-def test_parts_of_any_run(text, seed, workers, longest, borders):
+       st.sampled_from([0, 70 * MS]), st.lists(st.integers(1, 150), max_size=3, unique=True))
+@examples(50)
+@example(SMALL, 1, 2, 8, 0, [])
+@example(SMALL + PATHS, 1, 2, 20, 0, [40, 90])
+def test_any_run(text, seed, workers, longest, skip, borders):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'run.mcap')
         VirtualRun(path, loads(text, 'g.yaml'), seed, workers, longest=longest * MS,
                    shut_down=seed % 3 > 0)
         recording = open_recording(path)
+        check(recording, skip)
+        try:
+            other = open_recording(path, loads(SMALL, 'other.yaml'))
+        except ReplayError as error:
+            assert 'none of the callbacks' in str(error)
+        else:
+            check(other, skip)
     length = recording.end - (recording.start or 0)
     inner = [border * MS for border in sorted(borders) if border * MS < length]
     check_parts(recording, [0, *inner, 2 ** 62])
 
 
-def test_parts_of_a_bag():
-    recording = open_recording(BAGS / 'demo_short.mcap')
+def test_a_bag_and_its_parts():
+    recording = open_recording(DEMO)
+    check(recording)
     check_parts(recording, [0, 200 * MS, 210 * MS, 900 * MS, 1400 * MS, 2 ** 62])
     part = recording.cut(200 * MS, 500 * MS)
-    assert part.start == (recording.start or 0) + 200 * MS and 0 < len(part.executions) < len(
-        recording.executions) / 2
-
-
-def test_ranges_that_cannot_be():
-    recording = open_recording(BAGS / 'demo_short.mcap')
+    assert part.start == (recording.start or 0) + 200 * MS
+    assert 0 < len(part.executions) < len(recording.executions) / 2
     for begin, end in ((-1, 5), (5, 5)):
         with pytest.raises(ValueError, match='is no range of time'):
             recording.cut(begin, end)
@@ -184,11 +163,11 @@ def test_ranges_that_cannot_be():
 
 
 def test_a_recording_in_a_program(tmp_path):
-    recording = open_recording(BAGS / 'demo_short.mcap')
+    recording = open_recording(DEMO)
     graph = tmp_path / 'graph.yaml'
     graph.write_text(recording.task_set.text)
     for path in (graph, str(graph)):
-        judged = open_recording(BAGS / 'demo_short.mcap', path)
+        judged = open_recording(DEMO, path)
         assert judged.task_set.file == str(graph)
         assert (judged.executions == recording.executions).all()
     assert re.fullmatch(
@@ -198,14 +177,3 @@ def test_a_recording_in_a_program(tmp_path):
     recording.executions['end'][0] = -1     # a missing value rounds no other
     ends = recording.to_pandas('executions').end
     assert ends.isna()[0] and ends[1:].tolist() == recording.executions['end'][1:].tolist()
-
-
-def test_an_ordinary_bag_has_releases(tmp_path):
-    path, graph = write_bag(tmp_path / 'bag'), loads(GRAPH, 'g.yaml')
-    run = open_recording(path, graph)
-    assert np.bincount(run.releases['dag']).tolist() == [10, 31]
-    assert (reschedule(run).decisions == reschedule_bag(path, graph).decisions)
-    for wrong, says in ((lambda: open_recording(path), 'give the GRAPH'),
-                        (lambda: replay(path, graph), 'in which no callback ran: reschedule it')):
-        with pytest.raises(ReplayError, match=says):
-            wrong()

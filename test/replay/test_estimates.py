@@ -4,23 +4,17 @@
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.recording.entities import Entities
-from mddag_executor.recording.head import Head
-from mddag_executor.recording.tables import EXECUTIONS, Recording, rows
 from mddag_executor.replay import replay
 from mddag_executor.replay.dispatches import dispatch_times
-from mddag_executor.replay.usage import group_waits, PoolUse
-from mddag_executor.trace import TraceFile
+from mddag_executor.replay.usage import PoolUse
 import numpy as np
 import pytest
 
-from .helpers import add_execution, MS, small, START_TIME
+from .helpers import MS, Written
 
 
 def late(n_workers, *executions, holding=()):
     """Return how late executions began: of each worker, group, when ready, start and end."""
-    if not executions:
-        return []
     worker, group, ready, start, end = (
         np.array([-1 if each is None else each for each in column], dtype=np.int64)
         for column in zip(*executions))
@@ -50,7 +44,7 @@ def test_by_hand(workers, executions, expected):
     assert late(workers, *executions) == expected
 
 
-@given(st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), max_size=20))
+@given(st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), min_size=1, max_size=20))
 def test_a_schedule_without_overhead_has_none(jobs):
     free = [0, 0, 0]
     executions = []
@@ -64,21 +58,16 @@ def test_a_schedule_without_overhead_has_none(jobs):
 
 def test_waiting_for_what_computes_is_not_late():
     """Three that compute, one after the other; a fourth overtakes; one that only waits."""
-    ms = 1_000_000
     overtakes, first, second, _, third = range(5)
     # who overtakes and who only waits could begin at once; the machine tells why they did not
     assert late(
-        5, (3, None, 4 * ms, 5 * ms + 7, 6 * ms), (0, None, 0, 30, 10 * ms),
-        (1, None, 0, 10 * ms + 50, 20 * ms), (4, None, 12 * ms, 13 * ms + 9, 22 * ms),
-        (2, None, 15 * ms, 20 * ms + 60, 30 * ms), holding=(overtakes, first, second, third),
-    ) == [ms + 7, 30, 50, ms + 9, 60]
+        5, (3, None, 4 * MS, 5 * MS + 7, 6 * MS), (0, None, 0, 30, 10 * MS),
+        (1, None, 0, 10 * MS + 50, 20 * MS), (4, None, 12 * MS, 13 * MS + 9, 22 * MS),
+        (2, None, 15 * MS, 20 * MS + 60, 30 * MS), holding=(overtakes, first, second, third),
+    ) == [MS + 7, 30, 50, MS + 9, 60]
 
 
-STEP = PoolUse.FIRST_STEP_NS
-SPANS = st.lists(st.tuples(st.integers(0, 10 ** 13), st.integers(0, 10 ** 11)), max_size=30)
-
-
-@given(SPANS)
+@given(st.lists(st.tuples(st.integers(0, 10 ** 13), st.integers(0, 10 ** 11)), max_size=30))
 def test_no_time_is_lost_and_steps_are_few(spans):
     starts = np.array([start for start, _ in spans], dtype=np.int64)
     took = np.array([each for _, each in spans], dtype=np.int64)
@@ -88,41 +77,16 @@ def test_no_time_is_lost_and_steps_are_few(spans):
     busy = [(start, start + took) for start, took in spans if took]
     if busy:
         assert result['start_ns'] <= min(busy)[0] < result['start_ns'] + result['step_ns']
-        assert result['step_ns'] % STEP == 0
-
-
-def test_waits_for_the_group():
-    groups = Entities(by_address=True)
-    groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 50, 'mutually_exclusive'))
-    groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 60, 'reentrant'))
-    for entity, group in ((1, 50), (2, 50), (3, 60)):
-        groups.take(('ros2:rcl_timer_init', 0, 0, 0, entity, 5))
-        groups.take(('ros2:rclcpp_timer_callback_added', 0, 0, 0, entity, entity))
-        groups.take(('ros2_caret:callback_group_add_timer', 0, 0, 0, group, entity))
-    pieces = [(1, 0, 2, 10), (2, 4, 12, 20), (3, 5, 20, 30), (1, 8, 25, 30), (9, 0, 40, 41)]
-    callback, ready, start, end = (list(column) for column in zip(*pieces))
-    task_set = small()
-    recording = Recording(
-        'by hand', Head(0, '', '', 'rad', 1, 0, 0, False), task_set, task_set, groups,
-        executions=rows(EXECUTIONS, len(pieces), callback=callback, vertex=-1, ready=ready,
-                        began=start, start=start, end=end))
-    # the second from 4 to 10; the last of the group from 8 to 10 and from 12 to 20
-    assert group_waits(recording).tolist() == [0, 6, 0, 10, 0]
+        assert result['step_ns'] % PoolUse.FIRST_STEP_NS == 0
 
 
 def test_what_computed_and_held_the_interpreter(tmp_path):
     """Executions whose CPU time is not recorded are left out."""
-    path, text = tmp_path / 'a.mcap', 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, ' \
-        'timer: 100ms, deadline: 50ms}]}]'
-    took = [(4, 3, True), (2, 0, False), (9, None, False)]
-    with TraceFile(path) as file:
-        file.add('task_set', START_TIME, 1, 1, text, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
-        for job, (busy, cpu, held) in enumerate(took):
-            start = START_TIME + job * 100 * MS
-            end = start + busy * MS
-            file.add('job_release', start, 1, 1, 0, job, start)
-            add_execution(file, start, end, 0, 0, job,
-                          computed=() if cpu is None else (cpu * MS, held))
-    use = replay(path).result()['callbacks']['/n:a']
+    trace = Written(tmp_path / 'a.mcap', 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, '
+                    'timer: 100ms, deadline: 50ms}]}]')
+    for job, (busy, computed) in enumerate(((4, (3 * MS, True)), (2, (0, False)), (9, ()))):
+        trace.release(0, job, job * 100)
+        trace.run(0, 0, job, job * 100, job * 100 + busy, computed=computed)
+    use = replay(trace.end(300)).result()['callbacks']['/n:a']
     assert (use['executions'], use['measured'], use['measured_busy_ns']) == (3, 2, 6 * MS)
     assert (use['cpu_ns'], use['held_interpreter']) == (3 * MS, 1)

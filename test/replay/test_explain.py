@@ -9,30 +9,19 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.core.tally import total
 from mddag_executor.replay import open_recording, replay
-from mddag_executor.replay.causes import CAUSES, REMEDIES
+from mddag_executor.replay.causes import CAUSES
 from msg_graph import loads
 import pytest
 
 from ..conftest import examples
-from .helpers import (
-    add_execution,
-    begin_trace,
-    Chances,
-    end_trace,
-    MS,
-    small,
-    START_TIME,
-    VirtualRun,
-)
+from .helpers import Chances, MS, ns, small, START_TIME, VirtualRun, Written
 
 QUIET = Chances(0, 0, 0, 0, 0, 0, 0)
 VICTIM = """\
 mddag: 1
 nodes:
-  - node: /sensor
-    callbacks: [{name: tick, timer: 50ms, publishes: [/data]}]
-  - node: /victim
-    callbacks: [{name: use, subscription: /data, deadline: 12ms}]
+  - {node: /sensor, callbacks: [{name: tick, timer: 50ms, publishes: [/data]}]}
+  - {node: /victim, callbacks: [{name: use, subscription: /data, deadline: 12ms}]}
 """
 HEAVY = VICTIM + """\
   - node: /heavy
@@ -43,12 +32,9 @@ HEAVY = VICTIM + """\
 SYNC = """\
 mddag: 1
 nodes:
-  - node: /sensor
-    callbacks: [{name: tick, timer: 50ms, publishes: [/data, /more]}]
-  - node: /victim
-    callbacks: [{name: use, sync: [/data, /image], deadline: 22ms}]
-  - node: /camera
-    callbacks: [{name: take, subscription: /more, publishes: [/image]}]
+  - {node: /sensor, callbacks: [{name: tick, timer: 50ms, publishes: [/data, /more]}]}
+  - {node: /victim, callbacks: [{name: use, sync: [/data, /image], deadline: 22ms}]}
+  - {node: /camera, callbacks: [{name: take, subscription: /more, publishes: [/image]}]}
 """
 TICK, USE, FIRST, SECOND = range(4)
 
@@ -75,7 +61,6 @@ class Planned(VirtualRun):
     late: int = 0
     slow: int = 0
     stops: tuple[int, int] | None = None
-    records_stops: bool = True
     groups: dict[int, int] = field(default_factory=dict)
     holds: bool = False
     computes: int = 0
@@ -120,9 +105,13 @@ class Planned(VirtualRun):
     def _run(self):
         for group in sorted(set(self.groups.values())):
             assert self.scheduler.new_group() == group
-        if self.groups:
-            self._tell_groups()
-        if self.stops is not None and self.records_stops:
+            self.record('add_callback_group', START_TIME, 1, 1, 900 + group, 'mutually_exclusive')
+        for vertex, group in self.groups.items():
+            self.record('rcl_timer_init', START_TIME, 1, 800 + vertex, 1)
+            self.record('rclcpp_timer_callback_added', START_TIME, 1, 800 + vertex,
+                        self._address(vertex))
+            self.record('callback_group_add_timer', START_TIME, 1, 900 + group, 800 + vertex)
+        if self.stops is not None:
             every, length = self.stops
             for end in range(START_TIME + every, START_TIME + self.duration + 1, every):
                 self._at(end - 1, partial(self._note_stop, length))
@@ -130,15 +119,6 @@ class Planned(VirtualRun):
 
     def _note_stop(self, length, now):
         self.record('stop', now, 3, now - length, now)
-
-    def _tell_groups(self):
-        for group in set(self.groups.values()):
-            self.record('add_callback_group', START_TIME, 1, 1, 900 + group, 'mutually_exclusive')
-        for vertex, group in self.groups.items():
-            self.record('rcl_timer_init', START_TIME, 1, 800 + vertex, 1)
-            self.record('rclcpp_timer_callback_added', START_TIME, 1, 800 + vertex,
-                        self._address(vertex))
-            self.record('callback_group_add_timer', START_TIME, 1, 900 + group, 800 + vertex)
 
 
 BUSY = {FIRST: (30 * MS, 30 * MS), SECOND: (30 * MS, 30 * MS)}
@@ -167,8 +147,8 @@ PLANS = {
     'failed': (VICTIM, {'chances': Chances(0, 0, 0, 0, 0, 0, 0.2)})}
 
 
-def explained(path, task_set=None):
-    found = replay(path, task_set)
+def explained(path):
+    found = replay(path)
     result = found.explanation.result()
     assert len(result['jobs']) == result['missed'] == sum(result['causes'].values())
     assert result['missed'] == total(found.tally.result()['dags']).missed
@@ -218,166 +198,82 @@ def test_all_misses_of_any_run_are_explained(tmp_path, seed, workers):
                 assert each['ns'] <= workers * (job['until_ns'] - job['release_ns'])
 
 
-def test_what_people_see(tmp_path, call):
-    declaration, plan = PLANS['waited']
-    path, page = tmp_path / 'run.mcap', tmp_path / 'run.html'
-    Planned(path, loads(declaration, 'g.yaml'), **plan)
-    out = call('explain', path).stdout
-    assert REMEDIES['waited'] in out
-    assert out.splitlines()[-1] == '119 misses: 119 waited'
-    out = call('explain', path, '--sink', '/victim:use', '--job', '9').stdout
-    assert out.startswith('Job 9 of victim:use: late by ')
-    assert 'heavy:first' in out
-    assert call('explain', path, '--job', '8').stdout == 'no such job missed its deadline\n'
-    result = call('explain', path, '--job', '9', '--json', '-').result
-    assert [job['job'] for job in result['jobs']] == [9]
-    assert result['missed'] == 119
-    assert '119 misses: 119 waited' in call('replay', path, '--report', page).stdout
-    assert '119 misses: 119 waited' in page.read_text()
-
-
-MINUTE = 60_000 * MS
-ONE_WORKER = """\
+TWO = """\
 mddag: 1
 workers: 1
 nodes:
-  - node: /long
-    callbacks: [{name: hog, dag: long, timer: 1min, deadline: 50s}]
-  - node: /short
-    callbacks: [{name: late, dag: short, timer: 1min, deadline: 10ms}]
-"""
-
-
-@pytest.mark.parametrize('cause', ['waited', 'machine'])
-def test_misses_of_one_cause_have_it_however_long_the_run_is(cause, tmp_path, call):
-    # every minute the short one waits 50 ms for the only worker, or for the machine to go on
-    path = tmp_path / 'run.mcap'
-    minutes = 60
-    with begin_trace(path, ONE_WORKER) as file:
-        for job in range(minutes):
-            release = START_TIME + job * MINUTE
-            start = release + 50 * MS
-            if cause == 'machine':
-                file.add('stop', start, 1, 1, release, start)
-                ready = start
-            else:
-                ready = release
-                file.add('job_release', release, 1, 1, 0, job, release)
-                add_execution(file, release, start, 0, 0, job, address=7)
-            file.add('job_release', start, 1, 1, 1, job, release)
-            add_execution(file, start, start + MS, 1, 0, job, ready=ready, address=8)
-        end_trace(file, START_TIME + minutes * MINUTE)
-    result = call('explain', path, '--json', '-').result
-    assert result['missed'] == result['causes'][cause] == len(result['jobs']) == minutes
-    for job in result['jobs']:
-        parts = {part['cause']: part['ns'] for part in job['parts']}
-        assert parts == {cause: 50 * MS, 'ran': MS}
-        if cause == 'waited':
-            assert job['parts'][0]['behind'] == [{'callback': '/long:hog', 'ns': 50 * MS}]
-
-
-LENT = """\
-mddag: 1
-workers: 1
-nodes:
-  - node: /a
-    callbacks: [{name: asks, dag: a, timer: 1s, deadline: 990ms}]
-  - node: /x
-    callbacks: [{name: late, dag: x, timer: 1s, deadline: 50ms}]
+  - {node: /a, callbacks: [{name: asks, dag: a, timer: 1s, deadline: 990ms}]}
+  - {node: /x, callbacks: [{name: late, dag: x, timer: 1s, deadline: 15ms}]}
 """
 
 
 @pytest.mark.parametrize(('worker', 'cause'), [(-1, 'machine'), (0, 'waited')])
-def test_a_callback_that_has_lent_its_worker_keeps_none_busy(worker, cause, tmp_path, call):
+def test_a_callback_that_has_lent_its_worker_keeps_none_busy(worker, cause, tmp_path):
     # the one waits for the answer to a service call; the other starts 300 ms after it is ready
-    path = tmp_path / 'run.mcap'
-    with begin_trace(path, LENT) as file:
-        for job in range(5):
-            release = START_TIME + job * 1_000 * MS
-            late = release + 100 * MS
-            file.add('job_release', release, 1, 1, 0, job, release)
-            add_execution(file, release, release + 390 * MS, 0, 0, job, worker, address=7)
-            file.add('job_release', late, 1, 1, 1, job, late)
-            add_execution(file, late + 300 * MS, late + 301 * MS, 1, 0, job, ready=late,
-                          thread=11, address=8)
-        end_trace(file, START_TIME + 5_000 * MS)
-    result = call('explain', path, '--json', '-').result
-    assert {job['cause'] for job in result['jobs']} == {cause} and result['missed'] == 5
+    trace = Written(tmp_path / 'run.mcap', TWO)
+    for job in range(5):
+        release = job * 1000
+        trace.release(0, job, release)
+        trace.run(0, 0, job, release, release + 390, worker=worker, thread=10)
+        trace.release(1, job, release + 100)
+        trace.run(1, 0, job, release + 400, release + 401, ready=release + 100, thread=11)
+    result = explained(trace.end(5000))
+    assert result['causes'][cause] == result['missed'] == 5
+    mostly, = replay(trace.path).explanation.mostly()
+    assert (mostly['cause'], mostly['missed'], mostly['vertex'], mostly['behind']) == (
+        cause, 5, '/x:late', '/a:asks' if cause == 'waited' else None)
+    assert mostly['ns'] == (290 if cause == 'waited' else 300) * MS
     behind = [{'callback': '/a:asks', 'ns': 290 * MS}] if cause == 'waited' else []
-    for job in result['jobs']:
-        assert job['parts'][0]['behind'] == behind
+    assert all(job['parts'][0]['behind'] == behind for job in result['jobs'])
 
 
-def add_skipped_release(file, release, job, undeclared_end):
-    """Record an undeclared callback, a release beside it, and the next one, which is skipped."""
-    file.add('dispatch', release, 1, 10, 5, -1, -1, -1, 0, release, 0)
-    file.add('callback_start', release, 1, 10, 5, False)
-    file.add('callback_end', undeclared_end, 1, 10, 5)
-    file.add('job_release', release, 1, 1, 1, 2 * job, release)
-    file.add('job_release', release + 25 * MS, 1, 1, 1, 2 * job + 1, release + 20 * MS)
-    file.add('expire', release + 25 * MS, 1, 1, 1, 2 * job + 1)
-
-
-def test_an_undeclared_callback_may_hold_the_interpreter(tmp_path, call):
+@pytest.mark.parametrize('aborted', [False, True])
+def test_an_undeclared_callback_may_hold_the_interpreter(aborted, tmp_path, call):
     # one of two workers runs it: the other worker's callback cannot begin before it ends; its next
-    # release is skipped
-    path = tmp_path / 'run.mcap'
-    with begin_trace(path, LENT.replace('50ms', '15ms'), workers=2) as file:
-        for job in range(5):
-            release = START_TIME + job * 1_000 * MS
-            start = release + 50 * MS
-            add_skipped_release(file, release, job, undeclared_end=start)
-            add_execution(file, start, start + MS, 1, 0, 2 * job, 1, ready=release, thread=11,
-                          address=8, computed=(MS, True))
-        end_trace(file, START_TIME + 5_000 * MS)
-    result = call('explain', path, '--json', '-').result
+    # release is skipped; or it never begins, and is aborted
+    trace = Written(tmp_path / 'run.mcap', TWO, 2)
+    for job in range(5):
+        release = job * 1000
+        start = release + (25 if aborted else 50)
+        trace.piece(-1, -1, -1, release, start)
+        trace.release(1, 2 * job, release)
+        trace.release(1, 2 * job + 1, release + 20, noticed=release + 25)
+        trace.add('expire', release + 25, 1, 2 * job + 1)
+        if aborted:
+            trace.add('abort', start, 1, 2 * job)
+            trace.add('drop', start, 8, 1, 0, 2 * job, 'aborted')
+        else:
+            trace.run(1, 0, 2 * job, start, start + 1, worker=1, ready=release,
+                      computed=(MS, True))
+    path = trace.end(5000)
+    result = explained(path)
     assert result['causes']['interpreter'] == result['missed'] == 10
     for job in result['jobs']:
         if job['job'] % 2:
-            assert job['parts'] == [{'vertex': '/x:late', 'cause': 'skipped', 'ns': 5 * MS,
-                                     'behind': [], 'waiting_job': job['job'] - 1}]
-        else:
+            skipped, = job['parts']
+            assert (skipped['cause'], skipped['waiting_job']) == ('skipped', job['job'] - 1)
+        elif not aborted:
             assert [each['ns'] for each in job['parts'][0]['behind']] == [50 * MS]
-    assert 'skipped: job 2 had not started' in call('explain', path, '--job', '3').stdout
-    # the miss of the earliest deadline is the first one, though the other one was known before
-    assert 'first miss: /x:late, job 0, 36 ms late' in call('replay', path).stdout
-    assert '5 jobs skipped by a timer in the recording: skipped' in call(
-        'replay', path, '--reschedule').stdout
-
-
-def test_a_release_that_was_skipped_before_an_abort_has_the_cause_of_that(tmp_path, call):
-    path = tmp_path / 'run.mcap'
-    with begin_trace(path, LENT.replace('50ms', '15ms'), workers=2) as file:
-        for job in range(5):
-            release = START_TIME + job * 1_000 * MS
-            ended = release + 25 * MS
-            add_skipped_release(file, release, job, undeclared_end=ended)
-            file.add('abort', ended, 1, 1, 1, 2 * job)
-            file.add('drop', ended, 1, 1, 8, 1, 0, 2 * job, 'aborted')
-        end_trace(file, START_TIME + 5_000 * MS)
-    result = call('explain', path, '--json', '-').result
-    assert result['causes']['interpreter'] == result['missed'] == 10
-    assert [each['parts'][0]['waiting_job'] for each in result['jobs'] if each['job'] % 2] == [
-        0, 2, 4, 6, 8]
+    if not aborted:
+        assert 'skipped: job 2 had not started' in call('explain', path, '--job', '3').stdout
+        assert call('explain', path, '--job', '10').stdout == 'no such job missed its deadline\n'
+        # the miss of the earliest deadline is the first one, though another was known before
+        assert 'first miss: /x:late, job 0, 36 ms late' in call('replay', path).stdout
+        assert '5 jobs skipped by a timer in the recording: skipped' in call(
+            'replay', path, '--reschedule').stdout
 
 
 def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path, call):
     # /image has another name in the node
-    path = tmp_path / 'run.mcap'
-    with begin_trace(path, SYNC) as file:
-        for job in range(20):
-            time = START_TIME + job * 50 * MS
-            file.add('job_release', time, 1, 1, 0, job, time)
-            for vertex, address in ((TICK, 7), (2, 8)):
-                add_execution(file, time, time + MS, 0, vertex, job, address=address)
-                time += MS
-            for kind, *fields in (
-                    ('dispatch', 0, USE, job, 0, time, 0), ('callback_start', False),
-                    ('callback_end',), ('complete', 0, USE, job, False, time + MS, 0)):
-                file.add(kind, time + MS * (kind[-3:] in ('end', 'ete')), 1, 10, 9, *fields)
-            file.add('expire', time + 30 * MS, 1, 1, 0, job)
-        end_trace(file, START_TIME + 2_000 * MS)
-    result = call('explain', path, '--json', '-').result
+    trace = Written(tmp_path / 'run.mcap', SYNC)
+    for job in range(20):
+        at = job * 50
+        trace.release(0, job, at)
+        for place, vertex in enumerate((TICK, 2, USE)):
+            trace.run(0, vertex, job, at + place, at + place + 1, whole=vertex != USE)
+        trace.add('expire', at + 32, 0, job)
+    path = trace.end(2000)
+    result = explained(path)
     assert result['causes']['lost'] == result['missed'] == 20
     assert result['jobs'][0]['parts'][-1] == {
         'vertex': '/victim:use', 'cause': 'lost', 'ns': 29 * MS, 'behind': [],
@@ -388,23 +284,20 @@ def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path, call):
 def test_only_misses_in_stops_are_said_to_be_in_them(tmp_path, call):
     # each job's callback starts 20 ms after it was ready, with an idle worker; the machine stood
     # still twice in that of one job, and once in that of another
-    path = tmp_path / 'run.mcap'
-    declaration = LENT.replace('50ms', '15ms')
-    with begin_trace(path, declaration) as file:
-        file.add('stop', START_TIME, 1, 1, START_TIME, START_TIME)      # stops are recorded
-        for job in range(9):
-            release = START_TIME + job * 1_000 * MS
-            file.add('job_release', release, 1, 1, 1, job, release)
-            start = release + 20 * MS
-            if job in (3, 5):
-                start += 60 * MS
-                for stop in ((10, 35), (40, 70))[job // 5:]:
-                    first, last = (release + each * MS for each in stop)
-                    file.add('stop', last, 1, 1, first, last)
-            add_execution(file, start, start + MS, 1, 0, job, ready=release, address=8)
-        end_trace(file, START_TIME + 9_000 * MS)
+    trace = Written(tmp_path / 'run.mcap', TWO)
+    trace.add('stop', 0, ns(0), ns(0))      # stops are recorded
+    for job in range(9):
+        release = job * 1000
+        trace.release(1, job, release)
+        start = release + 20
+        if job in (3, 5):
+            start += 60
+            for first, last in ((10, 35), (40, 70))[job // 5:]:
+                trace.add('stop', release + last, ns(release + first), ns(release + last))
+        trace.run(1, 0, job, start, start + 1, ready=release)
+    path = trace.end(9000)
     assert len(open_recording(path).stops) == 3    # without the empty one
-    result = call('explain', path, '--json', '-').result
+    result = explained(path)
     assert result['causes']['machine'] == result['missed'] == 9
     assert sum(stall['misses'] for stall in result['stalls']) == 2
     for verb in ('explain', 'replay'):

@@ -27,9 +27,8 @@ ADDRESS = 0x7F00_0000_0010
 class Trace:
     """The trace of a process that runs one vertex; its clock is late by some ns."""
 
-    def __init__(self, folder, name, vertex, late=0, graph=GRAPH,
-                 judges_from=0, dag=0, boot='', begin=0,
-                 pid=None):
+    def __init__(self, folder, name, vertex, late=0, graph=GRAPH, judges_from=0, dag=0, boot='',
+                 begin=0, pid=None):
         self.path = str(folder / f'run.{name}.mcap')
         self.file = TraceFile(self.path, overwrite=True)
         self.vertex, self.late, self.job = vertex, late, 0
@@ -46,19 +45,17 @@ class Trace:
     def add(self, name, at, *fields):
         self.file.add(name, BASE + at - self.late, self.pid, self.pid, *fields)
 
-    def runs(self, release, start, took=MS, completes=True, ready=None, worker=0, fails=False):
+    def runs(self, release, start, took=MS, completes=True, ready=None):
         """Run its vertex for the next job; times in ns since the base."""
         t = BASE - self.late
         ready = start if ready is None else ready
         self.add('job_release', ready, self.dag, self.job, t + release)
-        self.add('dispatch', start, ADDRESS, self.dag, self.vertex, self.job, worker, t + ready,
+        self.add('dispatch', start, ADDRESS, self.dag, self.vertex, self.job, 0, t + ready,
                  t + release + 8 * MS)
         self.add('callback_start', start, ADDRESS, False)
         if completes:
             end = start + took
             self.add('callback_end', end, ADDRESS)
-            if fails:
-                self.add('fail', end, self.dag, self.vertex, self.job)
             self.add('complete', end, ADDRESS, self.dag, self.vertex, self.job, True, t + end, 0,
                      took, True)
         self.job += 1
@@ -84,20 +81,30 @@ def sink(result):
     return result['dags']['chain']['sinks']['/b:take']
 
 
-@pytest.mark.parametrize('late', [0, 7 * MS])
-def test_a_job_goes_on_in_the_other_trace(tmp_path, late):
-    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1, late)
-    for i, takes in enumerate((2, 2, 7)):
+def verdicts(result):
+    """Return how many results were due, in time and late."""
+    found = counts(sink(result))
+    return found.due, found.in_time, found.late
+
+
+def pair(folder, takes=(2,), **options):
+    """Return the traces of two processes that ran jobs, 10 ms each: 1 ms, and what is given."""
+    up, down = Trace(folder, 'up', 0), Trace(folder, 'down', 1, **options)
+    for i, took in enumerate(takes):
         release = i * 10 * MS
         up.runs(release, release + MS)
-        down.job += i == 0  # its jobs have other numbers
-        down.runs(release + 5, release + 3 * MS, takes * MS)  # its clock was read again
+        down.runs(release + 5, release + 3 * MS, took * MS)     # its clock was read again
+    return up, down
+
+
+@pytest.mark.parametrize('late', [0, 7 * MS])
+def test_a_job_goes_on_in_the_other_trace(tmp_path, late):
+    up, down = pair(tmp_path, (2, 2, 7), late=late)
     outcome = replay([up.end(100 * MS), down.end(90 * MS)])
     result = outcome.result()
     assert result['warnings'] == []
     assert result['dags']['chain']['jobs'] == 3
-    verdicts = counts(sink(result))
-    assert (verdicts.due, verdicts.in_time, verdicts.late) == (3, 2, 1)
+    assert verdicts(result) == (3, 2, 1)
     assert sink(result)['response_ns'] == {
         'min': 5 * MS, 'median': 5 * MS, 'p99': 10 * MS, 'max': 10 * MS}
     breakdown = sink(result)['breakdown']
@@ -107,7 +114,7 @@ def test_a_job_goes_on_in_the_other_trace(tmp_path, late):
     assert result['recording']['shut_down'] and result['recording']['end_ns'] == BASE + 100 * MS
 
 
-def two_machines(folder, late, back=True, stranger=False):
+def two_machines(folder, late, back=True):
     """Return the traces of a run on two machines, the clock of the other is late."""
     up = Trace(folder, 'up', 0, graph=STAMPED, boot='one')
     down = Trace(folder, 'down', 1, late, STAMPED, boot='other')
@@ -123,12 +130,10 @@ def two_machines(folder, late, back=True, stranger=False):
         up.sends(down, 1, release + 2 * MS, (i + 4) * MS // 10)
         if back:
             down.sends(up, 2, release + 4 * MS, (i + 2) * MS // 10)
-        if stranger:    # the same topic, from elsewhere: it was long on its way
-            down.add('rmw_take', release + 60 * MS, 1, 1, BASE + release + 20 * MS, True)
     return [up.end(100 * MS), down.end(100 * MS)]
 
 
-@pytest.mark.parametrize('late', [0, 3 * MS, -3 * MS, 40_000 * MS, -40_000 * MS])
+@pytest.mark.parametrize('late', [0, 3 * MS, -40_000 * MS])
 def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(tmp_path, late, call):
     paths = two_machines(tmp_path, late)
     result = replay(paths).result()
@@ -136,15 +141,14 @@ def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(tmp_path, lat
     # from up to down 0.4 ms at least, back 0.2 ms
     ahead = f'{abs(100_000 - late) / 1e6:.3f} ms ' + ('ahead' if late < 100_000 else 'behind')
     assert f'is taken to be {ahead}, within 0.300 ms, by the messages' in warning, warning
-    verdicts = counts(sink(result))
-    assert (verdicts.due, verdicts.in_time, verdicts.late) == (3, 2, 1)
+    assert verdicts(result) == (3, 2, 1)
     assert sink(result)['response_ns']['max'] == 10 * MS - 100_000
 
     run = call('replay', *paths, '--offset', f'down={-late}ns', '--json', '-')
     assert run.stderr == '' and '"max": 10000000' in run.stdout
     reversed_paths = replay(paths[::-1]).result()
-    assert counts(sink(reversed_paths)).in_time == 2 and sink(
-        reversed_paths)['response_ns']['max'] == 10 * MS - 100_000
+    assert verdicts(reversed_paths) == (3, 2, 1)
+    assert sink(reversed_paths)['response_ns']['max'] == 10 * MS - 100_000
 
 
 def test_clocks_are_taken_as_they_are_where_messages_go_one_way(tmp_path):
@@ -160,7 +164,7 @@ def test_one_machine_has_one_clock_whatever_it_was_set_to(tmp_path):
     up.runs(0, MS)
     down.runs(0, 3 * MS)
     outcome = replay([up.end(90 * MS), down.end(90 * MS)])
-    assert outcome.warnings == [] and counts(sink(outcome.result())).in_time == 1
+    assert outcome.warnings == [] and verdicts(outcome.result()) == (1, 1, 0)
 
 
 def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(tmp_path):
@@ -173,8 +177,7 @@ def test_a_process_that_was_killed_is_said_with_the_jobs_that_ended_with_it(tmp_
     warning, = result['warnings']
     assert warning.startswith(f'{tmp_path}/run.down.mcap: its end is not recorded')
     assert warning.endswith('it ends 0.087 s before the run; 1 job ended with it: chain 1')
-    verdicts = counts(sink(result))
-    assert (verdicts.due, verdicts.in_time, verdicts.late) == (4, 1, 3)
+    assert verdicts(result) == (4, 1, 3)
 
 
 def test_what_waits_when_its_process_ends_waits_until_the_end_of_the_run(tmp_path):
@@ -196,8 +199,7 @@ def test_who_is_started_again_or_never_judged_keeps_no_job_from_being_judged(tmp
         if i not in (2, 3):
             (down if i < 2 else again).runs(i * 10 * MS, i * 10 * MS + 3 * MS)
     result = replay([up.end(90 * MS), down.end(None), again.end(90 * MS), killed.end(None)])
-    verdicts = counts(sink(result.result()))
-    assert (verdicts.due, verdicts.in_time, verdicts.late) == (6, 4, 2)
+    assert verdicts(result.result()) == (6, 4, 2)
 
 
 TWO = """
@@ -229,7 +231,6 @@ def test_each_process_has_its_workers_and_interpreter_again(two, tmp_path, call)
 
     run = call('replay', *two, '--reschedule')
     assert '18 in time' in run.stdout and '4 workers in 2 processes' in run.stdout
-    assert '9 late' in call('replay', *two, '--reschedule', '--processes', '1').stdout
     for given in ('processes: {p: [/a, /b]}', 'processes: {p: [/a], q: [/b]}'):
         (tmp_path / 'placed.yaml').write_text(given)
         late = '9 late' if 'q:' not in given else ' 0 late'
@@ -239,37 +240,37 @@ def test_each_process_has_its_workers_and_interpreter_again(two, tmp_path, call)
     assert '9 late' in call('replay', *two, tmp_path / 'graph.yaml', '--reschedule').stdout
 
 
-def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path, call):
-    for folder, takes in (('before', 2), ('after', 7)):
-        (tmp_path / folder).mkdir()
-        up, down = Trace(tmp_path / folder, 'up', 0), Trace(tmp_path / folder, 'down', 1)
-        for i in range(3):
-            up.runs(i * 10 * MS, i * 10 * MS + MS)
-            down.runs(i * 10 * MS, i * 10 * MS + 3 * MS, takes * MS)
-        up.end(100 * MS)
-        down.end(100 * MS)
-    before, after = tmp_path / 'before', tmp_path / 'after'
-    assert '3 in time' in call('replay', before).stdout
-    assert '3 late' in call('explain', after).stdout
-    run = call('diff', before, after, '--fail-on-worse', '--json', '-')
-    found = json.loads(run.stdout)
-    sides = [found['dags']['chain']['sinks']['/b:take'][side] for side in 'ab']
-    assert run.returncode == 1 and [side['late'] for side in sides] == [0, 3]
-    Trace(before, 'other', 0, graph=TWO).end(MS)
-    refused = call('diff', before, after)
-    assert refused.returncode == 2 and 'another declaration' in refused.stderr
-
-
 def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path, call):
     trace = Trace(tmp_path, 'whole', 0, graph=TWO)
     for i in range(9):
         for trace.dag in range(2):
-            trace.runs(i * 12 * MS, i * 12 * MS + trace.dag * 5 * MS, 5 * MS,
-                       ready=i * 12 * MS)
-            trace.job -= not trace.dag
+            trace.job = i
+            at = i * 12 * MS
+            trace.runs(at, at + trace.dag * 5 * MS, 5 * MS, ready=at)
     path = trace.end(100 * MS)
-    assert ' 0 late' not in call('replay', path, '--reschedule').stdout
-    assert ' 0 late' in call('replay', path, '--reschedule', '--processes', '2').stdout
+    for more, in_time in (((), False), (('--processes', '2'), True)):
+        assert (' 0 late' in call('replay', path, '--reschedule', *more).stdout) == in_time
+
+
+def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path, graph, call):
+    graph.write_text(GRAPH.replace('8ms', '3ms'))
+    for folder, takes in (('before', 2), ('after', 7)):
+        (tmp_path / folder).mkdir()
+        for trace in pair(tmp_path / folder, [takes] * 3):
+            trace.end(100 * MS)
+    before, after, out = tmp_path / 'before', tmp_path / 'after', tmp_path / 'out.csv'
+    assert '3 in time' in call('replay', before).stdout
+    assert '3 late' in call('explain', after).stdout
+    assert '3 late' in call('replay', *before.iterdir(), graph).stdout
+    assert call('export', before, '-o', out).returncode == 0
+    assert [line.split(',')[2:4] for line in out.read_text().splitlines()[1:3]] == [
+        ['/a:tick', '2'], ['/b:take', '0']]
+    run = call('diff', before, after, '--fail-on-worse', '--json', '-')
+    both = sink(json.loads(run.stdout))
+    assert run.returncode == 1 and [both[side]['late'] for side in 'ab'] == [0, 3]
+    Trace(before, 'other', 0, graph=TWO).end(MS)
+    refused = call('diff', before, after)
+    assert refused.returncode == 2 and 'another declaration' in refused.stderr
 
 
 def test_traces_of_different_runs_are_refused(tmp_path):
@@ -312,24 +313,6 @@ def test_traces_of_two_runs_of_one_declaration_are_refused(tmp_path, call):
         twin.runs(release, release + 2 * MS)
     with pytest.raises(ReplayError, match='/b:take ran in it and, at the same time, in '):
         replay([twin.end(50 * MS), paths['one', 'up'], long.path])
-
-
-def test_the_command_takes_several_traces(tmp_path, call):
-    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
-    up.runs(0, MS)
-    down.runs(0, 3 * MS)
-    paths = up.end(90 * MS), down.end(90 * MS)
-    graph = tmp_path / 'graph.yaml'
-    graph.write_text(GRAPH.replace('8ms', '3ms'))
-    assert '1 in time' in call('replay', *paths).stdout
-    assert '1 late' in call('replay', *paths, graph).stdout
-    assert 'misses' in call('explain', *paths, graph).stdout
-    out = tmp_path / 'out.csv'
-    assert call('export', *paths, '-o', out).returncode == 0
-    assert [line.split(',')[2:4] for line in out.read_text().splitlines()[1:]] == [
-        ['/a:tick', '0'], ['/b:take', '2']]
-    refused = call('replay', paths[0], '-', paths[1])
-    assert refused.returncode == 2 and 'standard input' in refused.stderr
 
 
 def test_processes_of_containers_may_have_the_same_numbers(tmp_path, call):

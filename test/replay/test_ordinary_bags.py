@@ -1,25 +1,38 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Ordinary bags, written by rosbags, as releases: every storage and compression, and damage."""
+"""Ordinary bags as releases: all that `ros2 bag record` can write, and damage."""
 
+from contextlib import closing
 import os
+from pathlib import Path
+import re
 import shutil
 import sqlite3
+import tempfile
 
+from hypothesis import example, given
+from hypothesis import strategies as st
 from mddag_executor import open_recording
 from mddag_executor.errors import InputError
-from mddag_executor.replay.bags import Bag, BagError, is_ordinary
+from mddag_executor.replay import replay, ReplayError, reschedule
+from mddag_executor.replay.bags import Bag, BagError, is_ordinary, UNKNOWN
 from mddag_executor.replay.bags_reschedule import read_bag, reschedule_bag
 from mddag_executor.simulate import START
-from mddag_executor.trace import TraceError, TraceFile, TraceReader
+from mddag_executor.trace import times, TraceError, TraceFile
 from msg_graph import loads
+import numpy as np
 import pytest
-from rosbags.rosbag2 import CompressionFormat, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
+from ..conftest import examples
+
 MS = 1_000_000
+S = 1_000 * MS
 BEGIN = 1_732_166_766_000_000_000
 STORE = get_typestore(Stores.ROS2_JAZZY)
+MCAP, SQLITE = StoragePlugin.MCAP, StoragePlugin.SQLITE3
+HEADER, STRING = 'std_msgs/msg/Header', 'std_msgs/msg/String'
 GRAPH = """\
 mddag: 1
 workers: 2
@@ -30,59 +43,71 @@ nodes:
   - node: /detector
     callbacks:
       - {name: detect, subscription: /cloud, deadline: 20ms, execution_time: 8ms}
-  - node: /control
-    callbacks:
-      - {name: tick, timer: 30ms, deadline: 10ms, execution_time: 3ms}
+  - {node: /control, callbacks: [{name: tick, timer: 30ms, deadline: 10ms, execution_time: 3ms}]}
 """
 BY_HEADER = GRAPH.replace('period: 100ms', 'period: 100ms, release_from: header_stamp')
+TASK_SET = loads(GRAPH, 'g.yaml')
+
+
+def made(kind, *fields):
+    return STORE.types[kind](*fields)
+
+
+def time_of(stamp):
+    return made('builtin_interfaces/msg/Time', *divmod(stamp, 1_000_000_000))
 
 
 def header(stamp):
-    """Return a std_msgs/Header as CDR."""
-    time = STORE.types['builtin_interfaces/msg/Time'](*divmod(stamp, 1_000_000_000))
-    message = STORE.types['std_msgs/msg/Header'](time, 'lidar')
-    return bytes(STORE.serialize_cdr(message, 'std_msgs/msg/Header'))
+    return made(HEADER, time_of(stamp), 'lidar')
 
 
-def write_bag(path, storage=StoragePlugin.MCAP, compression=None, stamps=None, topic='/points'):
-    """Write a bag of ten scans, each 5 ms after its stamp, and a message of another topic."""
-    writer = Writer(path, version=9, storage_plugin=storage)
+def write(path, types, messages, storage=MCAP, compression=None, version=9):
+    """Write a bag; `types` by topic, `messages`: topic, arrival and message."""
+    writer = Writer(path, version=version, storage_plugin=storage)
     if compression is not None:
         writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
-        points = writer.add_connection(topic, 'std_msgs/msg/Header', typestore=STORE)
-        chatter = writer.add_connection('/chatter', 'std_msgs/msg/String', typestore=STORE)
-        text = STORE.types['std_msgs/msg/String']('hello')
-        writer.write(
-            chatter, BEGIN, STORE.serialize_cdr(text, 'std_msgs/msg/String'))
-        for i in range(10):
-            stamp = BEGIN + i * 100 * MS
-            given = stamp if stamps is None else stamps[i]
-            writer.write(points, stamp + 5 * MS, header(given))
+        connections = {topic: writer.add_connection(topic, kind, typestore=STORE)
+                       for topic, kind in types.items()}
+        for topic, arrival, message in messages:
+            writer.write(connections[topic], arrival, STORE.serialize_cdr(message, types[topic]))
     return path
 
 
-def responses(outcome, dag, sink):
-    return outcome.result()['dags'][dag]['sinks'][sink]['response_ns']
+def write_bag(path, storage=MCAP, compression=None, stamps=None, topic='/points'):
+    """Write a bag of ten scans, each 5 ms after its stamp, and a message of another topic."""
+    scans = [(topic, BEGIN + (i * 100 + 5) * MS, header(stamp)) for i, stamp in enumerate(
+        stamps or range(BEGIN, BEGIN + 1000 * MS, 100 * MS))]
+    return write(path, {topic: HEADER, '/chatter': STRING},
+                 [('/chatter', BEGIN, made(STRING, 'hello')), *scans], storage, compression)
+
+
+def responses(outcome):
+    return outcome.result()['dags']['/lidar']['sinks']['/detector:detect']['response_ns']
 
 
 def test_the_schedule_is_that_of_the_core(tmp_path):
     """On one worker scans and timer get into each other's way."""
-    outcome = reschedule_bag(write_bag(tmp_path / 'bag'), loads(GRAPH, 'g.yaml'), workers=1)
+    bag = write_bag(tmp_path / 'bag')
+    run = open_recording(bag, TASK_SET)
+    assert np.bincount(run.releases['dag']).tolist() == [10, 31]
+    outcome = reschedule_bag(bag, TASK_SET, workers=1)
+    assert reschedule(run, workers=1).decisions == outcome.decisions
     first = [(time - BEGIN, vertex) for time, kind, _, _, vertex, _ in outcome.log
              if kind == START][:4]
     assert first == [(0, 2), (5 * MS, 0), (6 * MS, 1), (30 * MS, 2)]
-    slow = reschedule_bag(
-        tmp_path / 'bag', loads(GRAPH, 'g.yaml'), workers=1, dispatch_overhead=MS)
+    slow = reschedule_bag(bag, TASK_SET, workers=1, dispatch_overhead=MS)
     begun = [time - BEGIN for time, kind, *_ in slow.log if kind == START]
     assert begun[:3] == [0, 5 * MS, 7 * MS]
-    table = [[2 * MS, 4 * MS], [MS]]
-    given = reschedule_bag(tmp_path / 'bag', loads(GRAPH, 'g.yaml'), times=table)
-    assert set(responses(given, '/lidar', '/detector:detect').values()) == {6 * MS}
+    given = reschedule_bag(bag, TASK_SET, times=[[2 * MS, 4 * MS], [MS]])
+    assert set(responses(given).values()) == {6 * MS}
     drawn = GRAPH.replace('execution_time: 8ms', 'execution_time: {quantiles_us: [1000, 9000]}')
-    seeds = [reschedule_bag(tmp_path / 'bag', loads(drawn, 'g.yaml'), seed=seed).log
-             for seed in (1, 1, 2)]
+    seeds = [reschedule_bag(bag, loads(drawn, 'g.yaml'), seed=seed).log for seed in (1, 1, 2)]
     assert seeds[0] == seeds[1] != seeds[2]
+    for wrong, says in ((lambda: open_recording(bag), 'give the GRAPH'),
+                        (lambda: replay(bag, TASK_SET), 'no callback ran: reschedule it')):
+        with pytest.raises(ReplayError, match=says):
+            wrong()
 
 
 def test_stamps_that_can_not_be_are_said(tmp_path):
@@ -94,166 +119,199 @@ def test_stamps_that_can_not_be_are_said(tmp_path):
     assert outcome.warnings == [
         f'{path}: 2 of 10 messages of /points (std_msgs/msg/Header) without a header stamp, or '
         'with one after the arrival or years before: released at the arrival']
-    assert responses(outcome, '/lidar', '/detector:detect')['min'] == 9 * MS
-    chatter = BY_HEADER.replace('/points', '/chatter')
-    outcome = reschedule_bag(path, loads(chatter, 'g.yaml'))
-    assert 'without a header stamp' in outcome.warnings[0]
-    published = BY_HEADER.replace('header_stamp', 'source_timestamp')
-    outcome = reschedule_bag(path, loads(published, 'g.yaml'))
-    assert '10 of 10 messages' in outcome.warnings[0]
-    assert 'without a publication time' in outcome.warnings[0]
+    assert responses(outcome)['min'] == 9 * MS
+    for old, new, says in (('/points', '/chatter', 'without a header stamp'),
+                           ('header_stamp', 'source_timestamp',
+                            '10 of 10 messages .*without a publication time')):
+        warning, = reschedule_bag(path, loads(BY_HEADER.replace(old, new), 'g.yaml')).warnings
+        assert re.search(says, warning)
 
 
 def test_what_is_not_in_the_bag_is_said(tmp_path):
     path = write_bag(tmp_path / 'bag')
-    text = GRAPH + """\
+    camera = """\
   - node: /camera
     callbacks:
-      - {name: in, subscription: /image, period: 10ms, deadline: 5ms, execution_time: 1ms}
-      - {name: ask, service: /s, period: 10ms, deadline: 5ms, execution_time: 1ms, dag: ask}
+      - {name: in, subscription: /image, period: 9ms, deadline: 5ms, execution_time: 1ms}
 """
-    outcome = reschedule_bag(path, loads(text, 'g.yaml'))
+    outcome = reschedule_bag(path, loads(GRAPH + camera + (
+        '      - {name: ask, service: /s, period: 9ms, deadline: 5ms, execution_time: 1ms, '
+        'dag: ask}'), 'g.yaml'))
     assert [text.split(': ', 1)[1] for text in outcome.warnings] == [
         'topic /image is not in it, so there are no jobs of /camera',
         'ask starts with a service call, which a bag does not have: there are no jobs of it']
-    nothing = """\
-mddag: 1
-nodes:
-  - node: /camera
-    callbacks: [{name: in, subscription: /i, period: 9ms, deadline: 5ms, execution_time: 1ms}]
-"""
+    nothing = 'mddag: 1\nnodes:\n' + camera
     with pytest.raises(BagError, match='none of the sources of g.yaml is in it: it has /chatter'):
         reschedule_bag(path, loads(nothing, 'g.yaml'))
-    with pytest.raises(InputError, match='g.yaml:4: /camera:in declares no execution_time'):
+    with pytest.raises(InputError, match='g.yaml:5: /camera:in declares no execution_time'):
         reschedule_bag(path, loads(nothing.replace(', execution_time: 1ms', ''), 'g.yaml'))
 
 
-@pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
-def test_several_files(tmp_path, storage):
-    """As `ros2 bag record --max-bag-size` splits; one may be missing, or metadata.yaml."""
-    suffix = 'db3' if storage == StoragePlugin.SQLITE3 else 'mcap'
-    path = tmp_path / 'drive'
-    path.mkdir()
-    for i, part in enumerate('ab'):
-        stamps = [BEGIN + (10 * i + j) * 100 * MS for j in range(10)]
-        write_bag(tmp_path / part, storage, stamps=stamps)
-        shutil.copy(tmp_path / part / f'{part}.{suffix}', path / f'drive_{i}.{suffix}')
-    metadata = (tmp_path / 'a' / 'metadata.yaml').read_text().replace(
-        f'- a.{suffix}', f'- drive_0.{suffix}\n  - drive_1.{suffix}')
-    metadata = metadata.replace('message_count: 11', 'message_count: 22')
-    (path / 'metadata.yaml').write_text(metadata)
-    bag = Bag(path, {'/points'})
-    assert bag.warnings == []
-    assert list(bag.stamps['/points'].header) == [BEGIN + i * 100 * MS for i in range(20)]
-    (path / 'metadata.yaml').unlink()
-    again = Bag(path, {'/points'})
-    assert list(again.stamps['/points'].header) == list(bag.stamps['/points'].header)
+# --- what users record ---------------------------------------------------------------------------
+
+# By topic: the type, and a message with a stamp.
+TOPICS = {
+    '/parameter_events': ('rcl_interfaces/msg/ParameterEvent', lambda ns: (
+        time_of(ns), '/camera', [], [], [])),
+    '/rosout': ('rcl_interfaces/msg/Log', lambda ns: (
+        time_of(ns), 20, 'camera', 'hello', 'camera.py', 'main', 7)),
+    '/camera/image/compressed': ('sensor_msgs/msg/CompressedImage', lambda ns: (
+        header(ns), 'jpeg', np.arange(200, dtype=np.uint8))),
+    '/joint_states': ('sensor_msgs/msg/JointState', lambda ns: (
+        header(ns), [], np.zeros(0), np.zeros(0), np.zeros(0))),
+    '/chatter': (STRING, lambda ns: ('no stamp',)),
+}
+TYPES = {topic: kind for topic, (kind, _) in TOPICS.items()}
+
+
+def messages(part):
+    """Make ten of each topic, 100 ms apart, each recorded 5 ms after its stamp."""
+    return [(topic, stamp + 5 * MS, made(kind, *fields(stamp)))
+            for stamp in (BEGIN + i * 100 * MS for i in range(10 * part, 10 * part + 10))
+            for topic, (kind, fields) in TOPICS.items()]
+
+
+BAGS = {
+    '-s mcap': (MCAP,),
+    '-s mcap of Iron': (MCAP, None, 8),
+    '-s mcap --compression-mode message': (MCAP, CompressionMode.MESSAGE),
+    '-s mcap --compression-mode file': (MCAP, CompressionMode.FILE),
+    '-s sqlite3': (SQLITE,),
+    '-s sqlite3 of Humble': (SQLITE,),
+    '-s sqlite3 --compression-mode message': (SQLITE, CompressionMode.MESSAGE),
+    '-s sqlite3 --compression-mode file': (SQLITE, CompressionMode.FILE),
+}
+OF_USERS = 'mddag: 1\nnodes:\n  - node: /all\n    callbacks:\n' + ''.join(
+    f'      - {{name: c{i}, subscription: {topic}, period: 100ms, release_from: '
+    f'{"arrival" if topic == "/chatter" else "header_stamp"}, deadline: 50ms, '
+    f'execution_time: 1ms, dag: d{i}}}\n' for i, topic in enumerate(TOPICS))
+
+
+def split_bag(folder, kind):
+    """Make a bag of two files, as `ros2 bag record --max-bag-size` splits; return both."""
+    bag, names = folder / 'drive', []
+    bag.mkdir()
+    for part in range(2):
+        write(folder / f'part{part}', TYPES, messages(part), *BAGS[kind])
+        file, = (path for path in (folder / f'part{part}').iterdir() if path.suffix != '.yaml')
+        names.append(f'drive_{part}{"".join(file.suffixes)}')
+        shutil.move(file, bag / names[-1])
+        if kind.endswith('Humble'):
+            with closing(sqlite3.connect(bag / names[-1])) as storage:
+                storage.execute('DROP TABLE message_definitions')
+    text = (folder / 'part0' / 'metadata.yaml').read_text()
+    line = next(line for line in text.splitlines() if '- part0' in line)
+    both = '\n'.join(line[:line.index('-')] + f'- {name}' for name in names)
+    (bag / 'metadata.yaml').write_text(text.replace(line, both, 1).replace(
+        'message_count: 50\n', 'message_count: 100\n'))
+    return bag, [bag / name for name in names]
+
+
+@pytest.mark.parametrize('kind', BAGS)
+def test_each_kind_of_bag(tmp_path, kind):
+    bag, _ = split_bag(tmp_path, kind)
+    outcome = reschedule_bag(bag, loads(OF_USERS, 'g.yaml'))
+    assert outcome.warnings == []
+    assert [dag['jobs'] for dag in outcome.result()['dags'].values()] == [20] * len(TOPICS)
+    read = Bag(bag, set(TOPICS))
+    for topic in TOPICS:
+        stamps = read.stamps[topic]
+        assert list(stamps.arrival) == [BEGIN + (i * 100 + 5) * MS for i in range(20)]
+        assert list(stamps.header) == [
+            UNKNOWN if topic == '/chatter' else BEGIN + i * 100 * MS for i in range(20)], topic
+
+
+@pytest.mark.parametrize('kind', ['-s mcap', '-s sqlite3'])
+def test_files_that_are_missing_are_said(tmp_path, kind):
+    bag, files = split_bag(tmp_path, kind)
+    metadata = (bag / 'metadata.yaml').read_text()
+    (bag / 'metadata.yaml').unlink()
+    again = Bag(bag, {'/rosout'})
+    assert len(again.stamps['/rosout'].header) == 20
     assert 'metadata.yaml is missing' in again.warnings[0]
-    (path / 'metadata.yaml').write_text(metadata)
-    (path / f'drive_1.{suffix}').unlink()
-    half = Bag(path, {'/points'})
-    assert len(half.stamps['/points'].header) == 10
-    assert half.warnings == [f'{path}/drive_1.{suffix}: is no file: it is left out']
-    (path / f'drive_0.{suffix}').unlink()
-    assert is_ordinary(str(path))       # not a folder without a trace
+    (bag / 'metadata.yaml').write_text(metadata)
+    files[1].unlink()
+    half = Bag(bag, {'/rosout'})
+    assert len(half.stamps['/rosout'].header) == 10
+    assert half.warnings == [f'{files[1]}: is no file: it is left out']
+    files[0].unlink()
+    assert is_ordinary(str(bag))       # not a folder without a trace
     with pytest.raises(BagError, match='is no file: it is left out'):
-        read_bag(path, loads(GRAPH, 'g.yaml'))
+        read_bag(bag, loads(OF_USERS, 'g.yaml'))
 
 
-def test_messages_in_a_write_ahead_log_are_not_passed_over(tmp_path):
-    """As a killed recorder leaves them: the bag needs repair."""
-    path = write_bag(tmp_path / 'bag', StoragePlugin.SQLITE3)
-    (path / 'bag.db3-wal').write_bytes(b'x')
-    with pytest.raises(BagError, match=r'its last messages are in bag\.db3-wal .*: let ros2 bag '):
-        Bag(path, {'/points'})
-
-
-@pytest.mark.parametrize('text', [
-    '', '[', '- 1', 'rosbag2_bagfile_information: 1', 'rosbag2_bagfile_information: {}',
-    'rosbag2_bagfile_information: {relative_file_paths: []}',
-    'rosbag2_bagfile_information: {relative_file_paths: [1]}', '\x00', '[' * 5000,
-    '!!python/object:os.system x'])
-def test_wrong_metadata(tmp_path, text):
-    path = write_bag(tmp_path / 'bag')
-    (path / 'metadata.yaml').write_text(text)
-    with pytest.raises(BagError) as caught:
-        Bag(path, {'/points'})
-    assert str(caught.value).startswith(f'{path}/metadata.yaml: this is no metadata of a bag (')
-    assert '\n' not in str(caught.value)
-
-
-def test_hostile_files(tmp_path):
-    empty = tmp_path / 'empty.db3'
-    sqlite3.connect(empty).execute('CREATE TABLE a(b)').connection.close()
-    for content in (b'SQLite format 3\0' * 100, None):
-        if content is not None:
-            empty.write_bytes(content)
-        with pytest.raises(BagError, match='its SQLite storage cannot be read'):
-            Bag(empty, {'/points'})
-    with pytest.raises(BagError, match='is no file'):
-        Bag(tmp_path / 'gone', {'/points'})
-    (tmp_path / 'folder').mkdir()
-    with pytest.raises(BagError, match='there is neither metadata.yaml nor a bag file'):
-        Bag(tmp_path / 'folder', {'/points'})
-
-
-def test_on_the_command_line(tmp_path, call):
-    path = write_bag(tmp_path / 'bag')
-    graph = tmp_path / 'g.yaml'
+def test_on_the_command_line(tmp_path, graph, call):
+    path, times = write_bag(tmp_path / 'bag'), tmp_path / 'times.json'
     graph.write_text(BY_HEADER)
-    times = tmp_path / 'times.json'
     times.write_text('{"/lidar": {"/lidar:in": 2000, "/detector:detect": 16000}, '
                      '"/control": {"/control:tick": 100}}')
-    status, out, err = call('replay', path, graph, '--reschedule', '--fail-on-miss')
+    arguments = 'replay', path, graph, '--reschedule', '--fail-on-miss'
+    status, out, err = call(*arguments)
     assert (status, err) == (0, '')
     assert '/lidar: 10 jobs from the header stamp of /points' in out.splitlines()
     assert 'policy rad, 2 workers' in out
-    status, out, _ = call('replay', path, graph, '--reschedule', '--execution-times', times,
-                          '--fail-on-miss')
-    assert status == 1
-    assert '9 late' in out     # the last one is open at the end
+    status, out, _ = call(*arguments, '--execution-times', times)
+    assert status == 1 and '9 late' in out     # the last one is open at the end
 
 
-@pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize('storage', [MCAP, SQLITE])
 def test_a_relative_topic_is_that_below_the_root(tmp_path, storage):
     relative = write_bag(tmp_path / 'relative', storage, topic='points')
-    absolute = write_bag(tmp_path / 'absolute', storage)
-    outcomes = [reschedule_bag(bag, loads(GRAPH)) for bag in (relative, absolute)]
+    outcomes = [reschedule_bag(bag, TASK_SET)
+                for bag in (relative, write_bag(tmp_path / 'absolute', storage))]
     assert [outcome.warnings for outcome in outcomes] == [[], []]
     assert outcomes[0].result()['dags'] == outcomes[1].result()['dags']
     assert Bag(relative, ['/points']).topics == {'/points', '/chatter'}
 
 
+# --- damage --------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('text', [
+    '', '[', '- 1', 'rosbag2_bagfile_information: {relative_file_paths: []}',
+    'rosbag2_bagfile_information: {relative_file_paths: [1]}', '\x00', '[' * 900,
+    '!!python/object:os.system x'])
+def test_wrong_metadata(tmp_path, text):
+    (tmp_path / 'metadata.yaml').write_text(text)
+    with pytest.raises(BagError) as caught:
+        Bag(tmp_path, {'/points'})
+    assert str(caught.value).startswith(
+        f'{tmp_path}/metadata.yaml: this is no metadata of a bag (')
+    assert '\n' not in str(caught.value)
+
+
+def test_hostile_files(tmp_path):
+    other, text = tmp_path / 'other.db3', tmp_path / 'text.db3'
+    sqlite3.connect(other).execute('CREATE TABLE a(b)').connection.close()
+    text.write_bytes(b'SQLite format 3\0' * 100)
+    (tmp_path / 'folder').mkdir()
+    killed = write_bag(tmp_path / 'killed', SQLITE)
+    (killed / 'killed.db3-wal').write_bytes(b'x')
+    for path, says in ((other, 'its SQLite storage cannot be read'),
+                       (text, 'its SQLite storage cannot be read'),
+                       (tmp_path / 'gone', 'is no file'),
+                       (killed, r'its last messages are in killed\.db3-wal .*: let ros2 bag '),
+                       (tmp_path / 'folder', 'there is neither metadata.yaml nor a bag file')):
+        with pytest.raises(BagError, match=says):
+            Bag(path, {'/points'})
+
+
 def test_a_folder_says_what_is_in_it(tmp_path):
     """A folder with a trace of this executor is no bag, and an empty one is nothing."""
-    (tmp_path / 'run').mkdir()
-    with TraceFile(tmp_path / 'run' / 'a.mcap') as file:
+    folder = tmp_path / 'run'
+    folder.mkdir()
+    with TraceFile(folder / 'a.mcap') as file:
         file.add('caret_init', BEGIN, 1, 1, 5, 'jazzy')
-    assert not is_ordinary(str(tmp_path / 'run'))
-    assert is_ordinary(str(write_bag(tmp_path / 'bag')))
+    assert not is_ordinary(str(folder))
+    for storage in (MCAP, SQLITE):
+        assert is_ordinary(str(write_bag(tmp_path / storage.name, storage)))
     # also where the recorder of a bag left its metadata next to it
-    (tmp_path / 'run' / 'metadata.yaml').write_text('{}')
-    assert not is_ordinary(str(tmp_path / 'run'))
+    (folder / 'metadata.yaml').write_text('{}')
+    assert not is_ordinary(str(folder))
     # nor is what is left of one a bag, however little it is
-    data = (tmp_path / 'run' / 'a.mcap').read_bytes()
+    data = (folder / 'a.mcap').read_bytes()
     for size in (len(data) // 2, 60, 45):
-        (tmp_path / 'run' / 'a.mcap').write_bytes(data[:size])
-        assert not is_ordinary(str(tmp_path / 'run' / 'a.mcap'))
-
-
-def test_a_folder_is_looked_through_once(tmp_path, monkeypatch):
-    path = write_bag(tmp_path / 'bag', StoragePlugin.MCAP)
-    (path / 'metadata.yaml').unlink()
-    opened = []
-
-    class Counted(TraceReader):
-
-        def __init__(self, path):
-            opened.append(path)
-            super().__init__(path)
-
-    monkeypatch.setattr('mddag_executor.replay.bags.TraceReader', Counted)
-    assert is_ordinary(str(path)) and opened == [str(path / 'bag.mcap')]
+        (folder / 'a.mcap').write_bytes(data[:size])
+        assert not is_ordinary(str(folder / 'a.mcap'))
 
 
 @pytest.mark.parametrize('mode', [0, 0o444])
@@ -266,7 +324,53 @@ def test_a_folder_that_may_not_be_read(tmp_path, monkeypatch, mode):
     os.seteuid(user or 65534)       # root may read everything
     try:
         with pytest.raises((TraceError, BagError), match='bag.*Permission denied'):
-            open_recording('bag', loads(GRAPH))
+            open_recording('bag', TASK_SET)
     finally:
         os.seteuid(user)
         path.chmod(0o755)
+
+
+N = 40                  # messages, 25 ms apart: 1 s
+ARRIVALS = [BEGIN + k * 25 * MS for k in range(N)]
+TIMER = 30 * MS
+
+
+def rescheduled(path, arrivals, storage=MCAP):
+    """Reschedule a bag of scans; there may not be more than each message warrants."""
+    outcome = reschedule_bag(write(path, {'/points': HEADER}, [
+        ('/points', arrival, header(BEGIN)) for arrival in arrivals], storage), TASK_SET)
+    jobs = [dag['jobs'] for dag in outcome.result()['dags'].values()]
+    assert jobs[0] <= N
+    # a message further away is there alone: one more stretch of time, with one job at most
+    assert jobs[1] <= (1 * S + times.GAP_NS) // TIMER + 2
+    assert len(outcome.decisions) <= 2 * sum(jobs)
+    assert len(outcome.log) <= 2 * (2 * jobs[0] + jobs[1])
+    return outcome
+
+
+@pytest.mark.parametrize(('storage', 'odd'), [(MCAP, 2**62), (SQLITE, 2**63 - 1)])
+def test_a_message_at_a_time_that_cannot_be(tmp_path, storage, odd):
+    sound = rescheduled(tmp_path / 'sound', ARRIVALS[:20] + ARRIVALS[21:], storage)
+    outcome = rescheduled(tmp_path / 'odd', ARRIVALS[:20] + [odd] + ARRIVALS[21:], storage)
+    assert [line.split(': ', 1)[1] for line in outcome.warnings] == [
+        'left out: 1 message at an impossible time']
+    assert outcome.result()['dags'] == sound.result()['dags']
+
+
+@given(st.integers(0, N - 1), st.integers(0, 63), st.sampled_from([MCAP, SQLITE]))
+@example(N - 1, 45, MCAP)
+@examples(20)
+def test_any_bit_of_a_time(place, bit, storage):
+    flipped = [*ARRIVALS]
+    flipped[place] = (flipped[place] ^ 1 << bit) & 2**63 - 1
+    with tempfile.TemporaryDirectory() as folder:
+        rescheduled(Path(folder, 'bag'), flipped, storage)
+
+
+def test_a_pause_has_no_jobs_of_timers(tmp_path):
+    outcome = rescheduled(
+        tmp_path / 'paused', ARRIVALS[:20] + [time + 3600 * S for time in ARRIVALS[20:]])
+    assert outcome.warnings == []
+    assert 'none in 1 pause of over a minute' in outcome.notes[1]
+    tick = outcome.result()['dags']['/control']['jobs']
+    assert tick <= 2 * (N * 25 * MS // 2 // TIMER + 1)

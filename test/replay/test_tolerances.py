@@ -1,8 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Tolerated misses, and JUnit XML."""
+"""Tolerated misses, failed jobs, a warm-up and runs without a job, wherever verdicts are told."""
 
-import json
 from xml.etree import ElementTree
 
 from hypothesis import given
@@ -19,19 +18,17 @@ from mddag_executor.core.state import (
 from mddag_executor.core.tally import counts
 from mddag_executor.core.tolerances import not_tolerated
 from mddag_executor.report.ci import annotation_lines, junit
-from mddag_executor.trace import TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
-from .helpers import add_execution
+from .helpers import MS, ns, Written
 
-MS = 1_000_000
 GRAPH = """\
 mddag: 1
 nodes:
-  - node: /n
-    callbacks: [{name: a, timer: 10ms, deadline: 8ms}]
+  - {node: /n, callbacks: [{name: a, timer: 10ms, deadline: 8ms}]}
 """
+MODES = pytest.mark.parametrize('mode', [[], ['--reschedule']])
 
 
 def sink_of(missed):
@@ -61,70 +58,89 @@ def test_without_a_tolerance_each_miss_counts(missed):
 HOSTILE = 'a"]]><&\'\x00\x1b[2J\n\ud800\uffff\u202e</testcase>'
 
 
-def test_junit_with_hostile_names():
+def test_junit_and_annotations_with_hostile_names():
     sinks = {HOSTILE: sink_of([True] * 3), 'good': sink_of([False]), 'none': sink_of([])}
     result = {'dags': {HOSTILE: {'sinks': sinks}}, 'duration_ns': 30 * MS, 'policy': 'rad',
               'workers': 2, 'preemptive': False, 'rescheduled': False, 'warnings': [HOSTILE]}
     broken = not_tolerated(result['dags'])
     assert list(broken) == [(HOSTILE, HOSTILE)]
-    root = ElementTree.fromstring(junit(result, broken, HOSTILE))
-    suite = root[0]
+    suite = ElementTree.fromstring(junit(result, broken, HOSTILE))[0]
     assert {key: suite.attrib[key] for key in ('tests', 'failures', 'errors', 'skipped')} == {
         'tests': '3', 'failures': '1', 'errors': '0', 'skipped': '1'}
     bad, good, none = suite.findall('testcase')
-    failure = bad.find('failure')
-    assert failure.attrib['message'] == '3 of 3 jobs missed the deadline'
+    assert bad.find('failure').attrib['message'] == '3 of 3 jobs missed the deadline'
     for text in (bad.attrib['name'], bad.attrib['classname'], suite.attrib['name']):
         assert '\\x00' in text and '\\x1b[2J\\n\\ud800' in text
         assert all(c.isprintable() for c in text)
     assert good.find('failure') is None and good.find('skipped') is None
     assert none.find('skipped') is not None
 
+    bad, none = annotation_lines(result['dags'], broken, 'a,b:c%.yaml')
+    assert bad.startswith('::error file=a%2Cb%3Ac%25.yaml,title=Deadline of a"]]><&')
+    assert bad.isprintable() and bad.count('::') == 2
+    assert bad.endswith('::3 of 3 jobs missed the deadline')
+    assert none == ('::warning file=a%2Cb%3Ac%25.yaml,title=Deadline of none::'
+                    'no job of it was due')
+
+
+def failure_in(path):
+    failure = ElementTree.parse(path).getroot().find('testsuite/testcase/failure')
+    return None if failure is None else failure.attrib['message']
+
+
+def record(path, failed=()):
+    """Record ten jobs, of which the third and the fourth are late."""
+    trace = Written(path, GRAPH)
+    for job in range(10):
+        release = (job + 1) * 10
+        end = release + (9 if job in (2, 3) else 1)
+        trace.release(0, job, release)
+        if job in failed:
+            trace.add('fail', end, 0, 0, job)
+            trace.add('deadline', end, 0, 0, job, ns(release + 8), -1)
+        trace.run(0, 0, job, release, end)
+        if job in (2, 3):
+            trace.add('deadline', end, 0, 0, job, ns(release + 8), ns(end))
+    return trace.end(200)
+
 
 @pytest.fixture
 def trace(tmp_path):
-    """Give a trace of ten jobs, of which the third and the fourth are late."""
-    path = tmp_path / 'run.mcap'
-    with TraceFile(path) as file:
-        file.add('task_set', 0, 1, 1, GRAPH, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
-        for job in range(10):
-            release = (job + 1) * 10 * MS
-            end = release + (9 if job in (2, 3) else 1) * MS
-            file.add('job_release', release, 1, 1, 0, job, release)
-            add_execution(file, release, end, 0, 0, job, thread=5, address=7)
-            if job in (2, 3):
-                file.add('deadline', end, 1, 5, 0, 0, job, release + 8 * MS, end)
-        file.add('shutdown', 200 * MS, 1, 1, 200 * MS)
-    return path
+    return record(tmp_path / 'run.mcap')
 
 
-@pytest.mark.parametrize(('tolerate', 'worst', 'kept'), [
-    ('2 of 3', 2, True), ('1 of 2', 2, False), ('2 of 100', 2, True), ('1 of 3', 2, False)])
-@pytest.mark.parametrize('mode', [[], ['--reschedule']])
+@pytest.fixture
+def empty(tmp_path):
+    """Give a run of the declaration's nodes in which no job came."""
+    trace = Written(tmp_path / 'empty.mcap', GRAPH)
+    trace.piece(-1, -1, -1, 10, 20)
+    return trace.end(200)
+
+
+@pytest.mark.parametrize(('tolerate', 'kept'), [
+    ('2 of 3', True), ('1 of 2', False), ('1 of 3', False)])
+@MODES
 def test_the_declaration_says_what_a_sink_tolerates(
-        trace, tmp_path, tolerate, worst, kept, mode, call):
-    graph, out = tmp_path / 'g.yaml', tmp_path / 'out.xml'
+        trace, graph, tmp_path, tolerate, kept, mode, call):
+    out = tmp_path / 'out.xml'
     graph.write_text(GRAPH.replace('8ms}', f'8ms, tolerate: {tolerate}}}'))
     arguments = 'replay', trace, graph, *mode, '--fail-on-miss'
     status, output, _ = call(*arguments, '--github', '--junit', out)
     assert status == (not kept)
-    why = f'{worst} of {tolerate.split()[-1]} jobs in a row missed the deadline, ' \
-          f'tolerated: {tolerate}'
+    misses, of = map(int, tolerate.split(' of '))
+    why = f'2 of {of} jobs in a row missed the deadline, tolerated: {tolerate}'
     assert (f'::error file={graph},title=Deadline of /n%3Aa::{why}\n' in output) != kept
-    failure = ElementTree.parse(out).getroot().find('testsuite/testcase/failure')
-    assert (None if failure is None else failure.attrib['message']) == (None if kept else why)
+    assert failure_in(out) == (None if kept else why)
     if not mode:
         header, row = output[output.index('DAG '):].splitlines()[:2]
         assert header.split()[-2:] == ['tolerates', 'worst']
-        assert row.split()[-4:] == [*tolerate.split(), str(worst)]
-    status, output, _ = call(*arguments, '--json', '-')
-    sink = json.loads(output)['dags']['/n']['sinks']['/n:a']
-    misses, of = map(int, tolerate.split(' of '))
-    assert sink['tolerate'] == {'misses': misses, 'of': of, 'worst': worst}
+        assert row.split()[-4:] == [*tolerate.split(), '2']
+    result = call(*arguments[:-1], '--json', '-').result
+    assert result['dags']['/n']['sinks']['/n:a']['tolerate'] == {
+        'misses': misses, 'of': of, 'worst': 2}
 
 
-def test_a_simulation_respects_it(tmp_path, call):
-    graph = tmp_path / 'g.yaml'
+def test_a_simulation_respects_it(graph, call):
     late = GRAPH.replace('8ms}', '8ms, execution_time: 9ms}')
     for tolerate, status in (('', 1), (', tolerate: 9 of 10', 1), (', tolerate: 10 of 11', 0)):
         graph.write_text(late.replace('9ms}', f'9ms{tolerate}}}'))
@@ -132,95 +148,61 @@ def test_a_simulation_respects_it(tmp_path, call):
         assert done.returncode == status and (' 10 of 11 ' in done.stdout or status)
 
 
-def test_annotations_with_hostile_names():
-    dags = {'d': {'sinks': {HOSTILE: sink_of([True]), 'none': sink_of([])}}}
-    broken = not_tolerated(dags)
-    bad, none = annotation_lines(dags, broken, 'a,b:c%.yaml')
-    assert bad.startswith('::error file=a%2Cb%3Ac%25.yaml,title=Deadline of a"]]><&')
-    assert bad.isprintable() and bad.count('::') == 2
-    assert bad.endswith('::1 of 1 job missed the deadline')
-    assert none == ('::warning file=a%2Cb%3Ac%25.yaml,title=Deadline of none::'
-                    'no job of it was due')
-
-
-def test_a_failed_job_is_told_wherever_verdicts_are(trace, tmp_path, call):
+@MODES
+def test_a_failed_job_is_told_wherever_verdicts_are(trace, tmp_path, mode, call):
     """The first job's callback raised, in a run that was in time but for the third and fourth."""
-    failed, out = tmp_path / 'failed.mcap', tmp_path / 'out.xml'
-    with TraceFile(failed) as file:
-        for name, time, pid, thread, *fields in TraceReader(trace).events():
-            if name == 'mddag:complete' and fields[3] == 0:
-                file.add('fail', time, pid, thread, 0, 0, 0)
-                file.add('deadline', time, pid, thread, 0, 0, 0, 18 * MS, -1)
-            file.add(name, time, pid, thread, *fields)
-    for mode in ([], ['--reschedule']):
-        page = tmp_path / 'page.html'
-        done = call('replay', failed, *mode, '--junit', out, '--report', page)
-        assert (done.returncode, done.stderr) == (0, '')
-        assert '2 late, 0 expired, 1 failed\n' in done.stdout
-        assert '2 late, 0 expired, 1 failed<' in page.read_text()
-        failure = ElementTree.parse(out).getroot().find('testsuite/testcase/failure')
-        assert failure is not None and failure.attrib['message'] == (
-            '3 of 10 jobs missed the deadline (1 failed: a callback raised)')
-        dag = call('replay', failed, *mode, '--json', '-').result['dags']['/n']
-        assert dag['ends'] == {'completed': 7, 'late': 2, 'aborted': 0, 'expired': 0, 'failed': 1,
-                               'dropped': 0}
-        assert dag['sinks']['/n:a']['failed'] == 1
-    done = call('diff', trace, failed, '--fail-on-worse')
-    assert done.returncode == 1 and '2 late, 0 expired, 1 failed; policy' in done.stdout
-    jobs = tmp_path / 'jobs.csv'
-    call('export', failed, '-o', jobs, '--rows', 'jobs')
-    assert jobs.read_text().count(',failed') == 1
+    failed, out = record(tmp_path / 'failed.mcap', failed=[0]), tmp_path / 'out.xml'
+    page, jobs = tmp_path / 'page.html', tmp_path / 'jobs.csv'
+    done = call('replay', failed, *mode, '--junit', out, '--report', page)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert '2 late, 0 expired, 1 failed\n' in done.stdout
+    assert '2 late, 0 expired, 1 failed<' in page.read_text()
+    assert failure_in(out) == '3 of 10 jobs missed the deadline (1 failed: a callback raised)'
+    dag = call('replay', failed, *mode, '--json', '-').result['dags']['/n']
+    assert {end: n for end, n in dag['ends'].items() if n} == {
+        'completed': 7, 'late': 2, 'failed': 1}
+    assert dag['sinks']['/n:a']['failed'] == 1
+    if not mode:
+        done = call('diff', trace, failed, '--fail-on-worse')
+        assert done.returncode == 1 and '2 late, 0 expired, 1 failed; policy' in done.stdout
+        call('export', failed, '-o', jobs, '--rows', 'jobs')
+        assert jobs.read_text().count(',failed') == 1
 
 
-@pytest.mark.parametrize('mode', [[], ['--reschedule']])
+@MODES
 def test_a_warm_up_is_left_out(trace, tmp_path, mode, call):
     """The jobs 2 and 3, released 20 ms and 30 ms after the first, are the late ones."""
-    for skip, due, late in (('0', 10, 2), ('20ms', 8, 2), ('20001us', 7, 1), ('31ms', 6, 0)):
+    for skip, skipped, due, late in (('0', 0, 10, 2), ('20ms', 20 * MS, 8, 2),
+                                     ('20001us', 20_001_000, 7, 1), ('31ms', 31 * MS, 6, 0)):
         arguments = 'replay', trace, *mode, '--skip', skip
         status, out, err = call(*arguments, '--fail-on-miss')
         assert (status, err) == (late > 0, '')
         assert f'{due} results due, {due - late} in time' in out
         assert ('left out: jobs released in the first' in out) == (skip != '0')
         result = call(*arguments, '--json', '-').result
-        assert result['dags']['/n']['jobs'] == due
-        assert result['dags']['/n']['ends'] == {
-            'completed': due - late, 'late': late, 'aborted': 0, 'expired': 0, 'failed': 0,
-            'dropped': 0}
-        assert result['skip_ns'] == {'0': 0, '20ms': 20 * MS, '20001us': 20_001_000}.get(
-            skip, 31 * MS)
+        dag = result['dags']['/n']
+        assert (dag['jobs'], dag['ends']['completed'], dag['ends']['late']) == (
+            due, due - late, late)
+        assert result['skip_ns'] == skipped
     page = tmp_path / 'report.html'
     call(*arguments, '--report', page)
     assert '6 results due, 6 in time (100.00 %)' in page.read_text()
 
 
-@pytest.mark.parametrize('mode', [[], ['--reschedule']])
-def test_where_nothing_was_due_nothing_is_proven(trace, tmp_path, mode, call):
-    """A run of the declaration's nodes in which no job came is no run that held its deadlines."""
-    empty, out = tmp_path / 'empty.mcap', tmp_path / 'out.xml'
-    with TraceFile(empty) as file:
-        file.add('task_set', 0, 1, 1, GRAPH, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
-        file.add('dispatch', 10, 1, 5, 7, -1, -1, -1, 0, 10, 0)
-        file.add('callback_start', 10, 1, 5, 7, False)
-        file.add('callback_end', 20, 1, 5, 7)
-        file.add('shutdown', 200 * MS, 1, 1, 200 * MS)
-    graph = tmp_path / 'g.yaml'
+@MODES
+def test_where_nothing_was_due_nothing_is_proven(empty, graph, tmp_path, mode, call):
     graph.write_text(GRAPH.replace('8ms}', '8ms, execution_time: 1ms}'))
     arguments = 'replay', empty, graph, *mode
-    page = tmp_path / 'page.html'
+    out, page = tmp_path / 'out.xml', tmp_path / 'page.html'
     status, said, err = call(*arguments, '--fail-on-miss', '--junit', out, '--report', page)
     assert status == 1 and err.count(f'error: {empty}: no job was due at any sink') == 1
     assert 'never due, so not judged: 1 sink: /n:a' in said
     assert 'No job was due at any sink: nothing is proven.' in page.read_text()
-    failure = ElementTree.parse(out).getroot().find('testsuite/testcase/failure')
-    assert failure is not None and 'no job was due' in failure.attrib['message']
-    assert json.loads(call(*arguments, '--json', '-').stdout)['never_due'] == ['/n:a']
+    assert 'no job was due' in failure_in(out)
+    assert call(*arguments, '--json', '-').result['never_due'] == ['/n:a']
 
 
-def test_a_run_in_which_nothing_was_due_is_no_better(trace, tmp_path, call):
-    empty = tmp_path / 'empty.mcap'
-    with TraceFile(empty) as file:
-        file.add('task_set', 0, 1, 1, GRAPH, 'g.yaml', 'rad', 1, 100 * MS, 64, False)
-        file.add('shutdown', 200 * MS, 1, 1, 200 * MS)
+def test_a_run_in_which_nothing_was_due_is_no_better(trace, empty, call):
     status, out, err = call('diff', trace, empty, '--fail-on-worse')
     assert status == 1 and 'error' not in err and 'worse, never due in B' in out
     status, _, err = call('diff', empty, empty, '--fail-on-worse')

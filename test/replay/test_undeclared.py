@@ -7,79 +7,75 @@ from pathlib import Path
 from mddag_executor.trace import EVENTS, TraceFile, TraceReader
 import pytest
 
-from ..replay.helpers import begin_trace, end_trace, MS, START_TIME, US
+from .helpers import MS, ns, Written
 
 DEMO = Path(__file__).parents[2] / 'bags' / 'demo_short.mcap'
 GRAPH = """\
 mddag: 1
 nodes:
-  - node: /camera
-    callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]
-  - node: /radar
-    callbacks: [{name: scan, timer: 100ms, publishes: [/image]}]
-  - node: /detect
-    callbacks: [{name: run, subscription: /image, deadline: 40ms}]
+  - {node: /camera, callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]}
+  - {node: /radar, callbacks: [{name: scan, timer: 100ms, publishes: [/image]}]}
+  - {node: /detect, callbacks: [{name: run, subscription: /image, deadline: 40ms}]}
 """
 GRAB, SCAN, RUN = 11, 12, 13
 _OF_JOBS = {f'mddag:{name}' for name in (
     'job_release', 'complete', 'deadline', 'fail', 'expire', 'abort', 'hosted', 'judge_from')}
 
 
-class Run:
-    """The trace of a run of three nodes; times are ns since the start."""
+class Run(Written):
+    """The trace of a run of three nodes; times are ms since the start."""
 
-    def __init__(self, folder, call):
-        self._call = call
-        self.path = folder / 'run.mcap'
-        self.graph = folder / 'graph.yaml'
-        self.graph.write_text(GRAPH)
-        self.file = begin_trace(self.path, '', workers=2)
+    def __init__(self, folder, graph, call):
+        super().__init__(folder / 'run.mcap', '', 2)
+        self.call, self.graph = call, graph
         for node, name in enumerate(('camera', 'radar', 'detect'), 1):
-            self.add('rcl_node_init', 0, 1, node, node, name, '/')
+            self.add('rcl_node_init', 0, node, node, name, '/')
         for timer, node in ((GRAB, 1), (SCAN, 2)):
-            self.add('rcl_publisher_init', 0, 1, 100 + node, node, 100 + node, '/image', 10)
-            self.add('rcl_timer_init', 0, 1, 20 + node, 100 * MS)
-            self.add('rclcpp_timer_callback_added', 0, 1, 20 + node, timer)
-            self.add('rclcpp_timer_link_node', 0, 1, 20 + node, node)
-        self.add('rcl_subscription_init', 0, 1, 30, 3, 30, '/image', 10)
-        self.add('rclcpp_subscription_init', 0, 1, 30, 30)
-        self.add('rclcpp_subscription_callback_added', 0, 1, 30, RUN)
+            self.add('rcl_publisher_init', 0, 100 + node, node, 100 + node, '/image', 10)
+            self.add('rcl_timer_init', 0, 20 + node, 100 * MS)
+            self.add('rclcpp_timer_callback_added', 0, 20 + node, timer)
+            self.add('rclcpp_timer_link_node', 0, 20 + node, node)
+        self.add('rcl_subscription_init', 0, 30, 3, 30, '/image', 10)
+        self.add('rclcpp_subscription_init', 0, 30, 30)
+        self.add('rclcpp_subscription_callback_added', 0, 30, RUN)
 
-    def add(self, name, time, thread, *fields):
-        self.file.add(name, START_TIME + time, 1, thread, *fields)
-
-    def runs(self, callback, ready, start, end, *published, thread=0):
-        """Run a callback, which publishes at some times."""
+    def runs(self, callback, start, end, sent=None, ready=None, thread=0):
+        """Run a callback, which publishes at some time."""
         thread = thread or callback
-        self.add('dispatch', start, thread, callback, -1, -1, -1, 0, START_TIME + ready, 0)
-        self.add('callback_start', start, thread, callback, False)
-        for time in published:
+        self.add('dispatch', start, callback, -1, -1, -1, 0, ns(
+            start if ready is None else ready), 0, thread=thread)
+        self.add('callback_start', start, callback, False, thread=thread)
+        if sent is not None:
             publisher = 101 if callback == GRAB else 102
-            self.add('rclcpp_publish', time, thread, publisher, 0, 0)
-            self.add('rcl_publish', time, thread, publisher, 0)
-        self.add('callback_end', end, thread, callback)
+            self.add('rclcpp_publish', sent, publisher, 0, 0, thread=thread)
+            self.add('rcl_publish', sent, publisher, 0, thread=thread)
+        self.add('callback_end', end, callback, thread=thread)
 
     def takes(self, stamp, time):
         """Take a message for /detect."""
-        self.add('rmw_take', time, 1, 30, 0, START_TIME + stamp, True)
+        self.add('rmw_take', time, 30, 0, ns(stamp), True)
 
-    def detects(self, stamp, taken, took=5 * MS):
-        """Take a message and run /detect for it."""
-        self.takes(stamp, taken)
-        self.runs(RUN, taken + US, taken + 2 * US, taken + 2 * US + took)
+    def detects(self, sent, took=5):
+        """Take a message soon after it was sent, and run /detect for it."""
+        self.takes(sent + 0.009, sent + 0.099)
+        self.runs(RUN, sent + 0.101, sent + 0.101 + took, ready=sent + 0.1)
 
     def result(self, until=None):
         """End the run and return what `mddag replay --json` says of it."""
         if until is None:
             self.file.finish()
         else:
-            end_trace(self.file, START_TIME + until)
-        return self._call('replay', self.path, self.graph, '--json', '-').result
+            self.end(until)
+        return self.call('replay', self.path, self.graph, '--json', '-').result
 
 
 @pytest.fixture
-def run(tmp_path, call):
-    return Run(tmp_path, call)
+def run(tmp_path, graph, call):
+    return Run(tmp_path, graph, call)
+
+
+def of_camera(result, dag='/camera'):
+    return result['dags'][dag]['sinks'][f'/detect:run@{dag}']
 
 
 def undeclared(source, target):
@@ -125,16 +121,16 @@ def test_the_same_run_gets_the_same_verdicts(tmp_path, call):
 
 def test_other_verbs_take_it(run, call):
     for job in range(5):
-        at = job * 100 * MS
-        run.runs(GRAB, at, at, at + 2 * MS, at + MS)
-        run.detects(at + MS + 9 * US, at + MS + 99 * US, (60 if job == 3 else 5) * MS)
-    assert run.result(500 * MS)['warnings'] == []
+        at = job * 100
+        run.runs(GRAB, at, at + 2, at + 1)
+        run.detects(at + 1, 60 if job == 3 else 5)
+    assert run.result(500)['warnings'] == []
     assert call('slack', run.path, run.graph).returncode == 0
     assert call('diff', run.path, run.path, run.graph).returncode == 0
     causes = call('explain', run.path, run.graph, '--json', '-').result['causes']
     assert {cause: n for cause, n in causes.items() if n} == {'ran long': 1}
-    result = call('replay', run.path, run.graph, '--reschedule', '--json', '-').result
-    sink = result['dags']['/camera']['sinks']['/detect:run@/camera']
+    sink = of_camera(call(
+        'replay', run.path, run.graph, '--reschedule', '--json', '-').result)
     assert (sink['completed'], sink['late']) == (5, 1)
 
 
@@ -142,15 +138,13 @@ def test_messages_of_others_are_of_no_job(run):
     # another process publishes while nothing of this one is being sent, or while /camera still
     # runs: its own message has been taken then
     for job in range(4):
-        at = job * 100 * MS
-        run.runs(GRAB, at, at, at + 20 * MS, at + MS)
-        run.detects(at + MS + 9 * US, at + MS + 99 * US)
-        run.detects(at + 10 * MS, at + 10 * MS + 99 * US)
-        run.detects(at + 50 * MS, at + 50 * MS + 99 * US)
-    result = run.result(400 * MS)
-    sink = result['dags']['/camera']['sinks']['/detect:run@/camera']
-    assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (
-        4, 0, 6 * MS + 101 * US)
+        at = job * 100
+        run.runs(GRAB, at, at + 20, at + 1)
+        for sent in (1, 10, 50):
+            run.detects(at + sent)
+    result = run.result(400)
+    sink = of_camera(result)
+    assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (4, 0, 6_101_000)
     assert result['callbacks']['/detect:run']['executions'] == 4
     assert result['undeclared']['executions'] == 8
     warning, = result['warnings']
@@ -161,16 +155,15 @@ def test_messages_of_others_are_of_no_job(run):
 def test_who_published_is_never_guessed(in_order, run):
     # both publish on one topic while both run; messages are taken later
     for job in range(3):
-        at = job * 100 * MS
-        run.runs(GRAB, at, at, at + 20 * MS, at + MS)
-        run.runs(SCAN, at, at, at + 20 * MS, at + 2 * MS)
-        first = at + (MS if in_order else 2 * MS) + 9 * US
-        run.takes(first, at + 30 * MS)
-        run.takes(at + 2 * MS + 10 * US, at + 31 * MS)
-        run.runs(RUN, at + 30 * MS + US, at + 30 * MS + US, at + 32 * MS)
-        run.runs(RUN, at + 31 * MS + US, at + 33 * MS, at + 35 * MS)
-    result = run.result(300 * MS)
-    sinks = [dag['sinks'][f'/detect:run@{name}'] for name, dag in result['dags'].items()]
+        at = job * 100
+        run.runs(GRAB, at, at + 20, at + 1)
+        run.runs(SCAN, at, at + 20, at + 2)
+        run.takes(at + (1 if in_order else 2) + 0.009, at + 30)
+        run.takes(at + 2.01, at + 31)
+        run.runs(RUN, at + 30.001, at + 32)
+        run.runs(RUN, at + 33, at + 35, ready=at + 31.001)
+    result = run.result(300)
+    sinks = [of_camera(result, dag) for dag in result['dags']]
     if in_order:
         assert [sink['response_ns']['max'] for sink in sinks] == [32 * MS, 35 * MS]
         assert [sink['completed'] for sink in sinks] == [3, 3]
@@ -184,32 +177,28 @@ def test_who_published_is_never_guessed(in_order, run):
 def test_the_pieces_of_a_coroutine_are_one_execution(run):
     # /detect awaits something for 30 ms, in every second job for 50 ms
     for job in range(4):
-        at, rest = job * 100 * MS, (50 if job % 2 else 30) * MS
-        run.runs(GRAB, at, at, at + 2 * MS, at + MS)
-        run.takes(at + MS + 9 * US, at + MS + 99 * US)
-        ready = at + MS + 100 * US
-        run.runs(RUN, ready, at + 2 * MS, at + 3 * MS)
-        run.runs(RUN, ready, at + 3 * MS + rest, at + 4 * MS + rest, thread=99)
-    result = run.result(400 * MS)
-    sink = result['dags']['/camera']['sinks']['/detect:run@/camera']
+        at, rest = job * 100, 50 if job % 2 else 30
+        run.runs(GRAB, at, at + 2, at + 1)
+        run.takes(at + 1.009, at + 1.099)
+        run.runs(RUN, at + 2, at + 3, ready=at + 1.1)
+        run.runs(RUN, at + 3 + rest, at + 4 + rest, ready=at + 1.1, thread=99)
+    result = run.result(400)
+    sink = of_camera(result)
     assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (4, 2, 54 * MS)
     mean = sink['breakdown']['mean']
-    assert (mean['executing_ns'], mean['suspended_ns']) == (3 * MS + 100 * US, 40 * MS)
-    assert result['callbacks']['/detect:run']['executions'] == 4
-    assert result['callbacks']['/detect:run']['busy_ns'] == 8 * MS
-    assert result['warnings'] == []
+    assert (mean['executing_ns'], mean['suspended_ns']) == (3_100_000, 40 * MS)
+    use = result['callbacks']['/detect:run']
+    assert (use['executions'], use['busy_ns'], result['warnings']) == (4, 8 * MS, [])
 
 
 def test_a_request_is_released_when_it_was_ready_also_for_a_coroutine(run):
-    run.graph.write_text(GRAPH + """\
-  - node: /detect
-    callbacks: [{name: ask, service: /ask, period: 1s, deadline: 20ms}]
-""")
-    run.add('rcl_service_init', 0, 1, 40, 3, 40, '/ask')
-    run.add('rclcpp_service_callback_added', 0, 1, 40, 14)
-    run.runs(14, 100 * MS, 103 * MS, 104 * MS)
-    run.runs(14, 100 * MS, 120 * MS, 121 * MS)      # resumed
-    run.runs(14, 200 * MS, 201 * MS, 202 * MS)
+    run.graph.write_text(GRAPH.replace('deadline: 40ms}', """deadline: 40ms},
+      {name: ask, service: /ask, period: 1s, deadline: 20ms}"""))
+    run.add('rcl_service_init', 0, 40, 3, 40, '/ask')
+    run.add('rclcpp_service_callback_added', 0, 40, 14)
+    run.runs(14, 103, 104, ready=100)
+    run.runs(14, 120, 121, ready=100)      # resumed
+    run.runs(14, 201, 202, ready=200)
     sink = run.result()['dags']['/detect']['sinks']['/detect:ask']
     assert (sink['completed'], sink['late']) == (2, 1)
     assert (sink['response_ns']['min'], sink['response_ns']['max']) == (2 * MS, 21 * MS)
@@ -218,36 +207,31 @@ def test_a_request_is_released_when_it_was_ready_also_for_a_coroutine(run):
 def test_timers_are_released_on_their_grid_if_they_keep_to_one(run):
     # /camera's timer is noticed 30 ms late once; /radar's is reset all the time
     for job in range(6):
-        at, late = job * 100 * MS, 30 * MS * (job == 2)
-        run.runs(GRAB, at + late, at + late, at + late + 2 * MS, at + late + MS)
-        run.detects(at + late + MS + 9 * US, at + late + MS + 99 * US, 7 * MS)
-        at += 50 * MS + 37 * job * job % 41 * MS
-        run.runs(SCAN, at, at, at + 2 * MS, at + MS)
-        run.detects(at + MS + 9 * US, at + MS + 99 * US, 7 * MS)
-    result = run.result(700 * MS)
-    camera, radar = (result['dags'][name]['sinks'][f'/detect:run@{name}']['breakdown']['worst']
-                     for name in ('/camera', '/radar'))
+        for callback, at in ((GRAB, job * 100 + 30 * (job == 2)),
+                             (SCAN, job * 100 + 50 + 37 * job * job % 41)):
+            run.runs(callback, at, at + 2, at + 1)
+            run.detects(at + 1, 7)
+    result = run.result(700)
+    camera, radar = (of_camera(result, dag)['breakdown']['worst'] for dag in ('/camera', '/radar'))
     assert (camera['job'], camera['release_lag_ns']) == (2, 30 * MS)
     assert radar['release_lag_ns'] == 0
     warning, = result['warnings']
     assert '6 executions of timers off the grid' in warning and '/radar timer' in warning
 
 
-@pytest.mark.parametrize('ready', [-2 ** 63, 2 ** 63 - 1])
+@pytest.mark.parametrize('ready', [-10.9e12, 7.4e12])      # almost the least and greatest int64
 def test_a_damaged_ready_time_affects_its_execution_only(ready, run):
-    for start in range(0, 500 * MS, 100 * MS):
-        run.runs(GRAB, ready - START_TIME if start == 200 * MS else start, start,
-                 start + 2 * MS, start + MS)
-        run.detects(start + MS + 9 * US, start + MS + 99 * US)
-    sink = run.result(500 * MS)['dags']['/camera']['sinks']['/detect:run@/camera']
-    assert sink['completed'] == 5
-    assert sink['late'] == (ready < 0)
+    for at in range(0, 500, 100):
+        run.runs(GRAB, at, at + 2, at + 1, ready=ready if at == 200 else at)
+        run.detects(at + 1)
+    sink = of_camera(run.result(500))
+    assert (sink['completed'], sink['late']) == (5, ready < 0)
 
 
 def test_a_job_that_is_open_at_the_end_is_judged_by_that(run):
-    run.runs(GRAB, 0, 0, 2 * MS, MS)
-    run.add('drop', 3 * MS, 1, RUN, -1, -1, -1, 'qos_depth')
-    result = run.result(80 * MS)
-    sink = result['dags']['/camera']['sinks']['/detect:run@/camera']
+    run.runs(GRAB, 0, 2, 1)
+    run.add('drop', 3, RUN, -1, -1, -1, 'qos_depth')
+    result = run.result(80)
+    sink = of_camera(result)
     assert (sink['completed'], sink['late'], sink['overdue']) == (0, 1, 1)
     assert result['dropped'] == {'qos_depth': 1}
