@@ -40,12 +40,10 @@ GOES_ON = {
     'two': ['first heard five'],
     'own_executor': ['own heard five'],
     'events_executor': ['events heard five'],
-    'spins_in_thread': ['in_thread heard five', 'thread joined'],
-    'spins_once': ['once heard five', 'once ended'],
+    'spins_in_thread': ['in_thread heard five', 'thread joined, ok: False'],
     'spins_once_for_ever': ['for_ever heard five'],
     'steps': ['30 steps'],
     'calls_a_service': ['answer: forty-two'],
-    'ends_in_a_thread': ['timed, ok: False'],
     'catches_signals': ['catcher heard five', 'read the settings again'],
     'handles_a_signal': [
         f'while it worked: signal {signal.SIGUSR1:d}', f'while it spun: signal {signal.SIGUSR1:d}',

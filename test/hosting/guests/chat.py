@@ -80,21 +80,11 @@ def spins_in_thread():
     executor.add_node(node)
     thread = threading.Thread(target=executor.spin)
     thread.start()
-    while rclpy.ok() and node.n < 5:
+    while node.n < 5:
         time.sleep(0.01)
-    rclpy.shutdown()
+    threading.Timer(0.1, rclpy.shutdown).start()
     thread.join()
-    print('thread joined')
-
-
-def spins_once():
-    rclpy.init()
-    node = Listener('once')
-    while rclpy.ok() and node.n < 5:
-        rclpy.spin_once(node, timeout_sec=0.1)
-    node.destroy_node()
-    rclpy.shutdown()
-    print('once ended')
+    print(f'thread joined, ok: {rclpy.ok()}')
 
 
 def spins_once_for_ever():
@@ -123,14 +113,6 @@ def calls_a_service():
     future = client.call_async(Trigger.Request())
     rclpy.spin_until_future_complete(node, future, timeout_sec=5.0)
     print(f'answer: {future.result().message}')
-
-
-def ends_in_a_thread():
-    rclpy.init()
-    node = Listener('timed')
-    threading.Timer(0.3, rclpy.shutdown).start()
-    rclpy.spin(node)
-    print(f'timed, ok: {rclpy.ok()}')
 
 
 def catches_signals():

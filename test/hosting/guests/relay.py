@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes of a chain that pass the stamp of the first message on, for programs of one node each."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -14,22 +12,13 @@ from std_msgs.msg import Header
 ENOUGH = 60
 
 
-def _relay(name: str, topic: str, *publishes: str) -> Node:
-    node = Node(name, start_parameter_services=False, enable_rosout=False)
-    publishers = [node.create_publisher(Header, t, 50) for t in publishes]
-
-    def on_message(message):
-        for publisher in publishers:
-            publisher.publish(Header(stamp=message.stamp, frame_id=name))
-
-    node.create_subscription(
-        Header, topic, on_message, 50, callback_group=ReentrantCallbackGroup())
-    return node
+def make(name):
+    return Node(name, start_parameter_services=False, enable_rosout=False)
 
 
-def sensor() -> Node:
+def sensor():
     """Publish with the time of the callback, once those who are to get it are there."""
-    node = Node('sensor', start_parameter_services=False, enable_rosout=False)
+    node = make('sensor')
     publisher = node.create_publisher(Header, '/raw', 50)
 
     def tick():
@@ -40,27 +29,33 @@ def sensor() -> Node:
     return node
 
 
-def first() -> Node:
-    """Relay /raw to /half."""
-    return _relay('first', '/raw', '/half')
+def relay(name, topic, to):
+    node = make(name)
+    publisher = node.create_publisher(Header, to, 50)
+    node.create_subscription(
+        Header, topic, publisher.publish, 50, callback_group=ReentrantCallbackGroup())
+    return node
 
 
-def second() -> Node:
-    """Relay /half to /whole."""
-    return _relay('second', '/half', '/whole')
+def first():
+    return relay('first', '/raw', '/half')
 
 
-def last() -> list[Node]:
+def second():
+    return relay('second', '/half', '/whole')
+
+
+def last():
     """Take /whole; make a mark when there have been enough."""
-    node = _relay('last', '/whole')
-    counts = [0]
+    node = make('last')
+    numbers = iter(range(1, 10 ** 6))
 
     def on_message(message):
-        counts[0] += 1
-        if counts[0] == ENOUGH:
+        if next(numbers) == ENOUGH:
             Path(os.environ['RELAY_MARK']).touch()
 
+    node.create_subscription(Header, '/whole', on_message, 50)
     # also on a topic of the graph, but of a node that the graph does not have
-    watch = Node('watch', start_parameter_services=False, enable_rosout=False)
-    watch.create_subscription(Header, '/whole', on_message, 50)
+    watch = make('watch')
+    watch.create_subscription(Header, '/whole', lambda message: None, 50)
     return [node, watch]
