@@ -97,10 +97,7 @@ def _answer(
 
 
 def signal_at_end_of(parent: int, which: signal.Signals) -> None:
-    """Let the kernel send this process a signal when its parent ends, on Linux."""
-    try:
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, which)
-    except (AttributeError, OSError):
-        return
+    """Let the kernel send this process a signal when its parent ends."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, which)
     if os.getppid() != parent:  # it has ended already
         os.kill(os.getpid(), which)

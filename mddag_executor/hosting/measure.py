@@ -206,9 +206,7 @@ def totals(sinks: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> dict[str, Any]:
     """Return one sink's verdicts about the deadlines within ]start, end]."""
     deadline, period = vertex.deadline_ns or 0, dag.period_ns
-    first = ledger.first_release.get(dag.name)
-    if first is None:
-        return judge_sink(deadline, (), {})
+    first = ledger.first_release[dag.name]
     completed: dict[int, int] = {}
     for release, completion in ledger.completions[vertex.name]:
         job = (release - first + min(_EARLY_NS, period // 4)) // period
@@ -247,7 +245,7 @@ def _throughput(
     seconds = (end.at_ns - start.at_ns) / 1e9
     return {
         'callbacks': callbacks,
-        'callbacks_per_s': callbacks / seconds if seconds > 0 else 0.0,
+        'callbacks_per_s': callbacks / seconds,
         'cpu_us_per_callback': max(0, cpu) / 1000 / callbacks if callbacks else None}
 
 

@@ -65,7 +65,7 @@ class ProcessError(MddagError):
 
 
 def belong_to_parent(parent: int) -> None:
-    """Ignore Ctrl-C, which the parent passes on, and end when the parent ends (on Linux)."""
+    """Ignore Ctrl-C, which the parent passes on, and end when the parent ends."""
     os.setpgrp()
     signal_at_end_of(parent, signal.SIGTERM)
 
@@ -261,10 +261,7 @@ class Part:
 
     def leave(self, result: Any) -> None:
         """Store the result of this process in the folder."""
-        path = self.folder / f'{os.getpid()}.json'
-        part = path.with_suffix('.part')
-        part.write_text(json.dumps(result, default=list))
-        part.replace(path)
+        _write(self.folder / f'{os.getpid()}.json', json.dumps(result, default=list))
 
     @staticmethod
     def ended(folder: str, name: str) -> None:
@@ -296,15 +293,19 @@ class Part:
 
     def _come_to(self, step: str, name: str, names: Sequence[str], session: Session) -> int:
         """Wait until all processes have reached a step; return when the last one did."""
-        own = self.folder / f'{name}.{step}'
-        part = own.with_suffix('.part')
-        part.write_text(str(time.monotonic_ns()))
-        part.replace(own)
+        _write(self.folder / f'{name}.{step}', str(time.monotonic_ns()))
         paths = [self.folder / f'{each}.{step}' for each in names]
         while not (all(path.exists() for path in paths) or self._is_left_alone()):
             if session.wait(0.01):
                 break
         return max(int(path.read_text()) for path in paths if path.exists())
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file that others never see half written."""
+    part = path.with_suffix('.part')
+    part.write_text(text)
+    part.replace(path)
 
 
 def left(folder: str, pid: int) -> Any:

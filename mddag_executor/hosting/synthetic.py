@@ -35,7 +35,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import threading
 import time
 from typing import Any
@@ -97,39 +97,35 @@ def stamped(release: int, sender: str = '') -> Header:
     return message
 
 
+@dataclass(eq=False)
 class Role:
     """
     A callback as one vertex, and its actions for a message of that DAG.
 
     :ivar senders: the ``frame_id`` of the messages that it waits for.
+    :ivar n_legs: of a sync the number of messages that it joins.
+    :ivar sender: the ``frame_id`` of the messages that it publishes.
     :ivar waiting: of a sync the incomplete joins: the received messages (topic and sender), by
-        release; ``n_legs`` are needed.
-    :param sender: the ``frame_id`` of the messages that it publishes.
+        release.
     """
 
-    def __init__(
-        self, vertex: Vertex, senders: list[str], n_legs: int, sender: str, execution_ns: int,
-        publishers: list[Publisher], emulate: Emulate, ledger: Ledger,
-    ) -> None:
-        self.vertex = vertex
-        self.senders = senders
-        self.waiting: dict[int, set[tuple[str, str]]] = {}
-        self._n_legs = n_legs
-        self._ledger = ledger
-        self._sender = sender
-        self._execution_ns = execution_ns
-        self._publishers = publishers
-        self._emulate = emulate
-        self._durations = ledger.durations[vertex.name]
-        self._completions = ledger.completions.get(vertex.name)
-        self._lock = threading.Lock()
+    vertex: Vertex
+    senders: list[str]
+    n_legs: int
+    sender: str
+    execution_ns: int
+    publishers: list[Publisher]
+    emulate: Emulate
+    ledger: Ledger
+    waiting: dict[int, set[tuple[str, str]]] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def is_whole(self, release: int, leg: tuple[str, str]) -> bool:
         """Note a message of a sync; return whether it was the last one of its job."""
         with self._lock:
             seen = self.waiting.setdefault(release, set())
             seen.add(leg)
-            if len(seen) == self._n_legs:
+            if len(seen) == self.n_legs:
                 del self.waiting[release]
                 return True
             if len(self.waiting) > JOIN_LIMIT:
@@ -138,16 +134,16 @@ class Role:
 
     def execute(self, message: Header, release: int) -> None:
         """Execute the body, publish, and note the completion of a sink."""
-        monotonic_ns = time.monotonic_ns
-        start = monotonic_ns()
-        self._emulate(self._execution_ns)
-        self._ledger.note(self._durations, monotonic_ns() - start)
-        message.frame_id = self._sender
-        for publisher in self._publishers:
+        ledger, name = self.ledger, self.vertex.name
+        start = time.monotonic_ns()
+        self.emulate(self.execution_ns)
+        ledger.note(ledger.durations[name], time.monotonic_ns() - start)
+        message.frame_id = self.sender
+        for publisher in self.publishers:
             publisher.publish(message)
-        if self._completions is not None:
-            self._ledger.note(
-                self._completions, (release, monotonic_ns() + self._ledger.clock_offset_ns))
+        if name in ledger.completions:
+            ledger.note(ledger.completions[name], (
+                release, time.monotonic_ns() + ledger.clock_offset_ns))
 
 
 class Grid:
@@ -197,29 +193,18 @@ def callback_of(
         release = header_stamp(message)
         if is_sync and not role.is_whole(release, (topic, message.frame_id)):
             return
-        if current_job is not no_job:
-            release = attributed(role, release, ledger, current_job)
-            if not role.vertex.predecessors:
-                message = stamped(release)
+        job = current_job()
+        if job is None:
+            if current_job is not no_job:
+                ledger.note(ledger.unattributed, role.vertex.name)
+        elif not role.vertex.predecessors:
+            release = job.release_ns  # of a source the executor's
+            message = stamped(release)
+        elif abs(job.release_ns - release) > ledger.tolerance_ns:
+            ledger.note(ledger.misattributed, (role.vertex.name, release, job.release_ns))
         role.execute(message, release)
 
     return on_message
-
-
-def attributed(role: Role, release: int, ledger: Ledger, current_job: CurrentJob) -> int:
-    """
-    Compare the release in a message with the job that the executor runs it as.
-
-    :return: of a source the executor's release, otherwise the message's.
-    """
-    job = current_job()
-    if job is None:
-        ledger.note(ledger.unattributed, role.vertex.name)
-    elif not role.vertex.predecessors:
-        return int(job.release_ns)
-    elif abs(job.release_ns - release) > ledger.tolerance_ns:
-        ledger.note(ledger.misattributed, (role.vertex.name, release, job.release_ns))
-    return release
 
 
 @dataclass

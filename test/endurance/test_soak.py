@@ -25,7 +25,7 @@ def test_a_short_soak_loses_nothing_and_keeps_nothing():
     assert [line for line in result['failed'] if 'deadlines missed' not in line] == [], said
     faults = result['faults']
     assert faults['raised'] == faults['raise'] + 1
-    assert sum(faults.values()) - faults['raised'] == result['clean_windows'] >= 2
+    assert sum(faults.values()) - faults['raised'] == result['clean_windows'] >= 1
     assert result['ran'] > 10_000 and result['jobs'] > 2_000
     # one that was made ready by the last tick of the simulated time may still wait
     assert 0 <= result['ready'] - result['ran'] - result['dropped'] <= 2
