@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded
-from mddag_executor.cli.text import warn
+from mddag_executor.cli.text import printable, warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
@@ -45,6 +45,8 @@ def main(args: argparse.Namespace) -> int:
         source.check_deadlines()
     outcome = recorded.as_recorded(source, 'explaining', args.skip, args.begin, args.end)
     sink = None if args.sink is None else _sink(args.sink, outcome.task_set)
+    if args.job is not None:
+        _check_job(args.job, outcome, sink)
     warn(*outcome.warnings)
     result = outcome.explanation.result(sink, args.job)
     every = sink is None and args.job is None
@@ -64,6 +66,19 @@ def _sink(name: str, task_set: TaskSet) -> int:
         raise UsageError(f'--sink: there is no sink {shown(name)}: ' + did_you_mean(
             name, sinks, 'mddag graph check lists them'))
     return sinks[meant[0]]
+
+
+def _check_job(job: int, outcome: Replay, sink: int | None) -> None:
+    """Check that a job is in the recording: one that leads to the sink, if that is given."""
+    judged, vertices = outcome.judged, outcome.task_set.vertices
+    dags = judged.jobs if sink is None else [judged.jobs[vertices[sink].dag]]
+    numbers = {number for jobs in dags for number in jobs.number.tolist()}
+    if job not in numbers:
+        raise UsageError(
+            f'--job: there is no job {job}' + (
+                '' if sink is None else f' of {printable(vertices[sink].name)}') + (
+                f': choose one from {min(numbers)} to {max(numbers)}' if numbers
+                else ', since no job was released: leave --job out'))
 
 
 def _lines(outcome: Replay) -> Iterator[str]:

@@ -192,7 +192,7 @@ class SinkTally:
         self.overdue = 0
         self.shortest: int | None = None
         self.longest: int | None = None
-        self.responses = Latest(keep)
+        self.responses: Any = Latest(keep)
 
     def done(self, response: int, late: bool) -> None:
         """Count a completion."""
@@ -275,6 +275,35 @@ class Tally:
                 if kind != SINK_IN_TIME:
                     self._add_miss(kind, dag, vertex, job, deadline, time)
 
+    def add_sink(
+        self, vertex: int, kinds: Sequence[int], responses: Sequence[int], missed: Iterable[int],
+    ) -> None:
+        """
+        Count all results of a sink at once.
+
+        :param kinds: the number of its results, by kind of decision.
+        :param responses: the ascending response times of its completed jobs, ns.
+        :param missed: the jobs that missed.
+        """
+        sink = self.sinks[vertex]
+        sink.completed = kinds[SINK_IN_TIME] + kinds[SINK_LATE]
+        sink.late, sink.overdue = kinds[SINK_LATE] + kinds[SINK_MISSED], kinds[SINK_MISSED]
+        sink.expired, sink.failed, sink.aborted, sink.dropped = (
+            kinds[kind] for kind in (SINK_EXPIRED, SINK_FAILED, SINK_ABORTED, SINK_DROPPED))
+        if responses:
+            sink.shortest, sink.longest = responses[0], responses[-1]
+        sink.responses = responses
+        if vertex in self.windows:
+            for job in missed:
+                self.windows[vertex].add(job)
+
+    def add_first_miss(
+        self, kind: int, vertex: int, job: int, deadline: int, completed: int
+    ) -> None:
+        """Note the miss with the earliest deadline."""
+        self.first_miss = self._miss(
+            vertex, job, deadline, completed if kind == SINK_LATE else None)
+
     def _end_overdue(self, vertex: int, job: int) -> None:
         """Let the verdict of a sink replace its overdue state."""
         if self.overdue.pop((vertex, job), None) is not None:
@@ -299,8 +328,7 @@ class Tally:
         elif kind == SINK_DROPPED:
             sink.dropped += 1
         if self.first_miss is None or deadline < self.first_miss['deadline_ns']:
-            self.first_miss = self._miss(
-                vertex, job, deadline, time if kind == SINK_LATE else None)
+            self.add_first_miss(kind, vertex, job, deadline, time)
 
     def _miss(
         self, vertex: int, job: int, deadline: int, completed: int | None

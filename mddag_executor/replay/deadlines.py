@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any, cast, NamedTuple
+from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER, Scheduler, Tables, Tally
 from mddag_executor.core.state import (
@@ -377,27 +377,15 @@ class Judged:
             for end, n in Counter(outcome[over].tolist()).items():
                 tally.ends[dag][end] += n
         for v, mine in zip(self.tables.sinks, self.by_sink()):
-            sink = tally.sinks[v]
-            kinds = np.bincount(mine['kind'], minlength=SINK_DROPPED + 1).tolist()
-            sink.completed = kinds[SINK_IN_TIME] + kinds[SINK_LATE]
-            sink.demoted = demoted[v]
-            sink.late, sink.overdue = kinds[SINK_LATE] + kinds[SINK_MISSED], kinds[SINK_MISSED]
-            sink.expired, sink.failed, sink.aborted, sink.dropped = (
-                kinds[kind] for kind in (SINK_EXPIRED, SINK_FAILED, SINK_ABORTED, SINK_DROPPED))
-            done = mine[mine['completed'] >= 0]
-            responses = np.sort(done['completed'] - done['release'])
-            if len(responses):
-                sink.shortest, sink.longest = int(responses[0]), int(responses[-1])
-            sink.responses = cast(Any, memoryview(responses))
-            if v in tally.windows:
-                for job in np.sort(mine['job'][mine['kind'] != SINK_IN_TIME]).tolist():
-                    tally.windows[v].add(job)
+            tally.sinks[v].demoted = demoted[v]
+            done = mine['completed'] >= 0
+            tally.add_sink(
+                v, np.bincount(mine['kind'], minlength=SINK_DROPPED + 1).tolist(),
+                memoryview(np.sort((mine['completed'] - mine['release'])[done])),
+                np.sort(mine['job'][mine['kind'] != SINK_IN_TIME]).tolist())
         for first in self.missed[:1]:
-            tally.first_miss = {
-                'dag': self.task_set.dags[int(first['dag'])].name,
-                'vertex': tally.vertex_name(int(first['sink'])), 'job': int(first['job']),
-                'deadline_ns': int(first['deadline']),
-                'completed_ns': int(first['completed']) if first['kind'] == SINK_LATE else None}
+            tally.add_first_miss(*(int(first[name]) for name in (
+                'kind', 'sink', 'job', 'deadline', 'completed')))
         return tally
 
     def by_sink(self) -> Iterator[Table]:

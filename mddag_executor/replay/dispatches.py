@@ -19,13 +19,15 @@ An execution that holds the GIL also waited until the previous one had released 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from mddag_executor.recording.tables import Ints, Mask
 import numpy as np
 
 
 def dispatch_times(
     n_workers: int, worker: Ints, group: Ints, ready: Ints, start: Ints, end: Ints,
-    process: Ints, holding: Mask,
+    processes: Iterable[Ints], holding: Mask,
 ) -> Ints:
     """
     Return the dispatch times of executions, ns.
@@ -35,16 +37,18 @@ def dispatch_times(
     :param n_workers: number of workers of each process.
     :param worker: the worker of each execution, -1: unknown.
     :param group: number of its mutually exclusive callback group, or -1.
+    :param processes: the executions of each process.
     :param holding: whether it holds the GIL.
     """
     free = np.maximum(ready, _end_before(group, end))
     could = np.maximum(free, _end_before(worker, end))
-    for number in np.unique(process).tolist():
-        here = process == number
-        n_free, n_ended = (
-            np.searchsorted(np.sort(times[here]), free, 'right') for times in (free, end))
-        could = np.where(here & (n_free - n_ended <= n_workers), free, could)
-        mine = np.flatnonzero(here & holding)
+    for mine in processes:
+        waiting = mine[free[mine] < could[mine]]
+        n_free, n_ended = (np.searchsorted(np.sort(times[mine]), free[waiting], 'right')
+                           for times in (free, end))
+        at_once = waiting[n_free - n_ended <= n_workers]
+        could[at_once] = free[at_once]
+        mine = mine[holding[mine]]
         place = np.searchsorted(end[mine], start[mine], 'right') - 1
         could[mine] = np.maximum(could[mine], np.where(place >= 0, end[mine][place], 0))
     late: Ints = np.maximum(0, start - could)

@@ -46,7 +46,16 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.recording import tables as recorded_tables
-from mddag_executor.recording.tables import Ints, look_up, Recording, sort_by
+from mddag_executor.recording.tables import (
+    in_parts,
+    Ints,
+    look_up,
+    pick,
+    Recording,
+    rows_by,
+    sort_by,
+    Table,
+)
 from mddag_executor.replay.dispatches import dispatch_times
 from mddag_executor.replay.spans import crowded, Spans
 from mddag_executor.replay.usage import ran
@@ -145,7 +154,7 @@ class LoadBuilder:
         self._failed: set[tuple[int, int]] = set()
         self._skipped: set[tuple[int, int]] = set()
         releases = recording.releases[sort_by(recording.releases['order'])]
-        of_dag = [releases[releases['dag'] == dag.index] for dag in task_set.dags]
+        of_dag = [releases[mine] for mine in rows_by(releases['dag'], len(task_set.dags))]
         self._jobs = [_Jobs(dag, n, mine['job'].copy()) for dag, n, mine in zip(
             task_set.dags, edges_of(tables), of_dag)]
         # by kind of column and DAG: the values of each job, and where they begin
@@ -153,6 +162,10 @@ class LoadBuilder:
             [jobs.widths for jobs in self._jobs], dtype=np.int64).reshape(-1, 3).T
         counts = np.array([len(jobs.numbers) for jobs in self._jobs], dtype=np.int64)
         self._begins = np.cumsum(np.pad(self._widths * counts, ((0, 0), (1, 0))), axis=1)
+        # by kind of column and vertex: its place in the first job, and the step to the next job
+        dag_of = np.array(tables.dag_of[:tables.n_vertices], dtype=np.int64)
+        self._base, self._step = self._begins[:, dag_of], self._widths[:, dag_of]
+        self._base[_VERTEX] += np.array(tables.index_in_dag[:tables.n_vertices], dtype=np.int64)
         self._whole: dict[str, Any] = {}
         for name, (by, kind) in _COLUMNS.items():
             self._whole[name] = np.full(self._begins[by, -1], _UNKNOWN, dtype=kind)
@@ -163,11 +176,9 @@ class LoadBuilder:
             jobs.noticed[:] = np.maximum(mine['release'], mine['noticed'])
         self._job_ends()
         table = recording.executions
-        dag = table['dag'].astype(np.int64)
         # by execution the row of its job
         self._row = np.full(len(table), _UNKNOWN)
-        for number, jobs in enumerate(self._jobs):
-            mine = np.flatnonzero(dag == number)
+        for jobs, mine in zip(self._jobs, rows_by(table['dag'], len(self._jobs))):
             self._row[mine] = look_up(jobs.numbers, table['job'][mine])
         self._take_pieces(n_workers)
         self._take_completions()
@@ -176,9 +187,8 @@ class LoadBuilder:
 
     def _places(self, by: int, row: Any, vertex: Any) -> Ints:
         """Return the places of vertices of jobs in a kind of column (``_EDGE``: of edge 0)."""
-        dag = np.array(self._tables.dag_of)[vertex]
-        place: Ints = self._begins[by][dag] + row * self._widths[by][dag]
-        return place if by != _VERTEX else place + vertex - np.array(self._first)[dag]
+        place: Ints = self._base[by][vertex] + row * self._step[by][vertex]
+        return place
 
     def _job_ends(self) -> None:
         """Keep failed and skipped executions: they fail or are skipped again."""
@@ -196,62 +206,67 @@ class LoadBuilder:
         """Find the dispatch times of pieces; keep undeclared pieces."""
         table = self._recording.executions
         rows = ran(table)
-        piece = table[rows]
-        vertex, row = piece['vertex'].astype(np.int64), self._row[rows]
-        first, ready = piece['piece'] == 0, piece['ready'].copy()
-        process = np.array(self._process, dtype=np.int64)[vertex]
-        self._find_turns(piece, process)
-        source = np.flatnonzero((row >= 0) & np.isin(vertex, self._tables.source[:-1]))
-        turn = self._whole['turn'][self._places(_JOB, row[source], vertex[source])]
-        ready[source] = np.where(turn >= 0, turn, ready[source])
-        self._late = dispatch_times(
-            n_workers, piece['worker'].astype(np.int64), self._groups(piece['callback'], vertex),
-            np.where(first, ready, piece['start']), piece['start'], piece['end'], process,
-            piece['holds_gil'] & (piece['cpu'] >= 0) & (
-                piece['completes'] == recorded_tables.VERTEX))
-        numbers = np.arange(len(rows))
+        vertex, piece, ready, start, end, worker, holds, cpu, completes = _columns(
+            table, rows, 'vertex', 'piece', 'ready', 'start', 'end', 'worker', 'holds_gil', 'cpu',
+            'completes')
+        row, first = self._row[rows], piece == 0
+        process = np.array(self._process, dtype=np.int16)[vertex]
+        members = [(number, np.flatnonzero(process == number))
+                   for number in sorted(set(self._process))]
+        for number, mine in members:
+            self._find_turns(number, start[mine], end[mine])
+        ready[~first] = start[~first]
         others = np.flatnonzero(vertex < 0)
         # ready, duration, dispatch or -1: undeclared callbacks, and legs that completed nothing
-        self._others = np.column_stack((
-            np.where(first, piece['ready'], piece['start']), piece['end'] - piece['start'],
-            numbers))[others]
-        declared = np.flatnonzero(vertex >= 0)
-        some, at = np.unique(vertex[declared], return_index=True)
+        self._others = [np.column_stack((ready[others], (end - start)[others], others))]
+        source = np.flatnonzero((row >= 0) & np.isin(vertex, self._tables.source[:-1]))
+        turn = self._whole['turn'][self._places(_JOB, row[source], vertex[source])]
+        known = first[source] & (turn >= 0)
+        ready[source[known]] = turn[known]
+        self._late = dispatch_times(
+            n_workers, worker, self._groups(rows, vertex), ready, start, end,
+            [mine for _, mine in members],
+            holds & (cpu >= 0) & (completes == recorded_tables.VERTEX))
+        ran_as = np.full(self._tables.n_vertices + 1, _UNKNOWN)
+        ran_as[vertex[::-1]] = rows[::-1]     # the first one is written last
         #: By global vertex: the address of the callback that ran as it.
-        self.callback_of: dict[int, int] = dict(zip(
-            some.tolist(), piece['callback'][declared[at]].tolist()))
+        self.callback_of: dict[int, int] = {
+            v: int(table['callback'][at]) for v, at in enumerate(ran_as[:-1].tolist()) if at >= 0}
         mine = np.flatnonzero(first & (row >= 0) & (vertex >= 0))
         self._whole['dispatch'][self._places(_VERTEX, row[mine], vertex[mine])] = mine
 
-    def _find_turns(self, piece: Any, process: Ints) -> None:
+    def _find_turns(self, process: int, start: Ints, end: Ints) -> None:
         """
         Find the timers that were noticed right after the end of an execution: ``turn``.
 
         ``busy`` says whether any execution ran at the release.
-        """
-        for number in np.unique(process).tolist():
-            here = process == number
-            start, end = np.sort(piece['start'][here]), piece['end'][here]
-            for source, timer, jobs in zip(self._tables.source, self._timer, self._jobs):
-                if not timer or self._process[source] != number:
-                    continue
-                ended = end[np.maximum(0, np.searchsorted(end, jobs.noticed, 'right') - 1)]
-                begun = np.searchsorted(start, jobs.noticed) - np.searchsorted(start, ended)
-                known = (ended >= jobs.release) & (ended <= jobs.noticed) & (begun == 0)
-                jobs.turn[known] = ended[known]
-                jobs.busy[:] = np.searchsorted(start, jobs.release, 'right') > np.searchsorted(
-                    end, jobs.release, 'right')
 
-    def _groups(self, callback: Any, vertex: Ints) -> Ints:
-        """Return numbers of the mutually exclusive groups of pieces, or -1."""
-        different, which = np.unique(callback, return_inverse=True)
+        :param start: of the executions of a process; ``end``: likewise, ascending.
+        """
+        start = np.append(np.sort(start), NEVER)
+        for source, timer, jobs in zip(self._tables.source, self._timer, self._jobs):
+            if not timer or self._process[source] != process or not len(end):
+                continue
+            ended = end[np.maximum(0, np.searchsorted(end, jobs.noticed, 'right') - 1)]
+            known = (ended >= jobs.release) & (ended <= jobs.noticed) & (
+                start[np.searchsorted(start, ended)] >= jobs.noticed)
+            jobs.turn[known] = ended[known]
+            jobs.busy[:] = np.searchsorted(start, jobs.release, 'right') > np.searchsorted(
+                end, jobs.release, 'right')
+
+    def _groups(self, rows: Ints, vertex: Ints) -> Ints:
+        """Return numbers of the mutually exclusive groups of executions, or -1."""
         known = self._recording.who.groups
-        group = np.array([known.get(each, _UNTOLD) for each in different.tolist()],
-                         dtype=np.int64)[which]
-        declared = np.array([*self._tables.group[:self._tables.n_vertices], -1])[vertex]
-        unknown = (group == _UNTOLD) & (declared >= 0)
-        group[unknown] = max(0, *known.values(), 0) + 1 + declared[unknown]
-        return np.maximum(group, -1)
+        callbacks, which = self._recording.callbacks()
+        group_of = [known.get(each, _UNTOLD) for each in callbacks.tolist()]
+        # small numbers, which are sorted fast: recorded groups, then declared ones
+        numbers = {each: n for n, each in enumerate({g for g in group_of if g >= 0})}
+        group = np.array([numbers.get(each, each) for each in group_of], dtype=np.min_scalar_type(
+            -2 - len(numbers) - self._tables.n_groups))[which[rows]]
+        unknown = np.flatnonzero(group == _UNTOLD)
+        declared = np.array([*self._tables.group[:self._tables.n_vertices], -1])[vertex[unknown]]
+        group[unknown] = np.where(declared >= 0, len(numbers) + declared, -1)
+        return group
 
     def _take_completions(self) -> None:
         """Note the execution times of executions that completed a vertex."""
@@ -264,29 +279,34 @@ class LoadBuilder:
         width = int(n_legs.max(initial=1))
         edges = np.array([[*each, *[-1] * (width - len(each))] for each in self._edges_into]
                          or [[-1]])
-        done, row, whole = table[rows], self._row[rows], self._whole
-        vertex = done['vertex'].astype(np.int64)
-        leg = np.where(done['leg'] < 0, n_legs[vertex] - 1, done['leg'])
-        edge = np.where(leg < width, edges[vertex, np.minimum(leg, width - 1)], -1)
-        known = edge >= 0
-        whole['arrived'][self._places(_EDGE, row[known], vertex[known]) + edge[known]] = done[
-            'ready'][known]
-        ended = done['completes'] == recorded_tables.VERTEX
-        part = done[~ended]
-        self._others = np.concatenate([self._others, np.column_stack((
-            part['ready'], part['busy'], np.full(len(part), _UNKNOWN)))])
-        place = self._places(_VERTEX, row[ended], vertex[ended])
-        for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
-                             ('start', 'began'), ('end', 'end')):
-            whole[name][place] = done[column][ended]
-        at_once = ended & (done['leg'] == recorded_tables.ALL_LEGS) & (n_legs[vertex] > 1)
-        for v in np.unique(vertex[at_once]).tolist():
-            self._all_at_once(self._jobs[self._tables.dag_of[v]], row[at_once & (vertex == v)],
+        together: list[Ints] = []   # rows of executions for several legs
+        for part in in_parts(rows):
+            done, row = pick(table, part), self._row[part]
+            vertex, ready = done['vertex'].copy(), done['ready'].copy()
+            leg = np.where(done['leg'] < 0, n_legs[vertex] - 1, done['leg'])
+            edge = np.where(leg < width, edges[vertex, np.minimum(leg, width - 1)], -1)
+            known = edge >= 0
+            self._whole['arrived'][
+                self._places(_EDGE, row[known], vertex[known]) + edge[known]] = ready[known]
+            ended = done['completes'] == recorded_tables.VERTEX
+            others = done[~ended]
+            self._others.append(np.column_stack((
+                others['ready'], others['busy'], np.full(len(others), _UNKNOWN))))
+            place = self._places(_VERTEX, row[ended], vertex[ended])
+            for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
+                                 ('start', 'began'), ('end', 'end')):
+                self._whole[name][place] = done[column][ended]
+            together.append(part[
+                ended & (done['leg'] == recorded_tables.ALL_LEGS) & (n_legs[vertex] > 1)])
+            source = np.flatnonzero(ended & ~known)
+            place = self._places(_JOB, row[source], vertex[source])
+            later = ready[source] >= self._whole['release'][place]
+            self._whole['noticed'][place[later]] = ready[source[later]]
+        every = np.concatenate(together) if together else rows
+        vertex = table['vertex'][every]
+        for v in np.unique(vertex).tolist():
+            self._all_at_once(self._jobs[self._tables.dag_of[v]], self._row[every[vertex == v]],
                               self._edges_into[v])
-        source = np.flatnonzero(ended & ~known)
-        place = self._places(_JOB, row[source], vertex[source])
-        later = done['ready'][source] >= whole['release'][place]
-        whole['noticed'][place[later]] = done['ready'][source[later]]
 
     def _all_at_once(self, jobs: _Jobs, rows: Ints, edges: list[int]) -> None:
         """If one execution completes all legs, only the last message's time is known."""
@@ -348,7 +368,8 @@ class LoadBuilder:
         demand, executions = int(took.sum()), len(took)
         if overheads:
             took += late
-        others = self._others[sort_by(*self._others.T)]
+        others = np.concatenate(self._others)
+        others = others[sort_by(*others.T)]
         more = np.zeros(len(others), dtype=np.int64)
         number = others[:, 2]
         costs = np.concatenate([took, np.maximum(0, others[:, 1]) + np.where(
@@ -545,3 +566,13 @@ class LoadBuilder:
             if len(times):
                 typical[key] = quantile(memoryview(times), 0.5)
         return typical
+
+
+def _columns(table: Table, rows: Ints, *names: str) -> list[Any]:
+    """Return columns of the chosen rows, contiguous."""
+    found: list[Any] = [np.empty(len(rows), dtype=table.dtype[name]) for name in names]
+    for part, *columns in zip(in_parts(rows), *map(in_parts, found)):
+        some = pick(table, part)
+        for column, name in zip(columns, names):
+            column[:] = some[name]
+    return found

@@ -203,7 +203,7 @@ class Memory:
         if length == 0:
             return np.empty((0, width), dtype=np.int64)
         data = (ctypes.c_int64 * (length * width)).from_address(address)
-        return np.ctypeslib.as_array(data).reshape(length, width).copy()
+        return np.array(data, dtype=np.int64).reshape(length, width)
 
 
 class Rows(Sequence[tuple[int, ...]]):
