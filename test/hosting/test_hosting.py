@@ -21,13 +21,48 @@ import rclpy.experimental
 from rclpy.node import Node
 
 from ..cli import golden
-from .conftest import wait_for
-from .workspace import GRAPH, make_workspace
+from .conftest import GUESTS, wait_for
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - node: /talker
+    callbacks: [{name: tick, timer: 50ms, publishes: [/chatter]}]
+  - node: /listener
+    callbacks: [{name: heard, subscription: /chatter, deadline: 50ms}]
+"""
 
 
 @pytest.fixture
 def world(tmp_path, monkeypatch):
-    return make_workspace(tmp_path, monkeypatch)
+    """Go to a workspace with an ament package and modules that people could have written."""
+    prefix = tmp_path / 'ws'
+    index = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    index.mkdir(parents=True)
+    (index / 'chat_nodes').touch()
+    (index / 'empty_nodes').touch()
+    library = prefix / 'lib' / 'chat_nodes'
+    library.mkdir(parents=True)
+    for name, text in {
+        'talker': '#!/usr/bin/env python3\n' + (GUESTS / 'talker.py').read_text(),
+        'shell': '#!/bin/sh\nexit 0\n', 'broken.py': 'def (\n', 'native': '\x7fELF\x02\x01',
+    }.items():
+        (library / name).write_text(text)
+        (library / name).chmod(0o755)
+    site = tmp_path / 'site'
+    site.mkdir()
+    (site / 'chat.py').write_text((GUESTS / 'chat.py').read_text())
+    (site / 'half.py').write_text('import not_installed_anywhere\n')
+    (site / 'wrong.py').write_text('x = 1\nraise RuntimeError("no licence\\nhere")\n')
+    (tmp_path / 'graph.yaml').write_text(GRAPH)
+    # Before what is there: rclpy and this package may come from a sourced ROS or workspace.
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(prefix), prepend=os.pathsep)
+    monkeypatch.setenv('PYTHONPATH', str(site), prepend=os.pathsep)
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.chdir(tmp_path)
+    for name in ('chat', 'half', 'wrong'):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return tmp_path
 
 
 def heard(result):

@@ -20,10 +20,9 @@ from msg_graph import loads
 import pytest
 
 from ..conftest import wait_for_run
+from .conftest import GUESTS, TWO_PROCESSES
 from .test_supervisor import Idle
-from .workspace import TWO_PROCESSES
 
-GUESTS = Path(__file__).resolve().parent / 'guests'
 CHAIN = """\
 mddag: 1
 workers: 2

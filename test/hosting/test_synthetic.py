@@ -15,7 +15,7 @@ from msg_graph import loads
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
-from .workspace import TWO_PROCESSES
+from .conftest import TWO_PROCESSES
 
 MS = 1_000_000
 

@@ -375,18 +375,6 @@ def test_a_callback_destroys_its_node(bag, graph):
     assert [number for _, number in seen] == [0, 1, 2, 3]
 
 
-def test_what_a_callback_raises_after_the_end_is_a_warning(bag, graph):
-    def take(node, number):
-        if number == 19:
-            node.get_clock().sleep_for(Duration(seconds=1))
-            raise ValueError('woken too early')
-
-    _, result = run_filter(bag, graph, take)
-    warning, = result.warnings
-    assert warning.startswith(
-        '/filter:take: after the end of the run it raised ValueError: woken too early, ')
-
-
 def test_a_circle_that_takes_no_time(bag, graph, monkeypatch):
     monkeypatch.setattr('mddag_executor.rerun.loop.MOST_AT_ONCE', 500)
 

@@ -78,14 +78,6 @@ def test_services_of_later_programs_are_waited_for_without_delay(bag, graph):
     assert seen == [*range(20)]
 
 
-@pytest.mark.parametrize('wait, what', [
-    (lambda node: node.create_client(Trigger, '/none').wait_for_service(), 'service /none'),
-    (lambda node: ActionClient(node, Fibonacci, '/none').wait_for_server(), 'action /none')])
-def test_a_callback_that_still_waits_is_named(bag, graph, wait, what):
-    _, result = run_filter(bag, graph, lambda node, number: number == 3 and wait(node))
-    assert result.warnings == [f'/filter:take: it still waits (for {what})']
-
-
 def test_ros_arguments(bag, graph):
     seen = []
 
@@ -293,16 +285,33 @@ def test_who_waits_by_looking_at_the_time_all_the_time(bag, graph):
     assert seen == [(220.0, 'time'), (230.0, 'clock')]
 
 
-def test_what_is_not_the_same_each_time_is_warned_of(bag, graph):
+def test_warnings(bag, graph):
+    """Of what is not the same each time, what waits at the end, and what is raised after it."""
     def take(node, number):
-        time.time()
-        time.sleep(0.0)
+        if number == 1:
+            node.get_node_names()
+        elif number == 2:
+            time.time()
+            time.sleep(0.0)
+        elif number == 3:
+            node.create_client(Trigger, '/none').wait_for_service()
+        elif number == 4:
+            ActionClient(node, Fibonacci, '/none').wait_for_server()
+        elif number == 19:
+            node.get_clock().sleep_for(Duration(seconds=1))
+            raise ValueError('woken too early')
 
-    _, result = run_filter(bag, graph, take)
-    assert [warning.partition(': ')[2] for warning in result.warnings] == [
+    _, result = run_filter(bag, graph, take, workers=3)
+    names, reads, sleeps, service, action, raised = result.warnings
+    assert names.startswith('/filter: get_node_names asks the middleware')
+    assert [warning.partition(': ')[2] for warning in (reads, sleeps)] == [
         'time.time() is not the same in each run: give --all-clocks',
         'time.sleep() takes real time: give --all-clocks']
-    assert all(warning.startswith(f'{__file__}:') for warning in result.warnings)
+    assert reads.startswith(f'{__file__}:') and sleeps.startswith(f'{__file__}:')
+    assert service == '/filter:take: it still waits (for service /none)'
+    assert action == '/filter:take: it still waits (for action /none)'
+    assert raised.startswith(
+        '/filter:take: after the end of the run it raised ValueError: woken too early, ')
 
 
 def test_simulated_time_is_that_of_the_recording(tmp_path, graph):
@@ -334,17 +343,14 @@ def test_who_is_there_is_known_at_once(bag, graph):
     def take(node, number):
         if number == 1:
             node.note((node.count_publishers('names'), node.count_subscribers('/names')))
-            node.get_node_names()
 
     def other():
         node = rclpy.create_node('other')
         node.create_subscription(String, '/names', lambda message: None, 10)
         return node
 
-    seen, result = run_filter(bag, graph, take, other, fill=fill)
+    seen, _ = run_filter(bag, graph, take, other, fill=fill)
     assert seen == [(0.0, 1), (100.0, (1, 2))]  # the rerun subscribes, too
-    warning, = result.warnings
-    assert warning.startswith('/filter: get_node_names asks the middleware')
 
 
 STALLS = """\
