@@ -3,9 +3,8 @@
 """
 Random declarations through every verb that reads one: done or refused in one line, no traceback.
 
-Half of them are put together from the words of the language, most of which make no sense, half
-come from `mddag generate` and are then damaged. `HARDENING_EXAMPLES=10000` draws that many
-of each.
+Half of them are those of `test/msg_graph` with more keys, half come from `mddag generate` and are
+then damaged. `HARDENING_EXAMPLES=10000` draws that many of each.
 """
 
 import os
@@ -17,12 +16,23 @@ from hypothesis import strategies as st
 import pytest
 import yaml
 
+from ..msg_graph.brute import as_yaml
+from ..msg_graph.test_against_brute_force import declarations
 from .verbs import run
 
 EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '60'))
-TOPICS = ['/a', '/b', '/c', '/d', '/e']
-NAMES = ['t', 'u', 'v', 'w', 'x']
-TIMES = ['1us', '7us', '1ms', '10ms', '33.3ms', '999.999ms', '1s', '86400s', '1440min', '0.5ms']
+TIMES = st.sampled_from(
+    ['1us', '7us', '1ms', '10ms', '33.3ms', '999.999ms', '1s', '86400s', '1440min', '0.5ms'])
+TIME = st.sampled_from(['0ns', '1us', '1ms', '86400s', {'quantiles_us': [1, 2, 3]},
+                        {'quantiles_us': [0, 10**10]}])
+MORE = {
+    'deadline': TIMES, 'timer': TIMES, 'period': TIMES,
+    'on_late': st.sampled_from(['abort', 'demote', 'continue']),
+    'keep': st.sampled_from(['newest', 'all']), 'importance': st.sampled_from(['high', 'low']),
+    'tolerate': st.sampled_from(['1 of 100', '0 of 1', '5']),
+    'max_active_jobs': st.sampled_from([1, 2, 10**6, 2**31, 10**30, 0]),
+    'release_from': st.sampled_from(['arrival', 'header_stamp', 'source_timestamp']),
+    'group': st.sampled_from(['g', 'h', 'reentrant'])}
 VERBS = (
     ('graph', 'check'), ('graph', 'analyse'),
     ('graph', 'draw', '-o', 'out.mmd'), ('graph', 'draw', '-o', 'out.dot'),
@@ -34,46 +44,15 @@ VERBS = (
 
 
 @st.composite
-def callbacks(draw, name):
-    """Draw a callback: usually one that could be meant."""
-    topic = st.sampled_from(TOPICS)
-    found = {'name': name}
-    start = draw(st.sampled_from(['timer', 'timer', 'subscription', 'subscription', 'sync',
-                                  'service', 'none']))
-    if start == 'timer':
-        found['timer'] = draw(st.sampled_from(TIMES))
-    elif start == 'subscription':
-        found['subscription'] = draw(topic)
-    elif start == 'sync':
-        found['sync'] = draw(st.lists(topic, min_size=1, max_size=3))
-    elif start == 'service':
-        found |= {'service': '/s', 'period': draw(st.sampled_from(TIMES))}
-    for key, values in (
-        ('publishes', st.lists(topic, max_size=3)), ('reads', st.lists(topic, max_size=2)),
-        ('deadline', st.sampled_from(TIMES)),
-        ('execution_time', st.sampled_from(
-            ['0ns', '1us', '1ms', '86400s', {'quantiles_us': [1, 2, 3]},
-             {'quantiles_us': [0, 10**10]}])),
-        ('on_late', st.sampled_from(['abort', 'demote', 'continue'])),
-        ('keep', st.sampled_from(['newest', 'all'])),
-        ('importance', st.sampled_from(['high', 'low'])),
-        ('tolerate', st.sampled_from(['1 of 100', '0 of 1', '5'])),
-        ('max_active_jobs', st.sampled_from([1, 2, 10**6, 2**31, 10**30, 0])),
-        ('release_from', st.sampled_from(['arrival', 'header_stamp', 'source_timestamp'])),
-        ('group', st.sampled_from(['g', 'h', 'reentrant'])), ('dag', st.sampled_from(NAMES)),
-    ):
-        if draw(st.integers(0, 2)) == 0:
-            found[key] = draw(values)
-    return found
-
-
-@st.composite
 def composed(draw):
-    nodes = []
-    for i in range(draw(st.integers(1, 3))):
-        each = [draw(callbacks(name)) for name in NAMES[:draw(st.integers(1, 4))]]
-        nodes.append({'node': f'/n{i}', 'callbacks': each})
-    data = {'mddag': 1, 'nodes': nodes}
+    data = as_yaml(draw(declarations()))
+    for node in data['nodes']:
+        callback, = node['callbacks']
+        if draw(st.integers(0, 9)):
+            callback['execution_time'] = draw(TIME)
+        for key in draw(st.lists(st.sampled_from(sorted(MORE)), max_size=2)):
+            if key in callback or key not in ('deadline', 'timer', 'period'):
+                callback[key] = draw(MORE[key])
     if draw(st.booleans()):
         data['workers'] = draw(st.sampled_from([1, 7, 4096, 10**9]))
     return str(yaml.safe_dump(data, sort_keys=False))
