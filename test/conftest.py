@@ -58,16 +58,15 @@ def pytest_configure(config):
     if (signal.getsignal(signal.SIGINT) is signal.SIG_IGN
             and threading.current_thread() is threading.main_thread()):
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    os.environ['ROS_DOMAIN_ID'] = str(_claim_domain())
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    os.environ.pop('ROS_STATIC_PEERS', None)
-    os.environ.setdefault('MDDAG_DEBUG', 'engine')  # of programs that tests start, too
     # What pytest itself keeps stays where it is.
     os.environ.setdefault('PYTEST_DEBUG_TEMPROOT', tempfile.gettempdir())
-    folder = _session.enter_context(
+    os.environ.setdefault('MDDAG_DEBUG', 'engine')  # of programs that tests start, too
+    tempfile.tempdir = _session.enter_context(
         tempfile.TemporaryDirectory(prefix='mddag-test-', ignore_cleanup_errors=True))
-    os.environ['TMPDIR'] = tempfile.tempdir = folder
-    os.environ['ROS_LOG_DIR'] = str(Path(folder, 'log'))
+    os.environ.pop('ROS_STATIC_PEERS', None)
+    os.environ.update(
+        ROS_DOMAIN_ID=str(_claim_domain()), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
+        TMPDIR=tempfile.tempdir, ROS_LOG_DIR=str(Path(tempfile.tempdir, 'log')))
     hypothesis.settings.register_profile(
         'mddag', deadline=None, print_blob=True,
         # The same examples on every run of continuous integration; new ones at home.
@@ -85,13 +84,13 @@ def pytest_unconfigure(config):
     if reporter is None:
         return
     reasons = Counter(report.longrepr[2] for report in reporter.stats.get('skipped', ()))
-    counts = {tool: reasons[f'Skipped: {NEEDS}{tool}'] for tool in missing_tools()
-              if f'Skipped: {NEEDS}{tool}' in reasons}
+    counts = {tool: count for tool in missing_tools()
+              if (count := reasons[f'Skipped: {NEEDS}{tool}'])}
     if counts:
-        reporter.write_line(
-            'not tested: ' + ', '.join(f'what {tool} is needed for ({count} tests)'
-                                       for tool, count in counts.items())
-            + ': sudo apt install ' + ' '.join(missing_tools()[tool] for tool in counts))
+        tools = ', '.join(f'what {tool} is needed for ({count} tests)'
+                          for tool, count in counts.items())
+        packages = ' '.join(missing_tools()[tool] for tool in counts)
+        reporter.write_line(f'not tested: {tools}: sudo apt install {packages}')
 
 
 def _claim_domain():
@@ -104,13 +103,10 @@ def _claim_domain():
             claim.bind(f'\0mddag-test-domain-{domain}')
         except OSError:
             claim.close()
-            continue
-        _session.enter_context(claim)
-        return domain
+        else:
+            _session.enter_context(claim)
+            return domain
     raise pytest.UsageError('every ROS domain for tests is in use by another test session')
-
-
-# --- what is not here ----------------------------------------------------------------------------
 
 
 @cache
@@ -128,8 +124,6 @@ def pytest_runtest_setup(item):
             say = pytest.fail if CI else pytest.skip
             say(f'{NEEDS}{tool}')
 
-
-# --- order ---------------------------------------------------------------------------------------
 
 # What runs ROS, or waits as time passes. Side by side (`make test`) a process takes whole files of
 # these, which come first: most of their time they wait, so that both take what is left then.
@@ -169,9 +163,6 @@ def _is_in(nodeid, places):
     return any(file.is_relative_to(PurePosixPath(HERE.name, each)) for each in places)
 
 
-# --- leftovers -----------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope='session', autouse=True)
 def nothing_left_behind():
     """Fail a session that leaves temporary files behind, or processes for more than a while."""
@@ -185,9 +176,9 @@ def nothing_left_behind():
             break
         time.sleep(0.05)
     folder = Path(tempfile.gettempdir())
-    files = sorted(str(path.relative_to(folder)) for path in folder.rglob('*')
-                   if path.relative_to(folder).parts[0] != 'log'
-                   and not path.relative_to(folder).parts[0].startswith('.org.chromium.'))
+    files = [str(path) for path in folder.rglob('*')
+             if (top := path.relative_to(folder).parts[0]) != 'log'
+             and not top.startswith('.org.chromium.')]
     assert (processes, files) == ({}, []), 'the tests left these processes and files behind'
 
 
@@ -211,15 +202,13 @@ def no_thread_leak():
     before = set(threading.enumerate())
     yield
     end = time.monotonic() + 2.0
-    while time.monotonic() < end:
-        left = [thread for thread in threading.enumerate() if thread not in before]
-        if not left:
-            return
+    while left := [thread for thread in threading.enumerate() if thread not in before]:
+        if time.monotonic() > end:
+            frames = sys._current_frames()
+            where = [f'{thread!r}\n' + ''.join(traceback.format_stack(frames[thread.ident]))
+                     for thread in left if thread.ident in frames]
+            pytest.fail('threads left behind:\n' + '\n'.join(where), pytrace=False)
         time.sleep(0.01)
-    frames = sys._current_frames()
-    where = [f'{thread!r}\n' + ''.join(traceback.format_stack(frames[thread.ident]))
-             for thread in left if thread.ident in frames]
-    pytest.fail('threads left behind:\n' + '\n'.join(where), pytrace=False)
 
 
 @pytest.fixture
@@ -272,15 +261,13 @@ def wait_for_run(process, condition):
 
 
 class Done(NamedTuple):
-    """How a command ended, and what it printed."""
-
     returncode: int
     stdout: str
     stderr: str
 
     @property
     def result(self):
-        """What it printed as JSON; its status must be 0."""
+        """What the command printed as JSON; its status must be 0."""
         assert self.returncode == 0, self.stderr
         return json.loads(self.stdout)
 
