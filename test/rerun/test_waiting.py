@@ -26,7 +26,7 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
-from .helpers import Filter, GRAPH, MS, run_filter, write_bag
+from .helpers import Filter, GRAPH, MS, run_filter, START, write_bag
 
 
 def server(answers_after_ms=0):
@@ -120,8 +120,13 @@ def test_timeouts_of_python_and_rclpy_take_virtual_time(bag, graph):
             node.note('semaphore')
             AsyncParameterClient(node, 'none').wait_for_services(0.5)
             node.note('services')
+        elif number == 15:
+            node.get_clock().sleep_for(Duration(seconds=0.004))
+            node.create_publisher(String, '/done', 10).publish(String())
 
-    seen, _ = run_filter(bag, graph, take)
+    seen, result = run_filter(bag, graph, take)
+    # It ends after its execution time, as it has waited for less; what it sends leaves then.
+    assert [each.time - START for each in result.outputs if each.topic == '/done'] == [1510 * MS]
     # seconds since the epoch are floats with a resolution of 0.2 us
     assert [(round(time, 2), what) for time, what in seen] == [
         (210.0, 'rate'), (710.0, 'clock'), (760.0, 'queue'), (810.0, 'semaphore'),

@@ -9,7 +9,7 @@ import time
 
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -49,28 +49,6 @@ def main():
 
 def two():
     return [Listener('first'), Node('idle')]
-
-
-def own_executor():
-    rclpy.init()
-    node = Listener('own')
-    executor = MultiThreadedExecutor(num_threads=4)
-    executor.add_node(node)
-    try:
-        executor.spin()
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.shutdown()
-    print('own executor ended')
-
-
-def events_executor():
-    from rclpy.experimental.events_executor import EventsExecutor
-    rclpy.init()
-    executor = EventsExecutor()
-    executor.add_node(Listener('events'))
-    executor.spin()
 
 
 def spins_in_thread():
