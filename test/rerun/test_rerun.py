@@ -103,6 +103,12 @@ def test_a_changed_constant_is_found_in_the_outputs(bag, graph, tmp_path, monkey
     assert not compare(result, out, 1e-3)
     with pytest.raises(AssertionError, match='/out: content, first in message 1'):
         assert_same(result, out)
+    less = write_bag(tmp_path / 'less.mcap', [(i * 100, '/points', Header(frame_id=str(i)))
+                                              for i in range(2)])
+    difference, = compare(rerun(less, graph, [Filter, Sink]), out, 1e-3)[-1:]
+    assert difference.line() == (
+        '/out: missing, first in message 2 at 0.215000 s: it is missing, expected a '
+        'message; 2 messages, expected 20')
 
 
 def test_processes_share_one_interpreter(bag, graph):
@@ -249,17 +255,21 @@ def test_timers_fire_at_their_virtual_times(bag, graph):
     def fill(node):
         def tick():
             node.note('first')
+            left, past = timer.time_until_next_call(), timer.time_since_last_call()
+            assert (left, past) == (timer.timer_period_ns, 0)
             if len(node.seen) == 3:
                 timer.timer_period_ns = 500 * MS
             elif len(node.seen) == 5:
                 timer.cancel()
-                node.create_timer(0.3, lambda: node.note('second'))
+                assert timer.time_until_next_call() is None
+                other.cancel()
+                other.reset()  # its period begins again
 
         timer = node.create_timer(0.03, tick)
+        other = node.create_timer(0.7, lambda: node.note('other'))
 
     seen, _ = run_filter(bag, graph, fill=fill)
-    assert seen == [(time, 'first') for time in (30, 60, 90, 120, 620)] + [
-        (time, 'second') for time in (920, 1220, 1520, 1820)]
+    assert seen == [(time, 'first') for time in (30, 60, 90, 120, 620)] + [(1320, 'other')]
 
 
 def draw():

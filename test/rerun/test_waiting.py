@@ -302,17 +302,20 @@ def test_warnings(bag, graph):
             node.create_client(Trigger, '/none').wait_for_service()
         elif number == 4:
             ActionClient(node, Fibonacci, '/none').wait_for_server()
+        elif number == 5:
+            node.create_client(Trigger, '/none').call_async(Trigger.Request())
         elif number == 19:
             node.get_clock().sleep_for(Duration(seconds=1))
             raise ValueError('woken too early')
 
     _, result = run_filter(bag, graph, take, workers=3)
-    names, reads, sleeps, service, action, raised = result.warnings
+    names, reads, sleeps, asked, service, action, raised = result.warnings
     assert names.startswith('/filter: get_node_names asks the middleware')
     assert [warning.partition(': ')[2] for warning in (reads, sleeps)] == [
         'time.time() is not the same in each run: give --all-clocks',
         'time.sleep() takes real time: give --all-clocks']
     assert reads.startswith(f'{__file__}:') and sleeps.startswith(f'{__file__}:')
+    assert asked == '/none: it is called, and no node of the run offers this service'
     assert service == '/filter:take: it still waits (for service /none)'
     assert action == '/filter:take: it still waits (for action /none)'
     assert raised.startswith(
