@@ -60,68 +60,50 @@ def test_many_subscriptions_share_few_descriptors(make_executor, make_node):
 # --- what waits ----------------------------------------------------------------------------------
 
 
-def waiting(executor):
-    return executor.statistics()['queue']
-
-
-def test_few_requests_wait_in_python_and_none_is_lost(make_executor, make_node):
-    node, go_on, answered, most = make_node(), threading.Event(), [], []
-    executor = make_executor(num_workers=2)
-
-    def answer(request, response):
-        go_on.wait(15.0)
-        most.append(sum(
-            each['waiting'] for each in executor.statistics()['callbacks'].values()
-            if each['kind'] == 'service'))
-        response.message = str(len(most))
-        return response
-
-    qos = QoSProfile(depth=100)
-    node.create_service(Trigger, '/ask', answer, qos_profile=qos)
-    client = node.create_client(Trigger, '/ask', qos_profile=qos)
-    executor.add_node(node)
-    assert client.wait_for_service(15.0)
-    with Spinning(executor):
-        for _ in range(60):
-            client.call_async(Trigger.Request()).add_done_callback(
-                lambda future: answered.append(future.result().message))
-        # one runs, and no more are taken than wait
-        assert wait_for(lambda: waiting(executor) == SERVICE_DEPTH)
-        go_on.set()
-        assert wait_for(lambda: len(answered) == 60, 10.0), len(answered)
-        assert wait_for(lambda: is_idle(executor))
-    assert sorted(map(int, answered)) == list(range(1, 61))
-    assert 0 < max(most) <= SERVICE_DEPTH
-
-
-@pytest.mark.parametrize('from_here', [True, False])
-def test_few_messages_of_keep_all_wait_in_python_and_none_is_lost(
-        make_executor, make_node, monkeypatch, from_here):
-    if not from_here:  # as from another process: a worker takes them
+@pytest.mark.parametrize('kind', ['requests', 'messages', 'messages from elsewhere'])
+def test_few_wait_in_python_and_none_is_lost(make_executor, make_node, monkeypatch, kind):
+    """Also of KEEP_ALL; what comes from another process is taken by a worker."""
+    if kind == 'messages from elsewhere':
         monkeypatch.setattr(
             'mddag_executor.executor.publishing.replace_delivery', lambda *args: None)
     node, go_on, got, most = make_node(), threading.Event(), [], []
-    executor = make_executor(num_workers=1)
+    executor = make_executor(num_workers=1, nodes=[node])
+
+    def waiting():
+        return sum(each['waiting'] for each in executor.statistics()['callbacks'].values()
+                   if each['kind'] in ('service', 'subscription'))
 
     def hear(message):
         go_on.wait(15.0)
-        most.append(waiting(executor))
+        most.append(waiting())
         got.append(message.stamp.sec)
 
-    qos = QoSProfile(history=HistoryPolicy.KEEP_ALL)
-    node.create_subscription(Header, '/all', hear, qos)
-    publisher = node.create_publisher(Header, '/all', qos)
-    executor.add_node(node)
+    def answer(request, response):
+        hear(Header(stamp=Time(sec=len(got))))
+        return response
+
     with Spinning(executor):
-        matched(publisher)
-        for number in range(300):
-            publisher.publish(Header(stamp=Time(sec=number)))
-        if from_here:
-            assert wait_for(lambda: waiting(executor) in (MOST, MOST - 1))
+        if kind == 'requests':
+            count, bound, qos = 60, SERVICE_DEPTH, QoSProfile(depth=100)
+            node.create_service(Trigger, '/ask', answer, qos_profile=qos)
+            client = node.create_client(Trigger, '/ask', qos_profile=qos)
+            assert client.wait_for_service(15.0)
+            futures = [client.call_async(Trigger.Request()) for _ in range(count)]
+        else:
+            count, bound, futures = 300, MOST, []
+            qos = QoSProfile(history=HistoryPolicy.KEEP_ALL)
+            node.create_subscription(Header, '/all', hear, qos)
+            publisher = node.create_publisher(Header, '/all', qos)
+            matched(publisher)
+            for number in range(count):
+                publisher.publish(Header(stamp=Time(sec=number)))
+        if kind != 'messages from elsewhere':  # one runs, and no more are taken than may wait
+            assert wait_for(lambda: waiting() in (bound, bound - 1))
         go_on.set()
-        assert wait_for(lambda: len(got) == 300), len(got)
-    assert got == list(range(300))
-    assert max(most) <= MOST
+        assert wait_for(lambda: len(got) == count and all(each.done() for each in futures))
+        assert wait_for(lambda: is_idle(executor))
+    assert got == list(range(count))
+    assert 0 < max(most) <= bound
     assert executor.statistics()['dropped'] == {}
 
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a live run says: diagnostics, statistics, drift, wrong names, a QoS that does not match."""
 
+import itertools
 import os
 import time
 from types import NoneType, UnionType
@@ -35,50 +36,37 @@ SECOND = 1_000_000_000
 # --- the verdicts, without ROS -------------------------------------------------------------------
 
 
-class Watched:
-    """A tally, and the diagnostics of its only DAG."""
+def test_levels_follow_the_share_of_misses_in_the_window():
+    task_set = loads(CHAIN)
+    tables = Tables.build(task_set)
+    tally = Tally(task_set, tables)
+    sink = next(v for v in tables.sinks if tables.sink_deadline[v] == 50_000_000)
+    in_stops, jobs, seconds = [0], itertools.count(), itertools.count(2)
+    watch = DagWatch(tally, task_set.dags[0], Thresholds(window=3), SECOND, in_stops)
 
-    def __init__(self, **thresholds):
-        task_set = loads(CHAIN)
-        tables = Tables.build(task_set)
-        self.tally = Tally(task_set, tables)
-        self.sink = next(v for v in tables.sinks if tables.sink_deadline[v] == 50_000_000)
-        self.job = 0
-        self.in_stops = [0]
-        self.now = SECOND
-        self.watch = DagWatch(
-            self.tally, task_set.dags[0], Thresholds(**thresholds), SECOND, self.in_stops)
-
-    def after(self, in_time=0, late=0, expired=0):
+    def after(in_time=0, late=0, expired=0):
         for kind, count, response in (
             (SINK_IN_TIME, in_time, 20_000_000), (SINK_LATE, late, 60_000_000),
             (SINK_EXPIRED, expired, -1),
         ):
             for _ in range(count):
-                self.tally.released(0)
-                deadline = 50_000_000
-                self.tally.add([(kind, 0, self.sink, self.job, deadline, response)])
-                self.job += 1
-        self.now += SECOND
-        return self.watch.status(self.now)
+                tally.released(0)
+                tally.add([(kind, 0, sink, next(jobs), 50_000_000, response)])
+        return watch.status(next(seconds) * SECOND)
 
-
-def test_levels_follow_the_share_of_misses_in_the_window():
-    watched = Watched(window=3)
-    assert watched.after().level == STALE
-    assert watched.after(in_time=50).level == OK
-    watched.in_stops[0] = 1
-    status = watched.after(in_time=49, late=1)
+    assert after().level == STALE
+    assert after(in_time=50).level == OK
+    in_stops[0] = 1
+    status = after(in_time=49, late=1)
     assert (status.level, status.message) == (
         WARN, '1 of 100 results missed their deadlines, 1 as the machine stood still')
     assert status.values['margin_min_ms'] == '-10.000'
-    assert status.values[f'margin_ms {watched.tally.vertex_name(watched.sink)}'] == '-10.000'
+    assert status.values[f'margin_ms {tally.vertex_name(sink)}'] == '-10.000'
     assert status.values['window_missed_ratio'] == '0.0100'
-    status = watched.after(in_time=20, expired=30)
+    status = after(in_time=20, expired=30)
     assert (status.level, status.values['expired']) == (ERROR, '30')
-    assert watched.after(in_time=50).level == ERROR
-    assert watched.after(in_time=50).level == ERROR
-    assert watched.after(in_time=50).level == OK  # the window has moved on
+    levels = [after(in_time=50).level for _ in range(3)]
+    assert levels == [ERROR, ERROR, OK]  # the window has moved on
 
 
 @pytest.mark.parametrize('wrong', [
@@ -90,24 +78,6 @@ def test_thresholds_that_make_no_sense(wrong):
 
 
 # --- published -----------------------------------------------------------------------------------
-
-
-class Listener:
-    """Keeps the newest status by name, from an executor of its own."""
-
-    def __init__(self, make_node, make_executor):
-        self.statuses = {}
-        self.stamps = []
-        self.node = make_node('listener')
-        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_array, 10)
-        self.executor = make_executor(nodes=[self.node])
-
-    def _on_array(self, message):
-        self.stamps.append(message.header.stamp.sec + message.header.stamp.nanosec / 1e9)
-        self.statuses = {status.name: status for status in message.status}
-
-    def level(self, name):
-        return self.statuses[name].level if name in self.statuses else None
 
 
 #: A DAG without a callback here has no status.
@@ -122,33 +92,44 @@ def values(status):
 
 
 def test_statuses_are_published_from_ok_to_stale(make_executor, make_node):
-    listener = Listener(make_node, make_executor)
-    slow = [0.0]
+    """Each level is seen from another executor."""
+    arrays, slow = [], [0.0]
+    listener = make_node('listener')
+    listener.create_subscription(DiagnosticArray, '/diagnostics', arrays.append, 10)
     chain = Declared(make_node, CHAIN, {'early': lambda: time.sleep(slow[0])})
     executor = make_executor(
         loads(CHAIN + ELSEWHERE), diagnostics_period='100ms',
         thresholds=Thresholds(window=2, name='robot'))
     names = [n for n, _ in make_node('look').get_node_names_and_namespaces()]
     assert not any('diagnostics' in name for name in names)  # not before it spins
-    with Spinning(listener.executor), Spinning(executor):
+
+    def becomes(level):
+        """Return the newest statuses by name when that of the DAG has this level."""
+        def found():
+            return {status.name: status for status in arrays[-1].status} if arrays else {}
+        assert wait_for(
+            lambda: 'robot: chain' in found() and found()['robot: chain'].level == level)
+        return found()
+
+    with Spinning(make_executor(nodes=[listener])), Spinning(executor):
         chain.start(executor)
-        assert wait_for(lambda: listener.level('robot: chain') == DiagnosticStatus.OK)
-        assert set(listener.statuses) == {'robot: chain', 'robot: workers'}
-        status = listener.statuses['robot: chain']
+        statuses = becomes(DiagnosticStatus.OK)
+        assert set(statuses) == {'robot: chain', 'robot: workers'}
+        status, workers = statuses['robot: chain'], statuses['robot: workers']
         assert status.message.endswith('results in time')
         assert values(status)['period_ms'] == '20.000'
-        assert status.hardware_id == listener.statuses['robot: workers'].hardware_id != ''
-        assert float(values(listener.statuses['robot: workers'])['callbacks_per_s']) > 20
+        assert status.hardware_id == workers.hardware_id != ''
+        assert float(values(workers)['callbacks_per_s']) > 20
         slow[0] = 0.012
-        assert wait_for(lambda: listener.level('robot: chain') == DiagnosticStatus.ERROR)
+        becomes(DiagnosticStatus.ERROR)
         slow[0] = 0.0
-        assert wait_for(lambda: listener.level('robot: chain') == DiagnosticStatus.OK)
+        becomes(DiagnosticStatus.OK)
         chain.cancel()
-        assert wait_for(lambda: listener.level('robot: chain') == DiagnosticStatus.STALE)
-        assert listener.statuses['robot: chain'].message.startswith('nothing has been released')
+        status = becomes(DiagnosticStatus.STALE)['robot: chain']
+        assert status.message.startswith('nothing has been released')
         chain.timers[0].reset()
-        assert wait_for(lambda: listener.level('robot: chain') == DiagnosticStatus.OK)
-        assert abs(listener.stamps[-1] - time.time()) < 5
+        becomes(DiagnosticStatus.OK)
+        assert abs(arrays[-1].header.stamp.sec - time.time()) < 5
         assert set(executor.get_nodes()) == set(chain.nodes.values())
 
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Timers whose due time changes while the executor waits, and what is due before it spins."""
 
-import threading
 import time
 
 from builtin_interfaces.msg import Time as TimeMessage
@@ -90,65 +89,42 @@ def test_timers_of_each_clock_run(make_executor, make_node, kind):
 # --- simulated time ------------------------------------------------------------------------------
 
 
-class Simulated:
-    """A node with simulated time, a timer that notes it, a publisher of it, and an executor."""
-
-    def __init__(self, make_executor, make_node):
-        self.now = 100 * 10**9
-        self.ran = []
-        self.node = make_node(
-            'simulated', parameter_overrides=[Parameter('use_sim_time', value=True)])
-        self._clock = self.node.get_clock()
-        self._publisher = make_node('clock').create_publisher(
-            ClockMessage, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-        self.executor = make_executor(nodes=[self.node])
-
-    def start(self, period_s):
-        self.step(0)
-        self.node.create_timer(period_s, lambda: self.ran.append(self._clock.now().nanoseconds))
-        assert self.is_idle() and not self.ran
-
-    def step(self, ns):
-        """Publish a later time until the node has it."""
-        matched(self._publisher)
-        self.now += ns
-        message = ClockMessage(clock=TimeMessage(sec=self.now // 10**9, nanosec=self.now % 10**9))
-        assert wait_for(lambda: self._publisher.publish(message) or wait_for(
-            lambda: self._clock.now().nanoseconds == self.now, 0.1))
-
-    def is_idle(self):
-        """Tell whether all that has to do with the present time is done."""
-        quiet = threading.Event()
-        self.executor.create_task(quiet.set)
-        return quiet.wait(15.0) and wait_for(
-            lambda: self.executor._pool.is_current and is_idle(self.executor))
-
-
 def test_a_timer_runs_by_simulated_time_and_by_nothing_else(make_executor, make_node):
-    simulated = Simulated(make_executor, make_node)
-    with Spinning(simulated.executor):
-        simulated.start(1.0)
-        start = simulated.now
-        for second in range(1, 6):
-            simulated.step(999 * MS)
-            assert simulated.is_idle() and len(simulated.ran) == second - 1
-            simulated.step(1 * MS)
-            assert wait_for(lambda n=second: len(simulated.ran) == n)
-    assert simulated.ran == [start + second * 10**9 for second in range(1, 6)]
+    """Its node may turn to the system's time and back."""
+    node = make_node('simulated', parameter_overrides=[Parameter('use_sim_time', value=True)])
+    publisher = make_node('clock').create_publisher(
+        ClockMessage, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    clock, executor, ran = node.get_clock(), make_executor(nodes=[node]), []
 
+    def set_clock(ms):
+        """Publish the time until the node has it, and all that is due then is done."""
+        matched(publisher)
+        message = ClockMessage(clock=TimeMessage(sec=ms // 1000, nanosec=ms % 1000 * MS))
+        assert wait_for(lambda: publisher.publish(message) or wait_for(
+            lambda: clock.now().nanoseconds == ms * MS, 0.1))
+        is_quiet()
 
-def test_a_node_may_turn_to_simulated_time_and_back(make_executor, make_node):
-    simulated = Simulated(make_executor, make_node)
-    ran, node = simulated.ran, simulated.node
-    with Spinning(simulated.executor):
-        simulated.start(0.01)
+    def is_quiet():
+        assert wait_for(executor.create_task(lambda: None).done)
+        assert wait_for(lambda: executor._pool.is_current and is_idle(executor))
+
+    with Spinning(executor):
+        set_clock(100_000)
+        node.create_timer(1.0, lambda: ran.append(clock.now().nanoseconds))
+        is_quiet()
+        for second in range(101, 106):
+            set_clock(second * 1000 - 1)
+            assert len(ran) == second - 101
+            set_clock(second * 1000)
+            assert wait_for(lambda n=second: len(ran) == n - 100)
+        assert ran == [second * 10**9 for second in range(101, 106)]
+
         node.set_parameters([Parameter('use_sim_time', value=False)])
-        assert wait_for(lambda: len(ran) >= 3)
+        assert wait_for(lambda: len(ran) >= 6)
         node.set_parameters([Parameter('use_sim_time', value=True)])
-        simulated.step(3600 * 10**9)
-        assert simulated.is_idle()
+        set_clock(3_700_000)
         count = len(ran)
-        simulated.step(20 * MS)
+        set_clock(3_701_000)
         assert wait_for(lambda: len(ran) > count)
 
 

@@ -161,7 +161,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         'test_executor.py', 'test_tasks_nodes_and_entities_wake_an_idle_executor[spin]')),
     Case('rest_not_collected', [(
         'executor/sources.py', 'entity.collect_more = partial(self.collect, MANY)', 'pass')], of(
-        'test_bounds.py', 'test_few_requests_wait_in_python_and_none_is_lost')),
+        'test_bounds.py', 'test_few_wait_in_python_and_none_is_lost[requests]')),
     Case('subscriptions_that_publishing_threads_took_from_stay_silent', [
         ('executor/loop.py', 'self._set_mask(sources, _EDGE)', 'pass'),
         # which would register them again
