@@ -218,31 +218,6 @@ def stays(calls):
     return len(calls) == before
 
 
-def test_queue_depth_is_kept_and_drops_are_counted(make_executor, make_node):
-    """A bounded queue, the policy is that of its QoS: the oldest goes (rclcpp#3213)."""
-    node, got, gate = make_node(), [], threading.Event()
-    group = MutuallyExclusiveCallbackGroup()
-
-    def slow(message):
-        got.append(message.stamp.sec)
-        gate.wait(5.0)
-
-    node.create_subscription(Header, '/topic', slow, 3, callback_group=group)
-    publisher = node.create_publisher(Header, '/topic', 100)
-    executor = make_executor(nodes=[node])
-    with Spinning(executor):
-        matched(publisher)
-        for second in range(11):
-            publisher.publish(Header(stamp=Time(sec=second)))
-            assert wait_for(lambda: got == [0])
-            time.sleep(0.01)
-        gate.set()
-        assert wait_for(lambda: len(got) >= 4)
-        assert stays(got)
-    assert got == [0, 8, 9, 10]
-    assert sum(executor.statistics()['dropped'].values()) == 7
-
-
 # --- groups --------------------------------------------------------------------------------------
 
 
@@ -321,7 +296,11 @@ def test_a_timer_runs_as_often_as_its_group_lets_it(make_executor, make_node):
 
 
 def test_messages_that_a_group_keeps_waiting_are_as_many_as_the_qos_says(make_executor, make_node):
-    """In their order; and a coroutine has ended when it has run to its end."""
+    """
+    The oldest go, and are counted (rclcpp#3213).
+
+    And a coroutine has ended when it has run to its end.
+    """
     node, group, future, steps = make_node(), Tokens(are_given_back=True), Future(), []
 
     async def callback(message):

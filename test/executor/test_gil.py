@@ -88,29 +88,8 @@ def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_
     assert min(seen[:3]) >= 3
 
 
-def test_who_computes_is_learnt_and_shown(make_executor, make_node):
-    node, ran = make_node(), []
-    node.create_timer(0.01, lambda: (compute(3), ran.append('computes')))
-    node.create_timer(0.011, lambda: (time.sleep(0.003), ran.append('sleeps')),
-                      callback_group=ReentrantCallbackGroup())
-    executor = make_executor(nodes=[node])
-
-    def found():
-        return {name: (count['holds_interpreter'], count['interpreter_share'])
-                for name, count in executor.statistics()['callbacks'].items()
-                if count['kind'] == 'timer'}
-
-    with Spinning(executor):
-        assert wait_for(lambda: [holds for holds, _ in found().values()] == [True, False], 20.0)
-        ran.clear()
-        assert wait_for(lambda: ran.count('sleeps') > 10 and ran.count('computes') > 10, 20.0)
-        (_, computing), (_, sleeping) = found().values()
-    # on a busy machine it is not known how much it would have computed without the others
-    assert computing is None or computing > 0.5
-    assert sleeping is None or sleeping < 0.5
-
-
-def test_what_a_callback_needs_when_nothing_disturbs_it(make_executor, make_node):
+def test_what_is_learnt_of_callbacks(make_executor, make_node):
+    """Who computes, and what each needs when nothing disturbs it."""
     node, bell, ran = make_node(), threading.Event(), []
     group = ReentrantCallbackGroup()
 
@@ -124,11 +103,21 @@ def test_what_a_callback_needs_when_nothing_disturbs_it(make_executor, make_node
         node.create_timer(0.1, lambda name=name, body=body: (body(), ran.append(name)), group)
     executor = make_executor(loads(declare(*(
         (name, 'timer: 100ms, deadline: 1s') for name in 'abcd'))), nodes=[node])
+
+    def found(key):
+        counts = executor.statistics()['callbacks']
+        return [counts.get(f'/node:{name}', {}).get(key) for name in 'ab']
+
     with Spinning(executor):
         assert wait_for(lambda: all(ran.count(name) > 12 for name in 'abcd'), 30.0)
+        assert wait_for(lambda: found('holds_interpreter') == [False, True], 20.0)
+        sleeping, computing = found('interpreter_share')
     sleeps, computes, empty, lent = executor._engine.scheduler.state.mean[:4]
     assert sleeps >= 20 * MS and computes >= 20 * MS
     assert empty < 20 * MS and lent < 20 * MS
+    # on a busy machine it is not known how much it would have computed without the others
+    assert computing is None or computing > 0.5
+    assert sleeping is None or sleeping < 0.5
 
 
 # --- what arrives next to a callback that computes for long --------------------------------------

@@ -125,7 +125,8 @@ may not check
         'test_deadlines.py', 'test_ready_callbacks_run_in_the_policys_order[rad-abc]')),
     Case('depth_not_kept', [(
         'executor/entity.py', 'self.depth = depth', 'self.depth = 0')], of(
-        'test_executor.py', 'test_queue_depth_is_kept_and_drops_are_counted')),
+        'test_executor.py',
+        'test_messages_that_a_group_keeps_waiting_are_as_many_as_the_qos_says')),
     Case('every_twentieth_response_lost', [(
         'executor/compat.py', 'future.set_result(response)', """\
 client.completed = getattr(client, 'completed', 0) + 1
