@@ -182,7 +182,7 @@ nodes:
 """), trace=trace, worker_cpus=list(os.sched_getaffinity(0)))
     check(executor.statistics(), Statistics, 'statistics')
     executor.add_node(node)
-    with Spinning(executor):
+    with executor as entered, Spinning(entered):
         assert wait_for(lambda: executor.statistics()['first_miss'] is not None)
     found = executor.statistics()
     check(found, Statistics, 'statistics')
