@@ -186,7 +186,7 @@ def after_a_while(callback, seconds=0.2):
 
 
 def shuts_down_in_a_callback():
-    after_a_while(lambda: rclpy.shutdown(), 0.6)
+    after_a_while(lambda: rclpy.shutdown(), 1.5)
     print('shut down')
 
 
@@ -215,7 +215,7 @@ def blocks_in_a_callback():
 
 
 def raises_in_a_callback():
-    after_a_while(lambda: 1 / 0)
+    after_a_while(lambda: 1 / 0, 0.5)  # when the next program has begun
 
 
 def no_longer_spins():
