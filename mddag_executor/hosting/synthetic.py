@@ -256,7 +256,6 @@ class SyntheticWorkload:
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._nodes: dict[str, Node] = {}
         self._sensor_node: Node | None = None
-        self._publishers: dict[tuple[str, str], Publisher] = {}
         self._n_subscribers = Counter(t for c in task_set.callbacks for t in c.topics)
         self._n_publishers = Counter(
             t for _, t in {(c.node, t) for c in task_set.callbacks for t in c.publishes})
@@ -326,16 +325,18 @@ class SyntheticWorkload:
 
     def unmatched(self) -> list[str]:
         """Return the topics whose publishers and subscriptions have not discovered each other."""
-        found = set()
-        for (_, topic), publisher in self._publishers.items():
-            if publisher.get_subscription_count() < self._n_subscribers[topic]:
-                found.add(topic)
-        for node in self._nodes.values():
-            for subscription in node.subscriptions:
-                wanted = self._n_publishers[subscription.topic_name]
-                if subscription.get_publisher_count() < wanted:
-                    found.add(subscription.topic_name)
+        found: set[str] = set()
+        for node in self._all_nodes():
+            found.update(
+                each.topic_name for each in node.publishers
+                if each.get_subscription_count() < self._n_subscribers[each.topic_name])
+            found.update(
+                each.topic_name for each in node.subscriptions
+                if each.get_publisher_count() < self._n_publishers[each.topic_name])
         return sorted(found)
+
+    def _all_nodes(self) -> list[Node]:
+        return [*self.nodes, *([] if self._sensor_node is None else [self._sensor_node])]
 
     def start(self, wake: Callable[[], None]) -> None:
         """
@@ -373,9 +374,8 @@ class SyntheticWorkload:
 
     def destroy(self) -> None:
         """Destroy the nodes."""
-        for node in (*self._nodes.values(), self._sensor_node):
-            if node is not None:
-                node.destroy_node()
+        for node in self._all_nodes():
+            node.destroy_node()
 
     def _run_sensors(self) -> None:
         sensors = list(self._sensors.values())
@@ -392,15 +392,14 @@ class SyntheticWorkload:
     def make(self, name: str) -> Node:
         """Make a declared node with its entities, perhaps again; its timers have not started."""
         node = self._nodes[name] = quiet_node(name, self._context)
-        for key in [key for key in self._publishers if key[0] == name]:
-            del self._publishers[key]
+        callbacks = [each for each in self.task_set.callbacks if each.node == name]
+        by_topic = {topic: node.create_publisher(Header, topic, QOS)
+                    for topic in dict.fromkeys(t for each in callbacks for t in each.publishes)}
         groups: dict[str, CallbackGroup] = {}
-        for callback in self.task_set.callbacks:
-            if callback.node != name:
-                continue
+        for callback in callbacks:
             kind = MutuallyExclusiveCallbackGroup if callback.group else ReentrantCallbackGroup
             group = groups.setdefault(callback.group or '', kind())
-            publishers = [self._publisher(node, topic) for topic in callback.publishes]
+            publishers = [by_topic[topic] for topic in callback.publishes]
             roles = [self._role(v, publishers) for v in self._vertices.get(callback.key, ())]
             if callback.kind == 'timer':
                 self._add_timer(node, group, callback, roles[0])
@@ -411,13 +410,6 @@ class SyntheticWorkload:
                     on_message = callback_of(topic, roles, self.ledger, self._current_job)
                     node.create_subscription(Header, topic, on_message, QOS, callback_group=group)
         return node
-
-    def _publisher(self, node: Node, topic: str) -> Publisher:
-        # Callbacks of a node that publish the same topic share the publisher.
-        key = (node.get_fully_qualified_name(), topic)
-        if key not in self._publishers:
-            self._publishers[key] = node.create_publisher(Header, topic, QOS)
-        return self._publishers[key]
 
     def _dag(self, vertex: Vertex) -> str:
         return self.task_set.dags[vertex.dag].name
@@ -489,24 +481,26 @@ class SyntheticWorkload:
                 self._sensor_node = quiet_node(SENSORS_NODE, self._context)
             period = vertex.callback.period_ns or 0
             if start not in self._sensors:
-                make = self._requests if vertex.callback.service else self._messages
-                self._sensors[start] = Sensor([], period, make(start))
+                make = requests_to if vertex.callback.service else messages_to
+                self._sensors[start] = Sensor([], period, make(self._sensor_node, start))
             sensor = self._sensors[start]
             # The shorter of two periods applies.
             sensor.period_ns = min(sensor.period_ns, period)
             sensor.dags.append(self._dag(vertex))
 
-    def _messages(self, topic: str) -> Callable[[int], None]:
-        assert self._sensor_node is not None
-        publisher = self._publisher(self._sensor_node, topic)
-        return lambda release: publisher.publish(stamped(release, SENSOR + topic))
 
-    def _requests(self, service: str) -> Callable[[int], None]:
-        assert self._sensor_node is not None
-        client = self._sensor_node.create_client(ListParameters, service)
+def messages_to(node: Node, topic: str) -> Callable[[int], None]:
+    """Return what publishes a release as a sensor does."""
+    publisher = node.create_publisher(Header, topic, QOS)
+    return lambda release: publisher.publish(stamped(release, SENSOR + topic))
 
-        def send(release: int) -> None:
-            future = client.call_async(ListParameters.Request(depth=release))
-            client.remove_pending_request(future)  # the answer is not used
 
-        return send
+def requests_to(node: Node, service: str) -> Callable[[int], None]:
+    """Return what calls a service with a release."""
+    client = node.create_client(ListParameters, service)
+
+    def send(release: int) -> None:
+        future = client.call_async(ListParameters.Request(depth=release))
+        client.remove_pending_request(future)  # the answer is not used
+
+    return send
