@@ -16,7 +16,6 @@ class Flow(NamedTuple):
 
 
 def flows(paths):
-    """Return the flows along the first path."""
     steps = paths.steps(0)
     last = len(paths.paths[0].callbacks) - 1
     found = []

@@ -67,7 +67,6 @@ paths:
 
 
 def small():
-    """Return two DAGs with a fork, a join and three sinks."""
     return loads(SMALL, 'small.yaml')
 
 
@@ -200,7 +199,6 @@ class VirtualRun:
     flush_every: int = 40
 
     def __post_init__(self):
-        """Run."""
         self.random = random.Random(self.seed)
         self.tables = Tables.build(
             self.task_set, legs=True, groups=False, max_active_jobs=3, expire_after=20 * MS)
@@ -243,7 +241,6 @@ class VirtualRun:
     # --- what a test may change ------------------------------------------------------------------
 
     def took(self, work):
-        """Return how long a piece takes."""
         return self.random.randrange(1, self.longest)
 
     def way(self, work):
@@ -255,7 +252,6 @@ class VirtualRun:
         return -1, False
 
     def lag(self, dag, job):
-        """Return how long after its release a job is noticed."""
         return self.random.randrange(MS)
 
     def _at(self, time, action):

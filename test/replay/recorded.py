@@ -55,7 +55,6 @@ class Recorded:
         self._next_message = 0x7000
 
     def add(self, name, time, tid, *fields, pid=1):
-        """Add an event by its full name."""
         self._events.append((BEGIN + time, pid, tid, name, fields))
 
     def write(self, but=(), stop=None):
@@ -75,22 +74,18 @@ class Recorded:
         return self.path
 
     def names(self):
-        """Return the names of the events in the order of time."""
         return [event[3] for event in sorted(self._events, key=lambda event: event[0])]
 
     def times(self):
-        """Return the times of the events, ns since `BEGIN`, in their order."""
         return sorted(event[0] - BEGIN for event in self._events)
 
     # --- who is who ------------------------------------------------------------------------------
 
     def node(self, handle, name, time=0, pid=1):
-        """Add a node, `name` with its namespace."""
         namespace, _, short = name.rpartition('/')
         self.add('ros2:rcl_node_init', time, 1, handle, handle, short, namespace or '/', pid=pid)
 
     def publisher(self, handle, node, topic, time=0, pid=1):
-        """Add a publisher."""
         self.add('ros2:rcl_publisher_init', time, 1, handle, node, handle, topic, 10, pid=pid)
 
     def timer(self, callback, node, period, time=0, pid=1):
@@ -112,7 +107,6 @@ class Recorded:
                          each, pid=pid)
 
     def group(self, address, kind, *callbacks, time=0):
-        """Add a callback group of timers and subscriptions."""
         self.add('ros2_caret:add_callback_group', time, 1, 5, address, kind)
         for entity, callback in callbacks:
             self.add(f'ros2_caret:callback_group_add_{entity}', time, 1, address,
@@ -121,7 +115,6 @@ class Recorded:
     # --- what happens ----------------------------------------------------------------------------
 
     def run(self, callback, tid, start, end, within=False, pid=1):
-        """Add an execution."""
         self.add('ros2:callback_start', start, tid, callback, within, pid=pid)
         self.add('ros2:callback_end', end, tid, callback, pid=pid)
 

@@ -1,13 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""As recorded: the replayer counts what the executor counted."""
+"""As recorded: what is counted and said of small runs (`test_deadlines.py`: of any run)."""
 
-from pathlib import Path
 import re
-import tempfile
 
-from hypothesis import example, given
-from hypothesis import strategies as st
 from mddag_executor.recording.head import declared, Head
 from mddag_executor.replay import replay, ReplayError
 from mddag_executor.replay.run import open_recording
@@ -16,51 +12,9 @@ from mddag_executor.trace import reading, TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
-from ..conftest import examples
-from .helpers import declarations, MS, SMALL, small, START_TIME, VirtualRun, Written
+from .helpers import MS, SMALL, small, START_TIME, VirtualRun, Written
 
 ONE = 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, timer: 10ms, deadline: 9ms}]}]'
-
-
-@given(declarations(), st.integers(0, 2**32), st.integers(1, 4),
-       st.sampled_from(['rad', 'fifo', 'rm']), st.integers(1, 25))
-@examples(80)
-@example(SMALL, 1, 2, 'rad', 8)
-def test_replay_counts_what_the_driver_counted(text, seed, workers, policy, longest):
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, 'run.mcap')
-        run = VirtualRun(path, loads(text, 'g.yaml'), seed, workers, policy,
-                         longest=longest * MS)
-        outcome = replay(path)
-    assert outcome.warnings == []
-    result = outcome.result()
-    expected = run.tally.result()
-    total = 0
-    for dag in result['dags'].values():
-        for sink in dag['sinks'].values():
-            del sink['slack_ns']
-            total += check_breakdown(sink.pop('breakdown'), sink)
-    assert total == pytest.approx(sum(run.responses), rel=1e-6)
-    assert {key: result[key] for key in expected} == expected
-    assert (result['policy'], result['workers'], result['preemptive']) == (policy, workers, False)
-    for key, use in result['callbacks'].items():
-        assert use['executions'] == run.executions[key]
-        assert use['busy_ns'] == run.busy[key]
-        assert use['waiting_ns'] == run.waited[key]
-    assert sum(result['dropped'].values()) == run.drops
-    assert result['worker_use']['use'] <= 1
-
-
-def check_breakdown(breakdown, sink):
-    """Compare the parts of the response times with them; return the sum of all."""
-    if breakdown is None:
-        return 0
-    worst = breakdown['worst']
-    parts = [worst[key] for key in breakdown['mean']]
-    assert sum(parts) == worst['completed_ns'] - worst['release_ns'] == sink['response_ns']['max']
-    assert worst['chain'][-1]['end_ns'] == worst['completed_ns']
-    assert min(parts) >= 0
-    return sink['completed'] * sum(breakdown['mean'].values())
 
 
 @pytest.mark.parametrize('in_order', [False, True])
@@ -104,7 +58,6 @@ def chain_of(worst):
 
 
 def test_a_job_to_the_millisecond(trace):
-    """A run written by hand: verdicts, times and chain are those that can be read off."""
     job_of_the_camera(trace, 0, 10)
     outcome = replay(trace.end(110))
     assert outcome.warnings == []

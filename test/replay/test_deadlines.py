@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts from tables are those of the scheduler core, and those of each part of a recording."""
+"""Verdicts from tables are those of the driver, of the scheduler core, and of each part."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +34,7 @@ def check(recording, skip=0):
 
 
 @given(st.integers(0, 2**32), st.data())
-@examples(60)
+@examples(40)
 def test_verdicts_of_any_tables(seed, data):
     """Tables that no executor records: ends and completions in any order, twice, or of no job."""
     with tempfile.TemporaryDirectory() as folder:
@@ -77,7 +77,6 @@ def verdicts(replay):
 
 
 def links(table, column, other, *names):
-    """Return the rows that a column refers to."""
     rows = table[column]
     return other[list(names)][rows[rows >= 0]].tolist()
 
@@ -90,7 +89,6 @@ def chains_of(jobs):
 
 
 def check_parts(recording, borders):
-    """Compare the parts between borders with the whole."""
     whole = Replay(recording)
     start = recording.start or 0
     found = []
@@ -125,17 +123,53 @@ def check_rows(whole, part, begin, end):
             assert part.executions['start'][row] <= time <= part.executions['end'][row]
 
 
-@given(declarations(), st.integers(0, 2**32), st.integers(1, 4), st.integers(1, 25),
+def check_counts(run, outcome):
+    assert outcome.warnings == []
+    result = outcome.result()
+    expected = run.tally.result()
+    total = 0
+    for dag in result['dags'].values():
+        for sink in dag['sinks'].values():
+            del sink['slack_ns']
+            total += check_breakdown(sink.pop('breakdown'), sink)
+    assert total == pytest.approx(sum(run.responses), rel=1e-6)
+    assert {key: result[key] for key in expected} == expected
+    assert (result['policy'], result['workers'], result['preemptive']) == (
+        run.policy, run.workers, False)
+    for key, use in result['callbacks'].items():
+        assert use['executions'] == run.executions[key]
+        assert use['busy_ns'] == run.busy[key]
+        assert use['waiting_ns'] == run.waited[key]
+    assert sum(result['dropped'].values()) == run.drops
+    assert result['worker_use']['use'] <= 1
+
+
+def check_breakdown(breakdown, sink):
+    """Compare the parts of the response times with them; return the sum of all."""
+    if breakdown is None:
+        return 0
+    worst = breakdown['worst']
+    parts = [worst[key] for key in breakdown['mean']]
+    assert sum(parts) == worst['completed_ns'] - worst['release_ns'] == sink['response_ns']['max']
+    assert worst['chain'][-1]['end_ns'] == worst['completed_ns']
+    assert min(parts) >= 0
+    return sink['completed'] * sum(breakdown['mean'].values())
+
+
+@given(declarations(), st.integers(0, 2**32), st.integers(1, 4),
+       st.sampled_from(['rad', 'fifo', 'rm']), st.integers(1, 25),
        st.sampled_from([0, 70 * MS]), st.lists(st.integers(1, 150), max_size=3, unique=True))
-@examples(50)
-@example(SMALL, 1, 2, 8, 0, [])
-@example(SMALL + PATHS, 1, 2, 20, 0, [40, 90])
-def test_any_run(text, seed, workers, longest, skip, borders):
+@examples(40)
+@example(SMALL, 1, 2, 'rad', 8, 0, [])
+@example(SMALL + PATHS, 1, 2, 'rad', 20, 0, [40, 90])
+def test_any_run(text, seed, workers, policy, longest, skip, borders):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'run.mcap')
-        VirtualRun(path, loads(text, 'g.yaml'), seed, workers, longest=longest * MS,
-                   shut_down=seed % 3 > 0)
+        run = VirtualRun(path, loads(text, 'g.yaml'), seed, workers, policy,
+                         longest=longest * MS, shut_down=seed % 3 > 0)
         recording = open_recording(path)
+        if run.shut_down:
+            check_counts(run, Replay(recording))
         check(recording, skip)
         try:
             other = open_recording(path, loads(SMALL, 'other.yaml'))

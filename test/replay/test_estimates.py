@@ -23,6 +23,13 @@ def late(n_workers, *executions, holding=()):
         np.isin(np.arange(len(worker)), holding)).tolist()
 
 
+COMPUTE = [
+    # who overtakes and who only waits could begin at once; the machine tells why they did not
+    (3, None, 4 * MS, 5 * MS + 7, 6 * MS), (0, None, 0, 30, 10 * MS),
+    (1, None, 0, 10 * MS + 50, 20 * MS), (4, None, 12 * MS, 13 * MS + 9, 22 * MS),
+    (2, None, 15 * MS, 20 * MS + 60, 30 * MS)]
+
+
 @pytest.mark.parametrize(('workers', 'executions', 'expected'), [
     # an idle worker could have started it at once
     (2, [(0, None, 100, 130, 500)], [30]),
@@ -39,9 +46,12 @@ def late(n_workers, *executions, holding=()):
          (1, None, 0, 0, 600)], [0, 0, 10, 0]),
     # an unknown worker is not waited for
     (1, [(-1, None, 0, 0, 400), (-1, None, 100, 430, 500)], [0, 330]),
+    # what computes is waited for: three, one after the other, by a fourth that overtakes
+    (5, COMPUTE, [MS + 7, 30, 50, MS + 9, 60]),
 ])
 def test_by_hand(workers, executions, expected):
-    assert late(workers, *executions) == expected
+    holding = (0, 1, 2, 4) if executions is COMPUTE else ()
+    assert late(workers, *executions, holding=holding) == expected
 
 
 @given(st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), min_size=1, max_size=20))
@@ -54,17 +64,6 @@ def test_a_schedule_without_overhead_has_none(jobs):
         free[worker] = start + takes
         executions.append((worker, None, ready, start, free[worker]))
     assert late(3, *executions) == [0] * len(jobs)
-
-
-def test_waiting_for_what_computes_is_not_late():
-    """Three that compute, one after the other; a fourth overtakes; one that only waits."""
-    overtakes, first, second, _, third = range(5)
-    # who overtakes and who only waits could begin at once; the machine tells why they did not
-    assert late(
-        5, (3, None, 4 * MS, 5 * MS + 7, 6 * MS), (0, None, 0, 30, 10 * MS),
-        (1, None, 0, 10 * MS + 50, 20 * MS), (4, None, 12 * MS, 13 * MS + 9, 22 * MS),
-        (2, None, 15 * MS, 20 * MS + 60, 30 * MS), holding=(overtakes, first, second, third),
-    ) == [MS + 7, 30, 50, MS + 9, 60]
 
 
 @given(st.lists(st.tuples(st.integers(0, 10 ** 13), st.integers(0, 10 ** 11)), max_size=30))

@@ -7,8 +7,8 @@ from functools import partial
 
 from hypothesis import example, given
 from hypothesis import strategies as st
-from mddag_executor.core.tally import total
-from mddag_executor.replay import open_recording, replay
+from mddag_executor.core.tally import counts, total
+from mddag_executor.replay import open_recording, replay, reschedule
 from mddag_executor.replay.causes import CAUSES
 from msg_graph import loads
 import pytest
@@ -54,7 +54,7 @@ class Planned(VirtualRun):
     """
 
     chances: Chances = field(default_factory=lambda: QUIET)
-    duration: int = 26_000 * MS
+    duration: int = 10_000 * MS
     longest: int = MS
     times: dict[int, tuple[int, int]] = field(default_factory=dict)
     legs: int = 1
@@ -125,11 +125,9 @@ BUSY = {FIRST: (30 * MS, 30 * MS), SECOND: (30 * MS, 30 * MS)}
 PLANS = {
     'ran long': (VICTIM, {'times': {USE: (2 * MS, 20 * MS)}}),
     # both heavy ones are released with every second job of the victim
-    'waited': (HEAVY, {'times': BUSY, 'duration': 12_000 * MS}),
-    'group': (HEAVY, {'times': BUSY, 'workers': 6, 'groups': {USE: 0, FIRST: 0, SECOND: 0},
-                      'duration': 12_000 * MS}),
-    'interpreter': (HEAVY, {'times': BUSY, 'workers': 6, 'holds': True, 'policy': 'fifo',
-                            'duration': 12_000 * MS}),
+    'waited': (HEAVY, {'times': BUSY}),
+    'group': (HEAVY, {'times': BUSY, 'workers': 6, 'groups': {USE: 0, FIRST: 0, SECOND: 0}}),
+    'interpreter': (HEAVY, {'times': BUSY, 'workers': 6, 'holds': True, 'policy': 'fifo'}),
     'released late': (VICTIM, {'late': 15 * MS}),
     # the message that comes first is only kept
     'released late, sync': (SYNC, {
@@ -162,10 +160,10 @@ def test_the_right_cause_is_told(cause, tmp_path):
     Planned(path, loads(declaration, 'g.yaml'), **plan)
     result = explained(path)
     cause, _, computing = cause.partition(', ')
-    assert result['missed'] >= 100
+    assert result['missed'] >= 39
     assert result['causes'][cause] >= 0.95 * result['missed'], result['causes']
     if cause == 'machine' and not computing:
-        assert len(result['stalls']) == 13
+        assert len(result['stalls']) == 5
         assert all(295 * MS <= stall['length_ns'] <= 320 * MS for stall in result['stalls'])
         assert sum(stall['misses'] for stall in result['stalls']) == result['causes'][cause]
     else:
@@ -329,3 +327,7 @@ nodes:
     behind = {each['callback'] for job in explained['jobs'] for part in job['parts']
               for each in part['behind']}
     assert '/n:main' in behind
+    # the recorded execution times say what is too much, whatever it was recorded with
+    in_time = [counts(reschedule(trace, on_late=on_late).result()['dags']['a']['sinks'][
+        '/n:main']).in_time for on_late in ('continue', 'demote')]
+    assert in_time[0] < 20 and in_time[1] >= 99

@@ -125,7 +125,6 @@ def attempt(path, read, seed):
 
 @pytest.fixture(autouse=True)
 def bounded_memory():
-    """Fail where the fuzzed readers took much memory, or all there is."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     yield
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -138,7 +137,7 @@ def test_damaged_files(tmp_path):
     VirtualRun(path, small(), 2, duration=60 * MS, flush_every=20)      # several chunks
     data, expected = path.read_bytes(), counts(replay(path).result())
     replayed = 0
-    for seed in rounds(120):
+    for seed in rounds(100):
         rng, changed = random.Random(seed), bytearray(data)
         mutate = rng.choice((flip, flip, cut, stretch, row))
         mutate(changed, rng)
@@ -154,7 +153,7 @@ def test_damaged_files(tmp_path):
                 assert {key: n for key, n in found.items() if n > expected[key]} == {}
         if seed % 8 == 0:
             attempt(path, lambda path: reschedule(path, workers=1).result(), seed)
-    assert replayed > 30
+    assert replayed > 20
 
 
 TEXTS = ('', '/', '/camera', 'x' * 5000, '\x1b[2J\n', '/camera\n')
@@ -222,7 +221,7 @@ def test_events_that_say_something_else(tmp_path, kind):
               for layout, *event in TraceReader(sound).layout_events(None)]
     whole = reschedule(sound, graph, policy='rad', workers=2)
     jobs, replayed = size(whole.result()), 0
-    for seed in rounds(50):
+    for seed in rounds(40):
         lies = tell_lies(events, path, random.Random(seed))
         result = attempt(path, lambda path: replay(path, graph).result(), seed)
         if result is None:
@@ -245,7 +244,7 @@ def test_events_that_say_something_else(tmp_path, kind):
         if again is not None:
             assert len(again.decisions) <= 2 * len(whole.decisions) + 2 * lies, seed
             assert len(again.log) <= 2 * len(whole.log) + 2 * lies, seed
-    assert replayed > 25
+    assert replayed > 20
 
 
 def test_an_event_at_the_end_of_all_times(tmp_path):
@@ -267,7 +266,7 @@ def test_damaged_bags(tmp_path, storage, compression):
     file = next(p for p in path.iterdir() if p.name != 'metadata.yaml')
     data = file.read_bytes()
     whole = list(Bag(path, {'/points'}).stamps['/points'].arrival)
-    for seed in rounds(80):
+    for seed in rounds(60):
         rng, changed = random.Random(seed), bytearray(data)
         mutate = rng.choice((flip, cut, stretch))
         mutate(changed, rng)
@@ -281,7 +280,6 @@ def test_damaged_bags(tmp_path, storage, compression):
 
 @pytest.mark.needs('babeltrace2')
 def test_damaged_ctf_sessions(tmp_path):
-    """babeltrace2 reads them in a process of its own: a trace, or an error."""
     kinds = [(f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')]
     folder = session(tmp_path / 'session', kinds, [
         (at % 2, at, 1, 1, 'p', 0x5550) for at in range(40)])

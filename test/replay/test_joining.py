@@ -61,12 +61,10 @@ class Trace:
         self.job += 1
 
     def knows(self, topic, handle):
-        """Publish a topic and subscribe to it."""
         for kind in ('publisher', 'subscription'):
             self.add(f'rcl_{kind}_init', 0, handle, 1, handle, topic, 10)
 
     def sends(self, other, handle, sent, transport):
-        """Send a message to another trace."""
         self.add('rclcpp_publish', sent, handle, 1, 0)
         other.add('rmw_take', sent + transport, handle, 1, BASE + sent - self.late, True)
 
@@ -87,9 +85,9 @@ def verdicts(result):
     return found.due, found.in_time, found.late
 
 
-def pair(folder, takes=(2,), **options):
+def pair(folder, takes=(2,), boot='', **options):
     """Return the traces of two processes that ran jobs, 10 ms each: 1 ms, and what is given."""
-    up, down = Trace(folder, 'up', 0), Trace(folder, 'down', 1, **options)
+    up, down = Trace(folder, 'up', 0, boot=boot), Trace(folder, 'down', 1, boot=boot, **options)
     for i, took in enumerate(takes):
         release = i * 10 * MS
         up.runs(release, release + MS)
@@ -115,7 +113,6 @@ def test_a_job_goes_on_in_the_other_trace(tmp_path, late):
 
 
 def two_machines(folder, late, back=True):
-    """Return the traces of a run on two machines, the clock of the other is late."""
     up = Trace(folder, 'up', 0, graph=STAMPED, boot='one')
     down = Trace(folder, 'down', 1, late, STAMPED, boot='other')
     for trace in (up, down):
@@ -159,10 +156,7 @@ def test_clocks_are_taken_as_they_are_where_messages_go_one_way(tmp_path):
 
 
 def test_one_machine_has_one_clock_whatever_it_was_set_to(tmp_path):
-    up = Trace(tmp_path, 'up', 0, boot='one')
-    down = Trace(tmp_path, 'down', 1, 3600_000 * MS, boot='one')
-    up.runs(0, MS)
-    down.runs(0, 3 * MS)
+    up, down = pair(tmp_path, boot='one', late=3600_000 * MS)
     outcome = replay([up.end(90 * MS), down.end(90 * MS)])
     assert outcome.warnings == [] and verdicts(outcome.result()) == (1, 1, 0)
 

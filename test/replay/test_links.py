@@ -33,14 +33,12 @@ class Links:
 
 
 def linked(path):
-    """Return the links of a recording, and the warnings."""
     recording = open_recording(path)
     return Links(recording), [line.removeprefix(f'{path}: ') for line in recording.warnings]
 
 
 @pytest.fixture
 def recorded(tmp_path):
-    """Give a recording of a camera with a timer and a detector with a subscription."""
     recorded = Recorded(tmp_path / 'recorded.mcap')
     recorded.node(1, '/camera')
     recorded.node(2, '/detector')
@@ -215,7 +213,6 @@ def test_what_was_initialised_before_the_recording(tmp_path):
 
 
 def test_any_lost_event_is_said_or_changes_nothing(recorded):
-    """Leave out each event once: no link may be another one, and what is missing is said."""
     for k in range(3):
         at = (k + 1) * 100 * MS
         recorded.run(CAMERA, 1, at, at + 3 * MS)

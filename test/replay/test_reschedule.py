@@ -3,7 +3,6 @@
 """Rescheduled: the recorded load through the core, with the same and with other settings."""
 
 from mddag_executor.core import PolicyError
-from mddag_executor.core.tally import counts
 from mddag_executor.errors import UsageError
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.run_writer import write_trace
@@ -269,25 +268,6 @@ def test_what_was_not_published_is_not_published_again(computes, tmp_path, call)
         # 8 ms in each of 40 jobs, but 1 ms less in those without an object
         assert again['utilisation'] * again['workers'] * again['duration_ns'] == \
             pytest.approx((40 * 7 + 14) * MS)
-
-
-def test_what_would_have_been_with_demote(tmp_path, call):
-    """The recorded execution times say what is too much; nothing is declared."""
-    graph, trace, times = (tmp_path / name for name in ('g.yaml', 'run.mcap', 'times.json'))
-    graph.write_text("""\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: main, timer: 30ms, deadline: 30ms, importance: high, dag: main}
-      - {name: rest, timer: 20ms, deadline: 20ms, dag: rest}
-""")
-    times.write_text('{"main": {"/n:main": 20000}, "rest": {"/n:rest": 10000}}')
-    call('simulate', graph, '--workers', 1, '--preemptive', '--duration', '3s',
-         '--execution-times', times, '--trace', trace)
-    in_time = [counts(reschedule(trace, on_late=on_late).result()['dags']['main']['sinks'][
-        '/n:main']).in_time for on_late in ('continue', 'demote')]
-    assert in_time[0] < 20 and in_time[1] >= 99
 
 
 # --- overheads -----------------------------------------------------------------------------------

@@ -53,7 +53,6 @@ RESCHEDULED = '--reschedule --workers 1 --policy fifo --overheads none --skip 50
 
 @pytest.fixture(autouse=True)
 def files(tmp_path, monkeypatch):
-    """Make the recordings that are not in the repository."""
     monkeypatch.chdir(tmp_path)
     Path('demo.mcap').symlink_to(DEMO)
     Path('four.yaml').write_text(IMPORTED)

@@ -98,7 +98,6 @@ def test_subscriptions_that_may_be_a_sync_have_a_comment():
 
 
 def test_names_periods_and_what_no_one_declares(tmp_path):
-    """Functions give names, periods are as people write them, lifecycle services are left out."""
     r = Recorded(tmp_path / 'n.mcap')
     r.node(100, '/cam')
     r.publisher(110, 100, '/cam/transition_event')

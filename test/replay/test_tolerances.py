@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Tolerated misses, failed jobs, a warm-up and runs without a job, wherever verdicts are told."""
+"""Tolerated misses, failed jobs and runs without a job, wherever verdicts are told."""
 
 from xml.etree import ElementTree
 
@@ -167,26 +167,6 @@ def test_a_failed_job_is_told_wherever_verdicts_are(trace, tmp_path, mode, call)
         assert done.returncode == 1 and '2 late, 0 expired, 1 failed; policy' in done.stdout
         call('export', failed, '-o', jobs, '--rows', 'jobs')
         assert jobs.read_text().count(',failed') == 1
-
-
-@MODES
-def test_a_warm_up_is_left_out(trace, tmp_path, mode, call):
-    """The jobs 2 and 3, released 20 ms and 30 ms after the first, are the late ones."""
-    for skip, skipped, due, late in (('0', 0, 10, 2), ('20ms', 20 * MS, 8, 2),
-                                     ('20001us', 20_001_000, 7, 1), ('31ms', 31 * MS, 6, 0)):
-        arguments = 'replay', trace, *mode, '--skip', skip
-        status, out, err = call(*arguments, '--fail-on-miss')
-        assert (status, err) == (late > 0, '')
-        assert f'{due} results due, {due - late} in time' in out
-        assert ('left out: jobs released in the first' in out) == (skip != '0')
-        result = call(*arguments, '--json', '-').result
-        dag = result['dags']['/n']
-        assert (dag['jobs'], dag['ends']['completed'], dag['ends']['late']) == (
-            due, due - late, late)
-        assert result['skip_ns'] == skipped
-    page = tmp_path / 'report.html'
-    call(*arguments, '--report', page)
-    assert '6 results due, 6 in time (100.00 %)' in page.read_text()
 
 
 @MODES
