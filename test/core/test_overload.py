@@ -7,7 +7,6 @@ from dataclasses import replace
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from mddag_executor.core.jobs import is_miss
-from mddag_executor.core.state import DROPPED
 from mddag_executor.core.tally import counts
 from mddag_executor.simulate import Settings, simulate
 from msg_graph import ExecutionTime
@@ -280,28 +279,3 @@ def test_the_slowest_callback_of_a_burst_works_off_its_backlog(extra):
     missed = misses_of_a_burst(case, 1, extra, 2000, 'demote')
     assert {dag for dag, _ in missed} == {0}
     assert max(time for _, time in missed) < 500 + extra * 7 / (1 - 0.7)
-
-
-def test_the_age_of_a_dropped_execution_is_passed_on_to_the_next_one_only():
-    """If that is in time, an execution that is late much later is demoted like any other."""
-    core = live(declaration([
-        single(name, 100, 100, on_late='demote', keep=keep)
-        for name, keep in (('slow', 'newest'), ('other', 'all'))]), workers=1)
-
-    def ready(dag, job, now):
-        x = core.source(core.release(dag, job, now * TICK, now * TICK))
-        core.ready(x, now * TICK)
-        return x
-
-    for begin, job in ((0, 0), (1_000_000, 2)):
-        first = ready(1, job, begin)
-        assert core.take(0, begin * TICK) == first
-        late = ready(0, job, begin)
-        core.complete(first, (begin + 150) * TICK)
-        other = ready(1, job + 1, begin + 150)
-        assert core.take(0, (begin + 150) * TICK) == other
-        newest = ready(0, job + 1, begin + 160)  # drops the late one
-        assert core.state.x_state[late] == DROPPED
-        core.complete(other, (begin + 170) * TICK)
-        assert core.take(0, (begin + 170) * TICK) == newest
-        core.complete(newest, (begin + 180) * TICK)

@@ -86,22 +86,17 @@ def test_one_event_with_other_fields_in_another_process(tmp_path):
 
 
 @bt2
-def test_discarded_events_are_counted(tmp_path):
-    folder = session(tmp_path / 's', [END], [(0, time, 1, 1, 'p', 3) for time in range(10)],
-                     discarded=17)
+@pytest.mark.parametrize(('options', 'says'), [
+    ({'discarded': 17}, 'discarded 17 events'), ({'context': False}, 'vpid and vtid')])
+def test_events_that_are_discarded_or_have_no_context_are_warned_of(tmp_path, options, says):
+    folder = session(tmp_path / 's', [END], [(0, time, 0, 0, '', 3) for time in range(10)],
+                     **options)
     result = import_ctf(folder, tmp_path / 'out.mcap')
-    assert result.discarded == 17
-    assert 'discarded 17 events' in result.warnings[0]
-    assert [event[4] for event in TraceReader(tmp_path / 'out.mcap').events({'mddag:lost'})] == [
-        17]
-
-
-@bt2
-def test_events_without_contexts(tmp_path):
-    folder = session(tmp_path / 's', [END], [(0, 1, 0, 0, '', 3)], context=False)
-    result = import_ctf(folder, tmp_path / 'out.mcap')
-    assert 'vpid and vtid' in result.warnings[0]
-    assert next(iter(read_events(tmp_path / 'out.mcap')))['callback'] == 3
+    assert says in result.warnings[0]
+    assert result.discarded == options.get('discarded', 0)
+    reader = TraceReader(tmp_path / 'out.mcap')
+    assert [event[4] for event in reader.events({END[0]})] == [3] * 10
+    assert sum(event[4] for event in reader.events({'mddag:lost'})) == result.discarded
 
 
 @bt2

@@ -116,16 +116,6 @@ def test_warnings_have_counts(tmp_path, sample):
                              'the data, 4 chunks with 14 messages']
 
 
-def flips(data, count, seed):
-    """Yield positions and the data with one bit flipped there, every position at least once."""
-    generator = random.Random(seed)
-    for number in range(count):
-        position = number if number < len(data) else generator.randrange(len(data))
-        changed = bytearray(data)
-        changed[position] ^= 1 << generator.randrange(8)
-        yield position, bytes(changed)
-
-
 def test_flipped_bits(tmp_path, sample):
     data, chunks = sample
     path = tmp_path / 'a.mcap'
@@ -133,26 +123,26 @@ def test_flipped_bits(tmp_path, sample):
                   Opcode.FOOTER)
     where = {position: opcode for opcode, start, end in records_of(data)
              for position in range(start, end)}
-    for position, changed in flips(data, len(data), 1):
+    generator = random.Random(1)
+    for position in range(len(data)):
+        changed = bytearray(data)
+        changed[position] ^= 1 << generator.randrange(8)
         is_summary = where.get(position) in in_summary      # which has a CRC
-        found = check(path, changed, chunks, position, warns=is_summary)
+        found = check(path, bytes(changed), chunks, position, warns=is_summary)
         assert not is_summary or found == len(chunks)
 
 
 def test_what_is_no_file(tmp_path):
     os.mkfifo(tmp_path / 'pipe')
-    for path in (tmp_path / 'pipe', '/dev/zero'):
-        with pytest.raises(TraceError, match='is no file: give the .mcap file itself'):
-            TraceReader(path)
-    for name, says in (('missing', 'no such file or directory: check the path'),
-                       ('missing/a.mcap', 'no such file or directory: check the path'),
-                       ('x' * 1000, r'cannot be read \(.*\): check its name')):
+    for path, says in (
+            (tmp_path / 'pipe', 'is no file: give the .mcap file itself'),
+            ('/dev/zero', 'is no file: give the .mcap file itself'),
+            (tmp_path / 'missing/a.mcap', 'no such file or directory: check the path'),
+            (tmp_path / ('x' * 1000), r'cannot be read \(.*\): check its name'),
+            ('a\0b', 'is no file name'),
+            ('/proc/self/mem', r'/proc/self/mem: cannot be read \(Input/output error\)')):
         with pytest.raises(TraceError, match=says):
-            TraceReader(tmp_path / name)
-    with pytest.raises(TraceError, match='is no file name'):
-        TraceReader('a\0b')
-    with pytest.raises(TraceError, match=r'/proc/self/mem: cannot be read \(Input/output error\)'):
-        TraceReader('/proc/self/mem')
+            TraceReader(path)
     if os.getuid() != 0:
         (tmp_path / 'secret').write_bytes(records.MAGIC)
         (tmp_path / 'secret').chmod(0)
@@ -161,7 +151,6 @@ def test_what_is_no_file(tmp_path):
 
 
 @pytest.mark.parametrize(('files', 'says'), [
-    (['notes.txt'], 'is a folder without a trace: give a trace, an .mcap file'),
     (['run.mcap', 'notes.txt'], 'is a folder: give the trace {}/run.mcap'),
     (['a.mcap', 'b.mcap'], 'is a folder: give the trace {}/a.mcap or another one in it'),
     (['ust/uid/1/metadata'], "is a folder that LTTng recorded to: make a trace of it with 'mddag "
@@ -257,11 +246,16 @@ def hostile():
     unsized = compressor.compress(zeros * 300)
     window = zstandard.ZstdCompressionParameters(window_log=27, write_content_size=False)
     claims = b'\x28\xb5\x2f\xfd\xe0' + (1 << 40).to_bytes(8, 'little') + b'\1\0\0'
+    lz4_bomb = lz4.frame.compress(zeros * 300)
     good = definitions() + message(bytes(8))
 
     def one(content, **changes):
         packed = zstandard.compress(content)
         return chunk(packed, size=len(content), crc=zlib.crc32(content), **changes)
+    preamble = 'int64 timestamp\nint32 vpid\nint32 vtid\n'
+
+    def of_schema(text):
+        return one(definitions(preamble + text) + message(b'\xff' * 4))
     return {
         'record of 2**63 bytes': struct.pack('<BQ', 6, 2**63) + bytes(100),
         'record of 2**64-1 bytes': struct.pack('<BQ', 6, 2**64 - 1) + bytes(100),
@@ -273,13 +267,12 @@ def hostile():
         'compression name of 2**32-1 bytes': records.record(
             Opcode.CHUNK, struct.pack('<QQQI', 0, 0, 1, 0) + b'\xff' * 40),
         'zstd bomb': chunk(large_bomb), 'zstd bomb of unknown size': chunk(unsized),
-        'zstd frame of 2**40 bytes': chunk(claims), 'zstd frame as it claims': chunk(
-            claims, size=2**40),
+        'zstd frame of 2**40 bytes': chunk(claims),
+        'zstd frame as it claims': chunk(claims, size=2**40),
         'zstd bomb with a large window': chunk(
             zstandard.ZstdCompressor(compression_params=window).compress(zeros * 300)),
-        'lz4 bomb': chunk(lz4.frame.compress(zeros * 300), compression='lz4'),
-        'lz4 bomb of 255 MiB': chunk(lz4.frame.compress(zeros * 300), compression='lz4',
-                                     size=255 << 20),
+        'lz4 bomb': chunk(lz4_bomb, compression='lz4'),
+        'lz4 bomb of 255 MiB': chunk(lz4_bomb, compression='lz4', size=255 << 20),
         'no zstd': chunk(b'nonsense'), 'no lz4': chunk(b'nonsense', compression='lz4'),
         'empty zstd': chunk(b''), 'empty lz4': chunk(b'', compression='lz4'),
         'zstd of no bytes': chunk(b'', size=0), 'content but size 0': chunk(bomb, size=0),
@@ -293,17 +286,12 @@ def hostile():
         'schemas of 70 MiB': one(b''.join(records.record(
             Opcode.SCHEMA, struct.pack('<H', number) + b'\1\0\0\0a\1\0\0\0b'
             + prefixed(zeros)) for number in range(1, 71))),
-        'undefined channel': one(message(bytes(8))), 'message without a head': one(
-            definitions() + records.record(Opcode.MESSAGE, b'\1\0')),
-        'string of 4 GiB': one(definitions('int64 timestamp\nint32 vpid\nint32 vtid\nstring s\n')
-                               + message(b'\xff\xff\xff\xff')),
-        'sequence of 4 G': one(definitions(
-            'int64 timestamp\nint32 vpid\nint32 vtid\nfloat64[] s\n') + message(b'\xff' * 4)),
-        'array of 10**12': one(definitions(
-            'int64 timestamp\nint32 vpid\nint32 vtid\nuint8[1000000000000] s\n')
-            + message(b'\xff' * 4)),
-        'names of 10**6': one(definitions('int64 timestamp\nint32 vpid\nint32 vtid\n' + ''.join(
-            f'int8 a{number}\n' for number in range(30_000))) + message(bytes(8))),
+        'undefined channel': one(message(bytes(8))),
+        'message without a head': one(definitions() + records.record(Opcode.MESSAGE, b'\1\0')),
+        'string of 4 GiB': of_schema('string s\n'),
+        'sequence of 4 G': of_schema('float64[] s\n'),
+        'array of 10**12': of_schema('uint8[1000000000000] s\n'),
+        'names of 10**6': of_schema(''.join(f'int8 a{number}\n' for number in range(30_000))),
         'a line of 10**6': one(definitions('int8 ' + 'a ' * 500_000) + message(bytes(8))),
         'a chunk in a chunk': one(chunk(bomb)),
         'a tail of zeros': one(good) + bytes(100_000),

@@ -43,7 +43,6 @@ def write_with_mcap(path, recorded, **options):
 
 
 @pytest.mark.parametrize('options', [
-    {'chunk_size': 2000, 'compression': CompressionType.ZSTD},
     {'chunk_size': 2000, 'compression': CompressionType.LZ4},
     {'chunk_size': 2000, 'compression': CompressionType.NONE},
     {'chunk_size': 2000, 'enable_crcs': False, 'use_statistics': False},
@@ -52,12 +51,12 @@ def write_with_mcap(path, recorded, **options):
     {'use_chunking': False, 'repeat_channels': False, 'repeat_schemas': False,
      'use_statistics': False, 'use_summary_offsets': False, 'index_types': IndexType.NONE},
 ], ids=str)
-@pytest.mark.parametrize('in_time_order', [False, True])
-def test_files_by_the_mcap_package(tmp_path, options, in_time_order):
+def test_files_by_the_mcap_package(tmp_path, options):
     path = tmp_path / 'a.mcap'
     recorded = mixture(300)
     write_with_mcap(path, recorded, **options)
-    assert read(path, in_time_order) == (read_back(recorded), [])
+    for in_time_order in (False, True):
+        assert read(path, in_time_order) == (read_back(recorded), [])
 
 
 def write_one(path, schema, data, topic='/trace/ros2/callback_end',
@@ -94,7 +93,6 @@ def test_other_fields_than_the_table(tmp_path, schema, data, expected):
     path = tmp_path / 'a.mcap'
     write_one(path, schema, data)
     assert read(path) == ([expected], [])
-    assert read(path, in_time_order=True) == ([expected], [])
 
 
 def test_an_event_that_is_not_in_the_table(tmp_path):
@@ -129,13 +127,11 @@ def test_an_event_that_is_not_in_the_table(tmp_path):
 def test_events_that_cannot_be_decoded_are_counted(tmp_path, options, reason):
     path = tmp_path / 'a.mcap'
     write_one(path, **{'data': HEAD + bytes(8), 'repeat': 5, **options})
-    for in_time_order in (False, True):
-        events, warnings = read(path, in_time_order)
-        assert not events
-        assert len(warnings) == 1
-        assert 'left out 5 messages that cannot be decoded, most of them (5) of ' \
-               '/trace/ros2/callback_end: ' in warnings[0]
-        assert reason in warnings[0]
+    events, (warning,) = read(path)
+    assert not events and reason in warning
+    assert ('left out 5 messages that cannot be decoded, most of them (5) of '
+            '/trace/ros2/callback_end: ') in warning
+    assert read(path, in_time_order=True) == ([], [warning])
     with pytest.warns(TraceWarning, match='left out 5 messages that cannot'):
         assert list(read_events(path)) == []
 
@@ -154,7 +150,7 @@ def test_names_select(tmp_path):
     assert reader.warnings == []
 
 
-@pytest.mark.parametrize('seed', range(20))
+@pytest.mark.parametrize('seed', range(10))
 @pytest.mark.parametrize('finish', [True, False])
 def test_any_disorder_is_put_into_order(tmp_path, seed, finish):
     """Also of chunks whose definitions stand in a chunk that starts later."""

@@ -15,11 +15,9 @@ from mddag_executor.trace import (
     TraceError,
     TraceFile,
     TraceReader,
-    TraceWriter,
 )
 from mddag_executor.trace.cdr import decode, FieldType
 from mddag_executor.trace.groups import events_of, EXECUTION, PUBLICATION
-import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
@@ -31,7 +29,6 @@ from .helpers import (
     read,
     read_back,
     records_of,
-    START,
     values,
     VPID,
     write_chunks,
@@ -55,52 +52,31 @@ def test_every_value_comes_back(tmp_path, recorded):
     assert read(path, in_time_order=True) == (by_time, [])
 
 
-def test_dicts_for_caret(tmp_path):
-    path = tmp_path / 'a.mcap'
-    with TraceFile(path) as file:
-        file.add('callback_end', 20, 1, 2, 77)
-        file.add('ros2:rcl_timer_init', 10, 1, 3, 2**64 - 1, -5)
-    assert list(read_events(path)) == [
-        {'_name': 'ros2:rcl_timer_init', '_timestamp': 10, '_vpid': 1, '_vtid': 3,
-         'timer_handle': 2**64 - 1, 'period': -5},
-        {'_name': 'ros2:callback_end', '_timestamp': 20, '_vpid': 1, '_vtid': 2, 'callback': 77}]
-
-
-@pytest.mark.parametrize('seeking', [True, False])
-def test_mcap_reads_it(tmp_path, seeking):
-    path = tmp_path / 'a.mcap'
-    recorded = mixture(200)
-    write_chunks(path, [recorded[:50], recorded[50:]])
-    found = []
-    with open(path, 'rb') as stream:
-        reader = (make_reader(stream, validate_crcs=True) if seeking
-                  else NonSeekingReader(stream, validate_crcs=True))
-        for schema, channel, message in reader.iter_messages():
-            assert channel.message_encoding == 'cdr'
-            assert schema is not None and schema.encoding == 'ros2msg'
-            assert message.log_time == message.publish_time
-            assert message.data[:4] == b'\0\1\0\0'
-            _, provider, name = channel.topic[1:].split('/')
-            event = EVENTS[f'{provider}:{name}']
-            assert schema.data.decode() == event.text
-            assert schema.name == 'mddag_trace/msg/' + ''.join(
-                part.capitalize() for part in name.split('_'))
-            values = decode(event.types, message.data[4:])
-            assert values[0] == message.log_time
-            found.append((event.key, *values))
-    assert found == read_back(recorded)
-
-
-def test_mcap_agrees_with_the_summary(tmp_path):
+def test_mcap_reads_it_and_agrees_with_the_summary(tmp_path):
     path = tmp_path / 'a.mcap'
     recorded = mixture(300)
     recorded[0], recorded[99] = recorded[99], recorded[0]       # out of order within a chunk
     write_chunks(path, [recorded[:100], recorded[100:]])
     data = path.read_bytes()
+    found = []
+    with open(path, 'rb') as stream:
+        for schema, channel, message in NonSeekingReader(
+                stream, validate_crcs=True).iter_messages(log_time_order=False):
+            _, provider, name = channel.topic[1:].split('/')
+            event = EVENTS[f'{provider}:{name}']
+            assert (channel.message_encoding, schema.encoding) == ('cdr', 'ros2msg')
+            assert schema.data.decode() == event.text
+            assert schema.name == 'mddag_trace/msg/' + name.title().replace('_', '')
+            assert message.data[:4] == b'\0\1\0\0'
+            values = decode(event.types, message.data[4:])
+            assert message.log_time == message.publish_time == values[0]
+            found.append((event.key, *values))
+    assert found == read_back(recorded)
     with open(path, 'rb') as stream:
         reader = make_reader(stream, validate_crcs=True)
         header = reader.get_header()
         summary = reader.get_summary()
+        assert sum(1 for _ in reader.iter_messages()) == 300
     assert (header.profile, header.library) == ('ros2', 'mddag_executor')
     statistics = summary.statistics
     times = [event[1] for event in recorded]
@@ -109,35 +85,18 @@ def test_mcap_agrees_with_the_summary(tmp_path):
     assert (statistics.message_start_time, statistics.message_end_time) == (min(times), max(times))
     assert sum(statistics.channel_message_counts.values()) == 300
     chunks = [(start, end) for opcode, start, end in records_of(data) if opcode == 6]
-    assert [(index.chunk_start_offset, index.chunk_start_offset + index.chunk_length)
-            for index in summary.chunk_indexes] == chunks
-    assert [(index.message_start_time, index.message_end_time)
+    parts = times[:100], times[100:]
+    assert [(index.chunk_start_offset, index.chunk_start_offset + index.chunk_length,
+             index.message_start_time, index.message_end_time)
             for index in summary.chunk_indexes] == [
-        (min(times[:100]), max(times[:100])), (min(times[100:]), max(times[100:]))]
+        (*chunk, min(part), max(part)) for chunk, part in zip(chunks, parts)]
     for index in summary.chunk_indexes:
         for channel, offset in index.message_index_offsets.items():
             assert data[offset] == 7 and data[offset + 9:offset + 11] == channel.to_bytes(
                 2, 'little')
 
 
-def test_rosbags_reads_it(tmp_path):
-    path = tmp_path / 'a.mcap'
-    recorded = mixture(200)
-    write_chunks(path, [recorded[:50], recorded[50:]])
-    found = []
-    with AnyReader([path]) as reader:
-        assert reader.message_count == 200
-        for connection, time, data in reader.messages():
-            _, provider, name = connection.topic[1:].split('/')
-            event = EVENTS[f'{provider}:{name}']
-            message = reader.deserialize(data, connection.msgtype)
-            assert message.timestamp == time
-            found.append((event.key, time, message.vpid, message.vtid,
-                          *(getattr(message, field) for field, _ in event.fields)))
-    assert found == read_back(recorded)
-
-
-def test_events_beyond_the_table(tmp_path):
+def test_events_beyond_the_table_and_rosbags_reads_them(tmp_path):
     path = tmp_path / 'a.mcap'
     extra = [
         # as CARET records a tracepoint of ros2 again, with one field more
@@ -149,26 +108,29 @@ def test_events_beyond_the_table(tmp_path):
     ]
     with TraceFile(path) as file:
         keys = [file.define(event) for event in extra]
+        file.add(keys[2], 4, VPID, 2, 7, 'n')
         file.add('rcl_node_init', 1, VPID, 2, 3, 4, 'name', '/')
         file.add(keys[0], 2, VPID, 2, 3, -4)
         file.add(keys[1], 3, VPID, 2, range(16), ['a', 'b'])
-        file.add(keys[2], 4, VPID, 2, 7, 'n')
     reader = TraceReader(path)
     assert list(reader.events()) == [
+        ('ros2:rcl_publish', 4, VPID, 2, None, 7),      # the table's fields, None where missing
         ('ros2:rcl_node_init', 1, VPID, 2, 3, 4, 'name', '/'),
         ('ros2_caret:rcl_node_init', 2, VPID, 2, 3, -4),
-        ('ros2:rmw_publisher_init', 3, VPID, 2, tuple(range(16)), ('a', 'b')),
-        ('ros2:rcl_publish', 4, VPID, 2, None, 7)]      # the table's fields, None where missing
+        ('ros2:rmw_publisher_init', 3, VPID, 2, tuple(range(16)), ('a', 'b'))]
     assert reader.fields['ros2:rmw_publisher_init'] == ('gid', 'more')
     assert reader.fields['ros2:rcl_publish'] == ('publisher_handle', 'message')
     assert reader.warnings == []
-    assert list(read_events(path))[3] == {
+    assert list(read_events(path))[3] == {              # by time; dicts have what the file has
         '_name': 'ros2:rcl_publish', '_timestamp': 4, '_vpid': VPID, '_vtid': 2,
-        'message': 7, 'node': 'n'}                      # dicts have what the file has
-    with AnyReader([path]) as rosbags_reader:           # two schemas of one name would fail here
-        assert {connection.msgtype for connection in rosbags_reader.connections} == {
-            'mddag_trace/msg/RclNodeInit', 'mddag_trace/msg/Ros2CaretRclNodeInit',
-            'mddag_trace/msg/RmwPublisherInit', 'mddag_trace/msg/Ros2RclPublish'}
+        'message': 7, 'node': 'n'}
+    with AnyReader([path]) as rosbags:                  # two schemas of one name would fail here
+        assert {connection.msgtype.rpartition('/')[2]: (
+            time, message.vpid, message.vtid, message.timestamp)
+            for connection, time, data in rosbags.messages()
+            for message in [rosbags.deserialize(data, connection.msgtype)]} == {
+            'RclNodeInit': (1, VPID, 2, 1), 'Ros2CaretRclNodeInit': (2, VPID, 2, 2),
+            'RmwPublisherInit': (3, VPID, 2, 3), 'Ros2RclPublish': (4, VPID, 2, 4)}
 
 
 def test_add_refuses_what_it_cannot_write(tmp_path):
@@ -187,23 +149,16 @@ def test_add_refuses_what_it_cannot_write(tmp_path):
     assert [event[1] for event in events] == [1, 2] and not warnings
 
 
-def test_an_empty_trace(tmp_path):
-    path = tmp_path / 'a.mcap'
-    with TraceFile(path):
+def test_a_trace_may_be_empty_or_left_by_an_exception(tmp_path):
+    with TraceFile(tmp_path / 'empty.mcap'):
         pass
-    assert read(path) == ([], [])
-    assert TraceReader(path).message_count == 0
-    with open(path, 'rb') as stream:
-        assert list(make_reader(stream, validate_crcs=True).iter_messages()) == []
-
-
-def test_a_block_left_by_an_exception_gives_the_file_up(tmp_path):
-    path = tmp_path / 'a.mcap'
-    with pytest.raises(KeyError), TraceFile(path) as file:
+    assert read(tmp_path / 'empty.mcap') == ([], [])
+    assert TraceReader(tmp_path / 'empty.mcap').message_count == 0
+    with pytest.raises(KeyError), TraceFile(tmp_path / 'left.mcap') as file:
         file.add('callback_end', 1, 2, 3, 4)
         file.flush()
         raise KeyError
-    events, warnings = read(path)
+    events, warnings = read(tmp_path / 'left.mcap')
     assert len(events) == 1
     assert len(warnings) == 1 and 'without a finish record' in warnings[0]
 
@@ -268,21 +223,6 @@ def test_a_file_is_the_same_either_way(tmp_path_factory, entries, flush_at):
     assert sum(map(events_of, entries)) == len(singles)
 
 
-@pytest.mark.parametrize('bad', [
-    (EXECUTION, START, 1), (PUBLICATION, START, 1, 'text', 2), (PUBLICATION,),
-    (EXECUTION, START, 1, -1, 0, 0, 0, 0, 0, 0, 0, 0, True, 0, 0, False)])
-def test_a_bad_entry_costs_its_events_only(tmp_path, bad):
-    path = tmp_path / 'a.mcap'
-    with TraceWriter(path, flush_interval_s=0.01) as writer:
-        writer.record('callback_end', START, 1, 7)
-        writer.record(*bad)
-        writer.record(PUBLICATION, START, 1, 2, 3)
-    events, _ = read(path)
-    assert writer.dropped == events_of(bad)
-    assert [e[0] for e in events if e[0].startswith('ros2:')] == [
-        'ros2:callback_end', 'ros2:rclcpp_publish', 'ros2:rcl_publish']
-
-
 PRIMITIVES = ['bool', 'byte', 'char', 'float32', 'float64', 'int8', 'int16', 'int32', 'int64',
               'uint8', 'uint16', 'uint32', 'uint64', 'string']
 TYPES = PRIMITIVES + [base + array for base in PRIMITIVES for array in ('[]', '[3]')]
@@ -326,7 +266,6 @@ def test_text_without_a_valid_encoding_does_not_fail():
 @pytest.mark.parametrize('kind, data', [
     ('string', b'\x05\0\0\0ab\0'),              # longer than the message
     ('string', b'\x02\0\0\0ab'),                # no NUL
-    ('string', b'\xff\xff\xff\xff'),
     ('uint64[]', b'\xff\xff\xff\xff' + bytes(60)),
     ('string[]', b'\xff\xff\xff\xff' + bytes(60)),
     ('float64[100000000000]', bytes(64)),
@@ -354,5 +293,3 @@ def test_values_that_do_not_fit_are_refused():
                         ('uint8[2]', (1,)), ('int32', None)):
         with pytest.raises((ValueError, TypeError, AttributeError, struct.error)):
             cdr.encode([FieldType.parse(kind)], (value,))
-    assert np.uint64(7) in cdr.decode([FieldType('uint64')],
-                                      cdr.encode([FieldType('uint64')], (np.uint64(7),)))
