@@ -125,23 +125,6 @@ def test_from_trace(call, tmp_path):
     assert {each['kind'] for each in found} == {'rate'}
 
 
-def test_from_trace_keeps_what_was_declared(call, mddag, tmp_path):
-    (tmp_path / 'g.yaml').write_text(
-        'mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n      - {name: t, timer: 10ms, '
-        'publishes: [/x], on_late: abort, max_active_jobs: 900, holds_interpreter: false}\n'
-        '      - {name: s, subscription: /x, deadline: 5s}\n'
-        "paths: [{name: p, callbacks: ['/n:t', '/n:s']}]\n")
-    assert mddag('run', 'g.yaml', '--synthetic', 'sleep', '--duration', '0.3s', '--trace',
-                 'r.mcap', cwd=tmp_path).returncode == 0
-    done = call('graph', 'from-trace', 'r.mcap', '-o', 'again.yaml', cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, '')
-    again = msg_graph.load(tmp_path / 'again.yaml')
-    assert again.paths == (msg_graph.Path('p', ('/n:t', '/n:s')),)
-    callback = again.callbacks[0]
-    assert (callback.on_late, callback.max_active_jobs, callback.holds_interpreter) == (
-        'abort', 900, False)
-
-
 def test_a_coroutine_is_one_execution_however_often_it_is_resumed(call, tmp_path, ros_context):
     node = Node('asking', context=ros_context)
     group = ReentrantCallbackGroup()

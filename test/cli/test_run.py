@@ -25,13 +25,15 @@ mddag: 1
 nodes:
   - node: /sensor
     callbacks:
-      - {name: tick, timer: 20ms, dag: main, publishes: [/data], execution_time: 2ms}
+      - {name: tick, timer: 20ms, dag: main, publishes: [/data], execution_time: 2ms,
+         on_late: continue, max_active_jobs: 900, holds_interpreter: false}
   - node: /quick
     callbacks:
       - {name: cb, subscription: /data, deadline: 500ms, execution_time: 1ms}
   - node: /slow
     callbacks:
       - {name: cb, subscription: /data, deadline: 10ms, execution_time: 15ms}
+paths: [{name: p, callbacks: ['/sensor:tick', '/quick:cb']}]
 """
 
 
@@ -62,6 +64,14 @@ def test_a_synthetic_run_is_counted_measured_and_recorded(graph, mddag):
     assert f'trace: {graph.parent / "out.mcap"}\n' in process.stdout
     golden.compare('run', golden.words(process.stdout.replace(f'{graph.parent}/', '')))
     golden.compare('run_json', json.dumps(golden.shape(result), indent=1) + '\n')
+    # A declaration from the recording keeps what was declared.
+    done = mddag('graph', 'from-trace', 'out.mcap', '-o', 'again.yaml')
+    assert (done.returncode, done.stderr) == (0, '')
+    again, before = load('again.yaml'), load(graph)
+    assert again.paths == before.paths
+    for name in ('on_late', 'max_active_jobs', 'holds_interpreter', 'deadline_ns', 'publishes'):
+        assert {getattr(c, name) for c in again.callbacks} == {
+            getattr(c, name) for c in before.callbacks}
 
 
 ROBOT = (Path(__file__).resolve().parents[2] / 'examples/rerun/robot.py').read_text()
