@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 
 from mddag_executor.hosting.host import Host
 from mddag_executor.hosting.loading import LoadingError, Program, resolve
@@ -231,9 +230,13 @@ def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host, kind):
     other.spin_once(timeout_sec=0.01)
     assert host.executor.get_nodes() == [first]
     assert first.executor is other
+    done = rclpy.Future()
+    done.set_result(None)
+    other.spin_once_until_future_complete(done, 60.0)
+    assert not other.is_spinning
     spinning = threading.Thread(target=other.spin)
     spinning.start()
-    time.sleep(0.05)
+    assert wait_for(lambda: other.is_spinning)
     other.add_node(second)
     assert set(host.executor.get_nodes()) == {first, second}
     other.remove_node(first)
