@@ -207,13 +207,13 @@ def missing(program, path):
 
 
 def compare(program, path, seconds):
-    """Run a program twice; return why it cannot be compared, or in what the runs differ."""
+    """Run a program twice; return what came of it, and whether the runs differ (None: skipped)."""
     why = missing(program, path)
     if why:
-        return f'skipped: {why}', False
+        return f'skipped: {why}', None
     theirs, ours = (observe(program, path, hosted, seconds) for hosted in (False, True))
     if theirs.end == 'by itself' and theirs.status:  # it compares nothing
-        return f'skipped: {(theirs.said.strip().splitlines() or ["it ends at once"])[-1]}', False
+        return f'skipped: {(theirs.said.strip().splitlines() or ["it ends at once"])[-1]}', None
     found = differences(theirs, ours)
     counts = ', '.join(f'{topic} {theirs.counts[topic]}/{ours.counts[topic]}'
                        for topic in sorted({*theirs.counts, *ours.counts}))
@@ -230,15 +230,15 @@ def main():
     options = parser.parse_args()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     before = [os.environ['PYTHONPATH']] if os.environ.get('PYTHONPATH') else []
-    n_different = 0
+    differ = []
     for program in PROGRAMS:
         if options.only in (None, program.name):
             path = [str((options.sources / each).resolve()) for each in program.folders] + before
             said, differs = compare(program, path, options.seconds)
-            n_different += differs
+            differ.append(differs)
             print(f'{program.name}: {said}', flush=True)
-    print(f'{n_different} programs differ')
-    return 1 if n_different else 0
+    print(f'{len(differ) - differ.count(None)} programs compared, {differ.count(True)} differ')
+    return 1 if any(differ) else 0
 
 
 if __name__ == '__main__':
