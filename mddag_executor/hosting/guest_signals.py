@@ -97,7 +97,7 @@ class GuestSignals:
         try:
             handler(number, frame)
         except BaseException as error:
-            if guest is None or guest.thread is None:
+            if guest is None:
                 raise
             raise_in(guest.thread, error)
             self._host.wake()

@@ -76,13 +76,13 @@ class Guest:
     """
 
     program: Program
+    thread: threading.Thread = field(init=False)
     nodes: list[Node] = field(default_factory=list)
     is_complete: bool = False
     ended: bool = False
     returned: bool = False
     uses_ros: bool = False
     error: BaseException | None = None
-    thread: threading.Thread | None = None
     global_executor: Any = None
 
 
@@ -174,11 +174,11 @@ class Host:
             if is_ending():
                 break
             guest = Guest(program)
-            self.guests.append(guest)
-            sys.argv = [program.argv0, *program.arguments, *arguments]
             guest.thread = threading.Thread(
                 target=self._run, args=(guest,), daemon=True, name=f'main of {program.spec}')
+            self.guests.append(guest)
             self.guest_of[guest.thread] = guest
+            sys.argv = [program.argv0, *program.arguments, *arguments]
             guest.thread.start()
             self._wait_for_nodes(guest)
             self._check_start(guest)
@@ -254,9 +254,8 @@ class Host:
             self.shut_down()
         end = time.monotonic() + timeout_s
         for guest in self.guests:
-            if guest.thread is not None:
-                guest.thread.join(max(0.0, end - time.monotonic()))
-        return [g for g in self.guests if g.thread is not None and g.thread.is_alive()]
+            guest.thread.join(max(0.0, end - time.monotonic()))
+        return [guest for guest in self.guests if guest.thread.is_alive()]
 
     # --- nodes and callbacks ---------------------------------------------------------------------
 

@@ -296,14 +296,13 @@ class Rerun:
 
     def _over(self) -> None:
         """Judge what is open; then let programs end, whose context has ended."""
-        failed = [guest for guest in self._host.guests if guest.error is not None]
+        failed = [(guest.program.spec, guest.error) for guest in self._host.guests
+                  if guest.error is not None]
         self._loop.warn_of_waiting()
         self._engine.finish(self._loop.now)
         self._host.shut_down()
-        for guest in failed:
-            assert guest.error is not None
-            raise CallbackFailed(
-                f'--node {guest.program.spec}', guest.error, self._passed_ns()) from guest.error
+        for spec, error in failed:
+            raise CallbackFailed(f'--node {spec}', error, self._passed_ns()) from error
 
     def _result(self, elapsed_s: float) -> Result:
         loop, recording, outputs = self._loop, self._recording, self._outputs

@@ -219,9 +219,9 @@ class RunThreads:
         run_thread.lock.acquire()
         return until is not None and not self.over and until()
 
-    def has_waiting(self, thread: threading.Thread | None) -> bool:
+    def has_waiting(self, thread: threading.Thread) -> bool:
         """Return whether a thread is a run thread that waits."""
-        return thread is not None and any(s.ident == thread.ident for s in self.waiting)
+        return any(each.ident == thread.ident for each in self.waiting)
 
     def expire(self, run_thread: RunThread, deadline: int) -> None:
         """Let a run thread go on whose time is over, if it still waits."""
