@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes and entities come and go: nothing of them is kept, and what stays loses nothing."""
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 import gc
 import os
@@ -64,30 +65,18 @@ def new_entity(node, draw):
     return lambda: node.destroy_subscription(subscription)
 
 
-class Churn(threading.Thread):
-    """Makes and destroys entities of a node, and moves it between executors."""
-
-    def __init__(self, node, executors, moving, seed):
-        super().__init__()
-        self.error = None
-        self._node, self._executors, self._moving = node, executors, moving
-        self._draw = random.Random(seed)
-
-    def run(self):
-        draw, present = self._draw, []
-        end = time.monotonic() + 3.0
-        try:
-            while time.monotonic() < end:
-                if len(present) < 12 and draw.random() < 0.6:
-                    present.append(new_entity(self._node, draw))
-                elif present:
-                    present.pop(draw.randrange(len(present)))()
-                if draw.random() < 0.05:
-                    with self._moving:  # else rclpy's add_node may wait for another one, for ever
-                        draw.choice(self._executors).add_node(self._node)
-                time.sleep(draw.choice([0.0, 0.0, 0.001, 0.01]))
-        except BaseException as error:
-            self.error = error
+def churn(node, executors, moving, seed):
+    """Make and destroy entities of a node, and move it between executors, for a while."""
+    draw, present, end = random.Random(seed), [], time.monotonic() + 3.0
+    while time.monotonic() < end:
+        if len(present) < 12 and draw.random() < 0.6:
+            present.append(new_entity(node, draw))
+        elif present:
+            present.pop(draw.randrange(len(present)))()
+        if draw.random() < 0.05:
+            with moving:  # else rclpy's add_node may wait for another one, for ever
+                draw.choice(executors).add_node(node)
+        time.sleep(draw.choice([0.0, 0.0, 0.001, 0.01]))
 
 
 def test_what_stays_loses_nothing(make_executor, make_node):
@@ -104,15 +93,13 @@ def test_what_stays_loses_nothing(make_executor, make_node):
         publishers.append(other.create_publisher(Header, f'/stable{number}', RELIABLE))
         clients.append(other.create_client(Trigger, f'/stable{number}/ask'))
         executors[number].add_node(node)
-    moving = threading.Lock()
-    churns = [Churn(make_node(f'churn{number}'), executors, moving, number) for number in range(4)]
+    others, moving = [make_node(f'churn{number}') for number in range(4)], threading.Lock()
     matched(*publishers)
     assert wait_for(lambda: all(each.service_is_ready() for each in clients))
     message = Header()
-    with Spinning(executors[0]), Spinning(executors[1]):
-        for each in churns:
-            each.start()
-        while any(each.is_alive() for each in churns):
+    with ThreadPoolExecutor() as pool, Spinning(executors[0]), Spinning(executors[1]):
+        churns = [pool.submit(churn, node, executors, moving, i) for i, node in enumerate(others)]
+        while not all(each.done() for each in churns):
             for publisher in publishers:
                 publisher.publish(message)
             message.stamp.sec += 1
@@ -123,7 +110,7 @@ def test_what_stays_loses_nothing(make_executor, make_node):
             time.sleep(0.005)
         assert wait_for(lambda: len(heard[0]) == len(heard[1]) == message.stamp.sec)
         assert wait_for(lambda: len(answers) == asked)
-    assert [each.error for each in churns] == [None] * len(churns)
+    assert [each.result() for each in churns] == [None] * 4
     assert heard == [list(range(message.stamp.sec))] * 2
 
 

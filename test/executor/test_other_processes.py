@@ -219,20 +219,21 @@ ONE_TOPIC = graph(
 
 
 class Bench:
-    """Jobs whose publications are given, with a publisher or two."""
+    """Jobs 1, 2, … whose publications are given: begin, end, and one of two publishers."""
 
-    def __init__(self):
-        self.jobs = Jobs(loads(ONE_TOPIC, 'g.yaml'))
+    def __init__(self, *publications):
+        self.jobs = Jobs(loads(ONE_TOPIC))
         self.topic = self.jobs.topics[TOPIC]
         self.publishers = [PublisherState(TOPIC), PublisherState(TOPIC)]
+        for job, publication in enumerate(publications, 1):
+            self.published(job, *publication)
 
-    def published(self, begin, end, job, publisher=0):
+    def published(self, job, begin, end, publisher=0):
         state = self.publishers[publisher]
         state.count += 1
         publication = Publication(begin, state.numbers, Origin(0, 0, job, publisher), state.count)
         self.topic.publications.append(publication)
-        if end is not None:
-            publication.end = end
+        publication.end = end
 
     def job(self, stamp, sequence=None):
         origin = self.jobs.find(TOPIC, stamp, sequence)
@@ -240,39 +241,27 @@ class Bench:
 
 
 def test_the_sequence_number_decides_between_publishers():
-    bench = Bench()
-    bench.published(0, 10, 1, publisher=0)
-    bench.published(1000, 1010, 2, publisher=1)
-    bench.published(2000, 2010, 3, publisher=1)
-    bench.published(3000, 3100, 4, publisher=0)
-    bench.published(3050, 3150, 5, publisher=1)
-    assert bench.job(3080) is None, 'without a number the job is unknown'
-    assert bench.jobs.doubtful == 1
-    assert bench.job(3080, 2) == 4
-    assert bench.job(3080, 3) == 5
-    assert bench.job(3080, 9) is None
+    bench = Bench((0, 10), (1000, 1010, 1), (2000, 2010, 1), (3000, 3100), (3050, 3150, 1))
+    assert [bench.job(3080, number) for number in (None, 2, 3, 9)] == [None, 4, 5, None]
     assert bench.jobs.doubtful == 2
 
 
 def test_publications_before_the_count_began_are_learnt():
     """The middleware counts 100 more than we do for publisher 0; two messages in a row show it."""
-    bench = Bench()
-    bench.published(0, 10, 1, publisher=0)
-    assert bench.job(5, 101) is None
-    assert bench.job(5, 101) is None, 'the same one'
-    bench.published(20, 30, 2, publisher=0)
+    bench = Bench((0, 10))
+    assert [bench.job(5, 101), bench.job(5, 101)] == [None, None]  # the same one
+    bench.published(2, 20, 30)
     assert bench.job(25, 102) == 2
-    bench.published(100, 200, 3, publisher=0)
-    bench.published(110, 210, 4, publisher=1)
-    assert bench.job(150, 103) == 3
-    assert bench.job(150, 1) == 4
+    bench.published(3, 100, 200)
+    bench.published(4, 110, 210, publisher=1)
+    assert [bench.job(150, 103), bench.job(150, 1)] == [3, 4]
 
 
 def test_messages_of_a_stranger_in_the_window_belong_to_no_job():
     """Whatever its numbers are, and however often they differ alike."""
     bench = Bench()
     for job in range(1, 100):
-        bench.published(job * 1000, job * 1000 + 10, job)
+        bench.published(job, job * 1000, job * 1000 + 10)
         for number in (job + 7, 3 * job + 1):  # as fast, and faster
             assert bench.job(job * 1000 + 5, number) is None
         assert bench.job(job * 1000 + 6, job) == job
@@ -290,7 +279,7 @@ def test_it_never_guesses(steps, data):
     for job, (gap, length) in enumerate(steps):
         now += gap
         windows.append((now, now + length))
-        bench.published(now, now + length, job, publisher=job % 2)
+        bench.published(job, now, now + length, job % 2)
     stamp = data.draw(st.integers(0, now + 60))
     holds = [job for job, (begin, end) in enumerate(windows)
              if begin - ROUNDING_NS <= stamp <= end + ROUNDING_NS]
@@ -308,10 +297,9 @@ def number(bench, stamp, sequence=None):
 
 
 def test_a_publication_here_and_one_elsewhere_at_once_are_a_doubt_if_their_numbers_agree():
-    bench, other = Bench(), PublisherNumbers()
-    bench.published(0, 10, 5)
+    bench, other = Bench((0, 10)), PublisherNumbers()
     announced(bench, 5, 15, 1, 9, other)
-    assert bench.job(7, 1) == 5 and number(bench, 7, 9) == 1
+    assert bench.job(7, 1) == 1 and number(bench, 7, 9) == 1
     announced(bench, 5, 15, 1, 1, PublisherNumbers())
     assert bench.jobs.find(TOPIC, 7, 1) is None and bench.jobs.doubtful == 1
 

@@ -81,21 +81,6 @@ def test_spinning_twice_is_an_error(make_executor):
     assert not executor.is_spinning
 
 
-# --- spin_once -----------------------------------------------------------------------------------
-
-
-def test_spin_once_runs_one_callback_and_has_finished_it(make_executor, make_node):
-    node, calls = make_node(), []
-    for _ in range(3):
-        node.create_timer(0.001, lambda: calls.append(threading.get_ident()))
-    executor = make_executor(nodes=[node])
-    time.sleep(0.01)
-    for count in range(1, 6):
-        executor.spin_once(1.0)
-        assert len(calls) == count
-    assert set(calls) == {threading.get_ident()}
-
-
 def test_wait_for_message_while_another_thread_spins(make_executor, make_node):
     node = make_node()
     publisher = node.create_publisher(Header, '/topic', 10)
