@@ -13,6 +13,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.laboratory.analyse import analyse, FAILS, HOLDS, NOTHING
+from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.laboratory.necessary import largest_demand
 from mddag_executor.laboratory.tasks import tasks_of
 from mddag_executor.simulate import periodic_load, Settings, simulate
@@ -27,37 +28,19 @@ HORIZON = 240 * MS
 
 def random_graph(seed, one_deadline, dags, load):
     """
-    Return a declaration: trees with joins, periods that divide the horizon.
+    Return a random task set whose periods divide the horizon.
 
-    Every third one has single callbacks instead, with deadlines of all lengths: for those the
-    tests leave the least room.
+    Every third one has single callbacks, with deadlines of all lengths: for those the tests of the
+    analysis leave the least room.
     """
-    rng = random.Random(seed)
     single = seed % 3 == 0
-    lines = ['mddag: 1', 'nodes:']
-    for dag in range(dags):
-        period = rng.choice([4, 5, 6, 8, 10, 12, 20, 24])
-        size = 1 if single else rng.randint(1, 7)
-        factors = [0.3, 0.5, 0.8, 1, 1.5, 3] if single else [1, 1, 1, 0.8, 1.5, 2.5]
-        deadline = max(1, round(period * rng.choice(factors)))
-        parents = [[0]] + [sorted(rng.sample(range(i), min(i, rng.choice([1, 1, 1, 2]))))
-                           for i in range(1, size)]
-        sinks = set(range(size)) - {p for i in range(1, size) for p in parents[i]}
-        share = load * period / size
-        lines += [f'  - node: /n{dag}', '    callbacks:']
-        for i in range(size):
-            start = f'timer: {period}ms'
-            if i > 0:
-                # A topic for each edge: vertices that start several publish several.
-                topics = [f'/d{dag}_{p}_{i}' for p in parents[i]]
-                start = (f'subscription: {topics[0]}' if len(topics) == 1
-                         else f'sync: [{", ".join(topics)}]')
-            out = [f'/d{dag}_{i}_{j}' for j in range(i + 1, size) if i in parents[j]]
-            own = deadline if one_deadline else max(1, round(deadline * rng.uniform(0.6, 1.6)))
-            ends = f', deadline: {own}ms' if i in sinks else f', publishes: [{", ".join(out)}]'
-            cost = max(1, round(1000 * share * rng.uniform(0.1, 1.9)))
-            lines.append(f'      - {{name: c{i}, {start}{ends}, execution_time: {cost}us}}')
-    return '\n'.join(lines) + '\n'
+    factor = random.Random(seed).choice(
+        [0.3, 0.5, 0.8, 1, 1.5, 3] if single else [1, 1, 1, 0.8, 1.5, 2.5])
+    return loads(generate(Options(
+        dags=(dags, dags), vertices=(1, 1) if single else (1, 7), or_share=0.1,
+        tightness=(factor, factor) if one_deadline else (0.6 * factor, 1.6 * factor),
+        utilisation=load * dags, workers=1, most_per_dag=2 * load,
+        periods_ns=tuple(ms * MS for ms in (4, 5, 6, 8, 10, 12, 20, 24)), seed=seed)))
 
 
 def shifted(load, phases):
@@ -107,7 +90,7 @@ def check_holds(task_set, verdict, workers, rng):
 @given(seed=st.integers(0, 2 ** 32), one=st.booleans(), dags=st.integers(1, 4),
        workers=st.integers(1, 5), part=st.floats(0.05, 1.1))
 def check_random_set(seed, one, dags, workers, part):
-    task_set = loads(random_graph(seed, one, dags, part * workers / dags))
+    task_set = random_graph(seed, one, dags, part * workers / dags)
     rng = random.Random(seed)
     for verdict in analyse(task_set, workers).verdicts:
         if verdict.name in ('longest path', 'demand bound') and verdict.verdict == FAILS:
@@ -124,7 +107,7 @@ def at_the_border(seed, one, dags, workers, name):
     low, high, found = 0.0, 1.2 * workers / dags, None
     for _ in range(8):
         load = (low + high) / 2
-        task_set = loads(random_graph(seed, one, dags, load))
+        task_set = random_graph(seed, one, dags, load)
         verdict = next(v for v in analyse(task_set, workers).verdicts if v.name == name)
         if verdict.verdict == HOLDS:
             low, found = load, (task_set, verdict)
@@ -157,8 +140,8 @@ def test_no_verdict_is_contradicted_by_a_run():
 def test_rad_holds_wherever_any_policy_does():
     for seed in range(60):
         dags, workers = 1 + seed % 3, 1 + seed % 4
-        text = random_graph(seed, True, dags, 0.3 * workers / dags)
-        found = {v.name: v.verdict for v in analyse(loads(text), workers).verdicts}
+        task_set = random_graph(seed, True, dags, 0.3 * workers / dags)
+        found = {v.name: v.verdict for v in analyse(task_set, workers).verdicts}
         assert (found['response time, any policy'] != HOLDS
                 or found['response time, RAD without preemption'] == HOLDS)
 
