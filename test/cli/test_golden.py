@@ -34,7 +34,7 @@ COMMANDS = {
     'analyse': 'graph analyse graph.yaml --budget mean',
     'analyse_status': (
         'graph analyse graph.yaml --fail-on-unschedulable; '
-        'graph analyse timed.yaml --fail-on-unschedulable'),
+        'graph analyse timed.yaml --fail-on-unschedulable; graph analyse late.yaml'),
     'analyse_json': 'graph analyse graph.yaml --json -',
     'assign': 'graph assign-deadlines graph.yaml --runs 20 -o out.yaml',
     'assign_target': (
@@ -179,6 +179,7 @@ def files(folder, call):
             'many_workers': overloaded.replace('workers: 4', 'workers: 512'),
             'other': unpublished.replace('image,', 'image, period: 100ms,'),
             'timed': timed.replace('8ms', '8ms, execution_time: 4ms'),
+            'late': timed.replace('8ms', '1ms, execution_time: 4ms'),
             'tight': runs.GRAPH.replace('8ms', '5ms'), 'wide': runs.GRAPH.replace('8ms', '20ms'),
             'tolerant': runs.GRAPH.replace('8ms', '5ms, tolerate: 1 of 3')}.items():
         (folder / f'{name}.yaml').write_text(text)
