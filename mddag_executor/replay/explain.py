@@ -51,7 +51,7 @@ from mddag_executor.replay.causes import (
 from mddag_executor.replay.chains import Chains, LINKS
 from mddag_executor.replay.deadlines import Judged
 from mddag_executor.replay.spans import crowded, Spans
-from mddag_executor.replay.usage import ran
+from mddag_executor.replay.usage import in_groups, ran
 import numpy as np
 
 _NO_END = 2 ** 62
@@ -182,17 +182,13 @@ class Explanation:
 
     def _in_groups(self, waits: Table) -> Ints:
         """Return how long the callback groups of waiting vertices were busy meanwhile, ns."""
-        table, groups, of_vertex = self._executions, self._who.groups, self._groups()
+        of_vertex = self._groups()
         group = np.array([of_vertex.get(vertex, -1) for vertex in waits['vertex'].tolist()],
                          dtype=np.int64)
         busy = np.zeros(len(waits), dtype=np.int64)
-        for each in np.unique(group[group >= 0]).tolist():
-            members = [callback for callback, number in groups.items() if number == each]
-            which = (table['start'] >= 0) & np.isin(table['callback'], members)
-            end = table['end'][which]
-            spans = Spans(table['start'][which], np.where(end < 0, self._recording.end, end))
-            mine = group == each
-            busy[mine] = spans.within(waits['ready'][mine], waits['start'][mine])
+        for number, _, starts, ends in in_groups(self._recording):
+            mine = group == number
+            busy[mine] = Spans(starts, ends).within(waits['ready'][mine], waits['start'][mine])
         return busy
 
     def _stops(self) -> list[tuple[int, int]]:

@@ -50,7 +50,6 @@ from mddag_executor.recording.tables import (
     in_parts,
     Ints,
     look_up,
-    pick,
     Recording,
     rows_by,
     sort_by,
@@ -175,15 +174,17 @@ class LoadBuilder:
             jobs.release[:] = mine['release']
             jobs.noticed[:] = np.maximum(mine['release'], mine['noticed'])
         self._job_ends()
-        table = recording.executions
-        # by execution the row of its job
-        self._row = np.full(len(table), _UNKNOWN)
+        #: Columns of the executions; by execution the row of its job.
+        self._executions = table = _contiguous(
+            recording.executions, 'dag', 'vertex', 'job', 'piece', 'leg', 'completes', 'order',
+            'worker', 'ready', 'start', 'began', 'end', 'busy', 'cpu', 'holds_gil')
+        self._row = np.full(len(recording.executions), _UNKNOWN)
         for jobs, mine in zip(self._jobs, rows_by(table['dag'], len(self._jobs))):
             self._row[mine] = look_up(jobs.numbers, table['job'][mine])
         self._take_pieces(n_workers)
         self._take_completions()
         self._take_publications()
-        del self._row
+        del self._row, self._executions
 
     def _places(self, by: int, row: Any, vertex: Any) -> Ints:
         """Return the places of vertices of jobs in a kind of column (``_EDGE``: of edge 0)."""
@@ -204,11 +205,12 @@ class LoadBuilder:
 
     def _take_pieces(self, n_workers: int) -> None:
         """Find the dispatch times of pieces; keep undeclared pieces."""
-        table = self._recording.executions
+        table = self._executions
         rows = ran(table)
-        vertex, piece, ready, start, end, worker, holds, cpu, completes = _columns(
-            table, rows, 'vertex', 'piece', 'ready', 'start', 'end', 'worker', 'holds_gil', 'cpu',
-            'completes')
+        vertex, piece, ready, start, end, worker, holds, cpu, completes = (
+            table[name][rows] for name in (
+                'vertex', 'piece', 'ready', 'start', 'end', 'worker', 'holds_gil', 'cpu',
+                'completes'))
         row, first = self._row[rows], piece == 0
         process = np.array(self._process, dtype=np.int16)[vertex]
         members = [(number, np.flatnonzero(process == number))
@@ -229,9 +231,10 @@ class LoadBuilder:
             holds & (cpu >= 0) & (completes == recorded_tables.VERTEX))
         ran_as = np.full(self._tables.n_vertices + 1, _UNKNOWN)
         ran_as[vertex[::-1]] = rows[::-1]     # the first one is written last
+        callback = self._recording.executions['callback']
         #: By global vertex: the address of the callback that ran as it.
         self.callback_of: dict[int, int] = {
-            v: int(table['callback'][at]) for v, at in enumerate(ran_as[:-1].tolist()) if at >= 0}
+            v: int(callback[at]) for v, at in enumerate(ran_as[:-1].tolist()) if at >= 0}
         mine = np.flatnonzero(first & (row >= 0) & (vertex >= 0))
         self._whole['dispatch'][self._places(_VERTEX, row[mine], vertex[mine])] = mine
 
@@ -270,7 +273,7 @@ class LoadBuilder:
 
     def _take_completions(self) -> None:
         """Note the execution times of executions that completed a vertex."""
-        table = self._recording.executions
+        table, whole = self._executions, self._whole
         rows = np.flatnonzero(
             (table['completes'] != recorded_tables.NOTHING) & (table['vertex'] >= 0)
             & (self._row >= 0) & (table['start'] >= 0))
@@ -281,27 +284,27 @@ class LoadBuilder:
                          or [[-1]])
         together: list[Ints] = []   # rows of executions for several legs
         for part in in_parts(rows):
-            done, row = pick(table, part), self._row[part]
-            vertex, ready = done['vertex'].copy(), done['ready'].copy()
-            leg = np.where(done['leg'] < 0, n_legs[vertex] - 1, done['leg'])
+            row, vertex, ready, leg = self._row[part], *(
+                table[name][part] for name in ('vertex', 'ready', 'leg'))
+            every_leg = (leg == recorded_tables.ALL_LEGS) & (n_legs[vertex] > 1)
+            leg = np.where(leg < 0, n_legs[vertex] - 1, leg)
             edge = np.where(leg < width, edges[vertex, np.minimum(leg, width - 1)], -1)
             known = edge >= 0
-            self._whole['arrived'][
-                self._places(_EDGE, row[known], vertex[known]) + edge[known]] = ready[known]
-            ended = done['completes'] == recorded_tables.VERTEX
-            others = done[~ended]
+            whole['arrived'][self._places(_EDGE, row[known], vertex[known]) + edge[known]] = ready[
+                known]
+            ended = table['completes'][part] == recorded_tables.VERTEX
+            others = part[~ended]
             self._others.append(np.column_stack((
-                others['ready'], others['busy'], np.full(len(others), _UNKNOWN))))
-            place = self._places(_VERTEX, row[ended], vertex[ended])
+                ready[~ended], table['busy'][others], np.full(len(others), _UNKNOWN))))
+            together.append(part[ended & every_leg])
+            place, done = self._places(_VERTEX, row[ended], vertex[ended]), part[ended]
             for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
                                  ('start', 'began'), ('end', 'end')):
-                self._whole[name][place] = done[column][ended]
-            together.append(part[
-                ended & (done['leg'] == recorded_tables.ALL_LEGS) & (n_legs[vertex] > 1)])
+                whole[name][place] = table[column][done]
             source = np.flatnonzero(ended & ~known)
             place = self._places(_JOB, row[source], vertex[source])
-            later = ready[source] >= self._whole['release'][place]
-            self._whole['noticed'][place[later]] = ready[source[later]]
+            later = ready[source] >= whole['release'][place]
+            whole['noticed'][place[later]] = ready[source[later]]
         every = np.concatenate(together) if together else rows
         vertex = table['vertex'][every]
         for v in np.unique(vertex).tolist():
@@ -326,7 +329,7 @@ class LoadBuilder:
                     edges_from.setdefault(
                         (first + before, vertex.callback.topics[place]), []).append(
                             numbers[first + before, first + vertex.index])
-        table, sent = self._recording.executions, self._recording.publications
+        table, sent = self._executions, self._recording.publications
         by = sent['execution']
         by, publisher = by[by >= 0], sent['publisher'][by >= 0]
         row, vertex_of = self._row[by], table['vertex'][by]
@@ -568,11 +571,10 @@ class LoadBuilder:
         return typical
 
 
-def _columns(table: Table, rows: Ints, *names: str) -> list[Any]:
-    """Return columns of the chosen rows, contiguous."""
-    found: list[Any] = [np.empty(len(rows), dtype=table.dtype[name]) for name in names]
-    for part, *columns in zip(in_parts(rows), *map(in_parts, found)):
-        some = pick(table, part)
-        for column, name in zip(columns, names):
-            column[:] = some[name]
+def _contiguous(table: Table, *names: str) -> dict[str, Any]:
+    """Return copies of columns, which are faster to read than those of a table."""
+    found = {name: np.empty(len(table), dtype=table.dtype[name]) for name in names}
+    for part, *columns in zip(in_parts(table), *map(in_parts, found.values())):
+        for name, column in zip(names, columns):
+            column[:] = part[name]
     return found

@@ -9,19 +9,20 @@ An execution of a declared callback counts when it completes; its time so far al
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mddag_executor.recording.tables import (
-    groups,
+    different,
     in_parts,
     Ints,
-    look_up,
     NOTHING,
     pick,
     Recording,
+    rows_by,
     sort_by,
     Table,
+    UNKNOWN,
 )
 from mddag_executor.replay.spans import Spans
 import numpy as np
@@ -32,13 +33,35 @@ NAMES = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
 _MEASURED = NAMES.index('measured')
 
 
-def ran(table: Table) -> Ints:
+def ran(table: Table | Mapping[str, Ints]) -> Ints:
     """Return the rows of ``executions`` that have a start and an end, in order of their ends."""
     rows = np.flatnonzero((table['start'] >= 0) & (table['end'] >= 0))
     end = table['end'][rows]
     if (end[1:] < end[:-1]).any():
         rows = rows[sort_by(end)]
     return rows
+
+
+def in_groups(recording: Recording) -> Iterator[tuple[int, Ints, Ints, Ints]]:
+    """
+    Yield mutually exclusive groups, and rows, starts and ends of their executions that started.
+
+    They are in the order of ends; open ones come last, and end with the recording.
+    """
+    table, known = recording.executions, recording.who.groups
+    if max(known.values(), default=UNKNOWN) < 0:
+        return
+    rows = np.r_[ran(table), np.flatnonzero((table['start'] >= 0) & (table['end'] < 0))]
+    callbacks, which = recording.callbacks()
+    group = np.array([known.get(each, UNKNOWN) for each in callbacks.tolist()], np.int64)[
+        which[rows]]
+    numbers, which = different(group)
+    for number, mine in zip(numbers.tolist(), rows_by(which, len(numbers))):
+        if number >= 0:
+            members = rows[mine]
+            end = table['end'][members]
+            yield number, members, table['start'][members], np.where(
+                end < 0, recording.end, end)
 
 
 def group_waits(recording: Recording) -> Ints:
@@ -50,26 +73,12 @@ def group_waits(recording: Recording) -> Ints:
     """
     table = recording.executions
     waited = np.zeros(len(table), dtype=np.int64)
-    number = {callback: group for callback, group in recording.who.groups.items() if group >= 0}
-    if not number:
-        return waited
-    rows = np.r_[ran(table), np.flatnonzero((table['start'] >= 0) & (table['end'] < 0))]
-    callbacks = np.array(sorted(number), dtype=np.int64)
-    at = look_up(callbacks, table['callback'][rows])
-    known = at >= 0
-    rows, group = rows[known], np.array([number[each] for each in callbacks.tolist()])[at[known]]
-    order = np.argsort(group, kind='stable')
-    rows, group = rows[order], group[order]
-    ready, start, end = (table[name][rows] for name in ('ready', 'start', 'end'))
-    end = np.where(end < 0, recording.end, end)
-    for begin, until in zip(*groups(group)):
-        mine = slice(begin, until)
+    for _, rows, starts, ends in in_groups(recording):
+        ready = table['ready'][rows]
         # only if the previous one ended after this one was ready
-        late = np.flatnonzero(
-            (np.r_[-1, end[mine][:-1]] > ready[mine]) & (table['piece'][rows[mine]] == 0))
+        late = np.flatnonzero((np.r_[-1, ends[:-1]] > ready) & (table['piece'][rows] == 0))
         if len(late):
-            busy = Spans(start[mine], end[mine])
-            waited[rows[mine][late]] = busy.within(ready[mine][late], start[mine][late])
+            waited[rows[late]] = Spans(starts, ends).within(ready[late], starts[late])
     later = np.flatnonzero(table['piece'] > 0)
     if len(later) and waited.any():
         first = np.flatnonzero(waited)
