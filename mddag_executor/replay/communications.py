@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mddag_executor.recording.tables import Recording
+from mddag_executor.recording.tables import different, Recording, rows_by
 from mddag_executor.replay.spread import spread, sum_of
 import numpy as np
 
@@ -32,18 +32,18 @@ def communications(recording: Recording) -> list[dict[str, Any]]:
     message = messages[table['message'][started]]
     known = (message['publisher'] >= 0) & (message['time'] > 0)
     started, message = started[known], message[known]
-    pairs = np.column_stack((message['publisher'], table['callback'][started]))
+    publishers, publisher_of = different(message['publisher'])
+    pairs, which = different(
+        recording.callbacks()[1][started].astype(np.int64) * len(publishers) + publisher_of)
     latency = table['start'][started] - message['time']
     sent = dict(zip(*(each.tolist() for each in np.unique(
         messages['publisher'], return_counts=True))))
-    different, first, which = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
-    for number in np.argsort(first).tolist():
-        publisher_number, callback = different[number].tolist()
-        publisher = recording.who.every_publisher[publisher_number]
+    for mine in sorted(rows_by(which, len(pairs)), key=lambda each: int(each[0])):
+        number = int(message['publisher'][mine[0]])
+        publisher = recording.who.every_publisher[number]
         found.append({
             'topic': publisher.topic,
             'publisher': publisher.node.name if publisher.node is not None else None,
-            'callback': recording.who.name(callback), 'sent': sent[publisher_number],
-            'arrived': int((which.ravel() == number).sum()),
-            'latency_ns': spread(latency[which.ravel() == number])})
+            'callback': recording.who.name(int(table['callback'][started[mine[0]]])),
+            'sent': sent[number], 'arrived': len(mine), 'latency_ns': spread(latency[mine])})
     return sorted(found, key=lambda each: (each['topic'], each['callback']))

@@ -13,7 +13,7 @@ from collections.abc import Callable as Function
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from mddag_executor.recording.tables import Ints, sort_by, Table
+from mddag_executor.recording.tables import different, Ints, sort_by, Table
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.events import Event
@@ -114,7 +114,7 @@ def read_events(
     kept = [event for _, event in tuples if 0 <= event[1] < NEVER]
     impossible = table['time'][~possible].tolist() + [
         event[1] for _, event in tuples if not 0 <= event[1] < NEVER]
-    threads, which = np.unique(table['thread'], return_inverse=True)
+    threads, which = different(table['thread'])
     table['thread'] = which
     warning = '' if not impossible else (
         f'left out: {counted(len(impossible), "event")} at an impossible time, the first at '

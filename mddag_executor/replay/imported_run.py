@@ -32,6 +32,7 @@ from mddag_executor.recording.entities import Entities, INIT_EVENTS
 from mddag_executor.recording.head import Head, named_errors, no_run
 from mddag_executor.recording.mapping import Matching
 from mddag_executor.recording.tables import (
+    different,
     earliest,
     EXECUTIONS,
     groups,
@@ -156,14 +157,15 @@ class ImportedRun:
         messages, publishers = self.links.messages, self.links.publishers
         run = messages['run']
         callback = np.append(self.links.runs['callback'], UNKNOWN)[run]
-        pairs, which = np.unique(np.stack((callback, messages['publisher'])), axis=1,
-                                 return_inverse=True)
-        vertices = [self._publisher_vertex(*pair) for pair in pairs.T.tolist()]
+        width = len(publishers) + 1     # -1: unknown
+        pairs, which = different(callback * width + messages['publisher'] + 1)
+        vertices = [self._publisher_vertex(pair // width, pair % width - 1)
+                    for pair in pairs.tolist()]
         return rows(
             PUBLICATIONS, len(messages), publisher=_values(
                 [each.number for each in publishers], messages['publisher']),
             execution=run, time=messages['time'], source_timestamp=messages['stamp'],
-            vertex=np.array(vertices, dtype=np.int64)[which.ravel()])
+            vertex=np.array(vertices, dtype=np.int64)[which])
 
     def _publisher_vertex(self, callback: int, publisher: int) -> int:
         """Return a vertex of a declared callback that publishes with its node's publisher."""

@@ -48,6 +48,7 @@ from mddag_executor.recording.head import (
 from mddag_executor.recording.own import end_lines, read_process
 from mddag_executor.recording.tables import (
     ALL_LEGS,
+    different,
     earliest,
     groups,
     Ints,
@@ -174,7 +175,7 @@ class _Part:
         worker += np.where(worker < 0, 0, np.where(      # other threads lent themselves
             worker < self.head.workers, self.first_worker, self.first_spare)).astype(worker.dtype)
         thread = found.executions['thread']
-        numbers, of = np.unique(thread, return_inverse=True)
+        numbers, of = different(thread)
         thread[:] = np.array([threads.of(self.place, each) for each in numbers.tolist()],
                              dtype=np.int64)[of]
         self.last = max(self.first, int(self.seen_at.max(initial=0)), *(

@@ -49,7 +49,15 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from mddag_executor.recording.entities import Addresses, Entities
-from mddag_executor.recording.tables import find_pairs, Ints, last_of, Mask, sort_by, Table
+from mddag_executor.recording.tables import (
+    different,
+    find_pairs,
+    Ints,
+    last_of,
+    Mask,
+    sort_by,
+    Table,
+)
 from mddag_executor.replay.imported_events import (
     ADDRESSES,
     BECAME,
@@ -490,8 +498,7 @@ class Links:
     def _may_take(self, at: Ints, callback: Ints) -> Mask:
         """Return whether callbacks are those of the subscriptions of `rmw_take` events."""
         subscription = self._subscription[at]
-        pairs, which = np.unique(
-            subscription * len(self.callbacks) + callback, return_inverse=True)
+        pairs, which = different(subscription * len(self.callbacks) + callback)
         fits = [number < 0 or self.callbacks[each] in self.taken[number] for number, each in (
             divmod(pair, len(self.callbacks)) for pair in pairs.tolist())]
         return np.array(fits, dtype=np.bool_)[which]
