@@ -283,9 +283,10 @@ class _Tables:
     def _ready(self) -> Ints:
         """Return by piece when its execution became ready; valid for first pieces."""
         load, each = self._load, self._pieces
-        first = np.arange(len(each.first)) == each.first
-        of_vertex = [np.flatnonzero(first & (each.vertex == v))
-                     for v in range(self._tables.n_vertices + 1)]
+        first, vertices = np.arange(len(each.first)) == each.first, np.arange(
+            1, self._tables.n_vertices + 1)
+        of_vertex, ended_of = (np.split(rows, np.searchsorted(each.vertex[rows], vertices))
+                               for rows in map(np.flatnonzero, (first, each.ended)))
         ready = np.full(len(first), -NEVER)
         jobs = 1 + max(int(each.job.max(initial=0)), int(load.jobs.max(initial=0)))
         for dag, source in enumerate(self._tables.source):
@@ -294,8 +295,7 @@ class _Tables:
             times[load.jobs[mine]] = load.times[mine]
             ready[rows] = times[each.job[rows]]
         for (before, after), edge in edge_numbers(self._tables).items():
-            ended = np.flatnonzero(each.ended & (each.vertex == before))
-            rows = of_vertex[after]
+            ended, rows = ended_of[before], of_vertex[after]
             at = look_up(each.job[rows], each.job[ended])
             ended, rows = ended[at >= 0], rows[at[at >= 0]]
             arrived = each.end[ended]
