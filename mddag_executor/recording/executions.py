@@ -8,12 +8,13 @@ Theory of operation
 1. The events of an execution are ``dispatch``, ``callback_end`` and, unless it was suspended or
    is undeclared, ``complete``; a sync callback that the simulator ran once has a ``complete`` for
    each leg.  ``callback_start``, which other tools read, has the time of ``dispatch``.
-2. Each event belongs to the last dispatch of its thread, in the order of the file.  The first end
-   ends the execution, if its callback is the dispatched one.
+2. A dispatch is a row.  Each other event belongs to the last dispatch of its thread, in the order
+   of the file.  The first end of the dispatched callback ends the execution.
 3. A ``complete`` completes an ended execution of the same DAG, vertex and job.  Otherwise it is a
    row without start.  A dispatch without end is a row without end: it ran at the end of the run,
    or waited (then its worker is -1, its start the run's end).
-4. What was dispatched last in each thread, and its events, wait for the next batch of events.
+4. Events come in batches.  Completions of the newest row of a thread wait for the next batch,
+   which may have those of other legs.
 5. Rows with the same vertex, job and ready time, up to the completing one, are pieces of one
    execution, in the order of their starts.
 """
@@ -21,8 +22,8 @@ Theory of operation
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of
 from mddag_executor.recording.tables import (
@@ -31,11 +32,9 @@ from mddag_executor.recording.tables import (
     groups,
     Growing,
     Ints,
-    last_of,
     LEG,
     Mask,
     NOTHING,
-    pick,
     rows,
     sort_by,
     Table,
@@ -73,23 +72,75 @@ class Numbering:
         return int(self.of(np.array(dag), np.array(vertex))[1])
 
 
+class Columns:
+    """
+    The fields of events of one kind, in the order of the file.
+
+    :param parts: structured arrays with their fields, and the positions of their rows in the file,
+        ascending.
+    """
+
+    def __init__(self, parts: Sequence[tuple[Table, Ints]] = ()) -> None:
+        self._tables = [table for table, _ in parts]
+        #: Positions in the file.
+        self.place = np.concatenate([np.empty(0, dtype=np.int64), *(at for _, at in parts)])
+        self._order: Any = slice(None)
+        if (self.place[1:] < self.place[:-1]).any():
+            self._order = sort_by(self.place)
+            self.place = self.place[self._order]
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    def __getitem__(self, field: str) -> Ints:
+        """Return a field as 64-bit numbers."""
+        if not self._tables:
+            return self.place
+        values = [table[field] for table in self._tables]
+        found: Ints = np.concatenate(values, dtype=np.int64, casting='unsafe')[self._order]
+        return found
+
+    def rows(self, kind: np.dtype[Any], which: Any = slice(None)) -> Table:
+        """Return some events as rows of a type, which has a column ``place``, too."""
+        place = self.place[which]
+        return rows(kind, len(place), place=place, **{
+            name: self[name][which] for name in kind.names or () if name != 'place'})
+
+
+class _Owned(NamedTuple):
+    """
+    Events of one kind by thread, those of a thread in the order of the file.
+
+    :ivar event: their numbers; ``row``: the rows of their executions, -1: none; ``is_newest``:
+        whether it is the newest row of the thread.
+    """
+
+    event: Ints
+    row: Ints
+    is_newest: Mask
+
+
 class ExecutionJoin:
     """
     Joins the events of executions, batch by batch.
 
-    :param kinds: by name in ``PARTS`` the type of its rows of events.
+    :param completion: type of the rows of completions that wait.
     :param strange: receives the number of senseless events by reason.
     :ivar orphans: number of completions without execution.
     :ivar last: the last time of a completion, ns.
     """
 
     def __init__(
-        self, kinds: dict[str, np.dtype[Any]], numbering: Numbering, strange: Counter[str]
+        self, completion: np.dtype[Any], numbering: Numbering, strange: Counter[str]
     ) -> None:
         self.orphans = self.last = 0
         self._numbering, self._strange = numbering, strange
-        self._pending = {name: rows(kinds[name]) for name in PARTS}
-        self._executions, self._completed = Growing(EXECUTIONS), Growing(COMPLETED)
+        self._waiting = rows(completion)
+        self._newest: dict[int, int] = {}       # row by thread
+        self._executions = Growing(EXECUTIONS, **dict.fromkeys((
+            'worker', 'ready', 'began', 'start', 'end', 'busy', 'cpu', 'message', 'order'),
+            UNKNOWN))
+        self._completed = Growing(COMPLETED, place=UNKNOWN, time=UNKNOWN)
 
     def tables(self) -> tuple[Table, Table]:
         """Return ``executions``, and ``COMPLETED``; no events can be added afterwards."""
@@ -98,158 +149,146 @@ class ExecutionJoin:
         _pieces(table)
         return table, self._completed.table()
 
-    def add(self, events: dict[str, list[Table]], at_end: bool = False) -> None:
-        """Add rows of events by name, of each kind in the order of the file."""
-        tables = [_in_order([self._pending[name], *events.get(name, ())]) for name in PARTS]
-        owners, is_last = _owners(tables)
-        waits = [is_last[owner] & (not at_end) for owner in owners]
-        self._pending = {name: pick(table, which)
-                         for name, table, which in zip(PARTS, tables, waits)}
-        dispatch, end, complete = tables
-        n = len(dispatch)
-        ended = len(end) - 1 - _last_positions(owners[1][::-1], n)      # the first one of each
-        end = np.append(end, rows(end.dtype, 1, timestamp=UNKNOWN))
-        good = (ended < len(end) - 1) & (end['callback'][ended] == dispatch['callback'])
-        ended[~good] = -1
-        strange = int(np.count_nonzero(~waits[1]) - np.count_nonzero(good & ~waits[0]))
-        if strange:
-            self._strange[f'{END} of an execution that was not dispatched'] += strange
-        done = np.flatnonzero(~waits[0])
-        row = np.append(_last_positions(done, n), -1)
-        self._store(
-            self._rows(pick(dispatch, done), end['timestamp'][ended[done]]),
-            pick(complete, ~waits[2]), row[owners[2][~waits[2]]])
+    def add(
+        self, parts: Mapping[str, Sequence[tuple[Table, Ints]]], at_end: bool = False
+    ) -> None:
+        """Add events by name; see ``Columns``."""
+        dispatch, end = (Columns(parts.get(name, ())) for name in (DISPATCH, END))
+        complete = Columns([
+            (self._waiting, self._waiting['place']), *parts.get(COMPLETE, ())])
+        first = self._dispatch(dispatch)
+        _, ends, completions = self._owned(first, (dispatch, end, complete))
+        self._end(end, ends)
+        waits = completions.is_newest & (not at_end)
+        self._complete(complete, completions.event[~waits], completions.row[~waits])
+        self._waiting = complete.rows(self._waiting.dtype, np.sort(completions.event[waits]))
 
-    def _rows(self, dispatch: Table, end: Ints) -> Table:
-        """Return rows of dispatched executions."""
+    def _dispatch(self, dispatch: Columns) -> int:
+        """Add dispatched executions; return the first row."""
+        self._completed.more(len(dispatch))
+        table = self._executions.more(len(dispatch))
         ready, start = dispatch['ready'], dispatch['timestamp']
         strange = (ready < 0) | (ready > start)
         if strange.any():
             self._strange[f'{DISPATCH} before it was ready'] += int(strange.sum())
             ready = np.where(strange, start, ready)
-        dag, vertex = self._numbering.of(dispatch['dag'], dispatch['vertex'])
-        return rows(
-            EXECUTIONS, len(dispatch), callback=dispatch['callback'], dag=dag, vertex=vertex,
-            job=dispatch['job'], thread=dispatch['vtid'], worker=dispatch['worker'], ready=ready,
-            began=start, start=start, end=end, busy=np.where(end < 0, UNKNOWN, end - start),
-            cpu=UNKNOWN, message=UNKNOWN, order=UNKNOWN)
+        table['dag'], table['vertex'] = self._numbering.of(dispatch['dag'], dispatch['vertex'])
+        for name in ('callback', 'job', 'worker'):
+            table[name] = dispatch[name]
+        table['thread'], table['ready'] = dispatch['vtid'], ready
+        table['began'] = table['start'] = start
+        return len(self._executions) - len(table)
 
-    def _store(self, table: Table, complete: Table, of: Ints) -> None:
-        """Store executions with their completions; those without execution are rows, too."""
-        completed = rows(COMPLETED, len(table), place=UNKNOWN, time=UNKNOWN)
-        rest = self._assigned(table, completed, complete, of)
-        self._executions.add(table)
-        self._completed.add(completed)
-        self.last = max(self.last, int(complete['timestamp'].max(initial=0)))
-        if not len(rest):
-            return
-        dag, vertex = self._numbering.of(rest['dag'], rest['vertex'])
-        more = rows(
-            EXECUTIONS, len(rest), callback=rest['callback'], dag=dag, vertex=vertex,
-            job=rest['job'], thread=rest['vtid'], worker=UNKNOWN, ready=UNKNOWN, began=UNKNOWN,
-            start=UNKNOWN, end=rest['completed'], busy=UNKNOWN, message=UNKNOWN)
-        _fill(more, rest)
-        self._executions.add(more)
-        self._completed.add(rows(
-            COMPLETED, len(rest), place=rest['place'], time=rest['timestamp']))
-
-    def _assigned(self, table: Table, completed: Table, complete: Table, of: Ints) -> Table:
+    def _owned(self, first: int, events: Sequence[Columns]) -> list[_Owned]:
         """
-        Assign completions to executions; return those without execution.
+        Find the last dispatch of their thread for events.
 
-        :param of: by completion the row that was dispatched before; -1: none.
+        :param first: the row of the first dispatch; ``events``: in the order of ``PARTS``.
         """
-        dag, vertex = self._numbering.of(complete['dag'], complete['vertex'])
+        thread = np.concatenate([each['vtid'] for each in events])
+        order = sort_by(np.concatenate([each.place for each in events]))
+        number = thread - thread.min(initial=0)
+        if number.max(initial=0) < 2 ** 15:     # numbers of 16 bits are sorted much faster
+            number = number.astype(np.int16)
+        order = order[sort_by(number[order])]
+        thread = thread[order]
+        begins, until = groups(thread)
+        borders = np.cumsum([0, *map(len, events)])
+        row = np.where(order < borders[1], order + first, UNKNOWN)
+        of_before = begins[row[begins] < 0]     # they belong to a dispatch of an earlier batch
+        row[of_before] = [
+            self._newest.get(number, UNKNOWN) for number in thread[of_before].tolist()]
+        at = np.where(row >= 0, np.arange(len(row)), 0)
+        at[begins] = begins
+        row = row[np.maximum.accumulate(at)]
+        newest = row[until - 1]
+        self._newest.update(zip(thread[begins].tolist(), newest.tolist()))
+        is_newest = (row == np.repeat(newest, until - begins)) & (row >= 0)
+        found = []
+        for begin, end in zip(borders[:-1], borders[1:]):
+            mine = (order >= begin) & (order < end)
+            found.append(_Owned(order[mine] - begin, row[mine], is_newest[mine]))
+        return found
+
+    def _end(self, end: Columns, owned: _Owned) -> None:
+        """End executions."""
+        table, event, row = self._executions.rows(), owned.event, owned.row
+        good = row >= 0
+        good[good] = (table['end'][row[good]] < 0) & (
+            table['callback'][row[good]] == end['callback'][event[good]])
+        event, row = event[good], row[good]
+        begins, _ = groups(row)
+        event, row = event[begins], row[begins]
+        time = end['timestamp'][event]
+        table['end'][row] = time
+        table['busy'][row] = np.where(time < 0, UNKNOWN, time - table['start'][row])
+        if len(row) < len(end):
+            self._strange[f'{END} of an execution that was not dispatched'] += len(end) - len(row)
+
+    def _complete(self, complete: Columns, event: Ints, row: Ints) -> None:
+        """
+        Complete executions; completions without execution become rows.
+
+        :param event: numbers of completions, those of the same ``row`` one after the other.
+        """
+        dag, vertex = (each[event] for each in self._numbering.of(
+            complete['dag'], complete['vertex']))
+        job, time, leg = (complete[name][event] for name in ('job', 'timestamp', 'leg'))
+        self.last = max(self.last, int(time.max(initial=0)))
         known = dag >= 0
         if not known.all():
             self._strange[f'{COMPLETE} of a vertex that is not declared'] += int((~known).sum())
-        good = known & (of >= 0)
-        row = of[good]
-        good[good] = (table['end'][row] >= 0) & (table['vertex'][row] == vertex[good]) & (
-            table['job'][row] == complete['job'][good])
+        table, good = self._executions.rows(), known & (row >= 0)
+        at = row[good]
+        good[good] = (table['end'][at] >= 0) & (table['vertex'][at] == vertex[good]) & (
+            table['job'][at] == job[good])
         self.orphans += int((known & ~good).sum())
         mine = np.flatnonzero(good)
-        mine = mine[np.argsort(of[mine], kind='stable')]
-        begins, until = groups(of[mine])
-        row, last_leg = of[mine[begins]], mine[until - 1]
+        begins, until = groups(row[mine])
+        at, last_leg = row[mine[begins]], mine[until - 1]
         rest = known
         rest[last_leg] = False
-        changed = pick(table, row)
-        _fill(changed, pick(complete, last_leg))
-        if len(row) < len(mine):    # one execution may complete several legs
-            legs = np.add.reduceat(
-                1 << np.clip(complete['leg'][mine], 0, 62).astype(np.int64), begins)
-            n_legs = self._numbering.n_legs[changed['vertex']]
+        self._fill(at, complete, event[last_leg])
+        if len(at) < len(mine):     # one execution may complete several legs
+            legs = np.bitwise_or.reduceat(1 << np.clip(leg[mine], 0, 62), begins)
+            n_legs = self._numbering.n_legs[table['vertex'][at]]
             every = (until - begins > 1) & (until - begins == n_legs) & (
                 legs == (1 << np.minimum(n_legs, 62)) - 1)
-            changed['leg'][every] = ALL_LEGS
+            table['leg'][at[every]] = ALL_LEGS
             rest[mine] &= ~np.repeat(every, until - begins)
-        table[row] = changed
-        completed['place'][row] = complete['place'][last_leg]
-        completed['time'][row] = complete['timestamp'][last_leg]
-        return pick(complete, rest)
+        which = np.flatnonzero(rest)
+        if len(which):
+            which = which[sort_by(event[which])]
+            more, chosen = self._executions.more(len(which)), event[which]
+            self._completed.more(len(which))
+            more['dag'], more['vertex'], more['job'] = dag[which], vertex[which], job[which]
+            for name, field in (('callback',) * 2, ('thread', 'vtid'), ('end', 'completed')):
+                more[name] = complete[field][chosen]
+            self._fill(np.arange(-len(which), 0), complete, chosen)
 
-
-def _in_order(parts: list[Table]) -> Table:
-    """Return rows of events in the order of the file; those of one channel are."""
-    table = np.concatenate(parts)
-    place = table['place']
-    return pick(table, sort_by(place)) if (place[1:] < place[:-1]).any() else table
-
-
-def _owners(tables: Sequence[Table]) -> tuple[list[Ints], Mask]:
-    """
-    Find the last dispatch of their thread for events.
-
-    :param tables: events in the order of ``PARTS``.
-    :return: by table the rows of dispatches, -1: none; and whether a dispatch is the last one of
-        its thread, with an entry for none.
-    """
-    place, thread = (np.concatenate([table[name] for table in tables])
-                     for name in ('place', 'vtid'))
-    n = len(tables[0])
-    owner, is_last = np.full(len(thread), -1), np.zeros(n + 1, dtype=np.bool_)
-    if not n:
-        return np.split(owner, np.cumsum([len(table) for table in tables])[:-1]), is_last
-    order = sort_by(place)
-    thread -= thread.min()
-    if thread.max() < 2 ** 15:      # numbers of 16 bits are sorted much faster
-        thread = thread.astype(np.int16)
-    order = order[sort_by(thread[order])]
-    thread = thread[order]
-    last = last_of(order < n, thread)
-    owner[order] = np.where(last >= 0, order[last], -1)
-    at = np.flatnonzero(order < n)
-    is_last[order[at]] = np.r_[thread[at[1:]] != thread[at[:-1]], True]
-    return np.split(owner, np.cumsum([len(table) for table in tables])[:-1]), is_last
-
-
-def _last_positions(numbers: Ints, n: int) -> Ints:
-    """Return by number from 0 to n - 1 its last position among the numbers, -1: none."""
-    found = np.full(n + 1, -1)      # -1 is a number, too
-    found[numbers] = np.arange(len(numbers))
-    return found[:-1]
-
-
-def _fill(table: Table, complete: Table) -> None:
-    """Fill in the columns about completions."""
-    table['leg'] = complete['leg']
-    table['completes'] = np.where(complete['last_leg'], VERTEX, LEG)
-    table['cpu'] = complete['cpu_time']
-    table['holds_gil'] = complete['held_interpreter']
+    def _fill(self, row: Any, complete: Columns, event: Ints) -> None:
+        """Fill in the columns about completions."""
+        table, completed = self._executions.rows(), self._completed.rows()
+        table['leg'][row], table['cpu'][row] = (
+            complete[name][event] for name in ('leg', 'cpu_time'))
+        table['holds_gil'][row] = complete['held_interpreter'][event]
+        table['completes'][row] = np.where(complete['last_leg'][event], VERTEX, LEG)
+        completed['place'][row] = complete.place[event]
+        completed['time'][row] = complete['timestamp'][event]
 
 
 def _pieces(table: Table) -> None:
     """Count the pieces of executions that were suspended (rule 5)."""
-    suspended = (table['completes'] == NOTHING) & (table['vertex'] >= 0)
-    undeclared = table['vertex'] < 0
-    if suspended.any():
-        mine = np.flatnonzero(table['vertex'] >= 0)
-        keys = _hashed(table['vertex'][mine], table['job'][mine], table['ready'][mine])
-        some = np.unique(_hashed(*(table[name][suspended] for name in ('vertex', 'job', 'ready'))))
+    vertex = table['vertex'].copy()
+    suspended = np.flatnonzero((table['completes'] == NOTHING) & (vertex >= 0))
+    if len(suspended):
+        mine = np.flatnonzero(np.isin(vertex, vertex[suspended]))
+        keys, some = (_hashed(*(table[name][which] for name in ('vertex', 'job', 'ready')))
+                      for which in (mine, suspended))
         number_pieces(table, mine[np.isin(keys, some)], 'job')
-    if undeclared.any():
-        number_pieces(table, np.flatnonzero(undeclared), 'callback')
+    undeclared = np.flatnonzero(vertex < 0)
+    if len(undeclared):
+        number_pieces(table, undeclared, 'callback')
 
 
 def _hashed(vertex: Any, job: Any, ready: Any) -> Ints:

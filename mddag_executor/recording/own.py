@@ -23,6 +23,7 @@ from mddag_executor.core import NEVER
 from mddag_executor.memory import give_back
 from mddag_executor.recording.entities import Entities, OWN_INIT_EVENTS
 from mddag_executor.recording.executions import (
+    Columns,
     COMPLETE,
     DISPATCH,
     END,
@@ -148,7 +149,7 @@ class _Source:
         self._task_set = declared(head, name)
         self._numbering = Numbering(self._task_set)
         self._strange: Counter[str] = Counter()
-        self._executions = ExecutionJoin(_ROWS, self._numbering, self._strange)
+        self._executions = ExecutionJoin(_ROWS[COMPLETE], self._numbering, self._strange)
         self._who = who
         #: The times of the core's events, by position in the order.
         self.seen_at = np.empty(0, dtype=np.int64)
@@ -162,7 +163,7 @@ class _Source:
         for batch in self._reader.batches({
                 *_ROWS, *OWN_INIT_EVENTS, TASK_SET, _DROP, _HOSTED}):
             self._take(batch)
-            count += len(batch)
+            count += batch.n_events
             if progress is not None:
                 progress(count)
         give_back()     # memory of the batches
@@ -172,27 +173,24 @@ class _Source:
 
     def _take(self, batch: Batch) -> None:
         """Store the events of a batch, executions as rows."""
-        parts: dict[str, list[Table]] = {}
-        for (name, *_), table, places in batch.tables():
+        parts: dict[str, list[tuple[Table, Ints]]] = {}
+        for (name, *_), table, places in batch.tables:
             if name in _ROWS:
-                fields = (_ROWS[name].names or ())[1:]
-                parts.setdefault(name, []).append(rows(
-                    _ROWS[name], len(table), place=places, **{
-                        field: table[field] for field in fields}))
+                parts.setdefault(name, []).append((table, places))
             else:
                 self._others += [(place, (name, *row)) for place, row in zip(
                     places.tolist(), table.tolist())]
-        for place, event in batch.others():
+        for place, event in batch.others:
             if None in event:
                 self._strange[f'{event[0]} without some of its fields'] += 1
             elif event[0] in _ROWS:
-                parts.setdefault(event[0], []).append(_one_row(place, event))
+                parts.setdefault(event[0], []).append((_one_row(event), np.array([place])))
             else:
                 self._others.append((place, event))
-        for name, grown in self._kinds.items():
-            for table in parts.get(name, ()):
-                grown.add(table)
         self._executions.add(parts)
+        for name, found in parts.items():
+            if name not in PARTS:
+                self._kinds[name].add(Columns(found).rows(_ROWS[name]))
 
     def _pop(self, name: str) -> Table:
         """Return the rows of a kind of event; forget them."""
@@ -396,9 +394,9 @@ class _Source:
         return lines
 
 
-def _one_row(place: int, event: Event) -> Table:
-    """Return the row of an event, a tuple with the fields of the table."""
+def _one_row(event: Event) -> Table:
+    """Return an event, a tuple with the fields of the table, as a row."""
     kind = _ROWS[event[0]]
     fields = [name for name, _ in (*PREAMBLE, *EVENTS[event[0]].fields)]
     values = dict(zip(fields, event[1:]))
-    return rows(kind, 1, place=place, **{name: values[name] for name in (kind.names or ())[1:]})
+    return rows(kind, 1, **{name: values[name] for name in (kind.names or ())[1:]})

@@ -106,26 +106,42 @@ def in_parts(column: Any) -> Iterator[Any]:
 
 
 class Growing:
-    """A table that grows by many rows at a time, in contiguous memory."""
+    """
+    A table that grows by many rows at a time, in contiguous memory.
 
-    def __init__(self, kind: np.dtype[Any]) -> None:
-        self._rows = np.empty(0, dtype=f'V{kind.itemsize}')
+    :param values: values of new rows, 0 in the other columns.
+    """
+
+    def __init__(self, kind: np.dtype[Any], **values: int) -> None:
+        self._new = rows(kind, 1, **values).view(f'V{kind.itemsize}')
+        self._rows = self._new[:0].copy()
         self._kind = kind
         self._count = 0
 
+    def __len__(self) -> int:
+        return self._count
+
+    def more(self, n: int) -> Table:
+        """Add rows; return them as a view, which is valid until more are added."""
+        count = self._count + n
+        if count > len(self._rows):
+            self._rows.resize(max(count, 1024, len(self._rows) * 9 // 8), refcheck=False)
+        self._rows[self._count:count] = self._new
+        self._count = count
+        return self.rows()[count - n:]
+
+    def rows(self) -> Table:
+        """Return all rows as a view, which is valid until more are added."""
+        return self._rows[:self._count].view(self._kind)
+
     def add(self, table: Table) -> None:
         """Add rows."""
-        count = self._count + len(table)
-        if count > len(self._rows):
-            self._rows.resize(max(count, 1024, len(self._rows) * 5 // 4), refcheck=False)
-        self._rows[self._count:count] = table.view(self._rows.dtype)
-        self._count = count
+        self.more(len(table)).view(self._new.dtype)[:] = table.view(self._new.dtype)
 
     def table(self) -> Table:
         """Return the table; no rows can be added afterwards."""
         self._rows.resize(self._count, refcheck=False)
-        found: Table = self._rows.view(self._kind)
-        return found
+        return self.rows()
 
 
 class Rows:

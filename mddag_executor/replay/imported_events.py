@@ -87,12 +87,12 @@ def read_events(
     tuples: list[tuple[int, Event]] = []
     count = 0
     for batch in reader.batches({*kinds, *others}, as_table=False):
-        for head, rows, places in batch.tables():
+        for head, rows, places in batch.tables:
             if head[0].name in kinds:
                 parts.append(_normal(rows, places, kinds[head[0].name]))
             if head[0].name not in kinds or head[0].name in others:
                 tuples += zip(places.tolist(), (head + row for row in rows.tolist()))
-        for place, event in batch.others():
+        for place, event in batch.others:
             layout = event[0]
             if layout.name in kinds:
                 names = ('timestamp', 'vpid', 'vtid', *layout.fields)
@@ -104,7 +104,7 @@ def read_events(
                 parts.append(_normal(row, np.array([place]), kinds[layout.name]))
             if layout.name not in kinds or layout.name in others:
                 tuples.append((place, event))
-        count += len(batch)
+        count += batch.n_events
         if progress is not None:
             progress(count)
     table = np.concatenate(parts)

@@ -157,10 +157,12 @@ class Channels:
             ends = [struct.calcsize('<' + fixed[:i + 1])
                     for i, code in enumerate(fixed) if code != 'x']
             formats = ['<' + code for code in fixed if code != 'x']
+            before = len(cdr.ENCAPSULATION)
             self.fixed[number] = Fixed(head, np.dtype({
-                'names': names, 'formats': formats, 'itemsize': struct.calcsize('<' + fixed),
-                'offsets': [end - struct.calcsize(code) for end, code in zip(ends, formats)]}), {
-                    field: defaults[field] for field in missing})
+                'names': names, 'formats': formats,
+                'itemsize': before + struct.calcsize('<' + fixed), 'offsets': [
+                    before + end - struct.calcsize(code) for end, code in zip(ends, formats)]}), {
+                        field: defaults[field] for field in missing})
 
 
 def _fields_of(topic: Topic) -> dict[str, FieldType]:

@@ -12,8 +12,6 @@ import numpy.typing as npt
 
 Event = tuple[Any, ...]
 Ints = npt.NDArray[np.int64]
-FIELDS = 35
-"""Bytes of a message's record before the fields of its content."""
 
 
 class Fixed(NamedTuple):
@@ -21,7 +19,7 @@ class Fixed(NamedTuple):
     How numpy decodes the messages of a channel with a fixed layout.
 
     :ivar head: the begin of an event's tuple.
-    :ivar kind: the type of a row, from ``timestamp`` on.
+    :ivar kind: the type of a message, with the encapsulation before the fields.
     :ivar missing: fields that the file lacks, with their values.
     """
 
@@ -32,7 +30,7 @@ class Fixed(NamedTuple):
 
 class Table(NamedTuple):
     """
-    The events of one kind.
+    The events of one channel.
 
     :ivar rows: a structured array with the event's fields, from ``timestamp`` on.
     :ivar places: positions of the rows in the order of the file over all batches, ascending.
@@ -43,48 +41,34 @@ class Table(NamedTuple):
     places: Ints
 
 
-class Batch:
+class Batch(NamedTuple):
     """
-    The events of some chunks; valid until the next batch is read.
+    The events of some chunks.
 
-    :param data: the records of the chunks.
-    :param base: position of the first byte of the data in the order of the file.
-    :param columns: by channel how its events are decoded, and the positions of their records in
-        the data, ascending.
-    :param others: events that numpy cannot decode, with their positions in the data.
+    :ivar tables: those that numpy can decode.
+    :ivar others: the others, with their positions in the order of the file.
     """
 
-    def __init__(
-        self, data: bytearray, base: int, columns: Sequence[tuple[Fixed, Ints]],
-        others: Sequence[tuple[int, Event]],
-    ) -> None:
-        self._data, self._base, self._columns, self._others = data, base, columns, others
+    tables: Sequence[Table]
+    others: Sequence[tuple[int, Event]]
 
-    def __len__(self) -> int:
-        return sum(len(at) for _, at in self._columns) + len(self._others)
+    @property
+    def n_events(self) -> int:
+        """Return the number of events."""
+        return sum(len(each.rows) for each in self.tables) + len(self.others)
 
-    def tables(self) -> Iterator[Table]:
-        """Yield the events that numpy can decode, by channel."""
-        for fixed, at in self._columns:
-            rows = rows_at(self._data, fixed.kind, at + FIELDS)
-            yield Table(fixed.head, _with_fields(rows, fixed.missing), at + self._base)
-
-    def others(self) -> list[tuple[int, Event]]:
-        """Return the other events with their positions."""
-        return [(self._base + place, event) for place, event in self._others]
-
-    def __iter__(self) -> Iterator[Event]:
+    def tuples(self) -> Iterator[Event]:
         """Yield all events as tuples, in the order of the file."""
-        found = [event for _, event in self._others]
-        places = [np.array([place for place, _ in self.others()], dtype=np.int64)]
-        for head, rows, at in self.tables():
+        found = [event for _, event in self.others]
+        places = [np.array([place for place, _ in self.others], dtype=np.int64)]
+        for head, rows, at in self.tables:
             found += [head + row for row in rows.tolist()]
             places.append(at)
         for number in np.argsort(np.concatenate(places), kind='stable').tolist():
             yield found[number]
 
 
-def _with_fields(rows: Any, missing: dict[str, int]) -> Any:
+def with_fields(rows: Any, missing: dict[str, int]) -> Any:
     """Return a structured array with additional fields, each with the same value in all rows."""
     if not missing:
         return rows

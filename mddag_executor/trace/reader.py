@@ -138,7 +138,7 @@ class TraceReader:
             yield from self._read(channels, Reading.by_time)
         else:
             for batch in self._read(channels, Reading.by_file):
-                yield from batch
+                yield from batch.tuples()
 
     def batches(self, names: Iterable[str], as_table: bool = True) -> Iterator[Batch]:
         """

@@ -33,7 +33,7 @@ from mddag_executor.trace import records
 from mddag_executor.trace.blocks import blocks, Damage, NO_MEMORY
 from mddag_executor.trace.cdr import ENCAPSULATION
 from mddag_executor.trace.channels import Channels, Topic, UNDEFINED
-from mddag_executor.trace.events import Batch, Event, FIELDS, Ints, rows_at
+from mddag_executor.trace.events import Batch, Event, Ints, rows_at, Table, with_fields
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
@@ -43,8 +43,8 @@ _HEAD = np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2')])
 _TIMES_AT, _TIMES = 15, np.dtype([('log_time', '<u8'), ('publish_time', '<u8')])
 _CONTENT = records.RECORD.size
 _LEAST = _CONTENT + records.MESSAGE_HEAD.size       # bytes of a message's record
-_ENCAPSULATION = np.dtype('<u2')
-_LITTLE_ENDIAN = 0x0100         # plain CDR, little endian, as read by _ENCAPSULATION
+_FIELDS = _LEAST + len(ENCAPSULATION)       # bytes before the fields of an event
+_PLAIN = int.from_bytes(ENCAPSULATION[:2], 'little')
 _INDEX_HEAD = 6         # bytes: channel, size of the entries
 _INDEX_ENTRY = np.dtype([('time', '<u8'), ('offset', '<u8')])
 
@@ -102,7 +102,7 @@ class Reading:
 
     def by_time(self) -> Iterator[Event]:
         """Yield the events in the order of time."""
-        found = [event for batch in self.by_file() for event in batch]
+        found = [event for batch in self.by_file() for event in batch.tuples()]
         possible = [event for event in found if 0 <= event[1] < NEVER]
         if len(possible) < len(found):
             self._left_out = [event[1] for event in found if not 0 <= event[1] < NEVER]
@@ -122,7 +122,7 @@ class Reading:
                     at[wanted].tolist(), lengths[wanted].tolist(), channels[wanted].tolist(),
                     heads[wanted].tolist()):
                 yield Message(known[channel], log_time, publish_time,
-                              bytes(data[start + FIELDS - 4:start + _CONTENT + length]))
+                              bytes(data[start + _LEAST:start + _CONTENT + length]))
 
     # --- positions of messages -------------------------------------------------------------------
 
@@ -196,7 +196,7 @@ class Reading:
 
     def _decoded(self, loaded: _Loaded) -> Batch:
         """Return the events of some blocks; count undecodable ones."""
-        columns, others = [], list[tuple[int, Event]]()
+        tables, others = list[Table](), list[tuple[int, Event]]()
         for channel in np.flatnonzero(np.bincount(loaded.channels)).tolist():
             if channel in self._channels.passed_over:
                 continue
@@ -204,25 +204,28 @@ class Reading:
             at, lengths = loaded.at[mine], loaded.lengths[mine] + _CONTENT
             fixed = self._channels.fixed.get(channel)
             if fixed is not None:
-                plain = lengths >= FIELDS + fixed.kind.itemsize
-                plain[plain] = rows_at(
-                    loaded.data, _ENCAPSULATION, at[plain] + FIELDS - 4) == _LITTLE_ENDIAN
-                columns.append((fixed, at[plain]))
+                plain = lengths >= _LEAST + fixed.kind.itemsize
+                rows = rows_at(loaded.data, fixed.kind, at[plain] + _LEAST)
+                is_plain = np.ndarray(len(rows), '<u2', rows, 0, rows.strides) == _PLAIN
+                plain[plain] = is_plain
+                tables.append(Table(fixed.head, with_fields(
+                    rows if is_plain.all() else rows[is_plain], fixed.missing),
+                    at[plain] + self._place))
                 at, lengths = at[~plain], lengths[~plain]
             for start, length in zip(at.tolist(), lengths.tolist()):
                 event = self._any(channel, bytes(loaded.data[start:start + length]))
                 if event is not None:
-                    others.append((start, event))
+                    others.append((self._place + start, event))
         others.sort(key=itemgetter(0))
-        return Batch(loaded.data, self._place, columns, others)
+        return Batch(tables, others)
 
     def _any(self, channel: int, message: bytes) -> Event | None:
         """Return the event in a message record; None, and count it, if it cannot be decoded."""
         try:
-            if message[FIELDS - 4:FIELDS - 2] != ENCAPSULATION[:2]:
+            if message[_LEAST:_LEAST + 2] != ENCAPSULATION[:2]:
                 raise ValueError('it is not plain little endian CDR')
             head, unpack = self._channels.decoder(channel)
-            return head + unpack(message[FIELDS:])
+            return head + unpack(message[_FIELDS:])
         except (ValueError, struct.error) as error:
             topic = self._channels.topics.get(channel)
             name = f'channel {channel}' if topic is None else topic.name
