@@ -268,9 +268,8 @@ class Chains:
     def _of_sink(self, sink: int, done: Table) -> dict[str, Any]:
         dag = int(done['dag'][0])
         worst = int((done['completed'] - done['release']).argmax())
-        parts, group, links = self._split(dag, sink, done)
-        chain = np.concatenate([each[each['of'] == worst] for each in links] or [
-            np.empty(0, dtype=LINKS)])[::-1]
+        parts, group = self._split(dag, done, self._followed(dag, sink, done))
+        chain = [links[0] for _, links in self._followed(dag, sink, done[worst:worst + 1])][::-1]
         n = len(done)
         return {
             'mean': {**{name: round(int(part.sum()) / n) for name, part in parts.items()},
@@ -282,24 +281,26 @@ class Chains:
                 'waiting_group_ns': int(group[worst]),
                 'chain': [_step_result(self._judged.task_set, link) for link in chain]}}
 
+    def _followed(self, dag: int, sink: int, done: Table) -> Iterator[tuple[Ints, Table]]:
+        """Follow the chains of a completed sink, from right after each completion."""
+        row, order, time = done['row'], done['order'] + 1, done['completed']
+        vertex = np.full(len(done), sink - self._dags[dag].first)
+        return self.follow(dag, row, order, time, *self.link(dag, row, vertex, order, time))
+
     def _split(
-        self, dag: int, sink: int, done: Table
-    ) -> tuple[dict[str, Ints], Ints, list[Table]]:
-        """Return the parts of response times, their waiting for callback groups, and the links."""
+        self, dag: int, done: Table, followed: Iterator[tuple[Ints, Table]]
+    ) -> tuple[dict[str, Ints], Ints]:
+        """Return the parts of response times, and their waiting for callback groups."""
         of = self._dags[dag]
         n = len(done)
         parts = {name: np.zeros(n, dtype=np.int64) for name in Breakdown._fields}
         lag, waiting, executing, suspended, transport, unknown = parts.values()
         group = np.zeros(n, dtype=np.int64)
-        row, order, completed = done['row'], done['order'], done['completed']
-        # right after its completion
-        link, running = self.link(dag, row, np.full(n, sink - of.first), order + 1, completed)
-        until, release = completed.copy(), done['release']
+        until, release = done['completed'].copy(), done['release']
         begun = np.zeros(n, dtype=np.bool_)     # whether the chain reaches the source
-        kept: list[Table] = []
-        for which, links in self.follow(dag, row, order + 1, completed, link, running):
+        for place, (which, links) in enumerate(followed):
             ready, start, end = links['ready'], links['start'], links['end']
-            published = until[which] if not kept else np.minimum(end, until[which])
+            published = np.minimum(end, until[which]) if place else until[which]
             # The position of a pause within the execution is not recorded: it counts as far as it
             # fits.
             pause = np.where(links['leg'] < 0, 0, np.maximum(
@@ -311,10 +312,9 @@ class Chains:
             group[which] += links['group']
             until[which] = ready
             begun[which] = of.is_source[links['vertex'] - of.first]
-            kept.append(links)
         rest = until - release
         lag[begun], unknown[~begun] = rest[begun], rest[~begun]
-        return parts, group, kept
+        return parts, group
 
 
 def _started(table: Table, running: Mask) -> Ints:

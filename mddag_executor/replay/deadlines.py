@@ -62,6 +62,7 @@ from mddag_executor.recording.tables import (
 )
 from mddag_executor.text import counted
 import numpy as np
+import numpy.typing as npt
 
 VERDICTS = np.dtype([
     ('kind', 'i1'), ('dag', 'i4'), ('sink', 'i4'), ('job', 'i8'), ('release', 'i8'),
@@ -90,7 +91,7 @@ class Jobs(NamedTuple):
     number: Ints
     release: Ints
     released: Ints
-    done: Ints
+    done: npt.NDArray[np.int32]
     done_order: Ints
     ended: Ints
 
@@ -119,15 +120,16 @@ class Judged:
         ends, releases = ([table[mine] for mine in rows_by(table['dag'], len(task_set.dags))]
                           for table in (recording.job_ends, recording.releases))
         executions = recording.executions
-        completing = np.flatnonzero(
-            (executions['completes'] != recorded.NOTHING) & (executions['vertex'] >= 0))
+        completing: Any = np.flatnonzero((executions['completes'] != recorded.NOTHING) & (
+            executions['vertex'] >= 0)).astype(np.int32)
         completing = completing[sort_by(executions['order'][completing])]
         by_dag = [completing[mine] for mine in rows_by(
             executions['dag'][completing].astype(np.int16), len(task_set.dags))]
+        del completing
         self.jobs: list[Jobs] = []
         found: list[Table] = []
         for dag in range(len(task_set.dags)):
-            jobs, verdicts = self._judge(dag, releases[dag], by_dag[dag], ends[dag])
+            jobs, verdicts = self._judge(dag, releases[dag], by_dag.pop(0), ends[dag])
             self.jobs.append(jobs)
             found += verdicts
         table = np.concatenate([np.empty(0, dtype=VERDICTS), *found])
@@ -150,8 +152,8 @@ class Judged:
         first, last = self.tables.first_vertex[dag:dag + 2]
         jobs = Jobs(
             released['job'].copy(), released['release'].copy(), released['order'].copy(),
-            np.full((len(released), last - first), -1), np.full((len(released), last - first),
-                                                                NEVER),
+            np.full((len(released), last - first), -1, dtype=np.int32),
+            np.full((len(released), last - first), NEVER),
             np.full(len(released), NEVER))
         reason, when = self._given_up(jobs, ends)
         expected = self._expected(dag, jobs)
@@ -293,8 +295,9 @@ class Judged:
         :return: positions of duplicate completions, and the rows of their jobs.
         """
         first = self.tables.first_vertex[dag]
-        table = pick(self._recording.executions, completing)
-        row, order, vertex = jobs.rows_of(table['job']), table['order'], table['vertex'] - first
+        job, order, vertex = (
+            self._recording.executions[name][completing] for name in ('job', 'order', 'vertex'))
+        row, vertex = jobs.rows_of(job), vertex - first
         known = row >= 0
         if len(jobs.number):
             known &= order > jobs.released[np.maximum(row, 0)]
@@ -302,8 +305,7 @@ class Judged:
             # no such job was released before, or it has ended
             newest = np.maximum.accumulate(np.r_[-1, jobs.number])
             before = newest[np.searchsorted(jobs.released, order)]
-            self.contradictions += int((~known & (table['job'] > before)).sum())
-        del table
+            self.contradictions += int((~known & (job > before)).sum())
         known[known] = order[known] < jobs.ended[row[known]]
         if not known.all():
             row, order, vertex, completing = (

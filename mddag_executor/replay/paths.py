@@ -90,6 +90,16 @@ end of an execution (-1: not recorded), ns.
 """
 
 
+_SENT = np.dtype([
+    ('place', 'i2'), ('node', 'i2'), ('run', 'i4'), ('message', 'i8'), ('time', 'i8')])
+"""
+Columns of a publication; -1: unknown.
+
+``place`` is the index of the callback, ``node`` that of the node, ``run`` the row of the first
+piece of the execution, ``message`` the number of the message.
+"""
+
+
 class Hop(NamedTuple):
     """How data gets from a callback of a path to the next."""
 
@@ -159,7 +169,7 @@ class Paths:
         self._ended: dict[str, tuple[Ints, Ints]] = {}
         keys = {key for path in self.paths for key in path.callbacks}
         records = bool(recording.who.every_publisher) or recording.links
-        sent: list[list[Ints]] = [[] for _ in self._topics]
+        sent: list[list[Table]] = [[] for _ in self._topics]
         for callback in task_set.callbacks:
             topics = [] if records else [
                 self._topics[each] for each in callback.publishes if each in self._topics]
@@ -167,7 +177,7 @@ class Paths:
                 self._add(callback, topics, sent)
         if records:
             self._published(sent)
-        # by topic its publications: callback, node, execution, message and time, in order of time
+        # by topic its publications in order of time, rows of ``_SENT``
         self._sent = [self._in_order(parts) for parts in sent]
         del self._of_place
         give_back()
@@ -184,34 +194,35 @@ class Paths:
         self._vertex[unknown[known]] = np.array(
             [of[each] for each in callbacks.tolist()])[at[known]]
 
-    def _add(self, callback: Callback, topics: list[int], sent: list[list[Ints]]) -> None:
+    def _add(self, callback: Callback, topics: list[int], sent: list[list[Table]]) -> None:
         """
         Collect the executions of a callback.
 
         :param topics: those on which it publishes when it ends; ``sent``: receives publications.
         """
         place = self._places[callback.key]
-        rows = self._of_place[place]
-        table = pick(self._table, rows)     # once: its rows are scattered over the whole table
+        mine: Any = self._of_place[place].astype(np.int32)
+        table = pick(self._table, mine)     # once: its rows are scattered over the whole table
         started = table['start'] >= 0
         self._ran[callback.key] = self._executions(
-            callback, rows, table, started & (self._first[rows] == rows))
+            callback, mine, table, started & (self._first[mine] == mine))
         ended = np.flatnonzero(started & (table['end'] >= 0))
         ended = ended[sort_by(table['end'][ended])]
-        rows, end = rows[ended], table['end'][ended]
-        self._ended[callback.key] = rows, end
+        mine, end, job = mine[ended], table['end'][ended], table['job'][ended]
+        del table
+        self._ended[callback.key] = mine, end
         for topic in topics:
-            found = np.full((5, len(rows)), NONE)
-            found[0], found[2], found[4] = place, self._first[rows], end
-            found[3] = self._message(table['job'][ended], self._vertex[rows], topic)
-            sent[topic].append(found)
+            sent[topic].append(rows(
+                _SENT, len(mine), place=place, node=NONE, run=self._first[mine], time=end,
+                message=self._message(job, self._vertex[mine], topic)))
 
     @staticmethod
-    def _in_order(sent: list[Ints]) -> Ints:
-        found = np.concatenate([np.empty((5, 0), dtype=np.int64), *sent], axis=1)
-        return found[:, sort_by(found[4])]
+    def _in_order(sent: list[Table]) -> Table:
+        found = sent.pop() if len(sent) == 1 else np.concatenate([rows(_SENT), *sent])
+        time = found['time']
+        return pick(found, sort_by(time)) if (time[1:] < time[:-1]).any() else found
 
-    def _published(self, found: list[list[Ints]]) -> None:
+    def _published(self, found: list[list[Table]]) -> None:
         """Collect the recorded publications on the topics of paths."""
         recording, table, sent = self._recording, self._table, self._recording.publications
         publishers = recording.who.every_publisher
@@ -227,9 +238,10 @@ class Paths:
             message = mine if recording.links else np.where(
                 (by >= 0) & (vertex >= 0),
                 self._message(table['job'][by], table['vertex'][by], number), NONE)
-            found[number].append(np.stack([
-                np.where(vertex >= 0, self._place[vertex], NONE), nodes[which[mine]],
-                np.where(by >= 0, self._first[by], NONE), message, sent['time'][mine]]))
+            found[number].append(rows(
+                _SENT, len(mine), place=np.where(vertex >= 0, self._place[vertex], NONE),
+                node=nodes[which[mine]], run=np.where(by >= 0, self._first[by], NONE),
+                message=message, time=sent['time'][mine]))
 
     def _message(self, job: Any, vertex: Any, topic: Any) -> Ints:
         """Return the numbers of the messages that vertices publish in jobs."""
@@ -342,12 +354,11 @@ class Paths:
 
         :param ran: the steps of the executions; ``step_of``: the same by row.
         """
-        sent = np.concatenate([self._sent[topic] for topic in topics], axis=1)
-        if len(topics) > 1:
-            sent = sent[:, sort_by(sent[4])]
-        mine = (sent[0] == self._places[callback.key]) | (
-            (sent[0] == NONE) & (sent[1] == self._nodes[callback.node]))
-        place, _, run, message, time = sent[:, mine]
+        sent = self._in_order([self._sent[topic] for topic in topics])
+        mine = (sent['place'] == self._places[callback.key]) | (
+            (sent['place'] == NONE) & (sent['node'] == self._nodes[callback.node]))
+        place, run, message, time = (
+            sent[name][mine] for name in ('place', 'run', 'message', 'time'))
         parent = np.where((place != NONE) & (run != NONE), step_of[run], NONE)
         latest = (parent == NONE) & ((callback.kind == 'sync') | (place == NONE))
         parent[latest] = ran.as_of(time[latest], before=True)
@@ -394,19 +405,16 @@ class _Steps:
     """The steps of a path."""
 
     def __init__(self) -> None:
-        self._n = 0
-        self._rows = Growing(STEPS)
+        self._rows = Growing(STEPS, end=NONE)
         self._ends: list[tuple[Ints, Ints]] = []
 
     def add(self, position: int, parent: Ints, is_run: bool, times: Ints) -> Ints:
         """Add steps that have a parent, or begin the path; return their numbers."""
         wanted = (parent != NONE) | (position == 0)
-        numbers = np.where(wanted, self._n + np.cumsum(wanted) - 1, NONE)
-        n = int(wanted.sum())
-        self._n += n
-        self._rows.add(rows(
-            STEPS, n, parent=parent[wanted], position=position, is_run=is_run, time=times[wanted],
-            end=NONE))
+        numbers = np.where(wanted, len(self._rows) + np.cumsum(wanted) - 1, NONE)
+        new = self._rows.more(int(wanted.sum()))
+        new['parent'], new['time'] = parent[wanted], times[wanted]
+        new['position'], new['is_run'] = position, is_run
         return numbers
 
     def end(self, steps: Ints, times: Ints) -> None:
