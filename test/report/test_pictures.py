@@ -40,17 +40,11 @@ HOSTILE = ('a"b', 'back\\slash', 'n\\N\\G', '<b>bold</b>', 'line\nbreak', '"]; e
            '%% comment', 'end', '--> x', '&quot;', '#35;', '\x1b[31m', '\u202e', '"', '\\')
 
 
-def drawn(text=GRAPH):
-    return picture(msg_graph.loads(text, name='g.yaml'))
-
-
-def laid_out(text):
-    """Return where Graphviz puts each DAG: left, low, right and high."""
-    done = subprocess.run(['dot', '-Tjson0'], input=text, text=True, check=True,
+def laid_out(text, form='json0'):
+    """Return by name what Graphviz makes of a text."""
+    done = subprocess.run(['dot', f'-T{form}'], input=text, text=True, check=True,
                           stdout=subprocess.PIPE, timeout=60)
-    return {item['name']: [float(number) for number in item['bb'].split(',')]
-            for item in json.loads(done.stdout)['objects']
-            if item['name'].startswith('cluster_')}
+    return {item['name']: item for item in json.loads(done.stdout)['objects']}
 
 
 @pytest.mark.needs('graphviz')
@@ -59,7 +53,7 @@ def test_dags_are_in_the_order_of_the_file(name):
     result = picture(msg_graph.load(ROOT / name))
     assert result.title == Path(name).name
     frames = laid_out(to_dot(result))
-    tops = [frames[f'cluster_{dag.mark}'][3] for dag in result.dags]
+    tops = [float(frames[f'cluster_{dag.mark}']['bb'].split(',')[3]) for dag in result.dags]
     assert tops == sorted(tops, reverse=True) and len(set(tops)) == len(tops)
 
 
@@ -76,15 +70,13 @@ def test_labels_hold_any_text(text):
 
 @pytest.mark.needs('graphviz')
 def test_graphviz_reads_hostile_names_as_they_are():
-    result = drawn()
+    result = picture(msg_graph.loads(GRAPH, name='g.yaml'))
     first = result.dags[0]
     boxes = tuple(replace(first.boxes[0], mark=f'd0v{place}', node=name, lines=(name,))
                   for place, name in enumerate(HOSTILE))
     hostile = replace(result, title='\\N"<b>&', arrows=(),
                       dags=(replace(first, title='"<\\', boxes=boxes),))
-    done = subprocess.run(['dot', '-Tdot_json'], input=to_dot(hostile), text=True, check=True,
-                          stdout=subprocess.PIPE, timeout=60)
-    objects = {item['name']: item for item in json.loads(done.stdout)['objects']}
+    objects = laid_out(to_dot(hostile), 'dot_json')
     for place, name in enumerate(HOSTILE):
         # Graphviz gives its strings back with the escapes for labels still in them.
         label = objects[f'd0v{place}']['label'].replace('\\\\', '\\')
