@@ -35,7 +35,7 @@ def test_the_publishing_thread_takes(make_executor, make_node):
 
     A message from before the subscription comes first.
     """
-    node, got, go_on = make_node(), [], threading.Event()
+    node, got, begun, go_on = make_node(), [], threading.Event(), threading.Event()
     qos = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     publisher = node.create_publisher(Header, '/a', qos)
     publisher.publish(Header(frame_id='early'))
@@ -45,8 +45,8 @@ def test_the_publishing_thread_takes(make_executor, make_node):
     publisher.publish(Header(frame_id='before'))
     with Spinning(executor):
         assert wait_for(lambda: got == ['early', 'before'])
-        executor.create_task(go_on.wait, 15.0)
-        assert wait_for(lambda: not executor.statistics()['idle_workers'])
+        executor.create_task(lambda: (begun.set(), go_on.wait(15.0)))
+        assert begun.wait(15.0)
         queues = []
         for number in range(3):
             in_threads(publisher.publish, Header(frame_id=str(number)))
@@ -128,18 +128,21 @@ def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
             assert wait_for(lambda: 'foreign:200' in got)  # its numbers are larger from then on
             timer.reset()
             executor.wake()
-            while 'foreign:1500' not in got:
+            for number in itertools.count():
+                if 'foreign:1500' in got:
+                    break
                 brief = other.create_publisher(Header, '/a', 10)
                 time.sleep(0.015)
+                publisher.publish(Header(frame_id=f'main:{number}'))  # not in a callback
                 other.destroy_publisher(brief)
                 time.sleep(0.015)
             timer.cancel()  # only the other one publishes: no thread here receives for it then
         assert foreign.returncode == 0
-        number = next(count)
-        assert wait_for(lambda: len(got) == len(declared) == number + 2000), len(got)
-    assert numbers(got, 'here') == list(range(number))
-    assert numbers(got, 'foreign') == list(range(2000))
-    assert {*declared} == {('fore', True), ('here', False)}
+        counts = {'here': next(count), 'main': number, 'foreign': 2000}
+        assert wait_for(lambda: len(got) == len(declared) == sum(counts.values())), len(got)
+    for name, sent in counts.items():
+        assert numbers(got, name) == list(range(sent))
+    assert {*declared} == {('fore', True), ('main', True), ('here', False)}
 
 
 def numbers(got, name):
