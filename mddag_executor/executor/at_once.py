@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
+from time import monotonic_ns
 from typing import Any
 
 from mddag_executor.executor import compat
@@ -50,11 +51,10 @@ class AtOnce:
     def handle(self, events: Events) -> bool:
         """Handle arrivals; return whether there were any."""
         self.has_run = False
-        sources, _, expired = self.loop.sources(events)
-        for source in sources:
+        for source in self.loop.sources(events):
             with self._lock if isinstance(source, TimerSource) else nullcontext():
                 source.collect()
-        if expired or self.timers.has_jumped:
+        if self.timers.has_jumped or self.loop.timer.is_due(monotonic_ns()):
             self.loop.timer.at = 0
             with self._lock:
                 fired = list(self.timers.fire())

@@ -73,9 +73,9 @@ class DueTimes:
         heappush(self._calls, (at, self._n_calls, function))
         self._arm_by(at)
 
-    def handle(self, now: int, since: int) -> list[Callable[[], None]]:
+    def handle(self, now: int, since: int) -> None:
         """
-        Handle everything due by now; return the functions to call without the lock.
+        Handle everything due by now; calls wait until the lock is free.
 
         :param now: the time on the trace's clock.
         :param since: since when the calling thread has waited in the epoll, on the trace's clock;
@@ -95,10 +95,10 @@ class DueTimes:
             self._check_gil(monotonic)
         if 0 < pool.muting.until <= now:
             pool.muting.end()
-        calls = []
         while self._calls and self._calls[0][0] <= monotonic:
-            calls.append(heappop(self._calls)[2])
-        return calls
+            pool.deferred.append(heappop(self._calls)[2])
+        if pool.miss_log.is_behind():
+            pool.deferred.append(pool.miss_log.write)
 
     def arm(self, now: int) -> None:
         """Set the timerfd to the next due time."""
@@ -283,7 +283,7 @@ class Muting:
         if not self.until:
             return
         self.until = self._bound = 0
-        for source in self._loop.sources(self._loop.unmute())[0]:
+        for source in self._loop.sources(self._loop.unmute()):
             source.collect()
         if self._pool.running:
             self._pool.fire_timers()

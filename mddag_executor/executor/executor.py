@@ -157,6 +157,7 @@ class MultiDeadlineExecutor(BareExecutor):
             'max_active_jobs', max_active_jobs, settings.MOST_JOBS)
         find_policy(policy)
         settings.check_on_late(on_late)
+        settings.check_handler(on_deadline_miss)
         settings.check_context(context)
         settings.check_process(process, task_set)
         # All parameters are checked by now: an error leaves no trace and no thread behind.

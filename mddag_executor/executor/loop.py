@@ -22,7 +22,7 @@ Theory of operation
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 import os
 import resource
 import select
@@ -44,14 +44,12 @@ class ChannelSource:
 
     :ivar fd: the descriptor, -1: none.
     :ivar is_patient: whether it is registered in the nested epoll.
-    :ivar asks_others: ``collect`` calls foreign code, so the caller must hold no lock.
     :ivar is_counted: the descriptor is not shared, so its count is the number of arrivals.
     """
 
     fd = -1
     is_patient = False
     is_counted = False
-    asks_others = False
 
     def collect(self) -> None:
         """Collect the arrivals."""
@@ -162,31 +160,13 @@ class EventLoop:
 
     # --- waiting ---------------------------------------------------------------------------------
 
-    def sources(
-        self, events: Events
-    ) -> tuple[list[ChannelSource], list[ChannelSource], bool]:
-        """
-        Return the sources with arrivals, and whether the timer has expired.
-
-        Sources that call foreign code come second.
-        """
-        found: list[ChannelSource] = []
-        asking: list[ChannelSource] = []
-        expired = False
-        channels = self._channels
+    def sources(self, events: Events) -> Iterator[ChannelSource]:
+        """Yield the sources with arrivals."""
         for fd, _ in events:
-            several = channels.get(fd)
-            if several is not None:
-                if several[0].asks_others:
-                    asking += several
-                else:
-                    found += several
-            elif fd == self.timer.fd:
-                expired = True
-            elif fd == self._nested_fd:
-                for inner, _ in self._nested.poll(0):
-                    found += channels.get(inner, ())
-        return found, asking, expired
+            if fd == self._nested_fd:
+                yield from self.sources(self._nested.poll(0))
+            else:
+                yield from self._channels.get(fd, ())
 
     def wake(self) -> None:
         """Wake one waiting thread; from any thread, also after ``close``."""

@@ -57,6 +57,13 @@ def check_process(name: str | None, task_set: TaskSet | None) -> None:
         raise UsageError(f'process {shown(name)}: the declaration has no such process: {remedy}')
 
 
+def check_handler(handler: object) -> None:
+    """Check that a handler of missed deadlines, or None, can be called."""
+    if handler is not None and not callable(handler):
+        raise UsageError(f'on_deadline_miss: {handler!r} cannot be called: '
+                         'give a function of one DeadlineMiss')
+
+
 @dataclass(frozen=True)
 class Thresholds:
     """

@@ -86,7 +86,7 @@ class Source(EntitySource):
                 left = os.eventfd_read(self.fd) if self.is_counted else MANY
             if entity.removed:
                 return  # another executor may have it now
-            for _ in range(min(left, MOST)):
+            for _ in range(left if left < MOST else MOST):
                 if 0 < entity.most_waiting <= len(entity.waiting):
                     entity.collect_more = partial(self.collect, MANY)
                     return
@@ -130,7 +130,7 @@ class SubscriptionSource(Source):
         :param publication: the one that has just sent it, if certain.
         """
         entity, pool = self.entity, self._pool
-        work = Work(entity, entity.rclpy.callback, taken if self._with_info else taken[:1])
+        work = Work(entity, entity.rclpy.callback, taken if self._with_info else (taken[0],))
         if self._is_plain:
             pool.engine.ready(work, pool.now)
         else:

@@ -261,7 +261,8 @@ class Upkeep:
 
         def listen(alive: list[Entity]) -> WaitableSource:
             source = make(
-                alive, self._context, self._executor, pool.post, pool.call_at, self._fail)
+                alive, self._context, self._executor, pool.post, pool.deferred.append,
+                pool.call_at, self._fail)
             with pool.lock:
                 pool.loop.add(source)
             try:

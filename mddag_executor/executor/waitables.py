@@ -71,20 +71,20 @@ class WaitableSource(ChannelSource):
 
     :param entities: those of the waitables.
     :param post: receives their executions.
-    :param at: lets ``collect`` be called at a time (monotonic ns).
+    :param later: calls a function when the lock is free; ``at``: at a time (monotonic ns).
     :raises ListenerError: when they contain an entity that has no listener.
     :raises InvalidHandle: when one of them has been destroyed.
     """
 
-    asks_others = True
-
     def __init__(
         self, entities: Iterable[Entity], context: Context, executor: Any, post: Post,
+        later: Callable[[Callable[[], None]], None],
         at: Callable[[int, Callable[[], None]], None], fail: Callable[[BaseException], None],
     ) -> None:
         self._by_id = {id(entity.rclpy): entity for entity in entities}
         self._executor = executor
         self._post = post
+        self._later = later
         self._at = at
         self._fail = fail
         self._set = FilledSet(context, [entity.rclpy for entity in entities])
@@ -110,7 +110,7 @@ class WaitableSource(ChannelSource):
             self._set.parts(self._set.waitables,
                             lambda kind, address: set_listener(kind, address, self.fd))
         if self._has_more:
-            self.collect()
+            self._ask()
 
     def ignore(self) -> None:
         """End ``listen``, and wait until no thread collects from it."""
@@ -122,7 +122,10 @@ class WaitableSource(ChannelSource):
         self._set.parts([each.rclpy for each in living], clear_listener)
 
     def collect(self) -> None:
-        """Collect arrivals; must be called without the engine's lock."""
+        """Collect the arrivals soon: without the engine's lock, as this calls foreign code."""
+        self._later(self._ask)
+
+    def _ask(self) -> None:
         self._has_more = True
         while self._has_more and not self._ignored and self._lock.acquire(blocking=False):
             try:
@@ -147,14 +150,14 @@ class WaitableSource(ChannelSource):
             if len(found) == before:
                 break
         else:  # there may be more, after the other sources
-            self._at(time.monotonic_ns(), self.collect)
+            self._at(time.monotonic_ns(), self._ask)
         if found:
             self._post_noted(found)
         with self._set.held():
             times = [timer.until() for timer in self._timers]
         for until in times:
             if until is not None and until > 0:  # else its handling is posted, which resets it
-                self._at(time.monotonic_ns() + until, self.collect)
+                self._at(time.monotonic_ns() + until, self._ask)
 
     def _post_noted(self, found: list[Work], checks: int = 0) -> None:
         """Post executions; a response only after the sending thread has noted the request."""

@@ -34,7 +34,7 @@ Theory of operation
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
 import threading
@@ -58,7 +58,7 @@ from mddag_executor.executor.due import DueTimes, Guard, Muting
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.jobs import PublisherState
-from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
+from mddag_executor.executor.loop import EventLoop, Events
 from mddag_executor.executor.misses import MissLog
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.timers import TimerQueue
@@ -166,7 +166,8 @@ class WorkerPool:
         self._offset = clock.offset_ns
         # reentrant only to know its owner: a signal handler may run inside
         self.lock = engine_lock(engine.validate, engine.size)
-        self._deferred: deque[Callable[[], None]] = deque()
+        #: functions to call when the calling thread does not own the lock
+        self.deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
         self.announcements: Announcements | None = None
         self.timers = TimerQueue(self.loop.wake, fail)
@@ -178,7 +179,7 @@ class WorkerPool:
         self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
         self.executor = executor
         self.fail = fail
-        self._miss_log = MissLog(engine.verdicts)
+        self.miss_log = MissLog(engine.verdicts)
         self._prepare_thread = prepare_thread
         self._threads: list[WorkerThread] = []
         self._parked: list[WorkerThread] = []
@@ -233,7 +234,7 @@ class WorkerPool:
 
     def _defer(self, function: Callable[[], None]) -> None:
         """Call a function as soon as the lock is free."""
-        self._deferred.append(function)
+        self.deferred.append(function)
         self.loop.wake()
 
     def post(self, several: list[Work]) -> None:
@@ -450,12 +451,6 @@ class WorkerPool:
 
     def _receive(self, me: WorkerThread, events: Events) -> bool:
         """Handle events, and find the thread's next execution if it has none; see ``_go_on``."""
-        arrived, asking, is_due = self.loop.sources(events)
-        if asking:
-            self._collect(asking)
-        if self._deferred:
-            self._do_deferred()
-        calls: list[Callable[[], None]] = []
         with self.lock:
             # inlined tick: saves a call for each execution
             now = self.now = monotonic_ns() + self._offset
@@ -467,18 +462,24 @@ class WorkerPool:
                 if self._leaving and not self.polling:
                     self._all_left.set()
             self._bell_rings = False  # the waiting thread may have received it
-            self._collect(arrived)
-            now = self.now      # a recorded message is later than the turn began
-            if is_due or self.timers.has_new or self.timers.has_jumped:
+            for source in self.loop.sources(events):
                 if self.running:
-                    calls = self.due.handle(now, since or now)
+                    source.collect()
+                else:
+                    self.loop.announce(source)  # for the next spin
+            now = self.now      # a recorded message is later than the turn began
+            timers = self.timers
+            if (timers.has_new or timers.has_jumped
+                    or self.loop.timer.is_due(now - self._offset)):
+                if self.running:
+                    self.due.handle(now, since or now)
                 self.due.arm(now - self._offset)
-            found = me.work is None and not calls and self._choose(me, now, True)
-        if calls:
-            self._call(calls)
-            found = me.work is None and self._go_on(me)
-        if (is_due or not found) and self._miss_log.is_behind():
-            self._call([self._miss_log.write])
+            is_ready = me.work is None and not self.deferred
+            found = is_ready and self._choose(me, now, True)
+        if self.deferred:
+            self._do_deferred()
+            if not is_ready:
+                found = me.work is None and self._go_on(me)
         return found
 
     def _go_on(self, me: WorkerThread, is_last: bool = False) -> bool:
@@ -489,7 +490,6 @@ class WorkerPool:
         :return: False: there is no execution, and the thread is to wait in the epoll or is parked.
         """
         engine = self.engine
-        settle = None
         with self.lock:
             now = self.now = monotonic_ns() + self._offset
             work: Any = me.work
@@ -500,7 +500,7 @@ class WorkerPool:
                     if engine.to_ask_again:
                         engine.ask_again()
                 else:
-                    settle = self._report_unusual_end(me, work, now)
+                    self._report_unusual_end(me, work, now)
                 if work.entity.removed:
                     self.executor.wake()  # the registry can forget it now
                 if self.muting.until and not engine.holders:
@@ -509,19 +509,9 @@ class WorkerPool:
             if is_last:
                 self.due.arm(now - self._offset)
             found = not is_last and self._choose(me, now, False)
-        if settle is not None:
-            self._call([settle])
-        if not found and self._miss_log.is_behind():
-            self._call([self._miss_log.write])
+        if self.deferred:
+            self._do_deferred()
         return found
-
-    def _collect(self, sources: Sequence[ChannelSource]) -> None:
-        """Collect from sources, or leave what arrived to the next spin."""
-        for source in sources:
-            if self.running:
-                source.collect()
-            else:
-                self.loop.announce(source)
 
     def waited_since(self, mine: int) -> int:
         """
@@ -534,17 +524,12 @@ class WorkerPool:
         return min([mine, *(each.waits_since for each in self._threads if each.waits_since)])
 
     def _do_deferred(self) -> None:
-        """Call the functions that waited for the lock."""
-        while self._deferred:
+        """Call the functions that waited for the lock; exceptions do not end the thread."""
+        while self.deferred:
             try:
-                function = self._deferred.popleft()
+                function = self.deferred.popleft()
             except IndexError:
                 break  # another thread has removed it
-            function()
-
-    def _call(self, functions: list[Callable[[], None]]) -> None:
-        """Call functions; their exceptions do not end the thread."""
-        for function in functions:
             try:
                 function()
             except BaseException as error:
@@ -560,6 +545,8 @@ class WorkerPool:
                     due.may_expire_early or engine.holders or engine.check_at < NEVER)):
             due.arm(now - self._offset)
         if work is None:
+            if self.miss_log.is_behind():
+                self.deferred.append(self.miss_log.write)
             if me.thread is not None:  # else a visitor: the thread of a spin_once
                 self._rest(me, has_events)
             return False
@@ -666,14 +653,8 @@ class WorkerPool:
             tail = me.end - self._offset - me.published
             entity.tail_ns += (tail - entity.tail_ns) >> 3
 
-    def _report_unusual_end(
-        self, me: WorkerThread, work: Work, now: int
-    ) -> Callable[[], None] | None:
-        """
-        Report an execution that was refused, waits, has failed, or has lent its worker.
-
-        :return: what to call afterwards without the lock.
-        """
+    def _report_unusual_end(self, me: WorkerThread, work: Work, now: int) -> None:
+        """Report an execution that was refused, waits, has failed, or has lent its worker."""
         engine, start, end = self.engine, me.start, me.end
         outcome, worker = me.outcome, work.worker
         me.outcome = None
@@ -696,7 +677,8 @@ class WorkerPool:
             engine.finished(work, start, end, now, me.vtid, worker, True)
         if not isinstance(outcome, Refused):
             engine.ask_again()
-        return None if outcome is None else partial(self._settle_end, work, outcome)
+        if outcome is not None:
+            self.deferred.append(partial(self._settle_end, work, outcome))
 
     def _settle_end(self, work: Work, outcome: Any) -> None:
         """Resume a suspended execution later, or report an exception; without the lock."""

@@ -68,7 +68,7 @@ def test_a_timer_that_left_while_its_arrival_was_handled_is_not_asked_again(
     executor._upkeep.refresh()
     place = executor._at_once if sleeps else executor._pool
     (source,) = place.timers._timers.values()
-    arrived = place.loop.sources(place.loop.wait(0))[0]
+    arrived = list(place.loop.sources(place.loop.wait(0)))
     assert source in arrived and place.timers.next_due()
     other.add_node(node)
     for each in arrived:
