@@ -393,9 +393,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 gc.freeze()
             self._submit_tasks()  # as in rclpy, before other ready callbacks
             self._upkeep.refresh()
-            self._wait_sets.start()
-            if self._notifier is not None:
-                self._notifier.start()
+            self._start_threads()
             self._pool.start()
             while not self.is_ending():
                 self._raise_error()
@@ -405,8 +403,6 @@ class MultiDeadlineExecutor(BareExecutor):
                 if self._was_ended():
                     return
                 self._submit_tasks()
-                if self._diagnostics is not None:
-                    self._diagnostics.start()
                 self._names.check(self._engine.is_judging)
                 rest = self._upkeep.rest_s()
                 if rest == 0.0:
@@ -429,6 +425,12 @@ class MultiDeadlineExecutor(BareExecutor):
                     self._notifier.stop()
             self._close()
             self._spinning.release()
+
+    def _start_threads(self) -> None:
+        """Start all threads but the workers; further calls do nothing."""
+        for each in (self._wait_sets, self._diagnostics, self._notifier):
+            if each is not None:
+                each.start()
 
     def _patience_s(self, deadline: float | None, rest: float | None) -> float | None:
         """Return for how long the spinning thread may wait; None: until a wake-up."""
@@ -574,11 +576,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._stepping = select.epoll()
             self._stepping.register(self._pool.loop.fd, select.EPOLLIN)
             self._stepping.register(self._at_once.loop.fd, select.EPOLLIN)
-            self._wait_sets.start()
-        if self._diagnostics is not None:
-            self._diagnostics.start()
-        if self._notifier is not None:
-            self._notifier.start()
+        self._start_threads()
         if self._handle_once():
             return True
         if done():  # the event that woke it has just been handled

@@ -147,7 +147,7 @@ class Upkeep:
                     self._listen(entity)
                 except InvalidHandle:
                     pass  # destroyed meanwhile: the next refresh forgets it
-            pool.arm()
+            pool.due.arm(time.monotonic_ns())
         self._refresh_waitables([*added, *back], gone)
 
     # --- sources ---------------------------------------------------------------------------------

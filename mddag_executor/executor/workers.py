@@ -519,8 +519,6 @@ class WorkerPool:
 
         :param mine: since when the calling one has, or now.
         """
-        if not self.polling:
-            return mine
         return min([mine, *(each.waits_since for each in self._threads if each.waits_since)])
 
     def _do_deferred(self) -> None:
@@ -595,10 +593,6 @@ class WorkerPool:
         if not self._closed:
             self._parked.append(me)
 
-    def arm(self) -> None:
-        """Set the timerfd again for new timers; the caller holds the lock."""
-        self.due.arm(monotonic_ns())
-
     def thread_of(self, work: Work) -> WorkerThread | None:
         """Return the thread that runs an execution."""
         return next(
@@ -664,34 +658,33 @@ class WorkerPool:
             self._waiting_calls -= 1
         if isinstance(outcome, Refused):
             engine.refused(work, now)
-        elif outcome is None:
+            self.due.call_at(
+                now - self._offset + AGAIN_NS, partial(self.report, lambda _: engine.ask_again()))
+            return
+        if outcome is None:
             engine.finished(work, start, end, now, me.vtid, worker)
         elif not isinstance(outcome, BaseException):
             engine.suspended(work, start, end, me.vtid, worker)
-        elif is_over(self.executor.context):  # this may destroy nodes, too
-            engine.left_open(
-                work, start, end, me.vtid, worker, not isinstance(outcome, Destroyed))
-        elif isinstance(outcome, Destroyed):
-            engine.destroyed(work, now)
+            self.deferred.append(partial(self._resume_after, work, outcome))
         else:
-            engine.finished(work, start, end, now, me.vtid, worker, True)
-        if not isinstance(outcome, Refused):
-            engine.ask_again()
-        if outcome is not None:
-            self.deferred.append(partial(self._settle_end, work, outcome))
+            is_gone = isinstance(outcome, Destroyed)
+            if is_over(self.executor.context):  # this may destroy nodes, too
+                engine.left_open(work, start, end, me.vtid, worker, not is_gone)
+            elif is_gone:
+                engine.destroyed(work, now)
+            else:
+                engine.finished(work, start, end, now, me.vtid, worker, True)
+            if not is_gone:
+                self.deferred.append(partial(self._report_error, work, outcome))
+        engine.ask_again()
 
-    def _settle_end(self, work: Work, outcome: Any) -> None:
-        """Resume a suspended execution later, or report an exception; without the lock."""
-        if isinstance(outcome, Refused):
-            self.call_at(monotonic_ns() + AGAIN_NS, partial(
-                self.report, lambda now: self.engine.ask_again()))
-        elif isinstance(outcome, Destroyed):
-            pass
-        elif isinstance(outcome, BaseException):
-            if self.callback_ended is None or not self.callback_ended(
-                    work.entity.rclpy, outcome):
-                self.fail(outcome)
-        elif outcome is NEXT_TURN or not hasattr(outcome, 'add_done_callback'):
+    def _report_error(self, work: Work, error: BaseException) -> None:
+        if self.callback_ended is None or not self.callback_ended(work.entity.rclpy, error):
+            self.fail(error)
+
+    def _resume_after(self, work: Work, awaited: Any) -> None:
+        """Resume a suspended execution when the future that it waits for is done."""
+        if awaited is NEXT_TURN or not hasattr(awaited, 'add_done_callback'):
             if self._is_stepping:
                 self._of_next_step.append(work)
                 return
@@ -700,8 +693,8 @@ class WorkerPool:
             self.call_at(monotonic_ns() + rest, partial(self.resume, work))
         else:
             work.yields = 0
-            adopt_awaited(outcome, self.executor)
-            outcome.add_done_callback(QuickCallback(partial(self.resume, work)))
+            adopt_awaited(awaited, self.executor)
+            awaited.add_done_callback(QuickCallback(partial(self.resume, work)))
 
     @contextmanager
     def lend(self, me: WorkerThread) -> Iterator[None]:
