@@ -54,7 +54,7 @@ class AtOnce:
         for source in self.loop.sources(events):
             with self._lock if isinstance(source, TimerSource) else nullcontext():
                 source.collect()
-        if self.timers.has_jumped or self.loop.timer.is_due(monotonic_ns()):
+        if self.timers.has_jumped or 0 < self.loop.timer.at <= monotonic_ns():
             self.loop.timer.at = 0
             with self._lock:
                 fired = list(self.timers.fire())

@@ -402,7 +402,7 @@ class Engine:
     @property
     def has_waiting(self) -> bool:
         """Return whether any execution waits, except for its callback group."""
-        return bool(self._lane) or self._core_has_waiting()
+        return bool(self._lane) or not self._is_bypassed and self._core_has_waiting()
 
     def _core_has_waiting(self) -> bool:
         state = self._state

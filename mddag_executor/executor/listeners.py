@@ -133,10 +133,6 @@ class TimerFd:
         self._time = array('q', (0, 0, 0, 0))  # interval, then time: seconds, nanoseconds
         self._address = ctypes.c_void_p(self._time.buffer_info()[0])
 
-    def is_due(self, now: int) -> bool:
-        """Return whether the set time has come."""
-        return 0 < self.at <= now
-
     def arm(self, at: int) -> None:
         """Set the time (monotonic ns); 0: none."""
         self.at = at

@@ -470,7 +470,7 @@ class WorkerPool:
             now = self.now      # a recorded message is later than the turn began
             timers = self.timers
             if (timers.has_new or timers.has_jumped
-                    or self.loop.timer.is_due(now - self._offset)):
+                    or 0 < self.loop.timer.at <= now - self._offset):
                 if self.running:
                     self.due.handle(now, since or now)
                 self.due.arm(now - self._offset)
@@ -478,8 +478,8 @@ class WorkerPool:
             found = is_ready and self._choose(me, now, True)
         if self.deferred:
             self._do_deferred()
-            if not is_ready:
-                found = me.work is None and self._go_on(me)
+        if not is_ready:
+            found = me.work is None and self._go_on(me)
         return found
 
     def _go_on(self, me: WorkerThread, is_last: bool = False) -> bool:
