@@ -21,7 +21,7 @@ WRONG = {
     'policy': (None, 'x', []), 'max_active_jobs': (0,), 'worker_priority': (5,),
     'default_deadline': (None, 1.5, 0, 10**30, Duration(seconds=-1), 'soon', '', '5', '1 parsec'),
     'worker_policy': (5, '__class__', 'sched_yield'),
-    'worker_cpus': ('0', {'a'}, set(), {10**6}),
+    'worker_cpus': ('0', {'a'}, set(), {10**6}), 'on_deadline_miss': (3, 'print'),
     'diagnostics_period': (-5, 1.5, Duration(nanoseconds=1), 'soon', '', '5', '1 parsec'),
 }
 
