@@ -73,35 +73,31 @@ def small():
 @st.composite
 def declarations(draw):
     """Return the text of a declaration: random DAGs, some of which share a callback."""
-    n_dags = draw(st.integers(1, 3))
-    shared = draw(st.booleans())
-    lines = ['mddag: 1', 'nodes:']
-    for d in range(n_dags):
+    shared, lines = draw(st.booleans()), ['mddag: 1', 'nodes:']
+
+    def add(name, about):
+        lines.append(
+            f'  - {{node: {name}, callbacks: [{{name: cb, {about}, execution_time: 1ms}}]}}')
+
+    for d in range(draw(st.integers(1, 3))):
         n = draw(st.integers(1, 6))
-        before = [sorted(draw(st.sets(st.integers(0, i - 1), min_size=1, max_size=3)))
-                  for i in range(1, n)]
+        before = [[], *(sorted(draw(st.sets(st.integers(0, i - 1), min_size=1, max_size=3)))
+                        for i in range(1, n))]
         publishing = {p for row in before for p in row}
         publisher = draw(st.integers(0, n - 1)) if shared else -1
         for i in range(n):
-            topics = [f'/d{d}t{i}'] if i in publishing else []
-            topics += ['/shared'] if i == publisher else []
-            about = []
+            topics = [f'/d{d}t{i}'] * (i in publishing) + ['/shared'] * (i == publisher)
+            heard = ', '.join(f'/d{d}t{p}' for p in before[i])
+            start = f'sync: [{heard}]' if len(before[i]) > 1 else f'subscription: {heard}'
             if i == 0:
-                about += ['timer: 10ms', f'dag: dag{d}']
-                about += ['on_late: abort'] if draw(st.booleans()) else []
-                about += ['max_active_jobs: 2'] if draw(st.booleans()) else []
-            elif len(before[i - 1]) == 1:
-                about.append(f'subscription: /d{d}t{before[i - 1][0]}')
-            else:
-                about.append('sync: [' + ', '.join(f'/d{d}t{p}' for p in before[i - 1]) + ']')
-            about += [f'publishes: [{", ".join(topics)}]'] if topics else [
-                f'deadline: {draw(st.integers(3, 30))}ms']
-            about.append('execution_time: 1ms')
-            lines += [f'  - node: /d{d}n{i}', '    callbacks:',
-                      f'      - {{name: cb, {", ".join(about)}}}']
+                start = f'timer: 10ms, dag: dag{d}' + ''.join(
+                    key for key in (', on_late: abort', ', max_active_jobs: 2')
+                    if draw(st.booleans()))
+            end = f'publishes: [{", ".join(topics)}]' if topics else \
+                f'deadline: {draw(st.integers(3, 30))}ms'
+            add(f'/d{d}n{i}', f'{start}, {end}')
     if shared:
-        lines += ['  - node: /common', '    callbacks:',
-                  '      - {name: cb, subscription: /shared, deadline: 9ms, execution_time: 1ms}']
+        add('/common', 'subscription: /shared, deadline: 9ms')
     return '\n'.join(lines) + '\n'
 
 

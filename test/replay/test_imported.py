@@ -14,8 +14,8 @@ IMAGE, BOXES, IMU_OUT, PATH = 100, 101, 102, 103
 GRAPH = """\
 mddag: 1
 nodes:
-  - {node: /camera, callbacks: [{name: grab, timer: 100ms, publishes: [/image, /info]}]}
   - {node: /detect, callbacks: [{name: detect, subscription: /image, publishes: [/boxes]}]}
+  - {node: /camera, callbacks: [{name: grab, timer: 100ms, publishes: [/image, /info]}]}
   - {node: /imu, callbacks: [{name: read, subscription: /info, publishes: [/imu]}]}
   - node: /fuse
     callbacks:
@@ -199,12 +199,14 @@ def test_late_and_off_the_grid(tmp_path):
     r.run(GRAB, 1, 24 * MS, 26 * MS)                # late
     r.run(GRAB, 1, 27 * MS, 28 * MS)                # not a period of this timer
     r.run(GRAB, 1, 50 * MS, 51 * MS)                # two left out
+    r.add('ros2:callback_start', 2 ** 63 - 1 - BEGIN, 1, GRAB, False)
     result, warnings = result_of(r.write(), graph)
     sink = result['dags']['/n']['sinks']['/n:t']
     assert (sink['completed'], sink['late']) == (4, 1)
     assert (sink['response_ns']['min'], sink['response_ns']['max']) == (1 * MS, 6 * MS)
     assert result['first_miss']['job'] == 1
     assert warnings == [
+        'left out: 1 event at an impossible time, the first at 9223372036854775807 ns',
         '1 execution of timers off the grid of the period (reset, by another clock, or without '
         'initialisation in it): released when it started: /n timer 10ms (1)',
         '2 periods of timers passed without an execution (late by more than one, or events were '
