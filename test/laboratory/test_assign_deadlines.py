@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 
+from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.acceptance import wilson
 from mddag_executor.laboratory.assign_deadlines import (
     least_runs,
@@ -53,6 +54,8 @@ def test_proportional_and_scaled():
     assert proportional(loads(GRAPH), 'max') == {
         '/n:x': 4_000_000, '/n:y': 20_000_000, '/n:z': 10_000_000}
     assert proportional(loads(GRAPH), 'mean')['/n:x'] == 8_000_000
+    with pytest.raises(UsageError, match="budget 'median': there is no such budget"):
+        proportional(loads(GRAPH), 'median')
     assert proportional(loads(SHARED), 'max') == {'/n:s': 20_000_000}
     assert scaled(loads(GRAPH), 'max', 1.5) == {
         '/n:x': 3_000_000, '/n:y': 15_000_000, '/n:z': 1_500_000}
