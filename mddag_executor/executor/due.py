@@ -97,8 +97,7 @@ class DueTimes:
             pool.muting.end()
         while self._calls and self._calls[0][0] <= monotonic:
             pool.deferred.append(heappop(self._calls)[2])
-        if pool.miss_log.is_behind():
-            pool.deferred.append(pool.miss_log.write)
+        pool.log_misses()
 
     def arm(self, now: int) -> None:
         """Set the timerfd to the next due time."""

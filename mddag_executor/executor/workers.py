@@ -179,7 +179,7 @@ class WorkerPool:
         self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
         self.executor = executor
         self.fail = fail
-        self.miss_log = MissLog(engine.verdicts)
+        self._miss_log = MissLog(engine.verdicts)
         self._prepare_thread = prepare_thread
         self._threads: list[WorkerThread] = []
         self._parked: list[WorkerThread] = []
@@ -508,10 +508,16 @@ class WorkerPool:
                     self.due.arm(now - self._offset)  # muted timers have new due times
             if is_last:
                 self.due.arm(now - self._offset)
+                self.log_misses()
             found = not is_last and self._choose(me, now, False)
         if self.deferred:
             self._do_deferred()
         return found
+
+    def log_misses(self) -> None:
+        """Let misses be logged when the lock is free, if there were new ones."""
+        if self._miss_log.is_behind():
+            self.deferred.append(self._miss_log.write)
 
     def waited_since(self, mine: int) -> int:
         """
@@ -543,8 +549,7 @@ class WorkerPool:
                     due.may_expire_early or engine.holders or engine.check_at < NEVER)):
             due.arm(now - self._offset)
         if work is None:
-            if self.miss_log.is_behind():
-                self.deferred.append(self.miss_log.write)
+            self.log_misses()
             if me.thread is not None:  # else a visitor: the thread of a spin_once
                 self._rest(me, has_events)
             return False

@@ -185,3 +185,13 @@ def test_a_callback_that_hangs_is_a_miss_once(make_executor, make_node, tmp_path
     dag = replay(trace).result()['dags']['once']
     assert dag['ends'] == executor.statistics()['dags']['once']['ends']
     assert (dag['sinks']['/sink:end']['late'], dag['sinks']['/sink:end']['overdue']) == (1, 0)
+
+
+def test_a_miss_in_the_last_step_is_logged(make_executor, make_node, capfd):
+    late = graph(late='name: t, timer: 50ms, dag: d, deadline: 20ms')
+    node = make_node('late')
+    executor = make_executor(loads(late), nodes=[node])
+    node.create_timer(0.05, lambda: time.sleep(0.03))
+    while not executor.statistics()['dags']['d']['sinks']['/late:t']['completed']:
+        executor.spin_once(10.0)
+    assert ': /late:t, 20 ms, job ' in capfd.readouterr().err
