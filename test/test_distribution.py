@@ -102,6 +102,12 @@ def test_help_loads_nothing_heavy():
             } & modules == set()
 
 
+def test_a_short_simulation_loads_no_numpy():
+    modules = loaded('from mddag_executor.cli.main import run\n'
+                     f"run(['simulate', '-q', {str(TOP / 'config' / 'autoware.yaml')!r}])\n")
+    assert {name.split('.')[0] for name in modules} & HEAVY == {'yaml'}
+
+
 def test_the_executor_loads_little_besides_rclpy():
     rclpy = loaded('import rclpy, rclpy.node, rclpy.executors')
     more = loaded('from mddag_executor import MultiDeadlineExecutor') - rclpy

@@ -25,7 +25,7 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import LogEntry, Orders, run
-from mddag_executor.simulate.load import as_lists, Load
+from mddag_executor.simulate.load import as_list, as_lists, Load
 from mddag_executor.simulate.machine import Machine
 
 # Approximate time of plain Python per execution, without and with a machine, to choose the faster.
@@ -94,7 +94,20 @@ class Scheduled(NamedTuple):
     busy: list[int]
 
     def count_into(self, tally: Tally, load: Load, settings: Settings) -> None:
-        """Count the judged jobs that were released, and the decisions, in an empty tally."""
+        """
+        Count the judged jobs that were released, and the decisions, in an empty tally.
+
+        Those of plain Python, which may exceed 64 bits, are counted without numpy: importing it
+        takes as long as a short run.
+        """
+        if isinstance(self.decisions, list):
+            for time, dag, release in zip(*map(as_list, (
+                    load.times, load.dags, load.releases if len(load.releases) else load.times))):
+                if (time <= self.ended and time < settings.duration_ns
+                        and release >= settings.judge_from):
+                    tally.released(dag)
+            tally.add(self.decisions)
+            return
         import numpy as np
         times, dags, releases = (np.asarray(each) for each in (
             load.times, load.dags, load.releases if len(load.releases) else load.times))
