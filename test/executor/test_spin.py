@@ -302,6 +302,23 @@ with executor._pool.lock:
         os._exit(3)
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
 """
+SPIN_UNTIL_SHUTDOWN = """try:
+        executor.spin()
+    except rclpy.executors.ExternalShutdownException:
+        pass"""
+OTHER_CONTEXT = """
+context = rclpy.Context()
+rclpy.init(context=context)
+other = MultiDeadlineExecutor(context=context)
+other.create_task(print, 'ready', flush=True)
+try:
+    other.spin()
+except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+    while executor.is_spinning:
+        time.sleep(0.01)
+    assert executor.shutdown(5.0) and other.shutdown(5.0)
+    assert not [each for each in threading.enumerate() if each.name.startswith('mddag')]
+"""
 
 
 @pytest.mark.parametrize('parts', [
@@ -312,8 +329,17 @@ assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
     {'callback': 'ran.set', 'end': FORK},
 ], ids=['shut down', 'steps', 'spun before', 'never ends', 'forked'])
 def test_a_program_may_end_while_a_daemon_thread_spins(parts):
+    end_with_it(parts)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_spins_of_all_contexts(number):
+    end_with_it({'spin': SPIN_UNTIL_SHUTDOWN, 'callback': 'ran.set', 'end': OTHER_CONTEXT}, number)
+
+
+def end_with_it(parts, send=None):
     out, err = run_program(
-        PROGRAM.format(**{'spin': SPIN, 'callback': 'sleep', 'end': '', **parts}))
+        PROGRAM.format(**{'spin': SPIN, 'callback': 'sleep', 'end': '', **parts}), send=send)
     assert out.splitlines()[-1] == 'end'
     expected = 'cannot keep its rate', 'use of fork() may lead to deadlocks'
     assert [line for line in err.splitlines()

@@ -24,8 +24,9 @@ def test_tasks_created_before_spin_run_in_rclpys_order(make_executor, ros_contex
         orders.append(order)
         for name in 'abc':
             executor.create_task(order.append, name)
-        for _ in range(3):
+        for count in range(1, 4):
             executor.spin_once(timeout_sec=0)
+            assert len(order) == count
         executor.shutdown()
     assert orders[0] == orders[1] and sorted(orders[0]) == ['a', 'b', 'c']
 

@@ -193,11 +193,13 @@ def test_an_exception_in_one_ends_the_run_with_its_status(world):
         'from relay import sensor as good\n'
         'def sensor():\n'
         '    node = good()\n'
-        '    def fail(): raise ValueError("boom")\n'
-        '    node.create_timer(0.05, fail)\n'
+        '    def fail():\n'
+        '        timer.cancel()\n'
+        '        raise ValueError("boom")\n'
+        '    timer = node.create_timer(0.05, fail)\n'
         '    return node\n')
     nodes = ('--node', 'up=bad:sensor', '--node', 'down=relay:last')
-    with running('graph.yaml', *nodes) as run:
+    with running('graph.yaml', *nodes, '--duration', '3s') as run:
         result, _, errors = end(run)
     assert run.returncode == 70
     assert ('warning: process up ended with status 70: error: /sensor: fail (timer 50ms): '

@@ -162,9 +162,18 @@ def test_refused_work_runs_when_what_it_waits_for_does_not_come(tmp_path, graph)
     assert [round(time) for time, _ in done] == [680, 2070]
 
 
+class SlowAtFirst(Filter):
+
+    def take(self, message):
+        super().take(message)
+        if message.frame_id == '0':
+            self.get_clock().sleep_for(Duration(nanoseconds=40 * MS))
+
+
 def test_the_trace_replays_and_gives_the_times(bag, graph, tmp_path):
+    """Those of a job count for releases within half a period, for others the medians."""
     trace = tmp_path / 'run.mcap'
-    result = rerun(bag, graph, [Filter, Sink], trace=trace)
+    result = rerun(bag, graph, [SlowAtFirst, Sink], trace=trace)
     again = replay(trace)
     assert not again.warnings
     mine, theirs = result.result()['dags']['main'], again.result()['dags']['main']
@@ -177,9 +186,11 @@ def test_the_trace_replays_and_gives_the_times(bag, graph, tmp_path):
         for name in ('ros2:rcl_publisher_init', 'ros2:rclcpp_publish')}
     assert len(handles['ros2:rclcpp_publish'] & handles['ros2:rcl_publisher_init']) == 2
     graph.write_text(GRAPH.replace('10ms', '30ms'))
-    result = rerun(bag, graph, [Filter, Sink], times=trace)
+    longer = write_bag(tmp_path / 'longer.mcap', [
+        (i * 100, '/points', Header(frame_id=str(i))) for i in range(-2, 20)])
+    result = rerun(longer, graph, [Filter, Sink], times=trace)
     assert [time for time, _ in published(result, '/filtered')] == [
-        100.0 * i + 10 for i in range(20)]
+        100.0 * i + (40 if i == 0 else 10) for i in range(-2, 20)]
 
 
 @pytest.mark.parametrize('takes', [', execution_time: 10ms', ''])
