@@ -15,7 +15,8 @@ interpreter when it came first, or no worker of its process was idle;
 of rclpy and rclcpp: a timer, or a subscription with its waiting messages.
 
 A dropped execution leaves a *stale* entry, until the entry reaches the top or stale entries are
-the larger part of all.
+the larger part of all.  So does one whose key changes (rule 7); if it gets an earlier key back, it
+has two equal entries, and one of them counts as stale.
 
 **Polling rounds** (rule 9).  Between two polls the ready queue is the result of the last one;
 executions that become ready wait at their entity, in that order.  ``poll`` takes the first of
@@ -66,13 +67,14 @@ def _sweep(s: State) -> None:
         length += len(s.entity_queue[entity])
     if 2 * s.scalars[N_STALE] <= length:
         return
-    _keep_valid(s, s.ready)
-    _keep_valid(s, s.held_back)
-    _keep_valid(s, s.reserved)
+    seen = [False] * len(s.x_state)
+    _keep_valid(s, s.ready, seen)
+    _keep_valid(s, s.held_back, seen)
+    _keep_valid(s, s.reserved, seen)
     for group in range(len(s.group_heap)):
-        _keep_valid(s, s.group_heap[group])
+        _keep_valid(s, s.group_heap[group], seen)
     for entity in range(len(s.entity_queue)):
-        _keep_valid(s, s.entity_queue[entity])
+        _keep_valid(s, s.entity_queue[entity], seen)
     kept = 0
     for i in range(len(s.unpolled)):
         if len(s.entity_queue[s.unpolled[i]]) > 0:
@@ -82,10 +84,13 @@ def _sweep(s: State) -> None:
     s.scalars[N_STALE] = 0
 
 
-def _keep_valid(s: State, heap: list[QueueEntry]) -> None:
+def _keep_valid(s: State, heap: list[QueueEntry], seen: list[bool]) -> None:
+    """Keep the entries that are not stale, of two equal ones the first."""
     kept = 0
     for i in range(len(heap)):
-        if not is_stale(s, heap[i]):
+        x = heap[i][4]
+        if not is_stale(s, heap[i]) and not seen[x]:
+            seen[x] = True
             heap[kept] = heap[i]
             kept += 1
     del heap[kept:]
