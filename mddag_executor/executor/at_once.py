@@ -10,15 +10,18 @@ that it runs even if all workers wait for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+import os
+import signal
+import threading
 from time import monotonic_ns
 from typing import Any
 
 from mddag_executor.executor import compat
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.loop import EventLoop, Events
+from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
 from mddag_executor.executor.sources import Source
 from mddag_executor.executor.timers import TimerQueue, TimerSource
 
@@ -102,3 +105,54 @@ class ClientSource(Source):
             self.entity.rclpy, header.request_id.sequence_number, response,
             self._at_once.executor)
         self._at_once.has_run = True
+
+
+class SignalPipe(ChannelSource):
+    """
+    Ends the wait of the main thread when a signal comes.
+
+    Python runs handlers between bytecodes only: without this, that of a signal which comes right
+    before the wait would run after it.
+    """
+
+    def __init__(self) -> None:
+        self.fd, self._write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._is_watching = False
+
+    @contextmanager
+    def watch(self) -> Iterator[None]:
+        """Watch for signals while entered in the main thread, unless asyncio does already."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        other = signal.set_wakeup_fd(self._write_fd, warn_on_full_buffer=False)
+        if other >= 0:
+            signal.set_wakeup_fd(other, warn_on_full_buffer=False)
+        self._is_watching = other < 0
+        try:
+            yield
+        finally:
+            if self._is_watching:
+                signal.set_wakeup_fd(-1)
+                self._is_watching = False
+                if self.fd < 0:
+                    os.close(self._write_fd)
+
+    def collect(self) -> None:
+        """Empty the pipe; the handlers have run already."""
+        with suppress(BlockingIOError):
+            while os.read(self.fd, 4096):
+                pass
+
+    def close(self) -> None:
+        """Close both ends, once; while signals are watched, the other one at the end of that."""
+        if self.fd < 0:
+            return
+        os.close(self.fd)
+        self.fd = -1
+        if not self._is_watching:
+            os.close(self._write_fd)
+
+    def __del__(self) -> None:
+        """Close the descriptors of an executor that was never shut down."""
+        self.close()

@@ -31,7 +31,7 @@ from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE
 from mddag_executor.core.policies import policy as find_policy
 from mddag_executor.executor import publishing, settings
 from mddag_executor.executor.announcements import Announcements
-from mddag_executor.executor.at_once import AtOnce
+from mddag_executor.executor.at_once import AtOnce, SignalPipe
 from mddag_executor.executor.compat import (
     BareExecutor,
     ends_call,
@@ -186,6 +186,8 @@ class MultiDeadlineExecutor(BareExecutor):
             self._engine, self._trace_clock, self, self._fail, prepare)
         self._at_once = AtOnce(self._engine, self._pool.lock, self, self._fail)
         self._at_once.loop.add_own(self._pool.guard)
+        self._signals = SignalPipe()
+        self._at_once.loop.add_own(self._signals)
         self._registry = Registry(task_set, self._engine, self._pool.leave_group)
         self._new_tasks: deque[Work] = deque()
         self._task_entity = Entity(TASK, None, '', None, -1, 0, '')
@@ -339,7 +341,7 @@ class MultiDeadlineExecutor(BareExecutor):
         :raises RuntimeError: when the executor spins already.
         :raises Exception: the exception of a callback.
         """
-        with short_switch_interval():
+        with short_switch_interval(), self._signals.watch():
             self._spin(lambda: False, None)
         self._raise_error()  # of the callback that has ended the context, raised after that
 
@@ -375,7 +377,7 @@ class MultiDeadlineExecutor(BareExecutor):
 
         future.add_done_callback(QuickCallback(note))
         try:
-            with short_switch_interval():
+            with short_switch_interval(), self._signals.watch():
                 self._spin(is_done, timeout_sec)
         except ExternalShutdownException:
             pass
@@ -548,7 +550,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
         try:
-            with self._pool.stepping():
+            with self._pool.stepping(), self._signals.watch():
                 while not self.is_ending():
                     self._check_context()
                     self._raise_error()
@@ -581,7 +583,7 @@ class MultiDeadlineExecutor(BareExecutor):
             return True
         if done():  # the event that woke it has just been handled
             return False
-        self._wait_stepping(self._patience_s(deadline, None))
+        self._wait_stepping(self._patience_s(deadline, self._upkeep.rest_s()))
         return self._handle_once()
 
     def _handle_once(self) -> bool:
@@ -634,6 +636,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._pool.loop.close()
                 self._at_once.loop.close()
                 self._pool.guard.close()
+                self._signals.close()
 
     def _end_run(self) -> None:
         """Judge open jobs and close the trace, once; a second thread waits for the first."""

@@ -368,11 +368,10 @@ def stop(*_):
     global stops
     publisher.publish(String(data='stop'))
     stops += 1
-    signal.setitimer(signal.ITIMER_REAL, 0.001 * (stops < 200), 1.0)
+    signal.setitimer(signal.ITIMER_REAL, 0.001 * (stops < 200))
 
 signal.signal(signal.SIGALRM, stop)
-# again after a second: Python notices no signal that comes just before the main thread waits
-signal.setitimer(signal.ITIMER_REAL, 0.001, 1.0)
+signal.setitimer(signal.ITIMER_REAL, 0.001)
 
 
 def done():
