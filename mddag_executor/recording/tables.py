@@ -23,7 +23,6 @@ Theory of operation
 
 from __future__ import annotations
 
-from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -142,30 +141,6 @@ class Growing:
         """Return the table; no rows can be added afterwards."""
         self._rows.resize(self._count, refcheck=False)
         return self.rows()
-
-
-class Rows:
-    """Rows of a table while it grows; ``add`` gets the values of the named columns in order."""
-
-    def __init__(self, kind: np.dtype[Any], *names: str) -> None:
-        self._kind, self._names = kind, names
-        self.columns = {name: array('q') for name in names}
-        self._add = [column.append for column in self.columns.values()]
-
-    def __len__(self) -> int:
-        return len(self.columns[self._names[0]])
-
-    def add(self, *values: int) -> int:
-        """Add a row; return its number."""
-        for append, value in zip(self._add, values):
-            append(value)
-        return len(self) - 1
-
-    def table(self) -> Table:
-        """Return the table."""
-        return rows(self._kind, len(self), **{
-            name: np.frombuffer(column, dtype=np.int64)
-            for name, column in self.columns.items()})
 
 
 @dataclass
