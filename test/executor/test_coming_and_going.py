@@ -74,8 +74,12 @@ def churn(node, executors, moving, seed):
         elif present:
             present.pop(draw.randrange(len(present)))()
         if draw.random() < 0.05:
+            executor = draw.choice(executors)
             with moving:  # else rclpy's add_node may wait for another one, for ever
-                draw.choice(executors).add_node(node)
+                executor.add_node(node)
+            executor.create_task(nothing)
+            executor.statistics()
+            executor.wake()
         time.sleep(draw.choice([0.0, 0.0, 0.001, 0.01]))
 
 
