@@ -25,6 +25,9 @@ def test_the_main_job_end_to_end(tmp_path, mddag):
     measured = live['measured']
     assert (measured['seed'], measured['attribution']) == (0, {'wrong': 0, 'none': 0})
     assert measured['utilisation'] == pytest.approx(0.3, abs=0.001)
+    for same in ('seed', 'workers', 'utilisation'):     # as rclpy's executor got it
+        assert every['baseline'][same] == measured[same]
+    assert every['baseline']['on_time'] > 0
     verdicts = measured['on_time'] + measured['late'] + measured['missing']
     assert verdicts == measured['sink_jobs_due'] > 200
     assert (tmp_path / 'demo.mcap').read_bytes()[:5] == b'\x89MCAP'
