@@ -234,6 +234,11 @@ def cluster(tmp_path_factory):
         yield cluster
 
 
+def test_an_address_without_a_scheduler(autoware):
+    with pytest.raises(UsageError, match='^--dask tcp://127.0.0.1:1: .*: check the address, and '):
+        evaluate(Experiment(autoware), 2, dask='tcp://127.0.0.1:1')
+
+
 @pytest.mark.timeout(120)
 def test_the_outcome_is_that_of_this_machine(cluster, autoware):
     """Also if a worker is killed: its runs are made again."""

@@ -68,7 +68,7 @@ def test_verdicts_of_any_tables(seed, data):
         releases=releases, executions=tables[1], job_ends=tables[2], hosted=hosted,
         judged_order=int(generator.integers(0, len(orders) + 1)) * 2 - 1,
         judge_from=start + 50 * MS if data.draw(st.booleans()) else -NEVER)
-    check(changed)
+    check(changed, data.draw(st.sampled_from([0, 30 * MS])))
 
 
 def verdicts(replay):

@@ -4,13 +4,16 @@
 
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.head import Head
+from mddag_executor.recording.tables import EXECUTIONS, Recording, rows
 from mddag_executor.replay import replay
 from mddag_executor.replay.dispatches import dispatch_times
-from mddag_executor.replay.usage import PoolUse
+from mddag_executor.replay.usage import group_waits, in_groups, PoolUse
 import numpy as np
 import pytest
 
-from .helpers import MS, Written
+from .helpers import MS, small, Written
 
 
 def late(n_workers, *executions, holding=()):
@@ -77,6 +80,30 @@ def test_no_time_is_lost_and_steps_are_few(spans):
     if busy:
         assert result['start_ns'] <= min(busy)[0] < result['start_ns'] + result['step_ns']
         assert result['step_ns'] % PoolUse.FIRST_STEP_NS == 0
+
+
+def test_waits_for_the_group():
+    groups = Entities(by_address=True)
+    groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 50, 'mutually_exclusive'))
+    groups.take(('ros2_caret:add_callback_group', 0, 0, 0, 1, 60, 'reentrant'))
+    for entity, group in ((1, 50), (2, 50), (3, 60)):
+        groups.take(('ros2:rcl_timer_init', 0, 0, 0, entity, 5))
+        groups.take(('ros2:rclcpp_timer_callback_added', 0, 0, 0, entity, entity))
+        groups.take(('ros2_caret:callback_group_add_timer', 0, 0, 0, group, entity))
+    # callback, ready, start, end, piece; the last one runs until the end of the recording
+    pieces = [(1, 0, 2, 10, 0), (2, 4, 12, 20, 0), (3, 5, 20, 30, 0), (1, 8, 25, 30, 0),
+              (9, 0, 40, 41, 0), (1, 29, 42, 44, 1), (2, 43, 45, -1, 0)]
+    callback, ready, start, end, piece = (list(column) for column in zip(*pieces))
+    task_set = small()
+    recording = Recording(
+        'by hand', Head(0, '', '', 'rad', 1, 0, 0, False), task_set, task_set, groups, end=60,
+        executions=rows(EXECUTIONS, len(pieces), callback=callback, vertex=-1, ready=ready,
+                        began=start, start=start, end=end, piece=piece))
+    # the second from 4 to 10; the third of the group from 8 to 10 and from 12 to 20
+    assert group_waits(recording).tolist() == [0, 6, 0, 10, 0, 0, 1]
+    (_, members, starts, ends), = in_groups(recording)
+    assert members.tolist() == [0, 1, 3, 5, 6]
+    assert (starts.tolist(), ends.tolist()) == ([2, 12, 25, 42, 45], [10, 20, 30, 44, 60])
 
 
 def test_what_computed_and_held_the_interpreter(tmp_path):

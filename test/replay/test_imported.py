@@ -125,6 +125,10 @@ def test_jobs_responses_where_the_time_went_and_paths(recorded, graph):
     assert again.tables.n_groups == 1
     with pytest.raises(ReplayError, match='it was imported'):
         reschedule(recorded.path)
+    below = loads('mddag: 1\nnodes:\n  - node: /robot/fuse\n    callbacks:\n'
+                  '      - {name: t, timer: 50ms, deadline: 5ms}\n', 'x.yaml')
+    with pytest.raises(ReplayError, match="/robot/fuse:t: did you mean the node '/fuse'\\?$"):
+        replay(recorded.path, below)
 
 
 def test_a_job_whose_message_was_lost_has_expired(recorded, graph):

@@ -110,12 +110,15 @@ def test_names_periods_and_what_no_one_declares(tmp_path):
                               'get_available_transitions', 'get_transition_graph',
                               'ask/get_state')):
         service(r, 200 + 2 * n, 100, f'/cam/{name}')
+    r.node(300, '/a')       # nodes are sorted
+    r.timer(310, 300, 50 * MS)
     ran(r, 1, 1, 1_000 * MS, MS, 110)
     ran(r, 211, 1, 1_100 * MS, MS)       # of /cam/ask/get_state: the others never run
     text = declaration_of(System(r.write()).draft())
     assert re.findall(r'name: (.*)', text) == [
-        'grab', 'callback_1', 'grab_2', 'callback_3', 'callback_4']
-    assert re.findall(r'timer: (.*)', text)[:4] == ['33.333ms', '33.3ms', '1.5us', '20ms']
+        'callback_0', 'grab', 'callback_1', 'grab_2', 'callback_3', 'callback_4']
+    assert re.findall(r'timer: (.*)', text)[:5] == [
+        '50ms', '33.333ms', '33.3ms', '1.5us', '20ms']
     assert re.findall(r'service: (.*)', text) == ['/cam/ask/get_state']
     assert 'transition_event' not in text
 

@@ -157,6 +157,14 @@ def test_a_seed_draws_the_same_for_ever():
     assert draw_execution_times(two_dags(), 2) == [[2_000, 2_896], [1_113, 1_000]]
 
 
+def test_a_callback_without_a_time_is_named_with_its_own_file(tmp_path):
+    (tmp_path / 'part.yaml').write_text(
+        'mddag: 1\nnodes:\n- node: /n\n  callbacks:\n  - {name: t, timer: 1ms, deadline: 1ms}\n')
+    (tmp_path / 'top.yaml').write_text('mddag: 1\ninclude: [part.yaml]\n')
+    with pytest.raises(MddagError, match='part.yaml:5: /n:t declares no execution_time: add one'):
+        draw_execution_times(load(tmp_path / 'top.yaml'), 0)
+
+
 def test_utilisation_and_its_scaling():
     times = [[2_000, 3_000], [1_000, 1_000]]
     assert utilisation(two_dags(), times, 2) == pytest.approx(0.5)
