@@ -141,6 +141,19 @@ ONCE = graph(
     sink='name: end, subscription: /a, deadline: 20ms')
 
 
+def test_a_result_that_never_comes_is_a_miss_at_its_deadline(make_executor, make_node):
+    """Though nothing runs then: the node of the sink is not there."""
+    nodes, misses = Declared(make_node, ONCE), []
+    start = make_node('other').create_publisher(Header, '/start', 10)
+    with Spinning(make_executor(
+            loads(ONCE), on_deadline_miss=misses.append, nodes=[nodes.nodes['source']])):
+        matched(start)
+        start.publish(Header())
+        assert wait_for(lambda: misses)
+    assert [(miss.kind, miss.vertex, miss.completed_ns) for miss in misses] == [
+        ('overdue', '/sink:end', None)]
+
+
 def test_a_callback_that_hangs_is_a_miss_once(make_executor, make_node, tmp_path, capfd):
     """Known at its deadline, to all who ask; what comes of it later is its verdict."""
     misses, reported, go_on = [], [], threading.Event()
