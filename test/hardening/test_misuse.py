@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executor under misuse: a clear exception, no hang, and everything as it was before."""
 
+import re
 import time
 
 from mddag_executor import MultiDeadlineExecutor
@@ -33,6 +34,7 @@ def test_a_wrong_argument_is_named_in_one_line(ros_context, tmp_path, name):
         with pytest.raises((MddagError, ValueError)) as caught:
             MultiDeadlineExecutor(**{'context': ros_context, 'trace': str(trace), name: value})
         assert name in str(caught.value) and '\n' not in str(caught.value), value
+        assert re.search(': (give|choose|write|add) ', str(caught.value)), value
     # Nothing was begun: no file, and (as ros_context looks) no thread.
     assert not trace.exists()
 
