@@ -12,7 +12,7 @@ from mddag_executor.trace import reading, TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
-from .helpers import MS, SMALL, small, START_TIME, VirtualRun, Written
+from .helpers import MS, ns, SMALL, small, START_TIME, VirtualRun, Written
 
 ONE = 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: a, timer: 10ms, deadline: 9ms}]}]'
 
@@ -101,6 +101,17 @@ def test_the_chain_of_a_job_goes_through_what_it_waited_for(trace):
     assert (use['completed'], use['late'], use['response_ns']['max']) == (1, 0, 5 * MS)
     assert {key: time for key, time in use['breakdown']['mean'].items() if time} == {
         'waiting_ns': 2 * MS, 'executing_ns': 3 * MS}
+
+
+def test_the_first_end_of_the_dispatched_callback_ends_it(trace):
+    trace.add('dispatch', 10, 1100, 1, 0, 0, 0, ns(10), 0, thread=10)
+    for at, address in ((11, 7), (12, 1100), (15, 1100)):
+        trace.add('callback_end', at, address, thread=10)
+    outcome = replay(trace.end(110))
+    assert outcome.recording.executions[['end', 'busy']].tolist() == [(ns(12), 2 * MS)]
+    assert outcome.warnings[0].endswith(
+        '2 events that make no sense, most often (2) ros2:callback_end of an execution that was '
+        'not dispatched')
 
 
 REORDERED = """\
