@@ -121,22 +121,23 @@ class SignalPipe(ChannelSource):
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        """Watch for signals while entered in the main thread, unless asyncio does already."""
-        if threading.current_thread() is not threading.main_thread():
+        """Watch for signals while entered in the main thread, unless something else does."""
+        if self.fd < 0 or threading.current_thread() is not threading.main_thread():
             yield
             return
         other = signal.set_wakeup_fd(self._write_fd, warn_on_full_buffer=False)
-        if other >= 0:
+        if other >= 0:  # asyncio's, or that of a spin which has called this one
             signal.set_wakeup_fd(other, warn_on_full_buffer=False)
-        self._is_watching = other < 0
+            yield
+            return
+        self._is_watching = True
         try:
             yield
         finally:
-            if self._is_watching:
-                signal.set_wakeup_fd(-1)
-                self._is_watching = False
-                if self.fd < 0:
-                    os.close(self._write_fd)
+            signal.set_wakeup_fd(-1)
+            self._is_watching = False
+            if self.fd < 0:
+                os.close(self._write_fd)
 
     def collect(self) -> None:
         """Empty the pipe; the handlers have run already."""

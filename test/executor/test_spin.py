@@ -81,6 +81,15 @@ def test_spinning_twice_is_an_error(make_executor):
     assert not executor.is_spinning
 
 
+def test_spinning_in_a_callback_of_spin_once_is_an_error(make_executor):
+    """And signals are not watched any more when that has ended."""
+    executor = make_executor()
+    task = executor.create_task(executor.spin)
+    with pytest.raises(RuntimeError, match='already spinning'):
+        executor.spin_once(5.0)
+    assert task.done() and signal.set_wakeup_fd(-1) == -1
+
+
 def test_wait_for_message_while_another_thread_spins(make_executor, make_node):
     node = make_node()
     publisher = node.create_publisher(Header, '/topic', 10)
