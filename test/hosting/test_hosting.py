@@ -197,7 +197,7 @@ def test_rclpy_is_as_before_when_the_host_is_left(default_context):
 
 
 def test_a_hangup_ends_the_run_unless_a_running_program_handles_it(default_context):
-    """Programs that have ended handle nothing."""
+    """Programs that have ended handle nothing, and their nodes run no more."""
     got = []
 
     def main():
@@ -210,8 +210,9 @@ def test_a_hangup_ends_the_run_unless_a_running_program_handles_it(default_conte
         with Host() as host:
             host.start(SingleThreadedExecutor(), [Program('main', 'main', main)])
             os.kill(os.getpid(), signal.SIGHUP)
-            assert wait_for(lambda: got == ['program'])
+            assert wait_for(lambda: got == ['program']) and host.executor.get_nodes()
             host.program_ended(host.guests[0])
+            assert host.executor.get_nodes() == []
             os.kill(os.getpid(), signal.SIGHUP)
             assert wait_for(lambda: got == ['program', 'run'])
     finally:
