@@ -103,10 +103,12 @@ def test_the_chain_of_a_job_goes_through_what_it_waited_for(trace):
         'waiting_ns': 2 * MS, 'executing_ns': 3 * MS}
 
 
-def test_the_first_end_of_the_dispatched_callback_ends_it(trace):
+def test_the_first_end_of_the_dispatched_callback_ends_it(trace, monkeypatch):
+    monkeypatch.setattr(reading, '_BATCH_BYTES', 1)
     trace.add('dispatch', 10, 1100, 1, 0, 0, 0, ns(10), 0, thread=10)
     for at, address in ((11, 7), (12, 1100), (15, 1100)):
         trace.add('callback_end', at, address, thread=10)
+        trace.file.flush()
     outcome = replay(trace.end(110))
     assert outcome.recording.executions[['end', 'busy']].tolist() == [(ns(12), 2 * MS)]
     assert outcome.warnings[0].endswith(
