@@ -174,27 +174,27 @@ def test_a_forked_process_disturbs_nothing_and_ends(make_executor, make_node):
     executor = make_executor(num_workers=3, nodes=[node])
     matched(publisher)
 
-    mine, theirs = fork.Pipe()
-    children = [fork.Process(target=wait_until_told, args=(theirs,)) for _ in range(2)]
+    pipes = [fork.Pipe() for _ in range(2)]
+    children = [fork.Process(target=wait_until_told, args=(theirs,)) for _, theirs in pipes]
     with Spinning(executor):
         task = executor.create_task(children[0].start)
         assert wait_for(task.done)
         children[1].start()
-        assert mine.recv() == mine.recv() == 'here'
+        assert [mine.recv() for mine, _ in pipes] == ['here'] * 2
         message = Header()
         for number in range(50):  # while there is a child that has all the descriptors
             message.stamp.sec = number
             publisher.publish(message)
         assert goes_on(ticks, 10) and wait_for(lambda: len(heard) == 50)
-        for _ in children:
+        for mine, _ in pipes:
             mine.send('go')
         for child in children:
             child.join(15.0)
     assert [child.exitcode for child in children] == [3, 3]
     assert sorted(heard) == list(range(50))
     assert is_idle(executor)
-    mine.close()
-    theirs.close()
+    for connection in (each for pipe in pipes for each in pipe):
+        connection.close()
 
 
 # --- kinds of nodes and events -------------------------------------------------------------------
