@@ -117,7 +117,6 @@ class SignalPipe(ChannelSource):
 
     def __init__(self) -> None:
         self.fd, self._write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._is_watching = False
 
     @contextmanager
     def watch(self) -> Iterator[None]:
@@ -130,14 +129,10 @@ class SignalPipe(ChannelSource):
             signal.set_wakeup_fd(other, warn_on_full_buffer=False)
             yield
             return
-        self._is_watching = True
         try:
             yield
         finally:
             signal.set_wakeup_fd(-1)
-            self._is_watching = False
-            if self.fd < 0:
-                os.close(self._write_fd)
 
     def collect(self) -> None:
         """Empty the pipe; the handlers have run already."""
@@ -146,13 +141,11 @@ class SignalPipe(ChannelSource):
                 pass
 
     def close(self) -> None:
-        """Close both ends, once; while signals are watched, the other one at the end of that."""
-        if self.fd < 0:
-            return
-        os.close(self.fd)
-        self.fd = -1
-        if not self._is_watching:
+        """Close both ends, once; not while signals are watched."""
+        if self.fd >= 0:
+            os.close(self.fd)
             os.close(self._write_fd)
+            self.fd = -1
 
     def __del__(self) -> None:
         """Close the descriptors of an executor that was never shut down."""

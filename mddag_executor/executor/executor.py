@@ -341,8 +341,7 @@ class MultiDeadlineExecutor(BareExecutor):
         :raises RuntimeError: when the executor spins already.
         :raises Exception: the exception of a callback.
         """
-        with short_switch_interval(), self._signals.watch():
-            self._spin(lambda: False, None)
+        self._spin(lambda: False, None)
         self._raise_error()  # of the callback that has ended the context, raised after that
 
     def spin_until_future_complete(
@@ -377,8 +376,7 @@ class MultiDeadlineExecutor(BareExecutor):
 
         future.add_done_callback(QuickCallback(note))
         try:
-            with short_switch_interval(), self._signals.watch():
-                self._spin(is_done, timeout_sec)
+            self._spin(is_done, timeout_sec)
         except ExternalShutdownException:
             pass
 
@@ -387,34 +385,8 @@ class MultiDeadlineExecutor(BareExecutor):
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
         try:
-            if self.is_ending() or is_over(self.context):
-                return
-            if self._freeze_gc:
-                self._freeze_gc = False
-                gc.collect()
-                gc.freeze()
-            self._submit_tasks()  # as in rclpy, before other ready callbacks
-            self._upkeep.refresh()
-            self._start_threads()
-            self._pool.start()
-            while not self.is_ending():
-                self._raise_error()
-                if done():
-                    self._raise_error()  # of callbacks that ran before the future was done
-                    return
-                if self._was_ended():
-                    return
-                self._submit_tasks()
-                self._names.check(self._engine.is_judging)
-                rest = self._upkeep.rest_s()
-                if rest == 0.0:
-                    self._upkeep.refresh()
-                    rest = None
-                left = self._patience_s(deadline, rest)
-                if left is not None and left <= 0 and rest is None:
-                    return
-                self._at_once.handle(self._at_once.loop.wait(-1 if left is None else left))
-            self._raise_error()
+            with short_switch_interval(), self._signals.watch():
+                self._spin_until(done, deadline)
         except RCL_ERRORS:
             if not self._was_ended():
                 raise
@@ -427,6 +399,36 @@ class MultiDeadlineExecutor(BareExecutor):
                     self._notifier.stop()
             self._close()
             self._spinning.release()
+
+    def _spin_until(self, done: Callable[[], bool], deadline: float | None) -> None:
+        if self.is_ending() or is_over(self.context):
+            return
+        if self._freeze_gc:
+            self._freeze_gc = False
+            gc.collect()
+            gc.freeze()
+        self._submit_tasks()  # as in rclpy, before other ready callbacks
+        self._upkeep.refresh()
+        self._start_threads()
+        self._pool.start()
+        while not self.is_ending():
+            self._raise_error()
+            if done():
+                self._raise_error()  # of callbacks that ran before the future was done
+                return
+            if self._was_ended():
+                return
+            self._submit_tasks()
+            self._names.check(self._engine.is_judging)
+            rest = self._upkeep.rest_s()
+            if rest == 0.0:
+                self._upkeep.refresh()
+                rest = None
+            left = self._patience_s(deadline, rest)
+            if left is not None and left <= 0 and rest is None:
+                return
+            self._at_once.handle(self._at_once.loop.wait(-1 if left is None else left))
+        self._raise_error()
 
     def _start_threads(self) -> None:
         """Start all threads but the workers; further calls do nothing."""
