@@ -183,10 +183,11 @@ nodes:
     check(executor.statistics(), Statistics, 'statistics')
     executor.add_node(node)
     with executor as entered, Spinning(entered):
-        assert wait_for(lambda: executor.statistics()['first_miss'] is not None)
+        assert wait_for(lambda: executor.statistics()['dags']['/n']['late'] > 0)
     found = executor.statistics()
     check(found, Statistics, 'statistics')
     assert found['trace'] == {'path': str(trace), 'lost': 0, 'error': None}
+    assert found['first_miss'] is not None
     assert found['dags']['/n']['sinks']['/n:t']['response_ns'] is not None
     assert {'/n:t'} < set(found['callbacks'])
 
