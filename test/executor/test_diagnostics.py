@@ -183,7 +183,7 @@ nodes:
     check(executor.statistics(), Statistics, 'statistics')
     executor.add_node(node)
     with executor as entered, Spinning(entered):
-        assert wait_for(lambda: executor.statistics()['dags']['/n']['late'] > 0)
+        assert wait_for(lambda: executor.statistics()['dags']['/n']['ends']['late'] > 0)
     found = executor.statistics()
     check(found, Statistics, 'statistics')
     assert found['trace'] == {'path': str(trace), 'lost': 0, 'error': None}
