@@ -100,19 +100,24 @@ class Scheduled(NamedTuple):
         Those of plain Python, which may exceed 64 bits, are counted without numpy: importing it
         takes as long as a short run.
         """
-        if isinstance(self.decisions, list):
-            for time, dag, release in zip(*map(as_list, (
-                    load.times, load.dags, load.releases if len(load.releases) else load.times))):
-                if (time <= self.ended and time < settings.duration_ns
-                        and release >= settings.judge_from):
-                    tally.released(dag)
-            tally.add(self.decisions)
+        releases = load.releases if len(load.releases) else load.times
+        if not isinstance(self.decisions, list):
+            self._count_columns(tally, load, releases, settings)
             return
+        for time, dag, release in zip(*map(as_list, (load.times, load.dags, releases))):
+            if (time <= self.ended and time < settings.duration_ns
+                    and release >= settings.judge_from):
+                tally.released(dag)
+        tally.add(self.decisions)
+
+    def _count_columns(
+        self, tally: Tally, load: Load, releases: Sequence[int], settings: Settings
+    ) -> None:
+        """Count the jobs and decisions of a compiled run."""
         import numpy as np
-        times, dags, releases = (np.asarray(each) for each in (
-            load.times, load.dags, load.releases if len(load.releases) else load.times))
+        times, dags, released = map(np.asarray, (load.times, load.dags, releases))
         judged = (times <= self.ended) & (times < settings.duration_ns) & (
-            releases >= settings.judge_from) & (dags < len(tally.jobs))
+            released >= settings.judge_from) & (dags < len(tally.jobs))
         tally.jobs = np.bincount(
             dags[judged].astype(np.int64), minlength=len(tally.jobs)).tolist()
         decisions = np.asarray(self.decisions, dtype=np.int64).reshape(-1, 6)
@@ -125,6 +130,7 @@ class Scheduled(NamedTuple):
         for pair, number in zip(pairs.tolist(), numbers.tolist()):
             tally.ends[pair >> 8][pair & 255] = number
         results = decisions[kind < JOB_END]
+        missed = results[results[:, 0] != SINK_IN_TIME]
         results = results[np.argsort(results[:, 2], kind='stable')]
         sinks = sorted(tally.sinks)
         for vertex, mine in zip(sinks, np.split(
@@ -135,7 +141,6 @@ class Scheduled(NamedTuple):
                 vertex, np.bincount(kind, minlength=JOB_END).tolist(), memoryview(np.sort(
                     time[done] - deadline[done] + tally.sinks[vertex].relative_deadline_ns)),
                 job[kind != SINK_IN_TIME].tolist())
-        missed = decisions[(decisions[:, 0] < JOB_END) & (decisions[:, 0] != SINK_IN_TIME)]
         if len(missed):
             kind, _, vertex, job, deadline, time = missed[missed[:, 4].argmin()].tolist()
             tally.add_first_miss(kind, vertex, job, deadline, time)
