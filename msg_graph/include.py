@@ -201,7 +201,7 @@ def _argument_values(tree: Mapping, given: dict[str, str]) -> dict[str, str]:
             raise GraphError(
                 error.file, error.line, error.problem,
                 "set it with 'set:' of the include, or give it a default here") from None
-    for name in given.keys() - values.keys():
+    for name in [each for each in given if each not in values]:
         raise top.error(
             'arguments', f'an include sets {shown(name)}, which is not an argument of this file',
             did_you_mean(name, values, "add it to 'arguments:'"))

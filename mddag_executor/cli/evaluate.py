@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
+from mddag_executor.cli.main import EXIT_INTERRUPTED
 from mddag_executor.cli.text import Cell, Progress, table, warn
 from mddag_executor.core import POLICIES
 from mddag_executor.errors import InputError, UsageError
@@ -36,7 +37,6 @@ mddag evaluate graph.yaml --runs 100000 --first-run 100000 --dask tcp://head:878
 mddag generate --sets 400 --utilisation 0.1:1.0 -o sets && mddag evaluate sets --plot sets.svg"""
 
 _RUNS, _RUNS_OF_EACH = 5000, 1
-_EXIT_INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,7 +78,7 @@ def main(args: argparse.Namespace) -> int:
         warn(f'interrupted: {outcome.runs} of {outcome.asked} runs are done')
     if outcome.runs > 0:
         _write(args, outcome)
-    return _EXIT_INTERRUPTED if outcome.interrupted else 0
+    return EXIT_INTERRUPTED if outcome.interrupted else 0
 
 
 def _graphs(names: Sequence[str]) -> list[str]:

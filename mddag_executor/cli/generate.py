@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--periods', lambda text: tuple(options.list_of(options.duration)(text)), 'TIME,TIME…',
         'each DAG gets one of these', 'periods_ns')
     add('--tightness', real, 'F[:F]', 'each deadline divided by the period, drawn in these bounds')
-    add('--seed', int, 'N', 'seed; the same seed and options give the same files')
+    add('--seed', options.seed, 'N', 'seed; the same seed and options give the same files')
 
 
 def _pair(kind: Callable[[str], Any]) -> Callable[[str], Any]:

@@ -35,6 +35,7 @@ from mddag_executor.cli import common, options, verdicts
 from mddag_executor.cli.main import SAME_SIGNAL_S
 from mddag_executor.cli.text import Progress, warn
 from mddag_executor.errors import MddagError, UsageError, UserCodeError
+from mddag_executor.output_rules import is_special
 from mddag_executor.report.live_runs import live_lines
 from mddag_executor.report.text import listed
 from msg_graph import loads, NO_GRAPH
@@ -125,7 +126,14 @@ def main(args: argparse.Namespace) -> int:
         task_set = replace(task_set, processes=())
     result, error = run_here(args, task_set)
     common.show(args, result, live_lines(result))
-    return _end(error, verdicts.exit_status(args, result['dags'], result['file'] or 'mddag run'))
+    return _end(error or incomplete(result['trace']), verdicts.exit_status(
+        args, result['dags'], result['file'] or 'mddag run'))
+
+
+def incomplete(*traces: dict[str, Any] | None) -> MddagError | None:
+    """Return the error about a recording that could not be written, if there is one."""
+    errors = [trace['error'] for trace in traces if trace is not None and trace['error']]
+    return MddagError(errors[0]) if errors else None
 
 
 def part(args: argparse.Namespace) -> int:
@@ -190,7 +198,7 @@ def run_here(
             with redirect_stdout(output):
                 return _run(args, task_set, executor, host, programs, plan, signals)
         except MddagError:
-            if trace is not None:  # nothing ran: leave no empty trace behind
+            if trace is not None and not is_special(str(trace)):     # nothing ran
                 trace.unlink(missing_ok=True)
             raise
 

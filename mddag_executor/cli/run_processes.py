@@ -20,7 +20,8 @@ from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, verdicts
-from mddag_executor.cli.run import Signals, warn_of
+from mddag_executor.cli.main import EXIT_DEFECT
+from mddag_executor.cli.run import incomplete, Signals, warn_of
 from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
 from mddag_executor.report.live_runs import live_lines
@@ -28,7 +29,6 @@ from msg_graph import TaskSet
 from msg_graph.edit import load_processes, with_processes
 from msg_graph.errors import listed, shown
 
-EXIT_DIED = 70
 _COMMON_OPTIONS = ('policy', 'on_late', 'workers', 'duration', 'seed', 'utilisation',
                    'diagnostics', 'overwrite', 'ros_args')
 _PROBE_TIMEOUT_S = 120.0
@@ -97,8 +97,12 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
             else part['trace']}
             for run, part in zip(supervisor.runs, parts)]}
     common.show(args, result, live_lines(result))
-    return EXIT_DIED if any(run.died for run in supervisor.runs) else verdicts.exit_status(
-        args, result['dags'], task_set.file)
+    if any(run.died for run in supervisor.runs):
+        return EXIT_DEFECT
+    status = verdicts.exit_status(args, result['dags'], task_set.file)
+    if error := incomplete(*(part['trace'] for part in parts if part is not None)):
+        raise error
+    return status
 
 
 def _warn_of_contested(task_set: TaskSet) -> None:

@@ -62,10 +62,10 @@ def main(args: argparse.Namespace) -> int:
                 print(_CLEAR + '\n'.join(text.splitlines()[:lines - 1]), flush=True)
             elif statuses and wanted and not args.once:
                 print(tables(statuses), flush=True)
-    if (args.once or args.duration is not None) and not board.statuses():
-        raise NothingHeard(
-            f'{TOPIC}: no executor has published its state here: start one with '
-            'mddag run, or with diagnostics_period, and check ROS_DOMAIN_ID')
+        if (args.once or args.duration is not None) and not board.statuses():
+            raise NothingHeard(
+                f'{TOPIC}: no executor has published its state here: start one with '
+                'mddag run, or with diagnostics_period, and check ROS_DOMAIN_ID')
     if common.write_result(args, board.result()) and args.once:
         print(tables(board.statuses()), end='')
     return 0

@@ -76,8 +76,8 @@ def evaluate(
     _check(experiments, runs, first_run)
     if compiled is None:
         compiled = compiling_pays(plain_s(experiments, runs) / jobs)
-    elif compiled:
-        from mddag_executor.simulate.compiled import check_available
+    if compiled:
+        from mddag_executor.simulate.compiled import check_available, prepare
         check_available()
     if not compiled and dask is None and plain_s(experiments, runs) < SOON_S:
         jobs = 1  # it is done before other processes have started
@@ -87,6 +87,8 @@ def evaluate(
     outcome = Evaluation(experiments, runs, first_run, compiled, jobs)
     begin = time.monotonic()
     try:
+        if compiled and dask is None:    # here, where Ctrl-C interrupts it
+            prepare()
         with _dask(dask, evaluator) if dask is not None else _local(jobs, evaluator) as submit:
             _collect(submit, outcome, progress)
     except KeyboardInterrupt:

@@ -101,8 +101,7 @@ def judge_of(task_set: TaskSet, duration_ns: int, compiled: bool) -> Judge:
     load = periodic_load(
         task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
     if compiled:
-        from mddag_executor.simulate.compiled import prepare, run_each
-        prepare()
+        from mddag_executor.simulate.compiled import run_each
 
     def judge(settings: Settings, times: Times) -> Bools:
         if compiled:

@@ -30,22 +30,29 @@ def test_figure(graph, tmp_path, call, ending, start):
             assert text in pictures[0]
 
 
-def test_interrupted(graph):
+@pytest.mark.parametrize('compiled', [False, True])
+def test_interrupted(graph, compiled):
     """Ctrl-C: the exit status is 130, and what is done is written as a whole."""
+    if compiled:
+        pytest.importorskip('numba')
     with subprocess.Popen(
             [sys.executable, '-m', 'mddag_executor', 'evaluate', str(graph), '--runs', '500000',
              '--jobs', '1', '--json', 'out.json', '--plot', 'out.png'],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-            env={**os.environ, 'NUMBA_DISABLE_JIT': '1'}) as process:  # not compiled
+            env={**os.environ, 'NUMBA_DISABLE_JIT': str(int(not compiled)),
+                 'NUMBA_CACHE_DIR': str(graph.parent / 'cache')}) as process:
 
         def seconds():
             fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
             return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
-        wait_for_run(process, lambda: seconds() > 2)
+        wait_for_run(process, lambda: seconds() > 4)    # compiling takes half a minute
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=120)
     assert process.returncode == 130
+    if compiled:
+        assert (out, err) == ('', 'warning: interrupted: 0 of 500000 runs are done\n')
+        return
     result = json.loads(Path('out.json').read_text())
     assert err == f"warning: interrupted: {result['runs']} of 500000 runs are done\n"
     assert 0 < result['runs'] < 500000 and result['interrupted'] is True

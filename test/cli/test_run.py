@@ -316,6 +316,22 @@ def test_nodes_that_change_the_folder_and_raise_what_has_no_text(folder, mddag, 
     assert [Path(name).exists() for name in ('out.mcap', 'result.json')] == [ran, ran]
 
 
+def test_a_recording_that_cannot_be_written_is_an_error(graph, mddag):
+    """Its reader goes away, as a disk that gets full; and a pipe stays when nothing ran."""
+    Path('bad.py').write_text(BAD_NODES)
+    for trace, status, what in (
+            ('out.mcap', 2, ('--synthetic', 'sleep')),
+            ('out.p1.mcap', 2, ('--synthetic', 'sleep', '--processes', '2')),
+            ('bad.mcap', 70, ('--node', 'bad:main'))):
+        os.mkfifo(trace)
+        with subprocess.Popen(['head', '-c', '1000', trace], stdout=subprocess.DEVNULL):
+            done = mddag('run', graph, *what, '--duration', '1s', '--trace',
+                         trace.replace('p1.', ''))
+        says = f'{trace}: writing failed (Broken pipe): ' if status == 2 else '--node bad:main: '
+        assert done.returncode == status and says in done.stderr.splitlines()[-1], done.stderr
+        assert Path(trace).is_fifo()
+
+
 def test_a_node_may_remove_the_folder_in_which_the_run_began(folder, mddag):
     """The trace is where it was named, and the summary is printed."""
     Path('start').mkdir()

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 import json
 import os
 from pathlib import Path
@@ -14,7 +14,7 @@ import sys
 import time
 from types import SimpleNamespace
 
-from mddag_executor.cli.top import _ticks
+from mddag_executor.cli import top
 from mddag_executor.report.board import Board, GONE_AFTER_S, tables
 from msg_graph import load
 import pytest
@@ -144,13 +144,17 @@ def test_live_in_a_terminal_until_the_user_ends_it(running):
     assert '\x1b[H\x1b[J' in text and 'workers of' in text and 'Traceback' not in text
 
 
-def test_no_process_to_hear(call):
+def test_no_process_to_hear(call, monkeypatch):
     done = call('top', '--once', '--timeout', '300ms')
     assert done.returncode == 2 and done.stdout == ''
     assert done.stderr.startswith('error: /diagnostics: no executor has published its state')
     done = call('top', '--duration', '300ms')
     assert done.returncode == 2
+    with monkeypatch.context() as patch:    # Ctrl-C before
+        patch.setattr(top, '_listening', lambda board: nullcontext(
+            lambda seconds: signal.raise_signal(signal.SIGINT)))
+        assert call('top', '--once') == (0, '', '')
     spent = []
     board = Board()
-    list(_ticks(spent.append, board, 3600 * 10**9, 50_000_000))     # gives up long before an hour
+    list(top._ticks(spent.append, board, 3600 * 10**9, 50_000_000))     # not for an hour
     assert spent
