@@ -24,7 +24,6 @@ incomplete or this program is wrong; ``Judged.differences`` reports it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -85,7 +84,7 @@ class Jobs(NamedTuple):
 
     ``done`` and ``done_order`` have, by job and vertex, the row of the execution that completed
     the vertex (-1: none) and its position in the order of events.  ``ended`` is the position at
-    which the job ended early.
+    which the job ended early, ``until`` when it or the run ended, ns.
     """
 
     number: Ints
@@ -94,6 +93,7 @@ class Jobs(NamedTuple):
     done: npt.NDArray[np.int32]
     done_order: Ints
     ended: Ints
+    until: Ints
 
     def rows_of(self, jobs: Any) -> Ints:
         """Return the rows of jobs; -1 for unknown jobs."""
@@ -154,7 +154,7 @@ class Judged:
             released['job'].copy(), released['release'].copy(), released['order'].copy(),
             np.full((len(released), last - first), -1, dtype=np.int32),
             np.full((len(released), last - first), NEVER),
-            np.full(len(released), NEVER))
+            np.full(len(released), NEVER), np.full(len(released), self._recording.judged_until))
         reason, when = self._given_up(jobs, ends)
         expected = self._expected(dag, jobs)
         duplicates = self._complete(dag, jobs, completing, expected)
@@ -257,6 +257,7 @@ class Judged:
         # the first end of several wins: it is written last
         jobs.ended[row] = ends['order']
         reason[row], when[row] = ends['reason'], ends['time']
+        jobs.until[row] = ends['time']
         return reason, when
 
     def _late_ends(self, jobs: Jobs, ends: Table, ended: Ints) -> None:
@@ -378,7 +379,8 @@ class Judged:
             tally.jobs[dag] = int(self._is_judged(self.jobs[dag].release).sum())
             for end, n in Counter(outcome[over].tolist()).items():
                 tally.ends[dag][end] += n
-        for v, mine in zip(self.tables.sinks, self.by_sink()):
+        for v in self.tables.sinks:
+            mine = self.of_sink(v)
             tally.sinks[v].demoted = demoted[v]
             done = mine['completed'] >= 0
             tally.add_sink(
@@ -390,13 +392,13 @@ class Judged:
                 'kind', 'sink', 'job', 'deadline', 'completed')))
         return tally
 
-    def by_sink(self) -> Iterator[Table]:
-        """Yield the verdicts of each sink, in the order of ``tables.sinks``."""
-        order = np.argsort(self.verdicts['sink'].astype(np.int32), kind='stable')
-        sinks = self.verdicts['sink'][order]
-        for v in self.tables.sinks:
-            begin, end = np.searchsorted(sinks, (v, v + 1))
-            yield pick(self.verdicts, order[begin:end])
+    @cached_property
+    def _by_vertex(self) -> list[Ints]:
+        return rows_by(self.verdicts['sink'].astype(np.int16), len(self.task_set.vertices))
+
+    def of_sink(self, sink: int) -> Table:
+        """Return the verdicts of a sink."""
+        return pick(self.verdicts, self._by_vertex[sink])
 
     def differences(self) -> str | None:
         """

@@ -89,18 +89,19 @@ def test_the_chain_of_a_job_goes_through_what_it_waited_for(trace):
             (0, 10, 12, {}), (1, 12, 14, {}), (2, 12, 15, {'worker': 1}),
             (4, 15, 16, {'leg': 1, 'whole': False, 'worker': 1}), (4, 18, 20, {})):
         trace.run(0, vertex, 0, start, end, **more)
-    # the IMU's callback publishes early, and still runs when its successor has completed
+    # the IMU's coroutine publishes early, and still runs when its successor has completed
     trace.release(1, 0, 30)
-    trace.run(1, 1, 0, 34, 35, ready=33, worker=1)
-    trace.run(1, 0, 0, 31, 60, ready=30)
+    trace.piece(1, 0, 0, 31, 32, ready=30)
+    trace.run(1, 1, 0, 35, 36, ready=34, worker=1)
+    trace.run(1, 0, 0, 33, 60, ready=30)
     dags = replay(trace.end(110)).result()['dags']
     worst = dags['/camera']['sinks']['/fuse:join']['breakdown']['worst']
     assert chain_of(worst) == ['/camera:grab', '/left:detect', '/fuse:join']
     assert (worst['transport_ns'], worst['executing_ns']) == (4 * MS, 6 * MS)
     use = dags['/imu']['sinks']['/imu:use']
-    assert (use['completed'], use['late'], use['response_ns']['max']) == (1, 0, 5 * MS)
+    assert (use['completed'], use['late'], use['response_ns']['max']) == (1, 0, 6 * MS)
     assert {key: time for key, time in use['breakdown']['mean'].items() if time} == {
-        'waiting_ns': 2 * MS, 'executing_ns': 3 * MS}
+        'waiting_ns': 2 * MS, 'executing_ns': 3 * MS, 'suspended_ns': MS}
 
 
 def test_the_first_end_of_the_dispatched_callback_ends_it(trace, monkeypatch):
