@@ -13,15 +13,13 @@ This module imports nothing of ROS.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import statistics
 from typing import Any
 
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
-from mddag_executor.hosting.child import ChildError, CrashError, run_child, Tick
-from msg_graph import GraphError, load
+from mddag_executor.hosting.child import ChildError, CrashError, run_child
 
 OURS = 'rad'
 """The name of this executor."""
@@ -44,7 +42,7 @@ PHASES = ('drawn', 'together')
 """When the topics of a message load are published: at drawn phases, or all in a row."""
 
 PATIENCE_S = 90.0
-"""Allowed time of a process beyond its window and warm-up: discovery and the end."""
+"""Allowed time of a process beyond its window: discovery, warm-up and the end."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class Spec:
 
     :ivar executor: one of ``EXECUTORS``.
     :ivar policy: of this executor; rclpy's have none.
-    :ivar seconds: length of the measured window, after ``warm_up_s``.
+    :ivar seconds: length of the measured window, after ``WARM_UP_S``.
     :ivar seed: of the execution times, or of the phases of the published topics.
     :ivar graph: path of the declaration, for declared loads.
     :ivar utilisation: target to which its execution times are scaled; None: as drawn.
@@ -64,7 +62,6 @@ class Spec:
     :ivar idle: number of additional subscriptions, to topics without publisher.
     :ivar phases: when the topics are published, one of ``PHASES``.
     :ivar scale: factor of the CPU time of the robot's nodes.
-    :ivar process: the declared process to measure; None: all.
     """
 
     load: str
@@ -73,7 +70,6 @@ class Spec:
     workers: int = 7
     seconds: float = 10.0
     seed: int = 0
-    warm_up_s: float = 1.0
     graph: str | None = None
     utilisation: float | None = None
     bodies: str = 'sleep'
@@ -82,7 +78,6 @@ class Spec:
     idle: int = 0
     phases: str = 'drawn'
     scale: float = 1.0
-    process: str | None = None
 
     @property
     def name(self) -> str:
@@ -122,41 +117,6 @@ def parse_executors(text: str, policies: str | None = None) -> list[tuple[str, s
     return found
 
 
-def measure(
-    spec: Spec, tick: Tick | None = None, patience_s: float = PATIENCE_S
-) -> dict[str, Any]:
-    """
-    Make one measurement in a new process; return its figures.
-
-    For a declaration with ``processes:`` each process is a new process, all at the same time.
-
-    :raises CrashError: if the process crashed, did not end and was killed, or gave no result.
-    :raises ChildError: if the measurement cannot be made.
-    """
-    names = _processes(spec)
-    if len(names) > 1:
-        from benchmarks.loads import of_processes
-        with ThreadPoolExecutor(len(names)) as threads:
-            parts = threads.map(lambda name: measure(
-                replace(spec, process=name), tick if name == names[0] else None, patience_s),
-                names)
-            return of_processes(spec, list(parts))
-    figures: dict[str, Any] = run_child(
-        'benchmarks.loads:run', (spec,), spec.name,
-        spec.seconds + spec.warm_up_s + patience_s + spec.idle * 0.05, tick)
-    return figures
-
-
-def _processes(spec: Spec) -> list[str]:
-    """Return the declared processes of a measurement."""
-    if spec.load not in DECLARED or spec.process is not None or spec.graph is None:
-        return []
-    try:
-        return [process.name for process in load(spec.graph).processes]
-    except GraphError as error:
-        raise ChildError(str(error)) from None
-
-
 def run_all(
     specs: Sequence[Spec], repeat: int, tick: Callable[[Spec, int, float], None],
     warn: Callable[[str], None],
@@ -176,7 +136,9 @@ def run_all(
                 tick(spec, made, passed)
 
             try:
-                results.append(measure(spec, report))
+                limit_s = spec.seconds + PATIENCE_S + spec.idle * 0.05
+                results.append(run_child(
+                    'benchmarks.loads:run', (spec,), spec.name, limit_s, report))
             except CrashError as error:
                 warn(str(error))
             made += 1

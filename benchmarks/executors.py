@@ -50,8 +50,7 @@ def make_executor(spec: Spec, task_set: TaskSet | None) -> Executor:
     if spec.executor == OURS:
         # Imported here: the others are measured without this executor in the process.
         from mddag_executor.executor.executor import MultiDeadlineExecutor
-        return MultiDeadlineExecutor(
-            task_set, num_workers=spec.workers, policy=spec.policy, process=spec.process)
+        return MultiDeadlineExecutor(task_set, num_workers=spec.workers, policy=spec.policy)
     if spec.executor == 'multi':
         return MultiThreadedExecutor(spec.workers)
     return {NONE: NoExecutor, 'single': SingleThreadedExecutor, 'events': EventsExecutor}[

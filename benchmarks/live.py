@@ -193,7 +193,7 @@ def make_specs(
 
 
 def _measure(specs: Sequence[Spec], repeat: int) -> list[dict[str, Any]]:
-    each = specs[0].seconds + specs[0].warm_up_s + 2.0
+    each = specs[0].seconds + 3.0  # with discovery and warm-up
     with Progress('measuring', len(specs) * repeat * each) as progress:
         def tick(spec: Spec, made: int, passed: float) -> None:
             note = f'({spec.name}, {made + 1} of {len(specs) * repeat})'

@@ -18,7 +18,7 @@ and *missing* if it was never done.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
 from importlib.util import module_from_spec, spec_from_file_location
 import os
 from pathlib import Path
@@ -31,15 +31,13 @@ from benchmarks.publisher import PublisherProcess
 from mddag_executor.core import quantile
 from mddag_executor.executor import current_job
 from mddag_executor.executor.quiet_nodes import quiet_node
-from mddag_executor.hosting.child import ChildError
 from mddag_executor.hosting.measure import (
     ExecutionPlan,
     judge_sink,
-    Ledger,
     measure,
     Mode,
-    Reading,
     totals,
+    WARM_UP_S,
 )
 from mddag_executor.hosting.peers import run_nodes, UnfinishedSession
 from mddag_executor.hosting.synthetic import no_job, QOS, SyntheticWorkload
@@ -92,89 +90,37 @@ def run(spec: Spec) -> dict[str, Any]:
 
 def run_declared(spec: Spec) -> dict[str, Any]:
     """
-    Run the nodes of a declaration, or of one of its processes, under an executor.
+    Run the nodes of a declaration, in one process, under an executor.
 
-    :return: the figures of ``result_of``; of one process the input of ``of_processes``.
+    :return: the figures of ``measure``, those of important sinks, and latencies.
     """
-    plan = _plan(spec)
-    task_set = plan.task_set
+    assert spec.graph is not None
+    task_set = dataclasses.replace(load(spec.graph), processes=())
+    plan = ExecutionPlan(
+        task_set, spec.seed, spec.utilisation, spec.workers, cast(Mode, spec.bodies))
     executor = make_executor(spec, task_set)
     job_of_thread = current_job if spec.executor == OURS else no_job
-    workload = SyntheticWorkload(
-        task_set, plan, current_job=job_of_thread, process=spec.process)
+    workload = SyntheticWorkload(task_set, plan, current_job=job_of_thread)
     starts: list[Start] = []
     for node in workload.nodes:
         for subscription in node.subscriptions:
             subscription.callback = noting(starts, subscription.callback)
-    run_nodes(executor, workload, spec.seconds, spec.warm_up_s, spin_of(executor))
+    run_nodes(executor, workload, spec.seconds, spin_of(executor))
     # rclpy's EventsExecutor advances a timer before it queues the call, so the due time of a call
     # in a backlog is unknown: only messages are counted there.
     if spec.executor != 'events':
         starts += [start for delays in workload.ledger.delays.values() for start in list(delays)]
     latencies = within(starts, *(reading.at_ns for reading in workload.ledger.window))
-    if spec.process is not None:
-        return {'ledger': vars(workload.ledger), 'latencies': latencies}
-    return result_of(plan, workload.ledger, latencies)
-
-
-def _plan(spec: Spec) -> ExecutionPlan:
-    if spec.graph is None:
-        raise ChildError(f'--load {spec.load}: it needs a declaration: give --graph')
-    return ExecutionPlan(
-        load(spec.graph), spec.seed, spec.utilisation, spec.workers, cast(Mode, spec.bodies))
-
-
-def result_of(plan: ExecutionPlan, ledger: Ledger, latencies: list[int]) -> dict[str, Any]:
-    """Return the figures of ``measure``, those of important sinks, and latencies."""
-    result = measure(ledger, plan)
+    result = measure(workload.ledger, plan)
     important = [
-        result['dags'][dag.name]['sinks'][dag.vertices[i].name] for dag in plan.task_set.dags
+        result['dags'][dag.name]['sinks'][dag.vertices[i].name] for dag in task_set.dags
         for i in dag.sinks if dag.vertices[i].callback.importance == 'high']
     return {
         **{f'important_{name}': sum(sink[name] for sink in important)
            for name in ('due', 'on_time')},
         **result, 'infeasible_sinks': len(plan.infeasible()),
         'dispatch_latency_us': quantiles_us(latencies),
-        'hot_path_us': hot_path(plan.task_set, result)}
-
-
-def of_processes(spec: Spec, parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the figures of a run from the results of its processes."""
-    plan = _plan(spec)
-    return result_of(
-        plan, ledger_of_processes(plan.task_set, [part['ledger'] for part in parts]),
-        [latency for part in parts for latency in part['latencies']])
-
-
-def ledger_of_processes(task_set: TaskSet, parts: Sequence[dict[str, Any]]) -> Ledger:
-    """
-    Return the ledger of a run from those of its processes (``vars``), at least one.
-
-    The window is that in which all of them measured.  The counts of a process in its own window,
-    which is almost the same, are scaled to it.
-    """
-    whole = Ledger(task_set)
-    for part in parts:
-        whole.first_release.update(part['first_release'])
-        for name in ('durations', 'completions', 'delays'):
-            for key, entries in part[name].items():
-                getattr(whole, name)[key].extend(entries)
-        for name in ('misattributed', 'unattributed'):
-            getattr(whole, name).extend(part[name])
-        for name in ('busy_below_ns', 'warm_up_ns'):
-            setattr(whole, name, max(getattr(whole, name), part[name]))
-    windows = [part['window'] for part in parts]
-    begin = max(start.at_ns for start, _ in windows)
-    until = max(begin, min(end.at_ns for _, end in windows))
-    cpu = 0
-    bodies = [0] * len(task_set.vertices)
-    for start, end in windows:
-        share = (until - begin) / max(1, end.at_ns - start.at_ns)
-        cpu += round((end.cpu_ns - start.cpu_ns) * share)
-        for i, (before, after) in enumerate(zip(start.bodies, end.bodies)):
-            bodies[i] += round((after - before) * share)
-    whole.window = Reading(begin, 0, [0] * len(bodies)), Reading(until, cpu, bodies)
-    return whole
+        'hot_path_us': hot_path(task_set, result)}
 
 
 def hot_path(task_set: TaskSet, result: dict[str, Any]) -> dict[str, Any] | None:
@@ -227,7 +173,7 @@ def run_messages(spec: Spec) -> dict[str, Any]:
         session.wait_until_matched(lambda: [
             each.topic_name for each in active if not each.get_publisher_count()])
         publisher.begin()
-        session.wait(spec.warm_up_s)
+        session.wait(WARM_UP_S)
         begin, cpu_begin, dds_begin = _clocks()
         session.wait(spec.seconds)
         end, cpu_end, dds_end = _clocks()
@@ -302,7 +248,7 @@ def run_robot(spec: Spec) -> dict[str, Any]:
         executor.add_node(node)
     session = UnfinishedSession(executor, spin_of(executor))
     with session:
-        ended = session.wait(spec.warm_up_s + 1.0)  # time for discovery
+        ended = session.wait(WARM_UP_S + 1.0)  # time for discovery
         begin, cpu = time.time_ns(), time.process_time_ns()
         ended = ended or session.wait(spec.seconds)
         end, cpu = time.time_ns(), time.process_time_ns() - cpu

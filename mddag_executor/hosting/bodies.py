@@ -20,10 +20,10 @@ Emulate = Callable[[int], None]
 """Executes for this many nanoseconds in the calling thread."""
 
 
-def typical_oversleep_ns(samples: int = 100, asked_ns: int = 300_000) -> int:
+def typical_oversleep_ns() -> int:
     """Measure by how much time.sleep() is typically late on an idle machine: the median, ns."""
-    late = []
-    for _ in range(samples):
+    late, asked_ns = [], 300_000
+    for _ in range(100):
         start = time.monotonic_ns()
         time.sleep(asked_ns / 1e9)
         late.append(time.monotonic_ns() - start - asked_ns)
@@ -37,8 +37,6 @@ def sleeper(oversleep_ns: int) -> Emulate:
     It reduces the argument of time.sleep() by the typical oversleep, so that the mean is right on
     an idle machine.  Shorter times (below about 70 us under Linux, whose timer slack is 50 us) are
     waited busily.  In an overload executions get longer, as those of real callbacks do.
-
-    :param oversleep_ns: the typical oversleep.
     """
     monotonic_ns, sleep = time.monotonic_ns, time.sleep
 
@@ -53,16 +51,11 @@ def sleeper(oversleep_ns: int) -> Emulate:
     return emulate
 
 
-def spinner() -> Emulate:
-    """Make a function that uses this much CPU time of the calling thread."""
-    thread_time_ns = time.thread_time_ns
-
-    def emulate(execution_ns: int) -> None:
-        end = thread_time_ns() + execution_ns
-        while thread_time_ns() < end:
-            pass
-
-    return emulate
+def spin(execution_ns: int) -> None:
+    """Use this much CPU time of the calling thread."""
+    end = time.thread_time_ns() + execution_ns
+    while time.thread_time_ns() < end:
+        pass
 
 
 def native() -> Emulate:
@@ -72,21 +65,19 @@ def native() -> Emulate:
     Its speed is first measured (some milliseconds), and then adapted from recent executions: the
     speed of a virtual machine changes by a tenth.
     """
-    def compute(iterations: int) -> None:
-        hashlib.pbkdf2_hmac('sha256', b'password', b'salt', iterations)
-
-    def taken(iterations: int) -> int:
+    def compute(iterations: int) -> int:
+        """Compute; return the CPU time."""
         before = time.thread_time_ns()
-        compute(iterations)
+        hashlib.pbkdf2_hmac('sha256', b'password', b'salt', iterations)
         return time.thread_time_ns() - before
 
-    few, many = (min(taken(n) for _ in range(5)) for n in (1, 2000))
+    few, many = (min(compute(n) for _ in range(5)) for n in (1, 2000))
     each = max(1, many - few) / 1999
 
     def emulate(execution_ns: int) -> None:
         nonlocal each
         iterations = max(1, round((execution_ns - few) / each))
-        took = taken(iterations)
+        took = compute(iterations)
         if iterations >= 500:
             each += ((took - few) / iterations - each) / 16
 

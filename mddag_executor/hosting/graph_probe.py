@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib import import_module
 import time
@@ -77,13 +78,6 @@ class Seen(Releases):
         self.add(stamp)
         self.published = (number or 0) - self._first_number + 1
 
-    def interval_ns(self, publishers: int = 1) -> int | None:
-        """Return the mean time between two messages; None if there are too few."""
-        count = max(self.count, self.published) if publishers == 1 else self.count
-        if count < _LEAST_MESSAGES or self.last <= self.first:
-            return None
-        return (self.last - self.first) // (count - 1)
-
 
 @dataclass
 class Probe:
@@ -92,13 +86,11 @@ class Probe:
 
     :ivar nodes: endpoints by node.
     :ivar seen: messages by topic.
-    :ivar publishers: number of publishers by topic.
     :ivar warnings: what could not be found out, one line each.
     """
 
     nodes: dict[str, Endpoints] = field(default_factory=dict)
     seen: dict[str, Seen] = field(default_factory=dict)
-    publishers: Counter[str] = field(default_factory=Counter)
     warnings: list[str] = field(default_factory=list)
 
     def warn(self, text: str) -> None:
@@ -106,40 +98,40 @@ class Probe:
         if text not in self.warnings:
             self.warnings.append(text)
 
+    def interval_ns(self, topic: str) -> int | None:
+        """Return the mean time between two messages of a publisher; None if there are too few."""
+        seen = self.seen.get(topic, Seen())
+        n_publishers = sum(topic in node.publishes for node in self.nodes.values())
+        count = max(seen.count, seen.published) if n_publishers == 1 else seen.count
+        if count < _LEAST_MESSAGES or seen.last <= seen.first:
+            return None
+        return n_publishers * (seen.last - seen.first) // (count - 1)
 
-def probe(seconds: float, tick: Callable[[float], None] | None = None) -> Probe:
+
+def probe(seconds: float, tick: Callable[[float], None] = lambda _: None) -> Probe:
     """
     Inspect the ROS graph of this domain.
 
     :param seconds: duration; most of it is spent on measuring rates.
     :param tick: called repeatedly with the elapsed seconds.
     """
-    context = Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = quiet_node('_mddag_graph_probe', context)
-        try:
-            return _look(node, context, seconds, tick or (lambda _: None))
-        finally:
-            node.destroy_node()
-    finally:
-        try_shutdown(context=context)
-
-
-def _look(node: Node, context: Context, seconds: float, tick: Callable[[float], None]) -> Probe:
-    begin = time.monotonic()
-    found = Probe()
+    found, context = Probe(), Context()
     subscriptions: list[tuple[Any, Seen]] = []
-    looked = begin - _STEP_S
-    while (now := time.monotonic()) < begin + seconds:
-        if now - looked >= _STEP_S:
-            looked = now
-            _nodes(node, found)
-            subscriptions += _listen(node, found)
-        for subscription, seen in subscriptions:
-            _take(subscription, seen)
-        tick(now - begin)
-        time.sleep(min(_POLL_S, max(0.0, begin + seconds - time.monotonic())))
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    with ExitStack() as stack:
+        stack.callback(try_shutdown, context=context)
+        node = quiet_node('_mddag_graph_probe', context)
+        stack.callback(node.destroy_node)
+        begin = next_look = time.monotonic()
+        while (now := time.monotonic()) < begin + seconds:
+            if now >= next_look:
+                next_look = now + _STEP_S
+                _find_nodes(node, found)
+                subscriptions += _listen(node, found)
+            for subscription, seen in subscriptions:
+                _take(subscription, seen)
+            tick(now - begin)
+            time.sleep(min(_POLL_S, max(0.0, begin + seconds - time.monotonic())))
     return found
 
 
@@ -156,7 +148,7 @@ def _take(subscription: Any, seen: Seen) -> None:
                          about['publication_sequence_number'])
 
 
-def _nodes(node: Node, found: Probe) -> None:
+def _find_nodes(node: Node, found: Probe) -> None:
     """Add the nodes, with their topics and services."""
     names = [f'{namespace.rstrip("/")}/{name}'
              for name, namespace in node.get_node_names_and_namespaces()
@@ -182,8 +174,6 @@ def _nodes(node: Node, found: Probe) -> None:
                 continue
             target.update((each, types[0]) for each, types in listed
                           if types and not is_background(each, full) and kind.fits(each))
-    found.publishers = Counter(
-        topic for endpoints in found.nodes.values() for topic in endpoints.publishes)
 
 
 def _listen(node: Node, found: Probe) -> list[tuple[Any, Seen]]:
@@ -194,17 +184,15 @@ def _listen(node: Node, found: Probe) -> list[tuple[Any, Seen]]:
              if not (endpoints.subscribes or endpoints.serves)
              for topic, kind in endpoints.publishes.items()}
     subscriptions = []
-    for topic, kind in sorted(types.items()):
-        if topic in found.seen:
-            continue
+    for topic in sorted(types.keys() - found.seen.keys()):
         seen = found.seen[topic] = Seen()
         try:
             subscription = node.create_subscription(
-                _message_type(kind), topic, lambda _: None, qos, raw=True,
+                _message_type(types[topic]), topic, lambda _: None, qos, raw=True,
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
         except Exception as error:  # any error of the import of the type's package
-            found.warn(
-                f'{topic}: its rate is not known: its type {kind} cannot be used here ({error})')
+            found.warn(f'{topic}: its rate is not known: its type {types[topic]} cannot be used '
+                       f'here ({error})')
         else:
             subscriptions.append((subscription, seen))
     return subscriptions
@@ -225,14 +213,11 @@ def draft_of(found: Probe) -> Draft:
         starts = [*(('subscription', topic) for topic in sorted(endpoints.subscribes)),
                   *(('service', service) for service in sorted(endpoints.serves))]
         published = sorted(endpoints.publishes)
-        callbacks = [DraftCallback(name, f'callback_{i}', kind, [start], maybe=list(published))
+        callbacks = [DraftCallback(name, f'callback_{i}', kind, [start], maybe=[*published])
                      for i, (kind, start) in enumerate(starts)]
         if not callbacks:
-            intervals = [interval * found.publishers[topic] for topic in published
-                         if topic in found.seen and (interval := found.seen[topic].interval_ns(
-                             found.publishers[topic])) is not None]
-            callbacks = [DraftCallback(
-                name, 'callback_0', 'timer', publishes=published,
-                interval_ns=min(intervals, default=None))]
+            intervals = filter(None, map(found.interval_ns, published))
+            callbacks = [DraftCallback(name, 'callback_0', 'timer', publishes=published,
+                                       interval_ns=min(intervals, default=None))]
         nodes.append(DraftNode(name, {callback.name: callback for callback in callbacks}))
     return Draft('the nodes that ran', nodes)

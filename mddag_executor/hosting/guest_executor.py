@@ -43,14 +43,12 @@ class GuestExecutor:
 
     host: Host
     guest: Guest | None
-    is_global: bool
+    is_global = False
     _changed: threading.Condition
     _errors: deque[BaseException]
-    _has_spun: bool
-    _is_stopped: bool
-    _turns: int  # callbacks that have run since the last spin
-    _n_stepping: int
-    _n_spinning: int
+    _has_spun = _is_stopped = False
+    _turns = 0  # callbacks that have run since the last spin
+    _n_stepping = _n_spinning = 0
 
     @property
     def is_spinning(self) -> bool:
@@ -180,11 +178,8 @@ class GuestExecutor:
 def make_guest(executor: Any, host: Host, guest: Guest | None) -> None:
     """Make a ``GuestExecutor`` of an executor."""
     executor.__class__ = _guest_class(executor.__class__)
-    executor.host, executor.guest, executor.is_global = host, guest, False
-    executor._changed = threading.Condition()
-    executor._errors = deque()
-    executor._has_spun = executor._is_stopped = False
-    executor._turns = executor._n_stepping = executor._n_spinning = 0
+    executor.host, executor.guest = host, guest
+    executor._changed, executor._errors = threading.Condition(), deque()
 
 
 @cache

@@ -30,7 +30,7 @@ not complete the join are not counted as callbacks: their cost is overhead.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 import random
 import time
 from typing import Any, Literal, NamedTuple
@@ -46,6 +46,8 @@ Body = Literal['sleep', 'spin', 'native']
 Mode = Literal[Body, 'mixed']
 BODIES: tuple[Body, ...] = ('sleep', 'spin', 'native')
 
+WARM_UP_S = 1.0
+"""The time from the start of the nodes to the window."""
 MOST_MEASURED_S = 600.0
 """The longest window; a longer run goes on without being measured."""
 _EARLY_NS = 1_000_000
@@ -73,12 +75,8 @@ class ExecutionPlan:
     """
 
     def __init__(
-        self,
-        task_set: TaskSet,
-        seed: int = 0,
-        utilisation: float | None = None,
-        workers: int = 7,
-        mode: Mode = 'sleep',
+        self, task_set: TaskSet, seed: int = 0, utilisation: float | None = None,
+        workers: int = 7, mode: Mode = 'sleep',
     ) -> None:
         self.seed = seed
         self.workers = workers
@@ -148,7 +146,6 @@ class Ledger:
         self.first_release: dict[str, int] = {}
         self.is_open = False
         self.window = Reading(0, 0, ()), Reading(0, 0, ())
-        self.warm_up_ns = 0
         self.clock_offset_ns = epoch_offset_ns()
         #: Executions up to this long were emulated busily, longer ones by sleep.
         self.busy_below_ns = 0
@@ -160,12 +157,14 @@ class Ledger:
         if self.is_open:
             entries.append(entry)
 
+    def now(self) -> int:
+        """Return the time, ns since the epoch."""
+        return time.monotonic_ns() + self.clock_offset_ns
+
     def reading(self) -> Reading:
         """Read the counters now."""
-        return Reading(
-            at_ns=time.monotonic_ns() + self.clock_offset_ns,
-            cpu_ns=time.process_time_ns(),
-            bodies=[len(durations) for durations in self.durations.values()])
+        return Reading(self.now(), time.process_time_ns(),
+                       [len(durations) for durations in self.durations.values()])
 
 
 def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:
@@ -180,13 +179,12 @@ def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:
     dags = {dag.name: {'sinks': {
         vertex.name: _judge(ledger, dag, vertex, start.at_ns, end.at_ns)
         for vertex in (dag.vertices[sink] for sink in dag.sinks)}} for dag in plan.task_set.dags}
-    sums = totals(sink for dag in dags.values() for sink in dag['sinks'].values())
+    sums = totals([sink for dag in dags.values() for sink in dag['sinks'].values()])
     due = sums['sink_jobs_due']
     return {
         'mode': plan.mode, 'seed': plan.seed, 'workers': plan.workers,
         'utilisation': plan.utilisation, 'utilisation_taken': _taken(ledger, plan),
-        'window_ns': end.at_ns - start.at_ns,
-        'warm_up_ns': ledger.warm_up_ns, **sums,
+        'window_ns': end.at_ns - start.at_ns, 'warm_up_ns': round(WARM_UP_S * 1e9), **sums,
         'on_time_ratio': sums['on_time'] / due if due else None,
         **_throughput(ledger, plan, start, end),
         'attribution': {
@@ -194,13 +192,10 @@ def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:
         'dags': dags}
 
 
-def totals(sinks: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+def totals(sinks: Collection[Mapping[str, Any]]) -> dict[str, int]:
     """Return the sums of ``judge_sink``."""
-    sums = dict.fromkeys(('sink_jobs_due', 'on_time', 'late', 'missing'), 0)
-    for sink in sinks:
-        for name in sums:
-            sums[name] += sink['due' if name == 'sink_jobs_due' else name]
-    return sums
+    names = {'sink_jobs_due': 'due', 'on_time': 'on_time', 'late': 'late', 'missing': 'missing'}
+    return {name: sum(sink[key] for sink in sinks) for name, key in names.items()}
 
 
 def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> dict[str, Any]:
@@ -236,17 +231,16 @@ def _throughput(
 ) -> dict[str, Any]:
     counts = [after - before for before, after in zip(start.bodies, end.bodies)]
     callbacks = sum(counts)
-    cpu = end.cpu_ns - start.cpu_ns
     # CPU time of the emulation itself is execution, not overhead.
-    cpu -= sum(
+    emulation = sum(
         count * planned for vertex, count in zip(plan.task_set.vertices, counts)
         if (planned := plan.execution_ns(vertex)) <= ledger.busy_below_ns
         or plan.body(vertex) != 'sleep')
-    seconds = (end.at_ns - start.at_ns) / 1e9
+    cpu_us = max(0, end.cpu_ns - start.cpu_ns - emulation) / 1000
     return {
         'callbacks': callbacks,
-        'callbacks_per_s': callbacks / seconds,
-        'cpu_us_per_callback': max(0, cpu) / 1000 / callbacks if callbacks else None}
+        'callbacks_per_s': callbacks / ((end.at_ns - start.at_ns) / 1e9),
+        'cpu_us_per_callback': cpu_us / callbacks if callbacks else None}
 
 
 def _taken(ledger: Ledger, plan: ExecutionPlan) -> float:
@@ -257,7 +251,6 @@ def _taken(ledger: Ledger, plan: ExecutionPlan) -> float:
     """
     total = 0.0
     for vertex in plan.task_set.vertices:
-        durations = ledger.durations[vertex.name]
-        mean = sum(durations) / len(durations) if durations else plan.execution_ns(vertex)
-        total += mean / plan.task_set.dags[vertex.dag].period_ns
+        durations = ledger.durations[vertex.name] or [plan.execution_ns(vertex)]
+        total += sum(durations) / len(durations) / plan.task_set.dags[vertex.dag].period_ns
     return total / plan.workers

@@ -17,14 +17,14 @@ from typing import Any
 from mddag_executor.hosting.child import ChildError, run_child, Tick
 from mddag_executor.hosting.measure import ExecutionPlan, measure
 from mddag_executor.hosting.session import Session
-from mddag_executor.hosting.synthetic import SyntheticWorkload, WARM_UP_S
+from mddag_executor.hosting.synthetic import SyntheticWorkload
 from msg_graph import load
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 PATIENCE_S = 90.0
-"""The time of a process in addition to its window and warm-up: discovery and the end."""
+"""The time of a process in addition to its window: discovery, warm-up and the end."""
 
 
 class UnfinishedSession(Session):
@@ -49,7 +49,7 @@ class UnfinishedSession(Session):
 
 
 def run_nodes(
-    executor: Executor, workload: SyntheticWorkload, seconds: float, warm_up_s: float = WARM_UP_S,
+    executor: Executor, workload: SyntheticWorkload, seconds: float,
     spin: Callable[[], None] | None = None,
 ) -> None:
     """Run synthetic nodes under any executor; their measurements are in their ledger."""
@@ -60,7 +60,7 @@ def run_nodes(
     gc.collect()
     gc.freeze()
     with session:
-        measured = workload.run(session, seconds, warm_up_s=warm_up_s)
+        measured = workload.run(session, seconds)
     session.check(measured)
 
 
@@ -78,7 +78,7 @@ def measure_peer(
     plan = ExecutionPlan(load(graph), seed, utilisation, workers)
     figures: dict[str, Any] = run_child(
         f'{__name__}:run', (plan, seconds), 'MultiThreadedExecutor',
-        seconds + WARM_UP_S + PATIENCE_S, tick)
+        seconds + PATIENCE_S, tick)
     return figures
 
 

@@ -35,26 +35,26 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+import math
 import threading
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of
 from mddag_executor.executor.jobs import header_stamp
 from mddag_executor.executor.listeners import NextCall
 from mddag_executor.executor.quiet_nodes import quiet_node
-from mddag_executor.hosting.bodies import (
-    Emulate,
-    native,
-    sleeper,
-    spinner,
-    typical_oversleep_ns,
-)
+from mddag_executor.hosting.bodies import Emulate, native, sleeper, spin, typical_oversleep_ns
 from mddag_executor.hosting.child import Tick
-from mddag_executor.hosting.measure import Body, ExecutionPlan, Ledger, MOST_MEASURED_S
+from mddag_executor.hosting.measure import (
+    Body,
+    ExecutionPlan,
+    Ledger,
+    MOST_MEASURED_S,
+    WARM_UP_S,
+)
 from mddag_executor.hosting.session import Session
-from msg_graph import Callback, TaskSet, Vertex
+from msg_graph import Callback, Dag, TaskSet, Vertex
 from rcl_interfaces.srv import ListParameters
 from rclpy.callback_groups import (
     CallbackGroup,
@@ -73,7 +73,6 @@ from std_msgs.msg import Header
 QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=10)
 SENSORS_NODE = '/mddag_sensors'
-WARM_UP_S = 1.0
 JOIN_LIMIT = 64
 """How many incomplete joins a sync vertex keeps."""
 SENSOR = '#sensor '
@@ -97,53 +96,52 @@ def stamped(release: int, sender: str = '') -> Header:
     return message
 
 
-@dataclass(eq=False)
 class Role:
     """
     A callback as one vertex, and its actions for a message of that DAG.
 
     :ivar senders: the ``frame_id`` of the messages that it waits for.
-    :ivar n_legs: of a sync the number of messages that it joins.
-    :ivar sender: the ``frame_id`` of the messages that it publishes.
-    :ivar waiting: of a sync the incomplete joins: the received messages (topic and sender), by
-        release.
     """
 
-    vertex: Vertex
-    senders: list[str]
-    n_legs: int
-    sender: str
-    execution_ns: int
-    publishers: list[Publisher]
-    emulate: Emulate
-    ledger: Ledger
-    waiting: dict[int, set[tuple[str, str]]] = field(default_factory=dict)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    def __init__(
+        self, vertex: Vertex, dag: Dag, execution_ns: int, emulate: Emulate,
+        publishers: list[Publisher], ledger: Ledger,
+    ) -> None:
+        self.vertex = vertex
+        self.senders = [f'{dag.name}#{index}' for index in vertex.predecessors] or [
+            SENSOR + topic for topic in vertex.callback.topics]
+        self._sender = f'{dag.name}#{vertex.index}'
+        self._execution_ns, self._emulate = execution_ns, emulate
+        self._publishers = publishers
+        self._ledger = ledger
+        self._n_legs = len(legs_of(vertex, dag.vertices))
+        # incomplete joins of a sync: the received messages (topic and sender), by release
+        self._waiting: dict[int, set[tuple[str, str]]] = {}
+        self._lock = threading.Lock()
 
     def is_whole(self, release: int, leg: tuple[str, str]) -> bool:
         """Note a message of a sync; return whether it was the last one of its job."""
         with self._lock:
-            seen = self.waiting.setdefault(release, set())
+            seen = self._waiting.setdefault(release, set())
             seen.add(leg)
-            if len(seen) == self.n_legs:
-                del self.waiting[release]
+            if len(seen) == self._n_legs:
+                del self._waiting[release]
                 return True
-            if len(self.waiting) > JOIN_LIMIT:
-                del self.waiting[next(iter(self.waiting))]
+            if len(self._waiting) > JOIN_LIMIT:
+                del self._waiting[next(iter(self._waiting))]
             return False
 
     def execute(self, message: Header, release: int) -> None:
         """Execute the body, publish, and note the completion of a sink."""
-        ledger, name = self.ledger, self.vertex.name
+        ledger, name = self._ledger, self.vertex.name
         start = time.monotonic_ns()
-        self.emulate(self.execution_ns)
+        self._emulate(self._execution_ns)
         ledger.note(ledger.durations[name], time.monotonic_ns() - start)
-        message.frame_id = self.sender
-        for publisher in self.publishers:
+        message.frame_id = self._sender
+        for publisher in self._publishers:
             publisher.publish(message)
         if name in ledger.completions:
-            ledger.note(ledger.completions[name], (
-                release, time.monotonic_ns() + ledger.clock_offset_ns))
+            ledger.note(ledger.completions[name], (release, ledger.now()))
 
 
 class Grid:
@@ -207,8 +205,7 @@ def callback_of(
     return on_message
 
 
-@dataclass
-class Sensor:
+class Sensor(NamedTuple):
     """Stand-in for the senders of messages and requests to sources that are no timers."""
 
     dags: list[str]
@@ -243,19 +240,16 @@ class SyntheticWorkload:
         self._process = process
         self._current_job = current_job
         self._context = context
-        self._emulate: dict[Body, Emulate] = {}
+        self._emulate: dict[Body, Emulate] = {'spin': spin}
         bodies = {plan.body(v) for v in task_set.vertices if self._is_here(v.callback.node)}
         if 'sleep' in bodies:
             self.ledger.busy_below_ns = typical_oversleep_ns()  # takes 30 ms
             self._emulate['sleep'] = sleeper(self.ledger.busy_below_ns)
-        if 'spin' in bodies:
-            self._emulate['spin'] = spinner()
         if 'native' in bodies:
             self._emulate['native'] = native()
         # Timers on the steady clock: steps of the system clock move no release.
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._nodes: dict[str, Node] = {}
-        self._sensor_node: Node | None = None
         self._n_subscribers = Counter(t for c in task_set.callbacks for t in c.topics)
         self._n_publishers = Counter(
             t for _, t in {(c.node, t) for c in task_set.callbacks for t in c.publishes})
@@ -264,13 +258,14 @@ class SyntheticWorkload:
             self._vertices.setdefault(vertex.callback.key, []).append(vertex)
         self.timers: dict[str, Timer] = {}
         self._grids: dict[str, Grid] = {}
-        self._sensors: dict[str, Sensor] = {}
-        self._sensor_thread: threading.Thread | None = None
+        self._sensor_nodes: list[Node] = []
+        self._sensor_thread = threading.Thread(
+            target=self._run_sensors, name='mddag_sensors', daemon=True)
         self._stop = threading.Event()
         for name in dict.fromkeys(callback.node for callback in task_set.callbacks):
             if self._is_here(name):
                 self.make(name)
-        self._add_sensors()
+        self._sensors = self._make_sensors()
 
     @property
     def nodes(self) -> list[Node]:
@@ -279,49 +274,42 @@ class SyntheticWorkload:
 
     def run(
         self, session: Session, duration_s: float | None, tick: Tick | None = None,
-        warm_up_s: float = WARM_UP_S,
         begin: Callable[[Session, Callable[[], list[str]]], object] = Session.wait_until_matched,
     ) -> bool:
         """
         Run in a session that spins already, and end the session.
 
-        :param duration_s: how long after ``warm_up_s``; None: until the session is stopped.  The
+        :param duration_s: how long after ``WARM_UP_S``; None: until the session is stopped.  The
             measured window ends after ``MOST_MEASURED_S`` at the latest.
         :param begin: waits until publishers and subscriptions have discovered each other, and for
             other processes.
         :return: whether there is a window: the run was not stopped before it began.
         :raises mddag_executor.hosting.session.SessionError: when discovery fails.
         """
-        ledger, was_measured = self.ledger, False
-        ledger.warm_up_ns = round(warm_up_s * 1e9)
-        ledger.is_open = True
+        self.ledger.is_open = True
         try:
             executors: Callable[[], list[str]] = getattr(session.executor, 'unmatched', list)
             begin(session, lambda: self.unmatched() + executors())
-            if not session.stopped:
-                self.start(session.executor.wake)
-                if not session.wait(warm_up_s):
-                    self._measure(session, duration_s, tick)
-                    was_measured = True
+            if session.stopped:
+                return False
+            self.start(session.executor.wake)
+            if session.wait(WARM_UP_S):
+                return False
+            self._measure(session, math.inf if duration_s is None else duration_s, tick)
+            return True
         finally:
             self.stop()
             session.end()
-        return was_measured
 
-    def _measure(self, session: Session, duration_s: float | None, tick: Tick | None) -> None:
+    def _measure(self, session: Session, seconds: float, tick: Tick | None) -> None:
         ledger = self.ledger
         start = ledger.reading()
-
-        def watch(passed: float) -> None:
-            if passed > MOST_MEASURED_S and ledger.is_open:
-                ledger.window = start, ledger.reading()
-                ledger.is_open = False
-            if tick is not None:
-                tick(passed)
-
-        session.wait(duration_s, watch)
-        if ledger.is_open:
-            ledger.window = start, ledger.reading()
+        is_over = session.wait(min(seconds, MOST_MEASURED_S), tick)
+        ledger.window = start, ledger.reading()
+        if seconds > MOST_MEASURED_S and not is_over:
+            ledger.is_open = False
+            session.wait(seconds - MOST_MEASURED_S,
+                         tick and (lambda passed: tick(MOST_MEASURED_S + passed)))
 
     def unmatched(self) -> list[str]:
         """Return the topics whose publishers and subscriptions have not discovered each other."""
@@ -336,7 +324,7 @@ class SyntheticWorkload:
         return sorted(found)
 
     def _all_nodes(self) -> list[Node]:
-        return [*self.nodes, *([] if self._sensor_node is None else [self._sensor_node])]
+        return [*self.nodes, *self._sensor_nodes]
 
     def start(self, wake: Callable[[], None]) -> None:
         """
@@ -348,13 +336,10 @@ class SyntheticWorkload:
         for dag in self.timers:
             self.start_timer(dag)
         wake()
+        begin = self.ledger.now() + _LEAD_NS
+        for sensor in self._sensors:
+            self.ledger.first_release.update(dict.fromkeys(sensor.dags, begin + sensor.period_ns))
         if self._sensors:
-            now = time.monotonic_ns() + self.ledger.clock_offset_ns
-            for sensor in self._sensors.values():
-                for dag in sensor.dags:
-                    self.ledger.first_release[dag] = now + _LEAD_NS + sensor.period_ns
-            self._sensor_thread = threading.Thread(
-                target=self._run_sensors, name='mddag_sensors', daemon=True)
             self._sensor_thread.start()
 
     def start_timer(self, dag: str) -> None:
@@ -363,13 +348,13 @@ class SyntheticWorkload:
 
     def stop(self) -> None:
         """
-        Stop the sensors and the threads that wait for the start.
+        Stop the sensors.
 
         Timers continue: rclpy's executors raise when a timer is cancelled that they are about to
         call.  They end with the executor.
         """
         self._stop.set()
-        if self._sensor_thread is not None:
+        if self._sensor_thread.is_alive():
             self._sensor_thread.join()
 
     def destroy(self) -> None:
@@ -378,16 +363,14 @@ class SyntheticWorkload:
             node.destroy_node()
 
     def _run_sensors(self) -> None:
-        sensors = list(self._sensors.values())
-        first = self.ledger.first_release
-        due = [(first[sensor.dags[0]], i) for i, sensor in enumerate(sensors)]
+        due = [(self.ledger.first_release[sensor.dags[0]], index)
+               for index, sensor in enumerate(self._sensors)]
         while True:
             release, index = min(due)
-            left = release - self.ledger.clock_offset_ns - time.monotonic_ns()
-            if self._stop.wait(max(0, left) / 1e9):
+            if self._stop.wait(max(0, release - self.ledger.now()) / 1e9):
                 return
-            sensors[index].send(release)
-            due[index] = (release + sensors[index].period_ns, index)
+            self._sensors[index].send(release)
+            due[index] = (release + self._sensors[index].period_ns, index)
 
     def make(self, name: str) -> Node:
         """Make a declared node with its entities, perhaps again; its timers have not started."""
@@ -400,7 +383,10 @@ class SyntheticWorkload:
             kind = MutuallyExclusiveCallbackGroup if callback.group else ReentrantCallbackGroup
             group = groups.setdefault(callback.group or '', kind())
             publishers = [by_topic[topic] for topic in callback.publishes]
-            roles = [self._role(v, publishers) for v in self._vertices.get(callback.key, ())]
+            roles = [
+                Role(vertex, self.task_set.dags[vertex.dag], self.plan.execution_ns(vertex),
+                     self._emulate[self.plan.body(vertex)], publishers, self.ledger)
+                for vertex in self._vertices.get(callback.key, ())]
             if callback.kind == 'timer':
                 self._add_timer(node, group, callback, roles[0])
             elif callback.kind == 'service':
@@ -414,28 +400,16 @@ class SyntheticWorkload:
     def _dag(self, vertex: Vertex) -> str:
         return self.task_set.dags[vertex.dag].name
 
-    def _role(self, vertex: Vertex, publishers: list[Publisher]) -> Role:
-        name = self._dag(vertex)
-        senders = [f'{name}#{index}' for index in vertex.predecessors]
-        return Role(
-            vertex, senders or [SENSOR + topic for topic in vertex.callback.topics],
-            len(legs_of(vertex, self.task_set.dags[vertex.dag].vertices)),
-            f'{name}#{vertex.index}', self.plan.execution_ns(vertex),
-            publishers, self._emulate[self.plan.body(vertex)], self.ledger)
-
     def _add_timer(
         self, node: Node, group: CallbackGroup, callback: Callback, role: Role
     ) -> None:
-        dag = self._dag(role.vertex)
-        current_job = self._current_job
-        ledger = self.ledger
-        offset, delays = ledger.clock_offset_ns, ledger.delays[dag]
+        dag, ledger, current_job = self._dag(role.vertex), self.ledger, self._current_job
 
         def on_timer() -> None:
-            start = time.monotonic_ns() + offset
+            start = ledger.now()
             job = current_job()
             release = grid.release() if job is None else job.release_ns
-            ledger.note(delays, (start, start - release))
+            ledger.note(ledger.delays[dag], (start, start - release))
             role.execute(stamped(release), release)
 
         timer = node.create_timer(
@@ -444,17 +418,15 @@ class SyntheticWorkload:
         # Once more, exactly: seconds as a float may lose a nanosecond.
         timer.timer_period_ns = callback.timer_period_ns or 0
         self.timers[dag] = timer
-        grid = self._grids[dag] = Grid(timer, offset)
+        grid = self._grids[dag] = Grid(timer, ledger.clock_offset_ns)
 
     def _add_service(
         self, node: Node, group: CallbackGroup, callback: Callback, role: Role
     ) -> None:
-        current_job = self._current_job
-
         def on_request(
             request: ListParameters.Request, response: ListParameters.Response
         ) -> ListParameters.Response:
-            job = current_job()
+            job = self._current_job()
             release = request.depth if job is None else job.release_ns
             role.execute(stamped(release), release)
             return response
@@ -465,28 +437,28 @@ class SyntheticWorkload:
     def _is_here(self, node: str) -> bool:
         return self._process in (None, self.task_set.process_of(node))
 
-    def _add_sensors(self) -> None:
+    def _make_sensors(self) -> list[Sensor]:
         """Make the senders for DAGs whose sources are no timers."""
-        first: dict[str, Callback] = {}
+        sources: dict[str, list[Vertex]] = {}
         for vertex in self.task_set.vertices:
-            if vertex.predecessors or vertex.callback.kind == 'timer':
-                continue
+            if not vertex.predecessors and vertex.callback.kind != 'timer':
+                start = vertex.callback.service or vertex.callback.topics[0]
+                sources.setdefault(start, []).append(vertex)
+        sensors = []
+        for start, vertices in sources.items():
+            self._n_publishers[start] += 1
             # One message on a topic releases all DAGs with a source on it, in other processes,
             # too.
-            start = vertex.callback.service or vertex.callback.topics[0]
-            self._n_publishers[start] += start not in first
-            if not self._is_here(first.setdefault(start, vertex.callback).node):
-                continue
-            if self._sensor_node is None:
-                self._sensor_node = quiet_node(SENSORS_NODE, self._context)
-            period = vertex.callback.period_ns or 0
-            if start not in self._sensors:
-                make = requests_to if vertex.callback.service else messages_to
-                self._sensors[start] = Sensor([], period, make(self._sensor_node, start))
-            sensor = self._sensors[start]
-            # The shorter of two periods applies.
-            sensor.period_ns = min(sensor.period_ns, period)
-            sensor.dags.append(self._dag(vertex))
+            callback = vertices[0].callback
+            if self._is_here(callback.node):
+                if not self._sensor_nodes:
+                    self._sensor_nodes.append(quiet_node(SENSORS_NODE, self._context))
+                make = requests_to if callback.service else messages_to
+                sensors.append(Sensor(
+                    [self._dag(vertex) for vertex in vertices],
+                    min(vertex.callback.period_ns or 0 for vertex in vertices),
+                    make(self._sensor_nodes[0], start)))
+        return sensors
 
 
 def messages_to(node: Node, topic: str) -> Callable[[int], None]:

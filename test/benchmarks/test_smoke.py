@@ -8,8 +8,6 @@ from pathlib import Path
 import subprocess
 import sys
 
-from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Reading
-from msg_graph import loads
 import pytest
 
 TOP = Path(__file__).resolve().parent.parent.parent
@@ -98,26 +96,3 @@ def test_a_wrong_command_line_is_one_line():
     assert done.stderr == (
         "error: --executors: 'rad-events' is unknown: give some of rad, single, multi, events, "
         'none\n')
-
-
-def test_the_ledgers_of_several_processes_are_that_of_one_run():
-    """A source from 100 to 300 ms, and its sink, of whose jobs some are late, from 150."""
-    task_set = loads("""
-mddag: 1
-nodes:
-  - {node: /a, callbacks: [{name: t, timer: 10ms, publishes: [/x], execution_time: 1ms}]}
-  - {node: /b, callbacks: [{name: s, subscription: /x, deadline: 5ms, execution_time: 1ms}]}
-""")
-    ms = 1_000_000
-    source, sink = Ledger(task_set), Ledger(task_set)
-    source.first_release['/a'] = 0
-    source.durations['/a:t'] = sink.durations['/b:s'] = [ms] * 40
-    sink.completions['/b:s'] = [(10 * ms * job, (10 * job + job % 8) * ms) for job in range(40)]
-    source.window = Reading(100 * ms, 0, (0, 0)), Reading(300 * ms, 8 * ms, (20, 0))
-    sink.window = Reading(150 * ms, 0, (0, 0)), Reading(350 * ms, 8 * ms, (0, 20))
-    from benchmarks.loads import ledger_of_processes
-    whole = ledger_of_processes(task_set, [vars(source), vars(sink)])
-    assert [reading.at_ns for reading in whole.window] == [150 * ms, 300 * ms]
-    result = measure(whole, ExecutionPlan(task_set, mode='spin'))
-    assert (result['sink_jobs_due'], result['on_time'], result['missing']) == (15, 12, 0)
-    assert (result['callbacks'], result['callbacks_per_s']) == (30, 200.0)

@@ -7,7 +7,7 @@ import time
 
 from mddag_executor.executor import current_job
 from mddag_executor.executor.executor import MultiDeadlineExecutor
-from mddag_executor.hosting.bodies import spinner
+from mddag_executor.hosting.bodies import spin
 from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Reading
 from mddag_executor.hosting.session import Session
 from mddag_executor.hosting.synthetic import SyntheticWorkload
@@ -83,15 +83,13 @@ nodes:
 
 
 def test_spinning_takes_cpu_of_its_own_thread_only():
-    emulate = spinner()
-
-    def spin(_):
+    def measured(_):
         start = time.thread_time_ns()
-        emulate(30 * MS)
+        spin(30 * MS)
         return time.thread_time_ns() - start
 
     with ThreadPoolExecutor(3) as pool:
-        assert min(pool.map(spin, range(3))) >= 30 * MS
+        assert min(pool.map(measured, range(3))) >= 30 * MS
 
 
 def test_nodes_have_exactly_what_is_declared(task_set, ros_context):
@@ -141,7 +139,7 @@ def test_every_release_reaches_every_sink(task_set, ros_context, monkeypatch):
                       for each in lists.values()])
 
     with Session(executor) as session:
-        assert workload.run(session, 2.3, tick, warm_up_s=0.5)
+        assert workload.run(session, 2.3, tick)
     assert session.error is None and session.clean
     assert sizes[-1] == sizes[-2] and max(sizes[0]) > 5
     result = measure(ledger, workload.plan)
