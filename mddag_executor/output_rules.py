@@ -130,6 +130,12 @@ def is_special(path: str) -> bool:
         return False
 
 
+def remove_recording(path: str) -> None:
+    """Remove what a run has recorded that could not begin (rule 4)."""
+    if os.path.isfile(path):
+        os.unlink(path)
+
+
 def is_recording(path: str) -> bool:
     """Return whether a file holds a recording, or is named like one: it may be damaged."""
     if path.lower().endswith(_ENDINGS):

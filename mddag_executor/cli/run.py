@@ -35,7 +35,7 @@ from mddag_executor.cli import common, options, verdicts
 from mddag_executor.cli.main import SAME_SIGNAL_S
 from mddag_executor.cli.text import Progress, warn
 from mddag_executor.errors import MddagError, UsageError, UserCodeError
-from mddag_executor.output_rules import is_special
+from mddag_executor.output_rules import remove_recording
 from mddag_executor.report.live_runs import live_lines
 from mddag_executor.report.text import listed
 from msg_graph import loads, NO_GRAPH
@@ -198,8 +198,8 @@ def run_here(
             with redirect_stdout(output):
                 return _run(args, task_set, executor, host, programs, plan, signals)
         except MddagError:
-            if trace is not None and not is_special(str(trace)):     # nothing ran
-                trace.unlink(missing_ok=True)
+            if trace is not None:  # nothing ran: leave no empty trace behind
+                remove_recording(str(trace))
             raise
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import subprocess
 import sys
 import tempfile
+import time
 from typing import Any
 
 from mddag_executor import defaults
@@ -24,6 +25,7 @@ from mddag_executor.cli.main import EXIT_DEFECT
 from mddag_executor.cli.run import incomplete, Signals, warn_of
 from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
+from mddag_executor.output_rules import remove_recording
 from mddag_executor.report.live_runs import live_lines
 from msg_graph import TaskSet
 from msg_graph.edit import load_processes, with_processes
@@ -48,7 +50,14 @@ def with_declared(args: argparse.Namespace, task_set: TaskSet) -> TaskSet:
 def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     """Run nodes in several processes until the run ends, and print what came of the deadlines."""
     from mddag_executor.hosting.measure import ExecutionPlan
-    from mddag_executor.hosting.processes import left, Part, Run, Supervisor, together
+    from mddag_executor.hosting.processes import (
+        left,
+        Part,
+        ProcessError,
+        Run,
+        Supervisor,
+        together,
+    )
     plan = None
     if args.synthetic is not None:
         workers = defaults.workers(args.workers, task_set)
@@ -80,7 +89,15 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
 
         supervisor = Supervisor(command, args.on_exit == 'continue', out, sys.stderr, ended)
         signals.end_of(supervisor)
-        supervisor.run(names, None if args.duration is None else args.duration / 1e9)
+        began = time.time()
+        try:
+            supervisor.run(names, None if args.duration is None else args.duration / 1e9)
+        except ProcessError:
+            traces = [] if Part.has_begun(folder) else [_trace(args.trace, n) for n in names]
+            for trace in traces:    # not those of an earlier run
+                if trace is not None and Path(trace).exists() and os.stat(trace).st_mtime > began:
+                    remove_recording(trace)
+            raise
         parts = [left(folder, run.process.pid) for run in supervisor.runs]
     results = {run.name: each for run, each in zip(supervisor.runs, parts) if each is not None}
     result = {

@@ -5,9 +5,10 @@ A run of several processes: start, watch and end them, and combine their results
 
 Theory of operation
 -------------------
-1. *Signals.*  Each process puts itself into its own process group.  So Ctrl-C reaches only the
-   supervisor, which passes it on.  The processes end when the supervisor does, even if it was
-   killed (``belong_to_parent``).  They stay in its session, which has its share of the CPUs.
+1. *Signals.*  Each process has its own process group, from its start on (with Python 3.10 a
+   little later).  So Ctrl-C reaches only the supervisor, which passes it on.  The processes end
+   when the supervisor does, even if it was killed (``belong_to_parent``).  They stay in its
+   session, which has its share of the CPUs.
 2. *Output* is passed on line by line, each prefixed with the name of its process.  If a process
    ends with status 2, its error line becomes the supervisor's error.
 3. *Ends.*  A process that ends before the run does has *died*, unless its status is 0.  Then all
@@ -38,6 +39,7 @@ import os
 from pathlib import Path
 import signal
 import subprocess
+import sys
 import threading
 import time
 from typing import Any, BinaryIO, TextIO
@@ -53,6 +55,7 @@ from msg_graph.drift import drift, Observed, Releases
 
 END_TIMEOUT_S = 20.0
 _LOOK_S = 0.02
+_OWN_GROUP: Any = {'process_group': 0} if sys.version_info >= (3, 11) else {}
 _BAD_INPUT = 2
 LEAD_NS = 100_000_000
 
@@ -166,7 +169,8 @@ class Supervisor:
     def _start(self, name: str) -> None:
         process = subprocess.Popen(
             self._command(name), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, env={**os.environ, 'PYTHONUNBUFFERED': '1'})
+            stderr=subprocess.PIPE, env={**os.environ, 'PYTHONUNBUFFERED': '1'},
+            **_OWN_GROUP)
         run = Run(name, process)
         self.runs.append(run)
         for source, target in ((process.stdout, self._out), (process.stderr, self._err)):
@@ -262,6 +266,11 @@ class Part:
     def leave(self, result: Any) -> None:
         """Store the result of this process in the folder."""
         _write(self.folder / f'{os.getpid()}.json', json.dumps(result, default=list))
+
+    @staticmethod
+    def has_begun(folder: str) -> bool:
+        """Return whether a process was ready to begin."""
+        return any(Path(folder).glob('*.ready'))
 
     @staticmethod
     def ended(folder: str, name: str) -> None:

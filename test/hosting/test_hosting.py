@@ -267,6 +267,9 @@ def test_a_program_that_cannot_start_ends_the_run_with_one_line(world, mddag):
     done = mddag('run', 'graph.yaml', '--node', 'chat:exits', '--trace', 'out.mcap')
     assert (done.returncode, done.stderr.count('\n')) == (2, 1)
     assert not Path('out.mcap').exists()
+    Path('null').symlink_to('/dev/null')    # a device stays, also if root names it
+    assert mddag('run', 'graph.yaml', '--node', 'chat:exits', '--trace', 'null').returncode == 2
+    assert Path('null').is_symlink()
 
 
 def test_a_program_has_a_command_line_of_its_own_while_it_is_imported(world, monkeypatch):

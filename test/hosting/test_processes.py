@@ -188,6 +188,24 @@ def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
     assert sink['completed'] > 0 and set(replayed['callbacks']) >= {'/first:relay', '/last:sink'}
 
 
+def test_a_run_that_cannot_begin_leaves_no_trace(world, mddag):
+    """Except one of an earlier run."""
+    (world / 'bad.py').write_text(
+        'import pathlib, time\n'
+        'def exits():\n'
+        '    while not pathlib.Path("out.up.mcap").exists():\n'
+        '        time.sleep(0.01)\n'
+        '    raise SystemExit(3)\n')
+    done = mddag('run', 'graph.yaml', '--node', 'up=relay:first', '--node', 'down=bad:exits',
+                 '--trace', 'out.mcap', '--overwrite')
+    assert (done.returncode, done.stderr.count('error: ')) == (2, 1), done.stderr
+    assert not list(world.glob('*.mcap'))
+    (world / 'out.up.mcap').write_text('earlier')
+    mddag('run', 'graph.yaml', '--node', 'up=bad:missing', '--node', 'down=bad:missing',
+          '--trace', 'out.mcap', '--overwrite')
+    assert (world / 'out.up.mcap').read_text() == 'earlier'
+
+
 def test_an_exception_in_one_ends_the_run_with_its_status(world):
     (world / 'bad.py').write_text(
         'from relay import sensor as good\n'

@@ -57,10 +57,11 @@ class Case:
 
 
 def test_output_has_the_name_of_the_process_before_each_line(tmp_path):
-    case = Case(tmp_path, True, a='print("one"); print("two", end="")',
-                b='import sys; print("three", file=sys.stderr)')
+    """And Ctrl-C does not reach a process, not even at its start: it is no error of its own."""
+    group = 'import os; print(1); print(os.getpgrp() == os.getpid(), end="")'
+    case = Case(tmp_path, True, a=group, b='import sys; print("three", file=sys.stderr)')
     assert case.run() == [('a', 0), ('b', 0)]
-    assert case.out.getvalue() == '[a] one\n[a] two\n'
+    assert case.out.getvalue() == f'[a] 1\n[a] {sys.version_info >= (3, 11)}\n'
     assert case.err.getvalue() == '[b] three\n'
     assert not case.died
 
