@@ -187,10 +187,7 @@ class ExecutionJoin:
         """
         thread = np.concatenate([each['vtid'] for each in events])
         order = sort_by(np.concatenate([each.place for each in events]))
-        number = thread - thread.min(initial=0)
-        if number.max(initial=0) < 2 ** 15:     # numbers of 16 bits are sorted much faster
-            number = number.astype(np.int16)
-        order = order[sort_by(number[order])]
+        order = order[sort_by(thread[order])]
         thread = thread[order]
         begins, until = groups(thread)
         borders = np.cumsum([0, *map(len, events)])

@@ -335,8 +335,14 @@ class RowNumbers:
 
 def sort_by(*columns: Any) -> Ints:
     """Return the stable order of rows by several columns, the first one first."""
-    order: Ints = np.lexsort(columns[::-1]) if len(columns) > 1 \
-        else np.argsort(columns[0], kind='stable')
+    if len(columns) > 1:
+        order: Ints = np.lexsort(columns[::-1])
+        return order
+    column, = columns
+    least = column.min() if len(column) else 0
+    if len(column) and int(column.max()) - int(least) < 2 ** 15:
+        column = (column - least).astype(np.int16)      # numpy sorts these much faster
+    order = np.argsort(column, kind='stable')
     return order
 
 

@@ -124,7 +124,7 @@ class Judged:
             executions['vertex'] >= 0)).astype(np.int32)
         completing = completing[sort_by(executions['order'][completing])]
         by_dag = [completing[mine] for mine in rows_by(
-            executions['dag'][completing].astype(np.int16), len(task_set.dags))]
+            executions['dag'][completing], len(task_set.dags))]
         del completing
         self.jobs: list[Jobs] = []
         found: list[Table] = []
@@ -394,7 +394,7 @@ class Judged:
 
     @cached_property
     def _by_vertex(self) -> list[Ints]:
-        return rows_by(self.verdicts['sink'].astype(np.int16), len(self.task_set.vertices))
+        return rows_by(self.verdicts['sink'], len(self.task_set.vertices))
 
     def of_sink(self, sink: int) -> Table:
         """Return the verdicts of a sink."""

@@ -90,13 +90,12 @@ end of an execution (-1: not recorded), ns.
 """
 
 
-_SENT = np.dtype([
-    ('place', 'i2'), ('node', 'i2'), ('run', 'i4'), ('message', 'i8'), ('time', 'i8')])
+_SENT = np.dtype([('known', '?'), ('run', 'i4'), ('message', 'i8'), ('time', 'i8')])
 """
 Columns of a publication; -1: unknown.
 
-``place`` is the index of the callback, ``node`` that of the node, ``run`` the row of the first
-piece of the execution, ``message`` the number of the message.
+``known``: whether the callback that published it is known; ``run`` is the row of the first piece
+of the execution, ``message`` the number of the message.
 """
 
 
@@ -119,6 +118,14 @@ class Executions(NamedTuple):
     start: Ints
     topics: Ints
     vertex: Ints
+    job: Ints
+
+
+class Ends(NamedTuple):
+    """The rows of the ended pieces of a callback, in order of their ends, and their jobs."""
+
+    rows: Ints
+    time: Ints
     job: Ints
 
 
@@ -161,25 +168,14 @@ class Paths:
         if recording.callback_vertex:
             self._add_vertices(recording.callback_vertex)
         # by the index of a callback the rows of its executions
-        place = np.where(self._vertex >= 0, self._place[self._vertex], NONE).astype(np.int16)
-        self._of_place = rows_by(place, len(self._places))
+        place = np.where(self._vertex >= 0, self._place[self._vertex], NONE)
+        self._of_place = [
+            each.astype(np.int32) for each in rows_by(place, len(self._places))]
         self._first = _first_pieces(table)
-        # by callback its executions, and the rows of their pieces in order of their ends
-        self._ran: dict[str, Executions] = {}
-        self._ended: dict[str, tuple[Ints, Ints]] = {}
-        keys = {key for path in self.paths for key in path.callbacks}
-        records = bool(recording.who.every_publisher) or recording.links
-        sent: list[list[Table]] = [[] for _ in self._topics]
-        for callback in task_set.callbacks:
-            topics = [] if records else [
-                self._topics[each] for each in callback.publishes if each in self._topics]
-            if topics or callback.key in keys:
-                self._add(callback, topics, sent)
-        if records:
-            self._published(sent)
-        # by topic its publications in order of time, rows of ``_SENT``
-        self._sent = [self._in_order(parts) for parts in sent]
-        del self._of_place
+        # by topic its publications, if they are recorded, and by publication the index of its node
+        self._of_topic: list[Ints] | None = None
+        if recording.who.every_publisher or recording.links:
+            self._published()
         give_back()
         # messages that running callbacks took themselves, by execution
         self._took = self._first[recording.takes['execution']], recording.takes['message']
@@ -194,69 +190,58 @@ class Paths:
         self._vertex[unknown[known]] = np.array(
             [of[each] for each in callbacks.tolist()])[at[known]]
 
-    def _add(self, callback: Callback, topics: list[int], sent: list[list[Table]]) -> None:
-        """
-        Collect the executions of a callback.
-
-        :param topics: those on which it publishes when it ends; ``sent``: receives publications.
-        """
-        place = self._places[callback.key]
-        mine: Any = self._of_place[place].astype(np.int32)
-        table = pick(self._table, mine)     # once: its rows are scattered over the whole table
-        started = table['start'] >= 0
-        self._ran[callback.key] = self._executions(
-            callback, mine, table, started & (self._first[mine] == mine))
-        ended = np.flatnonzero(started & (table['end'] >= 0))
-        ended = ended[sort_by(table['end'][ended])]
-        mine, end, job = mine[ended], table['end'][ended], table['job'][ended]
-        del table
-        self._ended[callback.key] = mine, end
-        for topic in topics:
-            sent[topic].append(rows(
-                _SENT, len(mine), place=place, node=NONE, run=self._first[mine], time=end,
-                message=self._message(job, self._vertex[mine], topic)))
-
-    @staticmethod
-    def _in_order(sent: list[Table]) -> Table:
-        found = sent.pop() if len(sent) == 1 else np.concatenate([rows(_SENT), *sent])
-        time = found['time']
-        return pick(found, sort_by(time)) if (time[1:] < time[:-1]).any() else found
-
-    def _published(self, found: list[list[Table]]) -> None:
-        """Collect the recorded publications on the topics of paths."""
-        recording, table, sent = self._recording, self._table, self._recording.publications
-        publishers = recording.who.every_publisher
-        numbers, which = different(sent['publisher'])
+    def _published(self) -> None:
+        """Find the recorded publications on the topics of paths."""
+        publishers = self._recording.who.every_publisher
+        numbers, which = different(self._recording.publications['publisher'])
         known = [publishers.get(number) for number in numbers.tolist()]
         topics, nodes = np.array(
             [(NONE, NONE) if each is None else (
                 self._topics.get(each.topic, NONE),
                 self._nodes.get(each.node.name if each.node is not None else '', NONE))
-             for each in known], dtype=np.int64).reshape(-1, 2).T
-        for number, mine in enumerate(rows_by(topics[which].astype(np.int16), len(self._topics))):
-            by, vertex = sent['execution'][mine], sent['vertex'][mine]
-            message = mine if recording.links else np.where(
-                (by >= 0) & (vertex >= 0),
-                self._message(table['job'][by], table['vertex'][by], number), NONE)
-            found[number].append(rows(
-                _SENT, len(mine), place=np.where(vertex >= 0, self._place[vertex], NONE),
-                node=nodes[which[mine]], run=np.where(by >= 0, self._first[by], NONE),
-                message=message, time=sent['time'][mine]))
+             for each in known], dtype=np.int16).reshape(-1, 2).T
+        self._of_topic, self._node = rows_by(topics[which], len(self._topics)), nodes[which]
+
+    def _sent(self, callback: Callback, topics: list[int], ended: Ends) -> Table:
+        """Return the publications of a callback on topics in order of time, a table of _SENT."""
+        found = [rows(_SENT)]
+        for topic in topics:
+            if self._of_topic is not None:
+                found.append(self._recorded(callback, topic, self._of_topic[topic]))
+                continue
+            found.append(rows(
+                _SENT, len(ended.rows), known=True, run=self._first[ended.rows], time=ended.time,
+                message=self._message(ended.job, self._vertex[ended.rows], topic)))
+        sent = np.concatenate(found)
+        time = sent['time']
+        return pick(sent, sort_by(time)) if (time[1:] < time[:-1]).any() else sent
+
+    def _recorded(self, callback: Callback, topic: int, mine: Ints) -> Table:
+        """Return the recorded publications of a callback among those on a topic."""
+        table, sent = self._table, self._recording.publications
+        vertex = sent['vertex'][mine]
+        mine = mine[np.where(
+            vertex >= 0, self._place[vertex] == self._places[callback.key],
+            self._node[mine] == self._nodes[callback.node])]
+        by, known = sent['execution'][mine], sent['vertex'][mine] >= 0
+        message = mine if self._recording.links else np.where(
+            (by >= 0) & known, self._message(table['job'][by], table['vertex'][by], topic), NONE)
+        return rows(_SENT, len(mine), known=known, message=message, time=sent['time'][mine],
+                    run=np.where(by >= 0, self._first[by], NONE))
 
     def _message(self, job: Any, vertex: Any, topic: Any) -> Ints:
         """Return the numbers of the messages that vertices publish in jobs."""
         number: Ints = (job * len(self._place) + vertex) * (len(self._topics) + 1) + topic
         return number
 
-    def _executions(
-        self, callback: Callback, rows: Ints, table: Table, first: Mask
-    ) -> Executions:
-        """
-        Return the executions of a callback.
-
-        :param rows: the rows of their pieces, and their ``table``; ``first``: the first pieces.
-        """
-        mine = np.flatnonzero(first)
+    def _ran(self, callback: Callback) -> tuple[Executions, Ends]:
+        """Return the executions of a callback, and the ends of their pieces."""
+        rows: Any = self._of_place[self._places[callback.key]]
+        table = pick(self._table, rows)     # once: its rows are scattered over the whole table
+        started = table['start'] >= 0
+        ended = np.flatnonzero(started & (table['end'] >= 0))
+        ended = ended[sort_by(table['end'][ended])]
+        mine = np.flatnonzero(started & (self._first[rows] == rows))
         mine = mine[sort_by(table['start'][mine])]
         if not callback.topics:
             topics = np.full(len(mine), NONE)
@@ -265,8 +250,9 @@ class Paths:
             names = [self._recording.who.topic(number) for number in numbers.tolist()]
             topics = np.array([self._topics.get(name, -2) if name else NONE
                                for name in names], dtype=np.int64)[which]
-        return Executions(rows[mine], table['start'][mine], topics, self._vertex[rows[mine]],
-                          table['job'][mine])
+        return Executions(
+            rows[mine], table['start'][mine], topics, self._vertex[rows[mine]],
+            table['job'][mine]), Ends(rows[ended], table['end'][ended], table['job'][ended])
 
     def flows(self, number: int) -> Flows:
         """Return the flows of a path."""
@@ -276,13 +262,14 @@ class Paths:
         """Return the steps of a path, a table of ``STEPS``."""
         path, path_hops = self.paths[number], self.hops[number]
         steps = _Steps()
-        step_of = np.full(len(self._table), NONE)   # by execution its step at the position
+        # by execution its step at the position
+        step_of: Any = np.full(len(self._table), NONE, dtype=np.int32)
         before: tuple[_Timeline, _Timeline] | None = None
         messages = np.empty((0, 3), dtype=np.int64)
         for position, key in enumerate(path.callbacks):
             callback = self._task_set.callback(key)
             hop = path_hops[position - 1] if position else None
-            ran = self._ran[key]
+            ran, ended = self._ran(callback)
             if hop is not None and hop.kind == 'trigger':
                 # otherwise another leg of a sync callback
                 fits = np.isin(ran.topics, [NONE, *(self._topics[t] for t in hop.topics)])
@@ -306,12 +293,13 @@ class Paths:
             step = step_of[ran.runs] = steps.add(position, parent, True, ran.start)
             topics = [self._topics[t] for t in path_hops[position].topics] \
                 if position < len(path_hops) else []
-            before = self._done(steps, callback, step_of), _Timeline(
+            before = self._done(steps, callback, ended, step_of), _Timeline(
                 np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
             if topics:
                 made = _Timeline(ran.start, step)
-                sent, messages = self._publish(steps, position, callback, made, step_of, topics)
-                before = before[0], sent
+                sent = self._sent(callback, topics, ended)
+                timeline, messages = self._publish(steps, position, callback, made, step_of, sent)
+                before = before[0], timeline
             step_of[ran.runs] = NONE
         return steps.table()
 
@@ -335,36 +323,33 @@ class Paths:
                             fits, self._message(ran.job, publisher, topic), -2))
         return found
 
-    def _done(self, steps: _Steps, callback: Callback, step_of: Ints) -> _Timeline:
+    def _done(
+        self, steps: _Steps, callback: Callback, ended: Ends, step_of: Ints
+    ) -> _Timeline:
         """Note when executions ended."""
-        ended, times = self._ended[callback.key]
-        of = step_of[self._first[ended]]
+        of = step_of[self._first[ended.rows]]
         known = of != NONE
-        steps.end(of[known], times[known])
+        steps.end(of[known], ended.time[known])
         if callback.kind != 'sync':
-            return _Timeline(times, of)
-        return _Timeline(times[known], of[known])
+            return _Timeline(ended.time, of)
+        return _Timeline(ended.time[known], of[known])
 
     def _publish(
         self, steps: _Steps, position: int, callback: Callback, ran: _Timeline, step_of: Ints,
-        topics: list[int],
+        sent: Table,
     ) -> tuple[_Timeline, Ints]:
         """
         Make the steps of the publications at a position; return times and messages.
 
         :param ran: the steps of the executions; ``step_of``: the same by row.
         """
-        sent = self._in_order([self._sent[topic] for topic in topics])
-        mine = (sent['place'] == self._places[callback.key]) | (
-            (sent['place'] == NONE) & (sent['node'] == self._nodes[callback.node]))
-        place, run, message, time = (
-            sent[name][mine] for name in ('place', 'run', 'message', 'time'))
-        parent = np.where((place != NONE) & (run != NONE), step_of[run], NONE)
-        latest = (parent == NONE) & ((callback.kind == 'sync') | (place == NONE))
+        known, run, message, time = (sent[name] for name in _SENT.names or ())
+        parent = np.where(known & (run != NONE), step_of[run], NONE)
+        latest = (parent == NONE) & ((callback.kind == 'sync') | ~known)
         parent[latest] = ran.as_of(time[latest], before=True)
         made = steps.add(position, parent, False, time)
-        known = (made != NONE) & (message != NONE)
-        return _Timeline(time, made), np.column_stack((message, time, made))[known]
+        there = (made != NONE) & (message != NONE)
+        return _Timeline(time, made), np.column_stack((message, time, made))[there]
 
     def results(self) -> dict[str, Any]:
         """
@@ -453,7 +438,7 @@ def flows_of(steps: Table, last: int) -> Flows:
     found = Flows(*(np.full(len(step), NONE) for _ in Flows._fields))
     flow = np.arange(len(step))
     while len(step):
-        of = steps[step]
+        of = pick(steps, step)
         run, begin, at_last = of['is_run'], of['position'] == 0, of['position'] == last
         for chosen, into, values in (
                 (run & at_last, found.arrival, of['time']), (run & begin, found.begin, of['time']),
