@@ -49,6 +49,7 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.recording import tables as recorded
 from mddag_executor.recording.tables import (
+    in_parts,
     Ints,
     JobNumbers,
     look_up,
@@ -64,14 +65,18 @@ import numpy as np
 import numpy.typing as npt
 
 VERDICTS = np.dtype([
-    ('kind', 'i1'), ('dag', 'i4'), ('sink', 'i4'), ('job', 'i8'), ('release', 'i8'),
-    ('deadline', 'i8'), ('completed', 'i8'), ('until', 'i8'), ('row', 'i8'), ('order', 'i8')])
+    ('kind', 'i1'), ('dag', 'i2'), ('sink', 'i4'), ('job', 'i8'), ('release', 'i8'),
+    ('deadline', 'i8'), ('completed', 'i8'), ('until', 'i8'), ('row', 'i4'), ('order', 'i8')])
 """
 Columns of the table of verdicts: one row per judged job and sink, in order.
 
 ``kind`` is one of the core's decisions; ``completed`` is -1 if the sink never completed; ``until``
 is the time of completion, or of the end of the job; ``row`` is the job's row in ``Jobs``.
 """
+
+_COMPLETIONS = np.dtype([
+    ('row', 'i4'), ('dag', 'i4'), ('vertex', 'i4'), ('order', 'i4'), ('job', 'i8')])
+"""Columns of a completion: the row of the execution, and some of its columns."""
 
 _ENDS = {
     recorded.EXPIRED: (EXPIRED, SINK_EXPIRED), recorded.ABORTED: (ABORTED, SINK_ABORTED),
@@ -82,16 +87,15 @@ class Jobs(NamedTuple):
     """
     The jobs of one DAG, one row each, in the order of their releases.
 
-    ``done`` and ``done_order`` have, by job and vertex, the row of the execution that completed
-    the vertex (-1: none) and its position in the order of events.  ``ended`` is the position at
-    which the job ended early, ``until`` when it or the run ended, ns.
+    ``done`` has, by job and vertex, the row of the execution that completed the vertex (-1: none).
+    ``ended`` is the position in the order of events at which the job ended early, ``until`` when
+    it or the run ended, ns.
     """
 
     number: Ints
     release: Ints
     released: Ints
     done: npt.NDArray[np.int32]
-    done_order: Ints
     ended: Ints
     until: Ints
 
@@ -117,19 +121,14 @@ class Judged:
         self._outcomes: list[tuple[int, Ints, Mask]] = []
         #: The first release that is judged.
         self.judge_from = _judge_from(recording, skip)
-        ends, releases = ([table[mine] for mine in rows_by(table['dag'], len(task_set.dags))]
-                          for table in (recording.job_ends, recording.releases))
-        executions = recording.executions
-        completing: Any = np.flatnonzero((executions['completes'] != recorded.NOTHING) & (
-            executions['vertex'] >= 0)).astype(np.int32)
-        completing = completing[sort_by(executions['order'][completing])]
-        by_dag = [completing[mine] for mine in rows_by(
-            executions['dag'][completing], len(task_set.dags))]
-        del completing
+        ends, releases, completions = (
+            [pick(table, mine) for mine in rows_by(table['dag'], len(task_set.dags))]
+            for table in (recording.job_ends, recording.releases,
+                          _completions(recording.executions)))
         self.jobs: list[Jobs] = []
         found: list[Table] = []
         for dag in range(len(task_set.dags)):
-            jobs, verdicts = self._judge(dag, releases[dag], by_dag.pop(0), ends[dag])
+            jobs, verdicts = self._judge(dag, releases[dag], completions.pop(0), ends[dag])
             self.jobs.append(jobs)
             found += verdicts
         table = np.concatenate([np.empty(0, dtype=VERDICTS), *found])
@@ -146,23 +145,25 @@ class Judged:
     # --- judging ---------------------------------------------------------------------------------
 
     def _judge(
-        self, dag: int, released: Table, completing: Ints, ends: Table
+        self, dag: int, released: Table, completions: Table, ends: Table
     ) -> tuple[Jobs, list[Table]]:
-        released = released[sort_by(released['order'])]
+        released = pick(released, sort_by(released['order']))
+        completions = pick(completions, sort_by(completions['order']))
         first, last = self.tables.first_vertex[dag:dag + 2]
         jobs = Jobs(
             released['job'].copy(), released['release'].copy(), released['order'].copy(),
             np.full((len(released), last - first), -1, dtype=np.int32),
-            np.full((len(released), last - first), NEVER),
             np.full(len(released), NEVER), np.full(len(released), self._recording.judged_until))
         reason, when = self._given_up(jobs, ends)
         expected = self._expected(dag, jobs)
-        duplicates = self._complete(dag, jobs, completing, expected)
+        # by job and vertex the position at which it completed
+        position = np.full(jobs.done.shape, NEVER)
+        duplicates = self._complete(dag, jobs, completions, expected, position)
         sinks = self.tables.sinks[self.tables.first_sink[dag]:self.tables.first_sink[dag + 1]]
         local = np.array(sinks, dtype=np.int64) - first
         here = expected[:, local] == HERE if expected is not None else \
             np.ones((len(released), len(local)), dtype=np.bool_)
-        order = jobs.done_order[:, local]
+        order = position[:, local]
         done = order < jobs.ended[:, None]
         deadline = jobs.release[:, None] + np.array(
             [self.tables.sink_deadline[sink] for sink in sinks], dtype=np.int64)
@@ -175,10 +176,9 @@ class Judged:
         closed = np.where(here & ~dropped, np.where(done, order, NEVER), -1).max(
             axis=1, initial=-1)
         if expected is not None:
-            inner = expected == LEADS_OUT
+            done_here = np.where(position < jobs.ended[:, None], position, NEVER)
             closed = np.maximum(closed, np.where(
-                inner, np.where(jobs.done_order < jobs.ended[:, None], jobs.done_order, NEVER),
-                -1).max(axis=1, initial=-1))
+                expected == LEADS_OUT, done_here, -1).max(axis=1, initial=-1))
         # no sinks here, or not the last completion but a drop closed the job
         closed[(closed < 0) | (reason == recorded.OUTDATED)] = NEVER
         ended = np.minimum(jobs.ended, closed)
@@ -288,16 +288,16 @@ class Judged:
         return expected
 
     def _complete(
-        self, dag: int, jobs: Jobs, completing: Ints, expected: Ints | None
+        self, dag: int, jobs: Jobs, completions: Table, expected: Ints | None, position: Ints
     ) -> tuple[Ints, Ints]:
         """
-        Fill in the executions that completed vertices (rule 1).
+        Fill in the executions that completed vertices (rule 1), and their positions.
 
         :return: positions of duplicate completions, and the rows of their jobs.
         """
         first = self.tables.first_vertex[dag]
-        job, order, vertex = (
-            self._recording.executions[name][completing] for name in ('job', 'order', 'vertex'))
+        job, order, vertex, completing = (
+            completions[name] for name in ('job', 'order', 'vertex', 'row'))
         row, vertex = jobs.rows_of(job), vertex - first
         known = row >= 0
         if len(jobs.number):
@@ -314,7 +314,7 @@ class Judged:
         n_legs = np.array(self.tables.n_legs[first:first + jobs.done.shape[1]])
         single = n_legs[vertex] == 1
         # the first completion of each vertex wins: it is written last
-        places, orders = jobs.done.reshape(-1), jobs.done_order.reshape(-1)
+        places, orders = jobs.done.reshape(-1), position.reshape(-1)
         cell = row * jobs.done.shape[1] + vertex
         duplicate = np.zeros(len(cell), dtype=np.bool_)
         mine = np.flatnonzero(single)[::-1]
@@ -323,16 +323,16 @@ class Judged:
         duplicate[mine] = places[cell[mine]] != completing[mine]
         if len(mine) < len(cell):
             self._complete_legs(
-                jobs, np.flatnonzero(~single), cell, order, completing, n_legs, duplicate)
+                jobs, np.flatnonzero(~single), cell, order, completing, n_legs, duplicate, orders)
         if expected is not None:
             no_legs = np.array(self.tables.n_predecessors[first:first + jobs.done.shape[1]]) > 0
             elsewhere = (expected == ELSEWHERE) & no_legs
-            jobs.done[elsewhere], jobs.done_order[elsewhere] = -1, NEVER
+            jobs.done[elsewhere], position[elsewhere] = -1, NEVER
         return order[duplicate], row[duplicate]
 
     def _complete_legs(
         self, jobs: Jobs, mine: Ints, cell: Ints, order: Ints, completing: Ints, n_legs: Ints,
-        duplicate: Mask,
+        duplicate: Mask, orders: Ints,
     ) -> None:
         """Fill in the completions of vertices with several legs."""
         leg = self._recording.executions['leg'][completing[mine]].astype(np.int64)
@@ -357,7 +357,7 @@ class Judged:
         whole = ((of >= 0) | ~wanted).all(axis=1)
         last = np.where(wanted, of, -1).max(axis=1)[whole]      # numbers are in order
         jobs.done.reshape(-1)[cells[whole]] = completing[last]
-        jobs.done_order.reshape(-1)[cells[whole]] = order[last]
+        orders[cells[whole]] = order[last]
 
     def _is_judged(self, release: Ints) -> Mask:
         """Return which releases are judged (rule 4)."""
@@ -421,6 +421,17 @@ class Judged:
         recorded_misses = counted(len(before), 'recorded miss', 'recorded misses')
         return (f'the replay does not find {less.total()} of {recorded_misses}, and it finds '
                 f'{more.total()} that were not recorded: the first is job {example[2]} at {name}')
+
+
+def _completions(executions: Table) -> Table:
+    """Return the completions of declared vertices."""
+    found, begin = [np.empty(0, dtype=_COMPLETIONS)], 0
+    for part in in_parts(executions):
+        which = np.flatnonzero((part['completes'] != recorded.NOTHING) & (part['vertex'] >= 0))
+        found.append(recorded.rows(_COMPLETIONS, len(which), row=begin + which, **{
+            name: part[name][which] for name in ('dag', 'vertex', 'order', 'job')}))
+        begin += len(part)
+    return np.concatenate(found)
 
 
 def _judge_from(recording: Recording, skip: int) -> int:
