@@ -12,6 +12,7 @@ from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from mddag_executor.core.jobs import is_miss
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
@@ -84,7 +85,7 @@ class Counts(NamedTuple):
 
 
 def counts(sink: Mapping[str, Any]) -> Counts:
-    """Return the verdicts in a sink's result, or in its counters (``vars``)."""
+    """Return the verdicts in the result of a sink, or in its counts (``SinkTally.verdicts``)."""
     overdue = sink.get('overdue', 0)
     aborted, failed, dropped = (sink.get(key, 0) for key in ('aborted', 'failed', 'dropped'))
     in_time = sink['completed'] - (sink['late'] - overdue)
@@ -164,6 +165,10 @@ class Latest:
         except OverflowError:
             self.append(2 ** 63 - 1 if value > 0 else -2 ** 63)
 
+    def extend(self, values: Any) -> None:
+        """Add an array of 64-bit numbers, if all are kept."""
+        self._values.frombytes(values.tobytes())
+
     def __len__(self) -> int:
         return len(self._values)
 
@@ -178,48 +183,53 @@ class Latest:
 
 
 class SinkTally:
-    """The results of one sink: counts, and response times (completion minus release, ns)."""
+    """
+    The results of one sink: counts, and response times (completion minus release, ns).
+
+    :ivar numbers: the number of decisions by kind; of overdue sinks those without verdict so far.
+    """
 
     def __init__(self, relative_deadline_ns: int, keep: int | None) -> None:
         self.relative_deadline_ns = relative_deadline_ns
-        self.completed = 0
-        self.late = 0
-        self.expired = 0
-        self.failed = 0
-        self.aborted = 0
-        self.dropped = 0
-        self.demoted = 0
-        self.overdue = 0
+        self.numbers = [0] * (SINK_DEMOTED + 1)
         self.shortest: int | None = None
         self.longest: int | None = None
-        self.responses: Any = Latest(keep)
+        self.responses = Latest(keep)
+
+    @property
+    def completed(self) -> int:
+        """Return the number of completed jobs."""
+        return self.numbers[SINK_IN_TIME] + self.numbers[SINK_LATE]
 
     def done(self, response: int, late: bool) -> None:
         """Count a completion."""
-        self.completed += 1
-        self.late += late
+        self.numbers[SINK_LATE if late else SINK_IN_TIME] += 1
         self.responses.append(response)
         if self.shortest is None or response < self.shortest:
             self.shortest = response
         if self.longest is None or response > self.longest:
             self.longest = response
 
+    def verdicts(self) -> dict[str, int]:
+        """Return the number of each verdict; ``late`` includes the overdue."""
+        numbers = self.numbers
+        overdue = numbers[SINK_MISSED] + numbers[SINK_OVERDUE]
+        return {
+            'completed': self.completed, 'late': numbers[SINK_LATE] + overdue, 'overdue': overdue,
+            'expired': numbers[SINK_EXPIRED], 'failed': numbers[SINK_FAILED],
+            'aborted': numbers[SINK_ABORTED], 'dropped': numbers[SINK_DROPPED],
+            **({'demoted': numbers[SINK_DEMOTED]} if numbers[SINK_DEMOTED] else {})}
+
     def result(self) -> dict[str, Any]:
-        """Return the sink's part of the result; ``late`` includes the overdue."""
+        """Return the sink's part of the result."""
         response = None
         if self.responses:
             ordered = sorted(self.responses)
             response = {
                 'min': self.shortest, 'median': quantile(ordered, 0.5),
                 'p99': quantile(ordered, 0.99), 'max': self.longest}
-        result = {
-            'relative_deadline_ns': self.relative_deadline_ns, 'completed': self.completed,
-            'late': self.late, 'overdue': self.overdue, 'expired': self.expired,
-            'failed': self.failed, 'aborted': self.aborted, 'dropped': self.dropped,
-            'response_ns': response}
-        if self.demoted:
-            result['demoted'] = self.demoted
-        return result
+        return {'relative_deadline_ns': self.relative_deadline_ns, **self.verdicts(),
+                'response_ns': response}
 
 
 class Tally:
@@ -238,7 +248,6 @@ class Tally:
         #: By sink: its misses in any window, if the declaration tolerates some.
         self.windows = {v: MissWindow(tolerate.of) for v in self.sinks
                         if (tolerate := self._tolerate(v)) is not None}
-        self.dropped = 0
         #: By vertex and job: the deadlines of sinks that are overdue and have no verdict yet.
         self.overdue: dict[tuple[int, int], int] = {}
         #: The miss with the earliest deadline.
@@ -258,77 +267,51 @@ class Tally:
                         self._end_overdue(sink_vertex, job)
                 if vertex != NOT_JUDGED:
                     self.ends[dag][deadline] += 1
-            elif kind == DROP:
-                self.dropped += 1
-            elif kind == SINK_DEMOTED:
-                self.sinks[vertex].demoted += 1
-            elif kind == SINK_OVERDUE:
-                self.overdue[vertex, job] = deadline
-                self.sinks[vertex].late += 1
-                self.sinks[vertex].overdue += 1
-            else:
-                if self.overdue:
+            elif kind != DROP:
+                sink = self.sinks[vertex]
+                if self.overdue and kind < JOB_END:
                     self._end_overdue(vertex, job)
                 if kind in SINK_COMPLETED:
-                    sink = self.sinks[vertex]
                     sink.done(time - deadline + sink.relative_deadline_ns, kind == SINK_LATE)
-                if kind != SINK_IN_TIME:
-                    self._add_miss(kind, dag, vertex, job, deadline, time)
+                else:
+                    sink.numbers[kind] += 1
+                if kind == SINK_OVERDUE:
+                    self.overdue[vertex, job] = deadline
+                elif is_miss(kind):
+                    self._add_miss(vertex, job, deadline, time if kind == SINK_LATE else None)
 
-    def add_sink(
-        self, vertex: int, kinds: Sequence[int], responses: Sequence[int], missed: Iterable[int],
-    ) -> None:
-        """
-        Count all results of a sink at once.
-
-        :param kinds: the number of its results, by kind of decision.
-        :param responses: the ascending response times of its completed jobs, ns.
-        :param missed: the jobs that missed.
-        """
-        sink = self.sinks[vertex]
-        sink.completed = kinds[SINK_IN_TIME] + kinds[SINK_LATE]
-        sink.late, sink.overdue = kinds[SINK_LATE] + kinds[SINK_MISSED], kinds[SINK_MISSED]
-        sink.expired, sink.failed, sink.aborted, sink.dropped = (
-            kinds[kind] for kind in (SINK_EXPIRED, SINK_FAILED, SINK_ABORTED, SINK_DROPPED))
-        if responses:
-            sink.shortest, sink.longest = responses[0], responses[-1]
-        sink.responses = responses
-        if vertex in self.windows:
-            for job in missed:
-                self.windows[vertex].add(job)
-
-    def add_first_miss(
-        self, kind: int, vertex: int, job: int, deadline: int, completed: int
-    ) -> None:
-        """Note the miss with the earliest deadline."""
-        self.first_miss = self._miss(
-            vertex, job, deadline, completed if kind == SINK_LATE else None)
+    def add_results(self, kind: Any, vertex: Any, job: Any, deadline: Any, time: Any) -> None:
+        """Count all results of a run at once: columns of the decisions, as arrays."""
+        import numpy as np
+        order = np.argsort(vertex, kind='stable')
+        sinks = sorted(self.sinks)
+        for v, mine in zip(sinks, np.split(order, np.searchsorted(vertex[order], sinks))[1:]):
+            sink, done = self.sinks[v], mine[kind[mine] <= SINK_LATE]
+            sink.numbers[:JOB_END] = np.bincount(kind[mine], minlength=JOB_END).tolist()
+            responses = np.sort(time[done] - deadline[done] + sink.relative_deadline_ns)
+            if len(responses):
+                sink.shortest, sink.longest = int(responses[0]), int(responses[-1])
+            sink.responses.extend(responses)
+            if v in self.windows:
+                for missed in np.sort(job[mine[kind[mine] > SINK_IN_TIME]]).tolist():
+                    self.windows[v].add(missed)
+        misses = np.flatnonzero(kind > SINK_IN_TIME)
+        if len(misses):
+            first = misses[deadline[misses].argmin()]
+            self.first_miss = self._miss(
+                int(vertex[first]), int(job[first]), int(deadline[first]),
+                int(time[first]) if kind[first] == SINK_LATE else None)
 
     def _end_overdue(self, vertex: int, job: int) -> None:
         """Let the verdict of a sink replace its overdue state."""
         if self.overdue.pop((vertex, job), None) is not None:
-            self.sinks[vertex].late -= 1
-            self.sinks[vertex].overdue -= 1
+            self.sinks[vertex].numbers[SINK_OVERDUE] -= 1
 
-    def _add_miss(
-        self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int
-    ) -> None:
-        sink = self.sinks[vertex]
+    def _add_miss(self, vertex: int, job: int, deadline: int, completed: int | None) -> None:
         if vertex in self.windows:
             self.windows[vertex].add(job)
-        if kind == SINK_MISSED:
-            sink.late += 1
-            sink.overdue += 1
-        elif kind == SINK_EXPIRED:
-            sink.expired += 1
-        elif kind == SINK_FAILED:
-            sink.failed += 1
-        elif kind == SINK_ABORTED:
-            sink.aborted += 1
-        elif kind == SINK_DROPPED:
-            sink.dropped += 1
         if self.first_miss is None or deadline < self.first_miss['deadline_ns']:
-            self.add_first_miss(kind, vertex, job, deadline, time)
+            self.first_miss = self._miss(vertex, job, deadline, completed)
 
     def _miss(
         self, vertex: int, job: int, deadline: int, completed: int | None

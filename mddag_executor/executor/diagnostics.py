@@ -97,7 +97,8 @@ class DagWatch:
     def _look(self) -> _Seen:
         sinks = self._sinks.values()
         return _Seen(
-            Counts.total(counts(vars(sink)) for sink in sinks), self._tally.jobs[self._dag.index],
+            Counts.total(counts(sink.verdicts()) for sink in sinks),
+            self._tally.jobs[self._dag.index],
             [sink.completed for sink in sinks], self._in_stops[self._dag.index])
 
     def status(self, now: int) -> Status:

@@ -220,10 +220,11 @@ def judge_sink(
         if release in completed:
             response = completed[release] - release
             tally.done(response, response > deadline)
+    result = tally.result()
     return {
         'relative_deadline_ns': deadline, 'due': len(due),
-        'on_time': tally.completed - tally.late, 'late': tally.late,
-        'missing': len(due) - tally.completed, 'response_ns': tally.result()['response_ns']}
+        'on_time': result['completed'] - result['late'], 'late': result['late'],
+        'missing': len(due) - result['completed'], 'response_ns': result['response_ns']}
 
 
 def _throughput(

@@ -40,6 +40,7 @@ from mddag_executor.core.state import (
     OUTDATED,
     SINK_ABORTED,
     SINK_COMPLETED,
+    SINK_DEMOTED,
     SINK_DROPPED,
     SINK_EXPIRED,
     SINK_FAILED,
@@ -374,22 +375,15 @@ class Judged:
             numbers = JobNumbers(self._recording.releases)
             kept = numbers.marked(self._recording.releases['release'] >= self.judge_from)
             demotions = demotions[kept[numbers.of(demotions)]]
-        demoted = Counter(demotions['vertex'].tolist())
         for dag, outcome, over in self._outcomes:
             tally.jobs[dag] = int(self._is_judged(self.jobs[dag].release).sum())
             for end, n in Counter(outcome[over].tolist()).items():
                 tally.ends[dag][end] += n
+        tally.add_results(*(self.verdicts[name] for name in (
+            'kind', 'sink', 'job', 'deadline', 'completed')))
+        demoted = Counter(demotions['vertex'].tolist())
         for v in self.tables.sinks:
-            mine = self.of_sink(v)
-            tally.sinks[v].demoted = demoted[v]
-            done = mine['completed'] >= 0
-            tally.add_sink(
-                v, np.bincount(mine['kind'], minlength=SINK_DROPPED + 1).tolist(),
-                memoryview(np.sort((mine['completed'] - mine['release'])[done])),
-                np.sort(mine['job'][mine['kind'] != SINK_IN_TIME]).tolist())
-        for first in self.missed[:1]:
-            tally.add_first_miss(*(int(first[name]) for name in (
-                'kind', 'sink', 'job', 'deadline', 'completed')))
+            tally.sinks[v].numbers[SINK_DEMOTED] = demoted[v]
         return tally
 
     @cached_property

@@ -14,13 +14,10 @@ from mddag_executor.core import policy as find_policy
 from mddag_executor.core.state import (
     as_object,
     Decision,
-    DROP,
     empty,
     JOB_END,
     NOT_JUDGED,
-    SINK_COMPLETED,
     SINK_DEMOTED,
-    SINK_IN_TIME,
     State,
 )
 from mddag_executor.simulate.deliveries import Deliveries
@@ -122,28 +119,13 @@ class Scheduled(NamedTuple):
             dags[judged].astype(np.int64), minlength=len(tally.jobs)).tolist()
         decisions = np.asarray(self.decisions, dtype=np.int64).reshape(-1, 6)
         kind = decisions[:, 0]
-        tally.dropped = int((kind == DROP).sum())
-        for vertex in decisions[kind == SINK_DEMOTED, 2].tolist():
-            tally.sinks[vertex].demoted += 1
+        kinds, _, *results = decisions[kind < JOB_END].T
+        tally.add_results(kinds, *results)
+        tally.add(decisions[kind == SINK_DEMOTED].tolist())
         ends = decisions[(kind == JOB_END) & (decisions[:, 2] != NOT_JUDGED)]
         pairs, numbers = np.unique(ends[:, 1] << 8 | ends[:, 4], return_counts=True)
         for pair, number in zip(pairs.tolist(), numbers.tolist()):
             tally.ends[pair >> 8][pair & 255] = number
-        results = decisions[kind < JOB_END]
-        missed = results[results[:, 0] != SINK_IN_TIME]
-        results = results[np.argsort(results[:, 2], kind='stable')]
-        sinks = sorted(tally.sinks)
-        for vertex, mine in zip(sinks, np.split(
-                results, np.searchsorted(results[:, 2], sinks))[1:]):
-            kind, _, _, job, deadline, time = mine.T
-            done = kind <= max(SINK_COMPLETED)
-            tally.add_sink(
-                vertex, np.bincount(kind, minlength=JOB_END).tolist(), memoryview(np.sort(
-                    time[done] - deadline[done] + tally.sinks[vertex].relative_deadline_ns)),
-                job[kind != SINK_IN_TIME].tolist())
-        if len(missed):
-            kind, _, vertex, job, deadline, time = missed[missed[:, 4].argmin()].tolist()
-            tally.add_first_miss(kind, vertex, job, deadline, time)
 
 
 def schedule(

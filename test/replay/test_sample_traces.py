@@ -38,7 +38,7 @@ def test_the_demo_rescheduled():
     """As recorded one job was late, for overheads; four workers would not have been enough."""
     same = reschedule(DEMO)
     assert same.tally.first_miss['vertex'].endswith('twist2accel:callback_0')
-    assert sum(sink.late for sink in same.tally.sinks.values()) == 1
+    assert sum(sink.verdicts()['late'] for sink in same.tally.sinks.values()) == 1
     assert not reschedule(DEMO, overheads=False).tally.missed
     assert reschedule(DEMO, workers=4).tally.missed
 

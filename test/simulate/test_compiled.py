@@ -12,7 +12,7 @@ import random
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.core import POLICIES, Tables
+from mddag_executor.core import POLICIES, Tables, Tally
 from mddag_executor.laboratory.experiment import judge_of
 from mddag_executor.simulate import compiled, schedule, Settings, simulate
 from mddag_executor.simulate.load import as_arrays, FAILS, RUNS, SKIPPED
@@ -42,8 +42,11 @@ def compare(case, horizon, judge='horizon', stop=False):
     settings = settings_of(case, horizon, judge, stop)
     load_ = case.load(horizon)
     plain = simulate(case.task_set, load_, settings, log=True)
-    found = schedule(
-        Tables.build(case.task_set), load_, settings, log=True, compiled=True)
+    tables = Tables.build(case.task_set)
+    found = schedule(tables, load_, settings, log=True, compiled=True)
+    tally = Tally(case.task_set, tables)
+    found.count_into(tally, load_, settings)
+    assert tally.result() == plain.tally.result()
     assert found.log == plain.log
     assert found.decisions == plain.decisions
     assert found.ended == plain.ended_ns
