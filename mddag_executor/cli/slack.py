@@ -92,8 +92,9 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
             preemptive=args.preemptive, name=source.name, progress=line.events, skip=args.skip,
             cpus=args.cpus)
     warn(*outcome.warnings)
-    problem = Problem(outcome.work, outcome.settings, outcome.tables,
-                      outcome.task_set.places_of_vertices())
+    work = outcome.work
+    problem = Problem(work.load, outcome.settings, outcome.tables,
+                      outcome.task_set.places_of_vertices(), work.dispatches)
     return problem, outcome.task_set, outcome.result()['dags']
 
 

@@ -42,6 +42,12 @@ class Replay:
             self.warnings.append(
                 f'{recording.name}: left out: {counted(self.judged.contradictions, "event")} that '
                 'contradict earlier ones')
+        verdicts = self.judged.verdicts
+        early = (verdicts['completed'] >= 0) & (verdicts['completed'] < verdicts['release'])
+        if early.any():
+            self.warnings.append(
+                f'{recording.name}: {counted(int(early.sum()), "result")} before the release of '
+                'the job: clocks differ, or times are damaged')
         differences = self.judged.differences() if recording.shut_down else None
         if differences is not None:
             self.warnings.append(f'{recording.name}: {differences}')

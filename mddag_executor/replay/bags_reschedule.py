@@ -22,8 +22,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 import os
 import random
-from typing import Any, NamedTuple
+from typing import Any
 
+from mddag_executor import defaults
 from mddag_executor.core import DEFAULT_DEADLINE_NS
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
@@ -36,102 +37,66 @@ from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
 import numpy as np
 
-DEFAULT_WORKERS = 7
 _MOST_JOBS = 20_000_000
-_STAMP_OF = {'header_stamp': 'header', 'source_timestamp': 'published'}
-_CALLED = {'header_stamp': 'header stamp', 'source_timestamp': 'publication time'}
+_STAMPS = {
+    'arrival': ('arrival', 'arrival'), 'header_stamp': ('header', 'header stamp'),
+    'source_timestamp': ('published', 'publication time')}
+"""By ``release_from``: the column of ``Stamps``, and its name in messages."""
+
+Jobs = list[tuple[int, int]]
+"""Jobs of a source as pairs (ready, release), ns."""
 
 
-class Source(NamedTuple):
-    """The jobs of a DAG's source as pairs (ready, release), ns, and notes about them."""
+def _source(bag: Bag, dag: Dag) -> tuple[Jobs, str]:
+    """Return the jobs of a DAG, and a note about them."""
+    callback = dag.vertices[dag.source].callback
+    if callback.kind == 'timer':
+        jobs = _timer_jobs(bag, dag.period_ns)
+        pauses = len(bag.stretches) - 1
+        return jobs, (
+            f'{counted(len(jobs), "job")} at the nominal period of its timer, from the '
+            'first message on: a bag does not show when timers ran'
+            + (f'; none in {counted(pauses, "pause")} of over a minute without any message'
+               if pauses else ''))
+    if not callback.topics:
+        bag.warnings.append(
+            f'{bag.name}: {dag.name} starts with a service call, which a bag does not have: there '
+            'are no jobs of it')
+        return [], 'no jobs: its source is a service'
+    topic = callback.topics[0]
+    stamps = bag.stamps.get(topic)
+    if stamps is None:
+        bag.warnings.append(
+            f'{bag.name}: topic {topic} is not in it, so there are no jobs of {dag.name}')
+        return [], f'no jobs: {topic} is not in the bag'
+    name, what = _STAMPS[dag.release_from]
+    column = getattr(stamps, name)
+    usable = [stamp <= arrival and bool(credible(stamp, arrival))
+              for arrival, stamp in zip(stamps.arrival, column)]
+    jobs = sorted((arrival, stamp if fits else arrival)
+                  for arrival, stamp, fits in zip(stamps.arrival, column, usable))
+    if name != 'arrival' and not all(usable):
+        bag.warnings.append(
+            f'{bag.name}: {usable.count(False)} of {counted(len(jobs), "message")} of '
+            f'{topic} ({stamps.type}) without a {what}, or with one after the arrival or '
+            'years before: released at the arrival')
+    return jobs, f'{counted(len(jobs), "job")} from the {what} of {topic}'
 
-    jobs: list[tuple[int, int]]
-    note: str
+
+def _timer_jobs(bag: Bag, period: int) -> Jobs:
+    """Return the jobs of a timer: at its period, while messages arrive."""
+    found: Jobs = []
+    begin = bag.start or 0
+    for start, end in bag.stretches:
+        first = begin - (begin - start) // period * period
+        if (end - first) // period + len(found) >= _MOST_JOBS:
+            raise _too_many(bag)
+        found.extend((t, t) for t in range(first, end + 1, period))
+    return found
 
 
-class _Releases:
-    """Makes the releases of a recording from the messages of a bag."""
-
-    def __init__(self, bag: Bag, task_set: TaskSet) -> None:
-        self._bag, self._task_set = bag, task_set
-        self._start = bag.start or 0
-        self.warnings = bag.warnings
-        #: Assumptions, one line each.
-        self.notes: list[str] = []
-
-    def table(self) -> Any:
-        """Return the releases, in the order of time."""
-        parts = [rows(RELEASES)]
-        for dag in self._task_set.dags:
-            source = self._source(dag)
-            self.notes.append(f'{dag.name}: {source.note}')
-            ready, release = np.array(source.jobs, dtype=np.int64).reshape(-1, 2).T
-            parts.append(rows(RELEASES, len(ready), dag=dag.index, job=np.arange(len(ready)),
-                              release=release, noticed=ready))
-            if sum(map(len, parts)) > _MOST_JOBS:
-                raise self._too_many()
-        found = np.concatenate(parts)
-        if not len(found):
-            raise BagError(
-                self._bag.name, f'none of the sources of {self._task_set.file} is in it: it has '
-                + (listed(sorted(self._bag.topics)) or 'no topics'),
-                'give the graph of the nodes that were recorded')
-        found = found[sort_by(*(found[name] for name in ('noticed', 'dag', 'job')))]
-        found['order'] = np.arange(len(found))
-        return found
-
-    def _source(self, dag: Dag) -> Source:
-        callback = dag.vertices[dag.source].callback
-        if callback.kind == 'timer':
-            jobs = self._timer_jobs(dag.period_ns)
-            pauses = len(self._bag.stretches) - 1
-            return Source(
-                jobs, f'{counted(len(jobs), "job")} at the nominal period of its timer, from the '
-                'first message on: a bag does not show when timers ran'
-                + (f'; none in {counted(pauses, "pause")} of over a minute without any message'
-                   if pauses else ''))
-        if not callback.topics:
-            self.warnings.append(
-                f'{self._bag.name}: {dag.name} starts with a service call, which a bag does not '
-                'have: there are no jobs of it')
-            return Source([], 'no jobs: its source is a service')
-        topic = callback.topics[0]
-        stamps = self._bag.stamps.get(topic)
-        if stamps is None:
-            self.warnings.append(
-                f'{self._bag.name}: topic {topic} is not in it, so there are no jobs of '
-                f'{dag.name}')
-            return Source([], f'no jobs: {topic} is not in the bag')
-        arrivals = list(stamps.arrival)
-        if dag.release_from == 'arrival':
-            jobs = [(arrival, arrival) for arrival in arrivals]
-            return Source(sorted(jobs), f'{counted(len(jobs), "job")} from the arrival of {topic}')
-        column = getattr(stamps, _STAMP_OF[dag.release_from])
-        usable = [stamp <= arrival and bool(credible(stamp, arrival))
-                  for arrival, stamp in zip(arrivals, column)]
-        jobs = [(arrival, stamp if fits else arrival)
-                for arrival, stamp, fits in zip(arrivals, column, usable)]
-        what = _CALLED[dag.release_from]
-        if not all(usable):
-            self.warnings.append(
-                f'{self._bag.name}: {usable.count(False)} of {counted(len(jobs), "message")} of '
-                f'{topic} ({stamps.type}) without a {what}, or with one after the arrival or '
-                'years before: released at the arrival')
-        return Source(sorted(jobs), f'{counted(len(jobs), "job")} from the {what} of {topic}')
-
-    def _timer_jobs(self, period: int) -> list[tuple[int, int]]:
-        """Return the jobs of a timer: at its period, while messages arrive."""
-        found: list[tuple[int, int]] = []
-        for start, end in self._bag.stretches:
-            first = self._start - (self._start - start) // period * period
-            if (end - first) // period + len(found) >= _MOST_JOBS:
-                raise self._too_many()
-            found.extend((t, t) for t in range(first, end + 1, period))
-        return found
-
-    def _too_many(self) -> BagError:
-        return BagError(
-            self._bag.name, f'there are more than {_MOST_JOBS} jobs in it', 'give a shorter bag')
+def _too_many(bag: Bag) -> BagError:
+    return BagError(bag.name, f'there are more than {_MOST_JOBS} jobs in it', 'give a shorter bag')
 
 
 def read_bag(
@@ -144,16 +109,31 @@ def read_bag(
     if bag.start is None:
         what = '; '.join(bag.warnings) or 'there are no messages in it'
         raise BagError(bag.name, what.removeprefix(f'{bag.name}: '), 'record one again')
-    releases = _Releases(bag, task_set)
-    workers = task_set.workers or DEFAULT_WORKERS
+    parts, notes = [rows(RELEASES)], []
+    for dag in task_set.dags:
+        jobs, note = _source(bag, dag)
+        notes.append(f'{dag.name}: {note}')
+        ready, release = np.array(jobs, dtype=np.int64).reshape(-1, 2).T
+        parts.append(rows(RELEASES, len(jobs), dag=dag.index, job=np.arange(len(jobs)),
+                          release=release, noticed=ready))
+        if sum(map(len, parts)) > _MOST_JOBS:
+            raise _too_many(bag)
+    releases = np.concatenate(parts)
+    if not len(releases):
+        raise BagError(
+            bag.name, f'none of the sources of {task_set.file} is in it: it has '
+            + (listed(sorted(bag.topics)) or 'no topics'),
+            'give the graph of the nodes that were recorded')
+    releases = releases[sort_by(*(releases[name] for name in ('noticed', 'dag', 'job')))]
+    releases['order'] = np.arange(len(releases))
+    workers = defaults.workers(None, task_set)
     end = (bag.end or 0) + 1
     return Recording(
         bag.name, Head(bag.start, '', task_set.file, 'rad', workers, DEFAULT_DEADLINE_NS, 0,
                        False),
-        task_set, task_set, Entities(), declared=False, imported=True,
-        releases=releases.table(), start=bag.start, end=end, judged_until=end,
-        workers_each=workers, messages=bag.count, notes=releases.notes,
-        warnings=releases.warnings)
+        task_set, task_set, Entities(), declared=False, imported=True, releases=releases,
+        start=bag.start, end=end, judged_until=end, workers_each=workers, messages=bag.count,
+        notes=notes, warnings=bag.warnings)
 
 
 def reschedule_bag(

@@ -66,6 +66,7 @@ REMEDIES = {
 _NOTHING_NS = 1_000_000
 _ABOUT_BITS = 4     # up to a 16th above the usual time is usual
 _WAITS = (WAITED, INTERPRETER, GROUP, OVERLOAD)
+_MOST_BEHIND = 5
 
 MISSED = np.dtype([
     ('kind', 'i8'), ('sink', 'i8'), ('job', 'i8'), ('release', 'i8'), ('until', 'i8'),
@@ -395,42 +396,33 @@ def _given_up(
 
 
 def behind(
-    parts: Table, chosen: Ints, runs: dict[int, Spans], on_workers: dict[int, Spans],
-    same_group: Any,
+    found: Found, runs: dict[int, Spans], on_workers: dict[int, Spans], group_of: dict[int, int],
+    groups: dict[int, int],
 ) -> dict[int, list[tuple[int, int]]]:
     """
     Return by part the callbacks that ran while it waited, and how long, longest first.
 
-    :param chosen: the numbers of the parts.
     :param runs: by callback when it ran; ``on_workers``: when its executions occupied a worker.
-    :param same_group: returns whether a vertex and a callback share a callback group.
+    :param group_of: by vertex its callback group, ``groups``: by callback; -1: a reentrant one.
     """
-    found: dict[int, list[tuple[int, int]]] = {}
-    if not len(chosen) or not runs:
-        return found
-    names = list(runs)
-    begins, ends = parts['begin'][chosen], parts['end'][chosen]
-    times = np.array([each.within(begins, ends) for each in runs.values()])
-    waited = np.isin(parts['cause'][chosen], (WAITED, OVERLOAD))
-    times[:, waited] = [
-        each.within(begins[waited], ends[waited]) for each in on_workers.values()]
-    grouped = np.flatnonzero(parts['cause'][chosen] == GROUP)
-    for vertex in np.unique(parts['vertex'][chosen[grouped]]).tolist():
-        others = [i for i, callback in enumerate(names) if not same_group(vertex, callback)]
-        mine = grouped[parts['vertex'][chosen[grouped]] == vertex]
-        times[np.ix_(others, mine)] = 0
-    for part, column in zip(chosen.tolist(), times.T):
-        order = np.argsort(-column, kind='stable')[:MOST_BEHIND].tolist()
-        found[part] = [(names[i], int(column[i])) for i in order if column[i] > 0]
-    return found
-
-
-MOST_BEHIND = 5
-
-
-def to_explain(found: Found) -> Ints:
-    """Return the parts that waited for other callbacks."""
     parts, rows = found.parts, found.misses
     share = 10 * parts['ns'] >= (rows['until'] - rows['release'])[parts['miss']]
-    which: Ints = np.flatnonzero(np.isin(parts['cause'], _WAITS) & share)
-    return which
+    chosen = np.flatnonzero(np.isin(parts['cause'], _WAITS) & share)
+    if not len(chosen) or not runs:
+        return {}
+    callbacks, parts = list(runs), parts[chosen]
+    begins, ends = parts['begin'], parts['end']
+    times = np.array([each.within(begins, ends) for each in runs.values()])
+    waited = np.isin(parts['cause'], (WAITED, OVERLOAD))
+    times[:, waited] = [
+        each.within(begins[waited], ends[waited]) for each in on_workers.values()]
+    grouped = parts['cause'] == GROUP
+    for vertex in np.unique(parts['vertex'][grouped]).tolist():
+        others = [i for i, callback in enumerate(callbacks)
+                  if group_of.get(vertex, -1) != groups.get(callback, -2)]
+        times[np.ix_(others, np.flatnonzero(grouped & (parts['vertex'] == vertex)))] = 0
+    waits: dict[int, list[tuple[int, int]]] = {}
+    for part, column in zip(chosen.tolist(), times.T):
+        order = np.argsort(-column, kind='stable')[:_MOST_BEHIND].tolist()
+        waits[part] = [(callbacks[i], int(column[i])) for i in order if column[i] > 0]
+    return waits

@@ -7,8 +7,7 @@ Theory of operation
 -------------------
 1. The tables of the recording have the executions and publications.  Entities of every node
    (parameter services and the like) are ignored, and nodes without others, too.
-2. A coroutine is one execution, however often it was resumed: its pieces have the same ``ready``
-   time.
+2. A coroutine is one execution, however often it was resumed.
 3. A callback in the recorded declaration keeps its name and the declared properties that a trace
    does not show: deadline, queue edges, period, sync, group, name of the DAG.  Other callbacks are
    named by their recorded function, otherwise ``callback_0``, ``callback_1``, … by node, in the
@@ -24,9 +23,9 @@ Theory of operation
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from itertools import pairwise
 import os
+from typing import NamedTuple
 
 from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
@@ -46,8 +45,7 @@ import numpy as np
 PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
 
 
-@dataclass
-class Runs:
+class Runs(NamedTuple):
     """
     The executions of a callback.
 
@@ -56,16 +54,10 @@ class Runs:
     :ivar topics: what they published on, in the order of time.
     """
 
-    starts: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    times: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    whole: Mask = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
-    topics: list[str] = field(default_factory=list)
-
-    @property
-    def interval_ns(self) -> int | None:
-        """Return the mean time between two executions; None with fewer than two."""
-        count = len(self.starts)
-        return int(self.starts.max() - self.starts.min()) // (count - 1) if count > 1 else None
+    starts: Ints
+    times: Ints
+    whole: Mask
+    topics: list[str]
 
 
 class System:
@@ -212,10 +204,10 @@ class System:
 
     def _measure(self, callback: DraftCallback, entity: Callback) -> bool:
         """Fill in the measured values of a callback; return whether there are any."""
-        runs = self._runs.get(entity.number) or Runs()
-        count = len(runs.starts)
+        runs = self._runs.get(entity.number)
+        count = 0 if runs is None else len(runs.starts)
         callback.runs = (callback.runs or 0) + count
-        if not count:
+        if runs is None or not count:
             return False
         callback.publishes.extend(
             t for t in dict.fromkeys(runs.topics)
@@ -228,7 +220,7 @@ class System:
             callback.times = execution_time(np.concatenate(
                 [leg.times[leg.whole] for leg in legs or [runs]]))
         else:
-            callback.interval_ns = runs.interval_ns
+            callback.interval_ns = int(np.ptp(runs.starts)) // (count - 1) if count > 1 else None
             callback.times = execution_time(runs.times)
         return True
 
@@ -253,24 +245,13 @@ class System:
 
 
 def _runs_of(recording: Recording, which: Mask) -> Runs:
-    """Return the executions of a callback: the chosen rows; pieces are taken together."""
+    """Return the executions of a callback: the chosen rows."""
     table = recording.executions[which]
     table = table[table['start'] >= 0]
-    if recording.imported:      # without pieces
-        first = last = np.arange(len(table))
-        pieces = np.where(table['end'] >= 0, table['end'] - table['start'], -1)
-    else:
-        keys = [table[name] for name in ('vertex', 'job', 'ready', 'start')]
-        table = table[sort_by(*keys)]
-        again = np.ones(len(table), dtype=np.bool_)
-        again[1:] = np.any([table[name][1:] != table[name][:-1]
-                            for name in ('vertex', 'job', 'ready')], axis=0)
-        first = np.flatnonzero(again)
-        last = np.append(first[1:], len(table)) - 1 if len(table) else first
-        took = np.where(table['end'] >= 0, table['end'] - table['start'], 0)
-        pieces = np.add.reduceat(took, first) if len(first) else took
-        pieces[table['end'][first] < 0] = -1
-    return Runs(table['start'][first], pieces, table['completes'][last] == VERTEX)
+    table = table[sort_by(*(table[name] for name in ('vertex', 'job', 'ready', 'start')))]
+    first = np.flatnonzero(table['piece'] == 0)
+    last = np.append(first, len(table))[1:] - 1
+    return Runs(table['start'][first], table['busy'][last], table['completes'][last] == VERTEX, [])
 
 
 def execution_time(took: Ints) -> tuple[ExecutionTime, int] | None:

@@ -13,8 +13,9 @@ last event before it.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from functools import cached_property
 from typing import Any
 
 from mddag_executor.core import legs_of, POLICIES
@@ -45,7 +46,6 @@ from mddag_executor.replay.causes import (
     RAN_USUALLY,
     SKIPPED,
     STARTED,
-    to_explain,
     Usual,
 )
 from mddag_executor.replay.chains import Chains, LINKS
@@ -90,7 +90,6 @@ class Explanation:
             mine = machine & delayed_by(missed, stop)
             machine &= ~mine    # each miss counts once
             self._in_stops[stop] += int(mine.sum())
-        self._waited: dict[int, list[tuple[int, int]]] | None = None
 
     # --- input -----------------------------------------------------------------------------------
 
@@ -182,7 +181,7 @@ class Explanation:
 
     def _in_groups(self, waits: Table) -> Ints:
         """Return how long the callback groups of waiting vertices were busy meanwhile, ns."""
-        of_vertex = self._groups()
+        of_vertex = self._groups
         group = np.array([of_vertex.get(vertex, -1) for vertex in waits['vertex'].tolist()],
                          dtype=np.int64)
         busy = np.zeros(len(waits), dtype=np.int64)
@@ -193,47 +192,30 @@ class Explanation:
 
     def _stops(self) -> list[tuple[int, int]]:
         """Return the stops of the machine, each from the last event before it."""
-        recording = self._recording
-        stops = recording.stops[recording.stops['end'] - recording.stops['start'] >= LEAST_NS]
-        if not len(stops):
-            return []
-        table = recording.executions
-        times = np.sort(np.concatenate([
-            *(table[name][table[name] >= 0] for name in ('ready', 'start', 'end')),
-            recording.releases['noticed'], recording.publications['time']]))
+        recording, table = self._recording, self._recording.executions
+        times = [*(table[name] for name in ('ready', 'start', 'end')),
+                 recording.releases['noticed'], recording.publications['time']]
         found = []
-        for begin, end in zip(stops['start'].tolist(), stops['end'].tolist()):
-            before = int(np.searchsorted(times, begin, 'right')) - 1
-            last = int(times[before]) if before >= 0 else begin
-            found.append((last if begin - last <= LEAST_NS else begin, end))
+        for begin, end in zip(*(recording.stops[name].tolist() for name in ('start', 'end'))):
+            if end - begin >= LEAST_NS:
+                last = max(int(each[each <= begin].max(initial=-_NO_END)) for each in times)
+                found.append((last if last >= max(0, begin - LEAST_NS) else begin, end))
         return sorted(found)
 
-    def _behind(self) -> dict[int, list[tuple[int, int]]]:
+    @cached_property
+    def _waited(self) -> dict[int, list[tuple[int, int]]]:
         """Return by part of a miss the callbacks that it waited for, and how long."""
-        if self._waited is not None:
-            return self._waited
-        self._waited = {}
-        chosen = to_explain(self.found)
-        if not len(chosen):
-            return self._waited
         table, rows = self._executions, self._rows
-        groups, of_vertex = self._who.groups, self._groups()
-
-        def same_group(vertex: int, callback: int) -> bool:
-            return of_vertex.get(vertex, -1) == groups.get(callback, -2)
-
         callbacks, which = different(table['callback'][rows])
         runs, on_workers = {}, {}
         for callback, at in zip(callbacks.tolist(), rows_by(which, len(callbacks))):
             mine = rows[at]
-            runs[callback] = on_workers[callback] = Spans(
-                table['start'][mine], table['end'][mine])
-            busy = mine[table['worker'][mine] >= 0]
-            if len(busy) < len(mine):       # some executions lent their worker
-                on_workers[callback] = Spans(table['start'][busy], table['end'][busy])
-        self._waited = behind(self.found.parts, chosen, runs, on_workers, same_group)
-        return self._waited
+            runs[callback], on_workers[callback] = (
+                Spans(table['start'][each], table['end'][each])
+                for each in (mine, mine[table['worker'][mine] >= 0]))
+        return behind(self.found, runs, on_workers, self._groups, self._who.groups)
 
+    @cached_property
     def _vertices(self) -> dict[int, int]:
         """Return by callback the vertex that it ran as last."""
         numbers, _ = self._recording.callbacks()
@@ -241,10 +223,20 @@ class Explanation:
         return {callback: vertex for callback, vertex in zip(numbers.tolist(), of.tolist())
                 if vertex >= 0}
 
+    @cached_property
     def _groups(self) -> dict[int, int]:
         """Return by vertex the callback group of its callback; -1 for a reentrant one."""
         groups = self._who.groups
-        return {vertex: groups.get(callback, -1) for callback, vertex in self._vertices().items()}
+        return {vertex: groups.get(callback, -1) for callback, vertex in self._vertices.items()}
+
+    @cached_property
+    def _names(self) -> dict[int, str]:
+        """Return the names of the callbacks that others waited for."""
+        vertices, ran_as = self._task_set.vertices, self._vertices
+        callbacks = {callback for each in self._waited.values() for callback, _ in each}
+        return {
+            callback: vertices[ran_as[callback]].callback.key if callback in ran_as
+            else self._who.name(callback) for callback in callbacks}
 
     # --- results ---------------------------------------------------------------------------------
 
@@ -272,7 +264,7 @@ class Explanation:
         if not wanted.any():
             return
         first = np.searchsorted(parts['miss'], np.arange(len(missed) + 1)).tolist()
-        vertices, names, waited = self._task_set.vertices, self._names(), self._behind()
+        vertices = self._task_set.vertices
         for miss in np.flatnonzero(wanted).tolist():
             kind, vertex, number, release, until, *_ = missed[miss].item()
             deadline = self._tables.sink_deadline[vertex]
@@ -282,16 +274,16 @@ class Explanation:
                 'release_ns': release, 'deadline_ns': release + deadline, 'until_ns': until,
                 'late_ns': until - release - deadline if kind == SINK_LATE else None,
                 'cause': CAUSES[self.found.causes[miss]], 'parts': [
-                    self._part(parts[i], number, waited.get(i, ()), names)
+                    self._part(i, number)
                     for i in range(first[miss], first[miss + 1])]}
 
-    def _part(
-        self, part: Any, job: int, waited: Iterable[tuple[int, int]], names: dict[int, str]
-    ) -> dict[str, Any]:
+    def _part(self, place: int, job: int) -> dict[str, Any]:
+        part = self.found.parts[place]
         found = {
             'vertex': self._task_set.vertices[int(part['vertex'])].name,
             'cause': PARTS[part['cause']], 'ns': int(part['ns']), 'behind': [
-                {'callback': names[callback], 'ns': took} for callback, took in waited]}
+                {'callback': self._names[callback], 'ns': took}
+                for callback, took in self._waited.get(place, ())]}
         if part['cause'] == SKIPPED:
             found['waiting_job'] = int(self._never.waiting(
                 part['vertex'][None], part['end'][None])[0])
@@ -306,14 +298,6 @@ class Explanation:
         legs = legs_of(one, self._task_set.dags[one.dag].vertices)
         return sorted({one.callback.topics[place] for leg, (place, _) in enumerate(legs)
                        if leg not in got and one.callback.topics})
-
-    def _names(self) -> dict[int, str]:
-        """Return the names of the callbacks that others waited for."""
-        vertices, ran_as = self._task_set.vertices, self._vertices()
-        callbacks = {callback for each in self._behind().values() for callback, _ in each}
-        return {
-            callback: vertices[ran_as[callback]].callback.key if callback in ran_as
-            else self._who.name(callback) for callback in callbacks}
 
     def causes(self) -> dict[tuple[int, int], str]:
         """Return the cause of each miss, by global vertex of the sink and job."""
@@ -339,29 +323,31 @@ class Explanation:
         ``ns`` is the mean time of the misses with this cause, ``vertex`` where most of it went,
         and ``behind`` the callback that they waited for longest, None if they did not wait.
         """
-        at: dict[tuple[int, int], Counter[int]] = {}
-        after: dict[tuple[int, int], Counter[int]] = {}
+        at: defaultdict[tuple[int, int], Counter[int]] = defaultdict(Counter)
+        after: defaultdict[tuple[int, int], Counter[int]] = defaultdict(Counter)
         missed, causes, parts, too_short = self.found
-        sinks, cause_of, waited = missed['sink'].tolist(), causes.tolist(), self._behind()
-        counts = Counter(zip(sinks, cause_of))
+        sinks, cause_of = missed['sink'].tolist(), causes.tolist()
         of, kind = parts['miss'], parts['cause']
         mine = np.flatnonzero((kind == causes[of]) | (
             (kind == RAN_USUALLY) & (causes[of] == RAN_LONG) & too_short[of]))
         for i, miss, vertex, ns in zip(mine.tolist(), *(
                 parts[name][mine].tolist() for name in ('miss', 'vertex', 'ns'))):
             key = sinks[miss], cause_of[miss]
-            at.setdefault(key, Counter())[vertex] += ns
-            for callback, took in waited.get(i, ()):
-                after.setdefault(key, Counter())[callback] += took
-        names, vertices = self._names(), self._task_set.vertices
-        return [{
-            'dag': self._task_set.dags[self._tables.dag_of[sink]].name,
-            'sink': vertices[sink].name, 'cause': CAUSES[cause], 'missed': n,
-            'ns': sum(at.get(key, {}).values()) // n,
-            'vertex': vertices[max(at[key], key=at[key].__getitem__)].name if key in at else None,
-            'behind': names[max(after[key], key=after[key].__getitem__)] if key in after else None}
-            for key, n in sorted(counts.items(), key=lambda item: (item[0][0], -item[1]))
-            for sink, cause in [key]]
+            at[key][vertex] += ns
+            for callback, took in self._waited.get(i, ()):
+                after[key][callback] += took
+        found, vertices = [], self._task_set.vertices
+        for key, n in sorted(Counter(zip(sinks, cause_of)).items(),
+                             key=lambda item: (item[0][0], -item[1])):
+            sink, cause = key
+            where, waited = (each[key].most_common(1) for each in (at, after))
+            found.append({
+                'dag': self._task_set.dags[self._tables.dag_of[sink]].name,
+                'sink': vertices[sink].name, 'cause': CAUSES[cause], 'missed': n,
+                'ns': at[key].total() // n,
+                'vertex': vertices[where[0][0]].name if where else None,
+                'behind': self._names[waited[0][0]] if waited else None})
+        return found
 
 
 def medians(numbers: Any, times: Ints, count: int) -> Ints:

@@ -30,18 +30,18 @@ Each trace becomes a recording; their tables are merged in the order of time.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import os
 from typing import Any
 
-from mddag_executor.core import legs_of, NEVER
+from mddag_executor.core import NEVER
 from mddag_executor.errors import UsageError
 from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.executions import Numbering
 from mddag_executor.recording.head import (
     declared,
     Head,
     is_declared,
-    named_errors,
     read_head,
     ReplayError,
 )
@@ -95,58 +95,45 @@ def label_of(path: str) -> str:
     return f'{rest.rpartition(".")[2]}.{word}' if rest and word.isdecimal() else word
 
 
-def names_of(paths: Iterable[str]) -> set[str]:
-    """Return the names of traces that an offset may use: paths or processes."""
-    return {name for path in paths for name in (path, label_of(path))}
-
-
 class _Part:
-    """One trace: the position of its times, workers and addresses in the joined recording."""
+    """
+    One trace: the position of its times, workers and addresses in the joined recording.
 
-    def __init__(self, place: int, path: str, name: str) -> None:
-        self.place, self.name = place, name
-        with named_errors(path, name):
-            self.reader = TraceReader(path)
-            head = read_head(self.reader)
-            if head is None:
-                raise ReplayError(
-                    name, 'it was not recorded by this executor', 'replay it by itself')
-            if not is_declared(head):
-                raise ReplayError(
-                    name, 'it was recorded without a declaration, so its jobs have no names that '
-                    'other traces know', 'replay it by itself, with a GRAPH')
-            self.head: Head = head
-            self.clock = self.judges_from = 0
-            self.end: int | None = None
-            self.boot = ''
-            for event in self.reader.events({_INIT, clocks.HOST, _SHUTDOWN, _JUDGE_FROM}):
-                if None in event:
-                    continue
-                if event[0] == _INIT:
-                    self.clock = event[4]
-                elif event[0] == clocks.HOST:
-                    self.boot = event[5]
-                elif event[0] == _SHUTDOWN:
-                    self.end = event[4]
-                else:
-                    self.judges_from = event[4]
-        self.shift = 0
-        self.label = label_of(name)
-        # by vertex the time of its first and last execution
-        self.ran: dict[int, tuple[int, int]] = {}
-        self.first_worker = 0
-        self.first_spare = 0
-        self.last = 0
-        #: By DAG the vertices that run here; only if some run elsewhere.
+    :ivar ran: by vertex the time of its first and last execution.
+    :ivar hosted: by DAG the vertices that run here; only if some run elsewhere.
+    :ivar number: by release the number of its job; ``is_first``: whether no other process released
+        it before; ``expected``: the number of legs to complete here.
+    :ivar open_jobs: DAGs and numbers of the jobs that are open at the end.
+    """
+
+    ran: dict[int, tuple[int, int]]
+    number: Ints
+    is_first: Mask
+    expected: Ints
+    open_jobs: list[tuple[int, int]]
+    recording: Recording
+    seen_at: Ints
+
+    def __init__(self, place: int, path: str, first_worker: int) -> None:
+        self.place, self.name, self.first_worker = place, path, first_worker
+        self.reader = TraceReader(path)
+        head = read_head(self.reader)
+        if head is None:
+            raise ReplayError(path, 'it was not recorded by this executor', 'replay it by itself')
+        if not is_declared(head):
+            raise ReplayError(
+                path, 'it was recorded without a declaration, so its jobs have no names that '
+                'other traces know', 'replay it by itself, with a GRAPH')
+        self.head: Head = head
+        last = {event[0]: event[4:] for event in self.reader.events(
+            {_INIT, clocks.HOST, _SHUTDOWN, _JUDGE_FROM}) if None not in event}
+        self.clock: int = last.get(_INIT, (0,))[0]
+        self.boot: str = last.get(clocks.HOST, ('', ''))[1]
+        self.end: int | None = last.get(_SHUTDOWN, (None,))[0]
+        self.judges_from: int = last.get(_JUDGE_FROM, (0,))[0]
+        self.shift = self.last = 0
+        self.label = label_of(path)
         self.hosted: dict[int, frozenset[int]] = {}
-        # By release: number of its job, whether no other process released it before, and number of
-        # legs to complete here.
-        self.number = self.expected = np.empty(0, dtype=np.int64)
-        self.is_first: Mask = np.empty(0, dtype=np.bool_)
-        #: DAGs and numbers of the jobs that are open at the end.
-        self.open_jobs: list[tuple[int, int]] = []
-        self.recording: Recording
-        self.seen_at = self.number
 
     @property
     def first(self) -> int:
@@ -154,9 +141,9 @@ class _Part:
         return self.head.time + self.shift
 
     def read(
-        self, who: Entities, threads: Numbers, count: int, progress: Progress | None
+        self, who: Entities, threads: Numbers, workers: int, count: int, progress: Progress | None
     ) -> None:
-        """Read its tables, with joined times and addresses (rules 1 and 2)."""
+        """Read its tables, with joined times, addresses and ``workers`` (rules 1 and 2)."""
         found, self.seen_at = read_process(
             self.reader, self.name, self.head, who, self._edited,
             None if progress is None else lambda more: progress(count + more))
@@ -172,8 +159,9 @@ class _Part:
         for addresses in (found.executions['callback'], found.publications['publisher']):
             addresses[(addresses > 0) & (addresses < 1 << _BITS)] |= self.place << _BITS
         worker = found.executions['worker']
-        worker += np.where(worker < 0, 0, np.where(      # other threads lent themselves
-            worker < self.head.workers, self.first_worker, self.first_spare)).astype(worker.dtype)
+        # other threads, with higher numbers, lent themselves
+        worker += np.where(worker < 0, 0, self.first_worker + np.where(
+            worker < self.head.workers, 0, workers)).astype(worker.dtype)
         thread = found.executions['thread']
         numbers, of = different(thread)
         thread[:] = np.array([threads.of(self.place, each) for each in numbers.tolist()],
@@ -239,48 +227,35 @@ class Joined:
     """
     Joins traces of this executor.
 
-    :param files: paths of the traces, and their names in messages.
     :param offsets: how far clocks of other machines are ahead of the first trace's clock, ns, by
         the last word of a trace's name, or its path.
     :raises mddag_executor.trace.TraceError: if a file is not a trace.
     :raises ReplayError: if the traces are of several runs.
     """
 
-    def __init__(
-        self, files: Sequence[tuple[str, str]], offsets: Mapping[str, int],
-    ) -> None:
-        self._parts = [_Part(i, path, name) for i, (path, name) in enumerate(files)]
+    def __init__(self, paths: Sequence[str], offsets: Mapping[str, int]) -> None:
+        self._parts: list[_Part] = []
+        self._workers = 0
+        for place, path in enumerate(paths):
+            self._parts.append(_Part(place, path, self._workers))
+            self._workers += self._parts[-1].head.workers
         first = self._parts[0]
-        self.head, self.name = first.head, ', '.join(part.name for part in self._parts)
+        self.head, self.name = first.head, ', '.join(paths)
         self.task_set = declared(first.head, first.name)
         self.warnings: list[str] = []
-        workers = spare = 0
         for part in self._parts:
             if part.head.yaml != self.head.yaml:
                 raise ReplayError(
                     part.name, f'it was recorded with another declaration than {first.name}',
                     'give the traces of one run')
-            part.first_worker = workers
-            workers += part.head.workers
-        for part in self._parts:
-            part.first_spare = workers + spare
-            spare += part.head.workers
         self._machines = clocks.machines([(part.boot, part.clock) for part in self._parts])
         self._set_clocks(self._given(offsets))
-        self._workers = workers
-        #: Number of workers of each process, at most.
-        self.workers_each = max(part.head.workers for part in self._parts)
-        #: Names of workers: the last word of the trace's name.
-        self.worker_names = [
-            f'{part.label} {worker}' for part in self._parts
-            for worker in range(part.head.workers)]
         # by DAG: releases with their job numbers, and the parts that have released the job
         self._releases: list[deque[tuple[int, int, set[int]]]] = [
             deque(maxlen=_KEPT) for _ in self.task_set.dags]
         self._next = [0] * len(self.task_set.dags)
         #: By vertex the number of its legs, and by DAG its vertices.
-        self._legs = np.array([max(1, len(legs_of(vertex, dag.vertices)))
-                               for dag in self.task_set.dags for vertex in dag.vertices])
+        self._legs = Numbering(self.task_set).n_legs
         first_of = np.cumsum([0, *(len(dag.vertices) for dag in self.task_set.dags)]).tolist()
         self._vertices = [range(*each) for each in zip(first_of, first_of[1:])]
         self._hosted: list[tuple[int, int, int, frozenset[int]]] = []
@@ -290,8 +265,8 @@ class Joined:
         found: dict[int, int] = {}
         for label, ahead in offsets.items():
             machine = next(
-                (m for m, part in zip(self._machines, self._parts) if label in names_of(
-                    [part.name])), None)
+                (m for m, part in zip(self._machines, self._parts)
+                 if label in (part.name, part.label)), None)
             if machine is None:
                 raise UsageError(f'--offset: there is no trace of {label}: name one of '
                                  + listed([part.label for part in self._parts]))
@@ -335,7 +310,7 @@ class Joined:
         """
         who, threads, count = Entities(by_address=True), Numbers(), 0
         for part in self._parts:
-            part.read(who, threads, count, progress)
+            part.read(who, threads, self._workers, count, progress)
             count += part.reader.message_count or 0
         self._number_jobs()
         rows = [part.renumber(self._legs) for part in self._parts]
@@ -344,8 +319,11 @@ class Joined:
             time=min(part.first for part in self._parts), workers=self._workers)
         found = Recording(
             self.name, head, self.task_set, self.task_set, who, same=False,
-            processes=len(self._parts), workers_each=self.workers_each, placed=self._placed(),
-            worker_names=self.worker_names)
+            processes=len(self._parts), placed=self._placed(),
+            workers_each=max(part.head.workers for part in self._parts),
+            # the last word of the trace's name
+            worker_names=[f'{part.label} {worker}' for part in self._parts
+                          for worker in range(part.head.workers)])
         self._join(found, rows)
         self._set_end(found)
         found.warnings = [*self.warnings, *self._lines(found.end), *end_lines(found)]

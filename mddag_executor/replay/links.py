@@ -430,12 +430,6 @@ class Links:
         found['stamp'][self._row[last[at]]] = table['b'][at]
         return np.empty((0, 2), dtype=np.int64)
 
-    def topic(self, row: int) -> str:
-        """Return the topic of a publication; empty if unknown."""
-        publisher = self.messages['publisher'][row]
-        topic: str = self.publishers[publisher].topic if publisher >= 0 else ''
-        return topic
-
     def _find(self, topic: Ints, stamp: Ints) -> Ints:
         """Return the publications of source timestamps; ``_NONE`` or ``_SEVERAL`` without one."""
         which, count = find_pairs(self._pairs, (topic, stamp))
@@ -551,7 +545,9 @@ class Links:
             elif what == ENQUEUE:
                 before = by_slot.pop((pid, a, b), -1)
                 if c and before >= 0 and last[here] >= 0 and kind[last[here]] > END:
-                    self.losses.count('overwritten', self.topic(before) or 'unknown topic')
+                    publisher = self.messages['publisher'][before]
+                    self.losses.count('overwritten', self.publishers[publisher].topic
+                                      if publisher >= 0 else 'unknown topic')
                 if last[here] >= 0 and kind[last[here]] > END:
                     by_slot[pid, a, b] = int(self._row[last[here]])
             elif (pid, a, b) in by_slot:

@@ -42,7 +42,7 @@ the recorded indices.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.recording import tables as recorded_tables
@@ -60,13 +60,13 @@ from mddag_executor.replay.spans import crowded, Spans
 from mddag_executor.replay.usage import ran
 from mddag_executor.simulate import Load
 from mddag_executor.simulate.deliveries import DELAY_NS
-from mddag_executor.simulate.load import edge_numbers, edges_of, FAILS, RUNS, SKIPPED
+from mddag_executor.simulate.load import edge_numbers, FAILS, RUNS, SKIPPED
 from msg_graph import Dag
 from msg_graph.model import topological_order
 import numpy as np
 
 _UNKNOWN = -1
-_UNTOLD = -2
+_NOT_RECORDED = -2
 
 
 class RecordedLoad(NamedTuple):
@@ -101,29 +101,6 @@ _COLUMNS = {
 """Columns by job, by job and vertex, or by job and edge; ns or unknown (``sent``: 1)."""
 
 
-class _Jobs:
-    """
-    The jobs of one DAG.
-
-    Each of ``_COLUMNS`` is an attribute, a view of its part of the column of all DAGs.
-    """
-
-    def __init__(self, dag: Dag, n_edges: int, numbers: Ints) -> None:
-        self.size = len(dag.vertices)
-        self.widths = 1, self.size, n_edges
-        self.publishers = [v.index for v in dag.vertices for _ in v.successors]     # by edge
-        self.numbers = numbers
-
-    if TYPE_CHECKING:
-        def __getattr__(self, name: str) -> Any:
-            """Declare the columns for type checkers."""
-
-    def rows(self, name: str) -> Any:
-        """Return a column as an array with a row for each job."""
-        return getattr(self, name).reshape(
-            len(self.numbers), self.widths[_COLUMNS[name][0]])
-
-
 class LoadBuilder:
     """
     Makes a load from a recording.
@@ -150,60 +127,74 @@ class LoadBuilder:
             [numbers[first + before, first + vertex.index]
              for _, before in legs_of(vertex, dag.vertices)]
             for dag, first in zip(task_set.dags, tables.first_vertex) for vertex in dag.vertices]
+        # by DAG and edge: the vertex that publishes
+        self._publishers = [[v.index for v in dag.vertices for _ in v.successors]
+                            for dag in task_set.dags]
         self._failed: set[tuple[int, int]] = set()
         self._skipped: set[tuple[int, int]] = set()
         releases = recording.releases[sort_by(recording.releases['order'])]
         of_dag = [releases[mine] for mine in rows_by(releases['dag'], len(task_set.dags))]
-        self._jobs = [_Jobs(dag, n, mine['job'].copy()) for dag, n, mine in zip(
-            task_set.dags, edges_of(tables), of_dag)]
+        # by DAG: the recorded numbers of its jobs
+        self._numbers = [mine['job'].copy() for mine in of_dag]
         # by kind of column and DAG: the values of each job, and where they begin
         self._widths = np.array(
-            [jobs.widths for jobs in self._jobs], dtype=np.int64).reshape(-1, 3).T
-        counts = np.array([len(jobs.numbers) for jobs in self._jobs], dtype=np.int64)
+            [(1, len(dag.vertices), len(edges)) for dag, edges in zip(
+                task_set.dags, self._publishers)], dtype=np.int64).reshape(-1, 3).T
+        counts = np.array([len(mine) for mine in of_dag], dtype=np.int64)
         self._begins = np.cumsum(np.pad(self._widths * counts, ((0, 0), (1, 0))), axis=1)
         # by kind of column and vertex: its place in the first job, and the step to the next job
         dag_of = np.array(tables.dag_of[:tables.n_vertices], dtype=np.int64)
         self._base, self._step = self._begins[:, dag_of], self._widths[:, dag_of]
         self._base[_VERTEX] += np.array(tables.index_in_dag[:tables.n_vertices], dtype=np.int64)
-        self._whole: dict[str, Any] = {}
-        for name, (by, kind) in _COLUMNS.items():
-            self._whole[name] = np.full(self._begins[by, -1], _UNKNOWN, dtype=kind)
-            for jobs, part in zip(self._jobs, np.split(self._whole[name], self._begins[by, 1:])):
-                setattr(jobs, name, part)
-        for jobs, mine in zip(self._jobs, of_dag):
-            jobs.release[:] = mine['release']
-            jobs.noticed[:] = np.maximum(mine['release'], mine['noticed'])
-        self._job_ends()
+        self._columns: dict[str, Any] = {
+            name: np.full(self._begins[by, -1], _UNKNOWN, dtype=kind)
+            for name, (by, kind) in _COLUMNS.items()}
+        for dag, mine in enumerate(of_dag):
+            release, noticed = self._of(dag, 'release', 'noticed')
+            release[:] = mine['release']
+            noticed[:] = np.maximum(mine['release'], mine['noticed'])
+        self._note_ends()
         #: Columns of the executions; by execution the row of its job.
         self._executions = table = _contiguous(
             recording.executions, 'dag', 'vertex', 'job', 'piece', 'leg', 'completes', 'order',
             'worker', 'ready', 'start', 'began', 'end', 'busy', 'cpu', 'holds_gil')
         self._row = np.full(len(recording.executions), _UNKNOWN)
-        for jobs, mine in zip(self._jobs, rows_by(table['dag'], len(self._jobs))):
-            self._row[mine] = look_up(jobs.numbers, table['job'][mine])
-        self._take_pieces(n_workers)
-        self._take_completions()
-        self._take_publications()
+        for jobs, mine in zip(self._numbers, rows_by(table['dag'], len(self._numbers))):
+            self._row[mine] = look_up(jobs, table['job'][mine])
+        self._note_pieces(n_workers)
+        self._note_completions()
+        self._note_publications()
         del self._row, self._executions
+
+    def _of(self, dag: int, *names: str) -> list[Any]:
+        """Return the columns of a DAG as views; those of vertices and edges have a row a job."""
+        found = []
+        for name in names:
+            by, _ = _COLUMNS[name]
+            begin, end = self._begins[by, dag:dag + 2]
+            shape = len(self._numbers[dag]), self._widths[by, dag]
+            found.append(self._columns[name][begin:end].reshape(shape[:1 + (by != _JOB)]))
+        return found
 
     def _places(self, by: int, row: Any, vertex: Any) -> Ints:
         """Return the places of vertices of jobs in a kind of column (``_EDGE``: of edge 0)."""
         place: Ints = self._base[by][vertex] + row * self._step[by][vertex]
         return place
 
-    def _job_ends(self) -> None:
+    def _note_ends(self) -> None:
         """Keep failed and skipped executions: they fail or are skipped again."""
         ends = self._recording.job_ends
-        for dag, jobs in enumerate(self._jobs):
+        for dag, jobs in enumerate(self._numbers):
             mine = ends[ends['dag'] == dag]
-            row = look_up(jobs.numbers, mine['job'])
+            row = look_up(jobs, mine['job'])
             failed = (row >= 0) & (mine['reason'] == recorded_tables.FAILED)
             self._failed |= set(zip(mine['vertex'][failed].tolist(), row[failed].tolist()))
             skipped = (row >= 0) & (mine['reason'] == recorded_tables.EXPIRED)
-            skipped[skipped] = jobs.noticed[row[skipped]] == mine['time'][skipped]
+            noticed, = self._of(dag, 'noticed')
+            skipped[skipped] = noticed[row[skipped]] == mine['time'][skipped]
             self._skipped |= {(dag, each) for each in row[skipped].tolist()}
 
-    def _take_pieces(self, n_workers: int) -> None:
+    def _note_pieces(self, n_workers: int) -> None:
         """Find the dispatch times of pieces; keep undeclared pieces."""
         table = self._executions
         rows = ran(table)
@@ -222,7 +213,7 @@ class LoadBuilder:
         # ready, duration, dispatch or -1: undeclared callbacks, and legs that completed nothing
         self._others = [np.column_stack((ready[others], (end - start)[others], others))]
         source = np.flatnonzero((row >= 0) & np.isin(vertex, self._tables.source[:-1]))
-        turn = self._whole['turn'][self._places(_JOB, row[source], vertex[source])]
+        turn = self._columns['turn'][self._places(_JOB, row[source], vertex[source])]
         known = first[source] & (turn >= 0)
         ready[source[known]] = turn[known]
         self._late = dispatch_times(
@@ -236,7 +227,7 @@ class LoadBuilder:
         self.callback_of: dict[int, int] = {
             v: int(callback[at]) for v, at in enumerate(ran_as[:-1].tolist()) if at >= 0}
         mine = np.flatnonzero(first & (row >= 0) & (vertex >= 0))
-        self._whole['dispatch'][self._places(_VERTEX, row[mine], vertex[mine])] = mine
+        self._columns['dispatch'][self._places(_VERTEX, row[mine], vertex[mine])] = mine
 
     def _find_turns(self, process: int, start: Ints, end: Ints) -> None:
         """
@@ -247,101 +238,95 @@ class LoadBuilder:
         :param start: of the executions of a process; ``end``: likewise, ascending.
         """
         start = np.append(np.sort(start), NEVER)
-        for source, timer, jobs in zip(self._tables.source, self._timer, self._jobs):
-            if not timer or self._process[source] != process or not len(end):
+        for dag, source in enumerate(self._tables.source[:-1]):
+            if not self._timer[dag] or self._process[source] != process or not len(end):
                 continue
-            ended = end[np.maximum(0, np.searchsorted(end, jobs.noticed, 'right') - 1)]
-            known = (ended >= jobs.release) & (ended <= jobs.noticed) & (
-                start[np.searchsorted(start, ended)] >= jobs.noticed)
-            jobs.turn[known] = ended[known]
-            jobs.busy[:] = np.searchsorted(start, jobs.release, 'right') > np.searchsorted(
-                end, jobs.release, 'right')
+            release, noticed, turn, busy = self._of(dag, 'release', 'noticed', 'turn', 'busy')
+            ended = end[np.maximum(0, np.searchsorted(end, noticed, 'right') - 1)]
+            known = (ended >= release) & (ended <= noticed) & (
+                start[np.searchsorted(start, ended)] >= noticed)
+            turn[known] = ended[known]
+            busy[:] = np.searchsorted(start, release, 'right') > np.searchsorted(
+                end, release, 'right')
 
     def _groups(self, rows: Ints, vertex: Ints) -> Ints:
         """Return numbers of the mutually exclusive groups of executions, or -1."""
         known = self._recording.who.groups
         callbacks, which = self._recording.callbacks()
-        group_of = [known.get(each, _UNTOLD) for each in callbacks.tolist()]
+        group_of = [known.get(each, _NOT_RECORDED) for each in callbacks.tolist()]
         # small numbers, which are sorted fast: recorded groups, then declared ones
         numbers = {each: n for n, each in enumerate({g for g in group_of if g >= 0})}
         group = np.array([numbers.get(each, each) for each in group_of], dtype=np.min_scalar_type(
             -2 - len(numbers) - self._tables.n_groups))[which[rows]]
-        unknown = np.flatnonzero(group == _UNTOLD)
+        unknown = np.flatnonzero(group == _NOT_RECORDED)
         declared = np.array([*self._tables.group[:self._tables.n_vertices], -1])[vertex[unknown]]
         group[unknown] = np.where(declared >= 0, len(numbers) + declared, -1)
         return group
 
-    def _take_completions(self) -> None:
+    def _note_completions(self) -> None:
         """Note the execution times of executions that completed a vertex."""
-        table, whole = self._executions, self._whole
+        table, columns = self._executions, self._columns
         rows = np.flatnonzero(
             (table['completes'] != recorded_tables.NOTHING) & (table['vertex'] >= 0)
             & (self._row >= 0) & (table['start'] >= 0))
         rows = rows[sort_by(table['order'][rows])]
+        row, vertex, ready, leg, completes = self._row[rows], *(
+            table[name][rows] for name in ('vertex', 'ready', 'leg', 'completes'))
         n_legs = np.array([max(1, len(each)) for each in self._edges_into])
         width = int(n_legs.max(initial=1))
         edges = np.array([[*each, *[-1] * (width - len(each))] for each in self._edges_into]
                          or [[-1]])
-        together: list[Ints] = []   # rows of executions for several legs
-        for part in in_parts(rows):
-            row, vertex, ready, leg = self._row[part], *(
-                table[name][part] for name in ('vertex', 'ready', 'leg'))
-            every_leg = (leg == recorded_tables.ALL_LEGS) & (n_legs[vertex] > 1)
-            leg = np.where(leg < 0, n_legs[vertex] - 1, leg)
-            edge = np.where(leg < width, edges[vertex, np.minimum(leg, width - 1)], -1)
-            known = edge >= 0
-            whole['arrived'][self._places(_EDGE, row[known], vertex[known]) + edge[known]] = ready[
-                known]
-            ended = table['completes'][part] == recorded_tables.VERTEX
-            others = part[~ended]
-            self._others.append(np.column_stack((
-                ready[~ended], table['busy'][others], np.full(len(others), _UNKNOWN))))
-            together.append(part[ended & every_leg])
-            place, done = self._places(_VERTEX, row[ended], vertex[ended]), part[ended]
-            for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
-                                 ('start', 'began'), ('end', 'end')):
-                whole[name][place] = table[column][done]
-            source = np.flatnonzero(ended & ~known)
-            place = self._places(_JOB, row[source], vertex[source])
-            later = ready[source] >= whole['release'][place]
-            whole['noticed'][place[later]] = ready[source[later]]
-        every = np.concatenate(together) if together else rows
-        vertex = table['vertex'][every]
-        for v in np.unique(vertex).tolist():
-            self._all_at_once(self._jobs[self._tables.dag_of[v]], self._row[every[vertex == v]],
-                              self._edges_into[v])
+        ended = completes == recorded_tables.VERTEX
+        every_leg = ended & (leg == recorded_tables.ALL_LEGS) & (n_legs[vertex] > 1)
+        leg = np.where(leg < 0, n_legs[vertex] - 1, leg)
+        edge = np.where(leg < width, edges[vertex, np.minimum(leg, width - 1)], -1)
+        known = edge >= 0
+        columns['arrived'][self._places(_EDGE, row[known], vertex[known]) + edge[known]] = ready[
+            known]
+        self._others.append(np.column_stack((
+            ready[~ended], table['busy'][rows[~ended]], np.full(int((~ended).sum()), _UNKNOWN))))
+        place, done = self._places(_VERTEX, row[ended], vertex[ended]), rows[ended]
+        for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
+                             ('start', 'began'), ('end', 'end')):
+            columns[name][place] = table[column][done]
+        source = ended & ~known
+        place = self._places(_JOB, row[source], vertex[source])
+        columns['noticed'][place] = np.maximum(ready[source], columns['release'][place])
+        for v in np.unique(vertex[every_leg]).tolist():
+            self._split_legs(self._tables.dag_of[v], row[every_leg & (vertex == v)],
+                             self._edges_into[v])
 
-    def _all_at_once(self, jobs: _Jobs, rows: Ints, edges: list[int]) -> None:
-        """If one execution completes all legs, only the last message's time is known."""
-        ends = jobs.rows('end')[rows][:, [jobs.publishers[edge] for edge in edges]]
-        arrived = jobs.rows('arrived')
-        for edge, end in zip(edges, ends.T):
-            early = end < ends.max(axis=1)
-            arrived[rows[early], edge] = end[early]
+    def _split_legs(self, dag: int, rows: Ints, edges: list[int]) -> None:
+        """If one execution completed all legs, only the last message's time is known."""
+        end, arrived = self._of(dag, 'end', 'arrived')
+        ends = end[rows][:, [self._publishers[dag][edge] for edge in edges]]
+        for edge, published in zip(edges, ends.T):
+            early = published < ends.max(axis=1)
+            arrived[rows[early], edge] = published[early]
 
-    def _take_publications(self) -> None:
+    def _note_publications(self) -> None:
         """Note which edges the publications of jobs satisfied."""
-        edges_from: dict[tuple[int, str], list[int]] = {}
-        numbers = edge_numbers(self._tables)
+        edges_from: dict[tuple[int, str | None], list[int]] = {}
         for dag, first in zip(self._task_set.dags, self._first):
             for vertex in dag.vertices:
-                for place, before in legs_of(vertex, dag.vertices):
+                for (place, before), edge in zip(
+                        legs_of(vertex, dag.vertices), self._edges_into[first + vertex.index]):
                     edges_from.setdefault(
-                        (first + before, vertex.callback.topics[place]), []).append(
-                            numbers[first + before, first + vertex.index])
+                        (first + before, vertex.callback.topics[place]), []).append(edge)
         table, sent = self._executions, self._recording.publications
         by = sent['execution']
         by, publisher = by[by >= 0], sent['publisher'][by >= 0]
         row, vertex_of = self._row[by], table['vertex'][by]
         known = (row >= 0) & (vertex_of >= 0)
         row, vertex_of, publisher = row[known], vertex_of[known], publisher[known]
+        publishers = self._recording.who.every_publisher
         for number in np.unique(publisher).tolist():
-            found = self._recording.who.every_publisher.get(number)
+            topic = publishers[number].topic if number in publishers else None
             mine = publisher == number
-            for v in np.unique(vertex_of[mine]).tolist() if found is not None else ():
+            for v in np.unique(vertex_of[mine]).tolist():
                 places = self._places(_EDGE, row[mine & (vertex_of == v)], v)
-                for edge in edges_from.get((v, found.topic), ()) if found is not None else ():
-                    self._whole['sent'][places + edge] = 1
+                for edge in edges_from.get((v, topic), ()):
+                    self._columns['sent'][places + edge] = 1
 
     def times(self) -> list[list[int]]:
         """Return by DAG and vertex the execution time, 0 if unknown."""
@@ -360,14 +345,15 @@ class LoadBuilder:
         """
         process = process or self._process
         every, usual, late = self._dispatches()
-        self._take_cpu_times(workers == 1 or max(process) < max(self._process))
+        self._subtract_others(workers == 1 or max(process) < max(self._process))
         unsent = self._unsent()
         delays, transport = self._transports(overheads, process)
         if unsent:
             delays[np.concatenate([each.ravel() for each in unsent])] = NEVER
-        self._drop('start', 'end', 'arrived', 'sent')
+        for name in ('start', 'end', 'arrived', 'sent'):    # they are large for long runs
+            del self._columns[name]
         estimated, unknown = self._estimate(process, unsent)
-        took, cpu, held = (self._whole.pop(name) for name in ('took', 'cpu', 'held'))
+        took, cpu, held = (self._columns[name] for name in ('took', 'cpu', 'held'))
         demand, executions = int(took.sum()), len(took)
         if overheads:
             took += late
@@ -377,7 +363,6 @@ class LoadBuilder:
         number = others[:, 2]
         costs = np.concatenate([took, np.maximum(0, others[:, 1]) + np.where(
             number >= 0, every[number], 0)])
-        bases = self._begins[_VERTEX].tolist()
         columns: dict[str, Any] = {
             'holds': np.concatenate([held, more]) if held.any() else []}
         if len(self._recording.executions):
@@ -385,26 +370,18 @@ class LoadBuilder:
                 'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
                 'delays': delays, 'delay_stride': self._widths[_EDGE].tolist(),
                 'delay_base': self._begins[_EDGE, :-1].tolist()}
-        load = self._load(costs, bases, others[:, 0], overheads, workers == 1)
-        load = load._replace(
-            fates=self._fates(len(costs)), **columns)
+        load = self._load(costs, others[:, 0], overheads, workers == 1)
         return RecordedLoad(
-            load, [jobs.numbers.tolist() for jobs in self._jobs], demand, executions, estimated,
-            unknown, usual, transport, late if overheads else late[:0])
-
-    def _drop(self, *columns: str) -> None:
-        """Free columns, which are large for long runs."""
-        for name in columns:
-            del self._whole[name]
-            for jobs in self._jobs:
-                delattr(jobs, name)
+            load._replace(fates=self._fates(len(costs)), **columns),
+            [jobs.tolist() for jobs in self._numbers], demand, executions, estimated, unknown,
+            usual, transport, late if overheads else late[:0])
 
     def _unsent(self) -> list[Any]:
         """Return by DAG, job and edge whether the edge was not published, as far as known."""
         found = []
-        for jobs in self._jobs:
-            sent, arrived, end = map(jobs.rows, ('sent', 'arrived', 'end'))
-            completed = end[:, jobs.publishers] >= 0
+        for dag, publishers in enumerate(self._publishers):
+            sent, arrived, end = self._of(dag, 'sent', 'arrived', 'end')
+            completed = end[:, publishers] >= 0
             found.append((sent < 0) & (arrived < 0) & completed & (sent >= 0).any(axis=0))
         return found
 
@@ -429,8 +406,8 @@ class LoadBuilder:
         typical = self._typical()
         unknown: dict[str, None] = {}
         estimated = 0
-        for dag, jobs, edges in zip(self._task_set.dags, self._jobs, unsent):
-            took, cpu, held = map(jobs.rows, ('took', 'cpu', 'held'))
+        for dag, edges in zip(self._task_set.dags, unsent):
+            took, cpu, held = self._of(dag.index, 'took', 'cpu', 'held')
             took[[row for of, row in self._skipped if of == dag.index]] = 0
             took[(took < 0) & self._never_ready(dag, edges)] = 0
             if self._times is not None:
@@ -467,55 +444,49 @@ class LoadBuilder:
 
     def _dispatches(self) -> tuple[Any, int | None, Any]:
         """Return dispatch times by number (the last: the median), the median, and by execution."""
-        number = self._whole['dispatch']
+        number = self._columns.pop('dispatch')
         known = number[number >= 0]
         usual = quantile(memoryview(np.sort(self._late[known])), 0.5) if len(known) else None
         every = np.append(self._late, usual or 0)     # number -1
-        late = every[number]
-        del self._late, number
-        self._drop('dispatch')
-        return every, usual, late
+        return every, usual, every[number]
 
-    def _take_cpu_times(self, alone: bool) -> None:
+    def _subtract_others(self, alone: bool) -> None:
         """
         Subtract from durations the time in which others computed, down to the CPU time.
 
         :param alone: whether executions that hold the GIL take their CPU time.
         """
         took, cpu, held, start, end = (
-            self._whole[name] for name in ('took', 'cpu', 'held', 'start', 'end'))
+            self._columns[name] for name in ('took', 'cpu', 'held', 'start', 'end'))
         known = cpu >= 0
         computes = known & np.where(held > 0, alone, 2 * cpu >= took)
         np.minimum(took, cpu, out=took, where=computes)
         holds = np.flatnonzero(known & (held > 0))
         process = np.concatenate([np.empty(0, dtype=np.int64), *(
-            np.tile(self._process[first:first + jobs.size], len(jobs.numbers))
-            for first, jobs in zip(self._first, self._jobs))])[holds]
+            np.tile(self._process[first:after], len(jobs))
+            for first, after, jobs in zip(self._first, self._first[1:], self._numbers))])[holds]
         for number in np.unique(process).tolist():
             mine = holds[process == number]
             shared = Spans(*crowded(start[mine], end[mine], 2)).within(start[mine], end[mine])
             took[mine] = np.maximum(np.minimum(took[mine], cpu[mine]), took[mine] - shared)
 
-    def _load(
-        self, costs: Any, bases: list[int], others: Ints, overheads: bool, one_worker: bool
-    ) -> Load:
+    def _load(self, costs: Any, others: Ints, overheads: bool, one_worker: bool) -> Load:
         # ready, DAG, row of the job in its DAG, release
+        n_dags = len(self._numbers)
         parts = [np.column_stack((
-            others, np.full(len(others), len(self._jobs)), np.arange(len(others)), others))]
-        for dag, jobs in zip(self._task_set.dags, self._jobs):
-            ideal = self._timer[dag.index] and not overheads
-            ready: Any = jobs.release if ideal else np.where(
-                (jobs.turn >= 0) | one_worker & (jobs.busy > 0), jobs.release, jobs.noticed)
+            others, np.full(len(others), n_dags), np.arange(len(others)), others))]
+        for dag in range(n_dags):
+            release, noticed, turn, busy = self._of(dag, 'release', 'noticed', 'turn', 'busy')
+            ready = release if self._timer[dag] and not overheads else np.where(
+                (turn >= 0) | one_worker & (busy > 0), release, noticed)
             parts.append(np.column_stack((
-                ready, np.full(len(ready), dag.index), np.arange(len(ready)), jobs.release)))
+                ready, np.full(len(ready), dag), np.arange(len(ready)), release)))
         columns = np.concatenate(parts).T
         ready, dags, rows, release = columns[:, np.lexsort(columns[::-1])]
-        return Load(
-            ready, dags, rows, costs, bases, [*(jobs.size for jobs in self._jobs), 1], release)
+        return Load(ready, dags, rows, costs, self._begins[_VERTEX].tolist(),
+                    [*self._widths[_VERTEX].tolist(), 1], release)
 
-    def _transports(
-        self, overheads: bool, process: Sequence[int]
-    ) -> tuple[Any, int | None]:
+    def _transports(self, overheads: bool, process: Sequence[int]) -> tuple[Any, int | None]:
         """
         Return the transports by job, and the median of all measured ones.
 
@@ -524,11 +495,11 @@ class LoadBuilder:
         delays: list[Any] = []
         measured: dict[bool, list[Any]] = {False: [np.zeros(0)], True: [np.zeros(0)]}
         changed: list[tuple[Any, bool]] = []
-        for jobs, crosses in zip(self._jobs, self._crossings(process)):
-            start, end, arrived = map(jobs.rows, ('start', 'end', 'arrived'))
-            ended = end[:, jobs.publishers]
+        for dag, crosses in enumerate(self._crossings(process)):
+            start, end, arrived = self._of(dag, 'start', 'end', 'arrived')
+            ended = end[:, self._publishers[dag]]
             found = arrived - ended
-            known = (arrived >= start[:, jobs.publishers]) & (ended >= 0)
+            known = (arrived >= start[:, self._publishers[dag]]) & (ended >= 0)
             for edge, (before, after) in enumerate(crosses):
                 column = found[known[:, edge], edge]
                 found[~known[:, edge], edge] = np.median(column) if len(column) else 0
@@ -547,7 +518,7 @@ class LoadBuilder:
 
     def _crossings(self, process: Sequence[int]) -> list[list[tuple[bool, bool]]]:
         """Return by DAG and edge whether it crossed processes, and whether it will."""
-        found: list[list[tuple[bool, bool]]] = [[] for _ in self._jobs]
+        found: list[list[tuple[bool, bool]]] = [[] for _ in self._numbers]
         was = self._process
         for a, b in edge_numbers(self._tables):
             found[self._tables.dag_of[a]].append((was[a] != was[b], process[a] != process[b]))
@@ -556,10 +527,10 @@ class LoadBuilder:
     def _typical(self) -> dict[str, int]:
         """Return by callback the median of its recorded times, otherwise the declared mean."""
         recorded: dict[str, list[Any]] = {}
-        for dag, jobs in zip(self._task_set.dags, self._jobs):
+        for dag in self._task_set.dags:
+            took, = self._of(dag.index, 'took')
             for vertex in dag.vertices:
-                recorded.setdefault(vertex.callback.key, []).append(
-                    np.array(jobs.took[vertex.index::jobs.size]))
+                recorded.setdefault(vertex.callback.key, []).append(took[:, vertex.index])
         typical = {
             c.key: c.execution_time.mean_ns
             for c in self._task_set.callbacks if c.execution_time is not None}

@@ -21,7 +21,7 @@ from mddag_executor.core.tables import DEMOTE, ON_LATE
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
 from mddag_executor.recording.head import Head, ReplayError
-from mddag_executor.recording.tables import Recording
+from mddag_executor.recording.tables import Recording, UNKNOWN
 from mddag_executor.replay.as_recorded import recording_result, Replay
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
@@ -53,14 +53,12 @@ class Reschedule:
         warnings: list[str], skip: int, overheads: bool, processes: Sequence[Process],
         recorded: Replay | None,
     ) -> None:
-        task_set = self.task_set = run.task_set
+        self.task_set, self._run, self.notes = run.task_set, run, run.notes
         self.work, self.tables, self.settings = work, tables, settings
-        self.recorded, self.processes, self.notes = recorded, processes, run.notes
+        self.recorded, self.processes, self.warnings = recorded, processes, warnings
         self.workers = settings.workers * settings.processes
-        self.warnings = warnings
-        self._skip, self._overheads, self._about = skip, overheads, recording_result(run)
-        self._start = run.begin
-        self.tally = Tally(task_set, tables)
+        self._skip, self._overheads = skip, overheads
+        self.tally = Tally(run.task_set, tables)
         result = schedule(tables, work.load, settings)
         self.decisions, self.busy = result.decisions, result.busy
         result.count_into(self.tally, work.load, settings)
@@ -79,7 +77,7 @@ class Reschedule:
     @property
     def duration_ns(self) -> int:
         """Return the duration of the recording."""
-        return max(0, self.settings.duration_ns - self._start)
+        return max(0, self.settings.duration_ns - self._run.begin)
 
     def computed(self) -> ComputedRun:
         """Return the schedule as a computed run."""
@@ -87,10 +85,6 @@ class Reschedule:
         return ComputedRun(
             self.task_set, self.work.load, self.log, self.decisions, end, end, True,
             self.work.jobs, self.settings.judge_from)
-
-    def recorded_job(self, dag: int, job: int) -> int:
-        """Return the recorded index of a job of the log or tally."""
-        return self.work.jobs[dag][job]
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``, including the recorded run."""
@@ -100,7 +94,7 @@ class Reschedule:
         miss = verdicts['first_miss']
         if miss is not None:
             dag = self.task_set.dag(miss['dag']).index
-            miss = {**miss, 'job': self.recorded_job(dag, miss['job'])}
+            miss = {**miss, 'job': work.jobs[dag][miss['job']]}
         return {
             'policy': settings.policy, 'on_late': settings.on_late, 'workers': self.workers,
             'preemptive': settings.preemptive,
@@ -123,7 +117,8 @@ class Reschedule:
                 'policy': self.recorded.recording.head.policy,
                 'workers': self.recorded.recording.head.workers,
                 **self.recorded.tally.result()},
-            'recording': self._about, **({'notes': self.notes} if self.notes else {}),
+            'recording': recording_result(self._run),
+            **({'notes': self.notes} if self.notes else {}),
             'warnings': self.warnings}
 
 
@@ -177,25 +172,23 @@ def reschedule(
         path, task_set, name, progress)
     if run.task_set is NO_GRAPH:
         raise undeclared(run.name)
-    head = run.head
-    each, ran = run.workers_each, run.placed
+    head, each = run.head, run.workers_each
     policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
     cpus = cpus or head.cpus or None
     if preemptive is None:
         preemptive = head.preemptive and not find_policy(policy).polling
     if on_late is None:     # any other number is damage
         on_late = next((name for name, n in ON_LATE.items() if n == head.on_late), 'continue')
-    bound = head.max_active_jobs if head.max_active_jobs > 0 else NEVER
     tables_of = partial(
-        Tables.build, default_deadline=head.default_deadline, max_active_jobs=bound,
-        expire_after=EXPIRE_AFTER_NS, on_late=on_late)
+        Tables.build, default_deadline=head.default_deadline, on_late=on_late,
+        max_active_jobs=head.max_active_jobs if head.max_active_jobs > 0 else NEVER,
+        expire_after=EXPIRE_AFTER_NS)
     tables = tables_of(run.task_set)
     recorded = Replay(run, skip) if run.messages is None else None
     with no_garbage():
-        builder = LoadBuilder(
-            run, tables, each, _processes(run, ran), times)
+        builder = LoadBuilder(run, tables, each, _processes(run, run.placed), times)
     give_back()
-    placed = _placed(run, ran, builder) if processes is None else processes(
+    placed = _placed(run, builder) if processes is None else processes(
         run.task_set, builder.times())
     if len(placed) < 2:
         placed = ()
@@ -221,12 +214,11 @@ def reschedule(
         warnings.append(
             f'{run.name}: CPU times are not recorded in it, so with --cpus each '
             'execution computes all the time')
-    pieces = run.executions[run.executions['piece'] > 0]
-    waited = sorted({run.task_set.vertices[v].callback.key for v in set(
-        pieces['vertex'].tolist()) if v >= 0})
+    waited = set(run.executions['vertex'][run.executions['piece'] > 0].tolist()) - {UNKNOWN}
     if waited and not head.preemptive:
         warnings.append(
-            f'{run.name}: the time in which coroutines waited is left out: {listed(waited)}')
+            f'{run.name}: the time in which coroutines waited is left out: '
+            + listed(sorted({run.task_set.vertices[v].callback.key for v in waited})))
     settings = Settings(
         policy, workers, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
         judge_from=judge_from, processes=max(1, len(placed)), on_late=on_late)
@@ -239,17 +231,15 @@ def _processes(run: Recording, placed: Sequence[Process]) -> list[int]:
     return processes_of(replace(run.task_set, processes=tuple(placed)))
 
 
-def _placed(
-    run: Recording, recorded: Sequence[Process], builder: LoadBuilder
-) -> Sequence[Process]:
+def _placed(run: Recording, builder: LoadBuilder) -> Sequence[Process]:
     """
     Return the processes of a recording, or of another declaration that judges it.
 
     The trace of one of several processes only has the callbacks of that process.
     """
     declared = run.task_set.processes
-    if recorded:
-        return declared or recorded
+    if run.placed:
+        return declared or run.placed
     vertices = run.task_set.vertices
     ran = {run.task_set.process_of(vertices[v].callback.node) for v in builder.callback_of}
     return declared if len(ran) == 1 or not run.same else ()

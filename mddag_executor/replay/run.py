@@ -61,32 +61,36 @@ def open_recording(
     if not isinstance(path, (str, os.PathLike, TraceReader)):
         traces = path if isinstance(path, Traces) else Traces(path)
         from mddag_executor.replay.joining import Joined
-        joined = Joined([(path, path) for path in traces.paths], traces.offsets)
-        return judged_by(joined.recording(progress), task_set)
-    reader = path if isinstance(path, TraceReader) else None
-    path = os.fspath(path) if not isinstance(path, TraceReader) else path.path
+        return judged_by(Joined(traces.paths, traces.offsets).recording(progress), task_set)
+    path, reader = _opened(path)
+    name = name or path
     if reader is None:
         from mddag_executor.replay.bags import is_ordinary
         if is_ordinary(path):
             return _bag(path, task_set, name)
-    with named_errors(path, name or path):
+    with named_errors(path, name):
         reader = reader or TraceReader(path)
         head = read_head(reader)
-        if head is not None and (task_set is None or is_declared(head)):
-            return judged_by(read_own(reader, name or path, head, progress), task_set)
-        if head is not None:
-            from mddag_executor.replay.undeclared_run import UndeclaredRun
-            return UndeclaredRun(reader, name or path, task_set, head, progress).read()
-        from mddag_executor.replay.imported_run import ImportedRun
-        return ImportedRun(reader, name or path, task_set, progress=progress).read()
+        if head is None:
+            from mddag_executor.replay.imported_run import ImportedRun
+            return ImportedRun(reader, name, task_set, progress=progress).read()
+        if task_set is None or is_declared(head):
+            return judged_by(read_own(reader, name, head, progress), task_set)
+        from mddag_executor.replay.undeclared_run import UndeclaredRun
+        return UndeclaredRun(reader, name, task_set, head, progress).read()
 
 
-def _bag(path: str, task_set: TaskSet | None, name: str | None) -> Recording:
+def _opened(path: str | os.PathLike[str] | TraceReader) -> tuple[str, TraceReader | None]:
+    """Return the path of a trace, and the trace if it is open."""
+    return (path.path, path) if isinstance(path, TraceReader) else (os.fspath(path), None)
+
+
+def _bag(path: str, task_set: TaskSet | None, name: str) -> Recording:
     """Return the recording of an ordinary bag."""
     if task_set is None:
         raise ReplayError(
-            name or path, 'it is an ordinary bag: nothing in it says which callbacks its messages '
-            'start', 'give the GRAPH')
+            name, 'it is an ordinary bag: nothing in it says which callbacks its messages start',
+            'give the GRAPH')
     from mddag_executor.replay.bags_reschedule import read_bag
     return read_bag(path, task_set, name)
 
@@ -94,8 +98,7 @@ def _bag(path: str, task_set: TaskSet | None, name: str | None) -> Recording:
 def check_declared(path: Given, name: str) -> None:
     """Check that a recording declares deadlines, or raise ReplayError."""
     if isinstance(path, (str, os.PathLike, TraceReader)):
-        reader = path if isinstance(path, TraceReader) else None
-        path = os.fspath(path) if not isinstance(path, TraceReader) else path.path
+        path, reader = _opened(path)
         with named_errors(path, name):
             reader = reader or TraceReader(path)
             if read_head(reader) is None:

@@ -17,7 +17,7 @@ order in which the core processed them, each with its verdicts; starts come last
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import os
 from typing import Any
 
@@ -41,27 +41,21 @@ def write_trace(
     path: str | os.PathLike[str], task_set: TaskSet, load: Load, run: SimulatedRun
 ) -> None:
     """Write the trace of a run that was simulated with its log."""
-    with TraceFile(path) as file:
-        write_events(task_set, load, run, lambda *event: file.extend((event,), PROCESS))
-        assert file.rejected == 0, file.rejection
-
-
-def write_events(
-    task_set: TaskSet, load: Load, run: SimulatedRun, add: Callable[..., object]
-) -> None:
-    """Pass the events of such a trace to ``add``: name, time, thread, fields."""
     settings = run.settings
-    add('task_set', 0, 0, task_set.text, task_set.file, settings.policy, settings.workers,
-        DEFAULT_DEADLINE_NS, _MOST, settings.preempts, settings.cpus or 0,
-        ON_LATE[settings.on_late])
-    for place, callback in enumerate(task_set.callbacks, 1):
-        add('rclcpp_callback_register', 0, 0, place, callback.key)
-    computed = ComputedRun.of_run(task_set, load, run)
     knows_cpu = settings.cpus is not None or len(load.holds) > 0
-    events = sorted(_events(computed, knows_cpu), key=lambda event: event[0])
-    for _, name, time, thread, fields in events:
-        add(name, time, thread, *fields)
-    add('shutdown', run.ended_ns, 0, run.ended_ns)
+    events = sorted(_events(ComputedRun.of_run(task_set, load, run), knows_cpu),
+                    key=lambda event: event[0])
+    with TraceFile(path) as file:
+        file.extend([
+            ('task_set', 0, 0, task_set.text, task_set.file, settings.policy, settings.workers,
+             DEFAULT_DEADLINE_NS, _MOST, settings.preempts, settings.cpus or 0,
+             ON_LATE[settings.on_late]),
+            *(('rclcpp_callback_register', 0, 0, place, callback.key)
+              for place, callback in enumerate(task_set.callbacks, 1))], PROCESS)
+        file.extend(((name, time, thread, *fields)
+                     for _, name, time, thread, fields in events), PROCESS)
+        file.extend([('shutdown', run.ended_ns, 0, run.ended_ns)], PROCESS)
+        assert file.rejected == 0, file.rejection
 
 
 def _events(run: ComputedRun, knows_cpu: bool) -> Iterator[_Entry]:

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
@@ -40,7 +40,6 @@ from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.jobs import is_miss
 from mddag_executor.core.state import Decision, SINK_IN_TIME
 from mddag_executor.replay.as_recorded import slack as margin
-from mddag_executor.replay.load import RecordedLoad
 from mddag_executor.simulate import Load, schedule, Settings
 from mddag_executor.simulate.load import as_arrays
 from mddag_executor.simulate.schedule import prepare
@@ -82,30 +81,16 @@ class Problem(NamedTuple):
     """
     A load and its scheduling.
 
-    :ivar work: a recorded load, or a periodic one.
-    :ivar settings: the scheduling.
+    :ivar load: a recorded load, or a periodic one.
     :ivar callback_of: by global vertex the number of its callback.
+    :ivar dispatches: the dispatch part of the first of ``load.costs``.
     """
 
-    work: RecordedLoad | Load
+    load: Load
     settings: Settings
     tables: Tables
     callback_of: list[int]
-
-    def with_number(self, of: str, number: int) -> Problem:
-        """Return the same problem with another number of ``workers`` or ``cpus``."""
-        return self._replace(
-            settings=replace(self.settings, **{of: number}))    # type: ignore[arg-type]
-
-    @property
-    def load(self) -> Load:
-        """Return the load."""
-        return self.work if isinstance(self.work, Load) else self.work.load
-
-    def prepare(self) -> bool:
-        """Return whether to search compiled; if so, compile."""
-        runs = _RUNS * len(set(self.callback_of))
-        return prepare(self.tables, self.load, self.settings, runs)
+    dispatches: Any = ()
 
 
 class Found(NamedTuple):
@@ -127,31 +112,34 @@ class Search:
     """
     Searches the greatest factors of a problem.
 
-    :param compiled: whether the core runs compiled (see ``Problem.prepare``).
+    :param compiled: whether the core runs compiled.
+    :ivar missed: by sink the number of missed deadlines with factor 1.
+    :ivar left_out: sinks that miss all of them.
     """
 
     def __init__(self, problem: Problem, compiled: bool = False) -> None:
-        self._problem = problem
-        self._compiled = compiled
-        load, tables = as_arrays(problem.load), problem.tables
+        self._problem, self._compiled = problem, compiled
+        load: Any = as_arrays(problem.load)
         self._load = load
-        self._costs: Any = load.costs
-        self._dispatches = np.zeros_like(self._costs)
-        self._computed: Any = load.computed
-        work = problem.work
-        if isinstance(work, RecordedLoad):
-            self._dispatches[:len(work.dispatches)] = work.dispatches
-        self._of = self._callback_of_cost(load, tables)
+        self._dispatches = np.zeros_like(load.costs)
+        self._dispatches[:len(problem.dispatches)] = problem.dispatches
+        self._of = self._callback_of_cost(load, problem.tables)
         self._length = int(load.times[-1] - load.times[0]) if len(load.times) else 0
-        self._stops = True
         #: Windows with a miss, the last one first.
         self._windows: list[tuple[int, int]] = []
-        #: By sink the number of missed deadlines with factor 1.
-        self.missed: Counter[int] = Counter()
-        #: Sinks that miss all of them.
-        self.left_out: list[int] = []
-        self._missed: set[tuple[int, int]] = set()      # sink and job, with factor 1
-        self._find_missed()
+        decisions = self._decisions(load)
+        self.missed = Counter(vertex for kind, _, vertex, *_ in decisions if is_miss(kind))
+        met = {vertex for kind, _, vertex, *_ in decisions if kind == SINK_IN_TIME}
+        self.left_out = sorted(set(self.missed) - met)
+        if self.left_out:
+            deadlines = list(problem.tables.sink_deadline)
+            for sink in self.left_out:
+                deadlines[sink] = _NO_DEADLINE
+            self._problem = problem._replace(
+                tables=problem.tables._replace(sink_deadline=deadlines))
+            decisions = self._decisions(load)
+        #: Sinks and jobs that miss with factor 1.
+        self._known = {(vertex, job) for kind, _, vertex, job, *_ in decisions if is_miss(kind)}
 
     def _callback_of_cost(self, load: Load, tables: Tables) -> Any:
         """Return by index of a cost its callback; -1: undeclared."""
@@ -165,49 +153,34 @@ class Search:
             of[base:base + rows * len(row)] = np.tile(row, rows)
         return of
 
-    def _find_missed(self) -> None:
-        """Find the misses with factor 1, and ignore the sinks that miss everything."""
+    def _decisions(
+        self, load: Load, end: int = NEVER, stop: bool = False
+    ) -> Sequence[Decision]:
         problem = self._problem
+        settings = replace(
+            problem.settings, duration_ns=min(end, problem.settings.duration_ns),
+            stop_at_first_miss=stop)
         with no_garbage():
-            decisions = self._decisions(self._scaled(ALL, 1), False)
-            self.missed.update(
-                vertex for kind, _, vertex, *_ in decisions if is_miss(kind))
-            met = {vertex for kind, _, vertex, *_ in decisions if kind == SINK_IN_TIME}
-            self.left_out = sorted(set(self.missed) - met)
-            if self.left_out:
-                deadlines = list(problem.tables.sink_deadline)
-                for sink in self.left_out:
-                    deadlines[sink] = _NO_DEADLINE
-                self._problem = problem._replace(
-                    tables=problem.tables._replace(sink_deadline=deadlines))
-                decisions = self._decisions(self._scaled(ALL, 1), False)
-        self._missed = {(vertex, job) for kind, _, vertex, job, *_ in decisions if is_miss(kind)}
-        self._stops = not self._missed
+            return schedule(problem.tables, load, settings, compiled=self._compiled).decisions
 
-    def _decisions(self, scaled: tuple[Load, int], stop: bool) -> Sequence[Decision]:
-        problem, (load, end) = self._problem, scaled
-        settings = replace(problem.settings, duration_ns=end, stop_at_first_miss=stop)
-        return schedule(problem.tables, load, settings, compiled=self._compiled).decisions
+    def _misses(self, load: Load, end: int, stop: bool) -> list[Miss]:
+        """Return the additional misses."""
+        relative = self._problem.tables.sink_deadline
+        return [Miss(vertex, deadline, deadline - relative[vertex], until)
+                for kind, _, vertex, job, deadline, until in self._decisions(load, end, stop)
+                if is_miss(kind) and (vertex, job) not in self._known]
 
-    def _misses(self, scaled: tuple[Load, int], stop: bool) -> Iterator[Miss]:
-        """Yield the additional misses."""
-        for kind, _, vertex, job, deadline, until in self._decisions(scaled, stop):
-            if is_miss(kind) and (vertex, job) not in self._missed:
-                release = deadline - self._problem.tables.sink_deadline[vertex]
-                yield Miss(vertex, deadline, release, until)
-
-    def _scaled(self, callback: int, factor: float) -> tuple[Load, int]:
-        """Return the load with a longer callback, and the end of the run."""
-        which = self._of == callback if callback != ALL else self._of >= 0
-        costs = self._costs.copy()
+    def _scaled(self, callback: int, factor: float) -> Load:
+        """Return the load with a longer callback."""
+        load, which = self._load, self._of == callback if callback != ALL else self._of >= 0
+        costs, computed = load.costs.copy(), load.computed.copy()
         pure = costs[which] - self._dispatches[which]
         costs[which] += np.minimum(pure * (factor - 1), NEVER >> 8).astype(np.int64)
-        computed = self._computed.copy()
         if len(computed):
             which &= computed >= 0
             computed[which] = np.minimum(computed[which] * factor, NEVER >> 8).astype(np.int64)
-        load = self._load._replace(costs=costs, computed=computed)
-        return load, self._problem.settings.duration_ns
+        scaled: Load = load._replace(costs=costs, computed=computed)
+        return scaled
 
     def miss(
         self, callback: int, factor: float, window: tuple[int, int] | None = None,
@@ -218,21 +191,20 @@ class Search:
 
         :param worst: the miss with the greatest lateness; otherwise the first.
         """
-        load, end = self._scaled(callback, factor)
+        load, end = self._scaled(callback, factor), NEVER
         if window is not None:
+            end = window[1]
             first, last = (bisect_left(load.times, each) for each in window)
-            end = min(end, window[1])
             load = load._replace(
                 times=load.times[first:last], dags=load.dags[first:last],
                 jobs=load.jobs[first:last], releases=load.releases[first:last])
-        with no_garbage():
-            stops = self._stops and not worst
-            missed = list(self._misses((load, end), stops))
-            if stops and missed and all(miss.sink in self.left_out for miss in missed):
-                # the run stopped at an expired job of an ignored sink
-                missed = list(self._misses((load, end), False))
-            return min((miss for miss in missed if miss.sink not in self.left_out), default=None,
-                       key=lambda miss: miss.deadline - worst * miss.until)
+        stops = not self._known and not worst
+        missed = self._misses(load, end, stops)
+        if stops and missed and all(miss.sink in self.left_out for miss in missed):
+            # the run stopped at an expired job of an ignored sink
+            missed = self._misses(load, end, False)
+        return min((miss for miss in missed if miss.sink not in self.left_out), default=None,
+                   key=lambda miss: miss.deadline - worst * miss.until)
 
     def factor(self, callback: int) -> Found:
         """Return the greatest factor for a callback, or for ``ALL``."""
@@ -268,16 +240,15 @@ class Search:
         given = getattr(problem.settings, of)
         if given is None:
             return None
-        least, breaks = given, NOTHING
-        while least > 1 and breaks == NOTHING:
-            self._problem = problem.with_number(of, least - 1)
+        least, miss = given, None
+        while least > 1 and miss is None:
+            self._problem = problem._replace(settings=replace(
+                problem.settings, **{of: least - 1}))
             miss = self.miss(ALL, 1.0)
             if miss is None:
                 least -= 1
-            else:
-                breaks = miss.sink
         self._problem = problem
-        return Fewer(given, least, breaks)
+        return Fewer(given, least, NOTHING if miss is None else miss.sink)
 
     def _bisect(
         self, callback: int, high: float, breaks: int, window: tuple[int, int] | None
@@ -319,7 +290,8 @@ def find_slack(
     :param progress: called with the number of finished callbacks.
     :param jobs: number of processes for long searches.
     """
-    compiled = problem.prepare()
+    compiled = prepare(problem.tables, problem.load, problem.settings,
+                       _RUNS * len(set(problem.callback_of)))
     search = Search(problem, compiled)
     rest = sorted(set(problem.callback_of))
     found = {ALL: search.factor(ALL)}

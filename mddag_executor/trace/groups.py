@@ -44,8 +44,8 @@ GROUPS = {
 
 
 def events_of(entry: Sequence[Any]) -> int:
-    """Return the number of events of an entry."""
-    return len(GROUPS.get(entry[0], (0,)))
+    """Return the number of events of an entry; 1 for what is none."""
+    return next((len(events) for name, events in GROUPS.items() if entry[:1] == (name,)), 1)
 
 
 _SEQUENCE = 0xFFFFFFFF

@@ -5,7 +5,7 @@
 import re
 
 from mddag_executor.recording.head import declared, Head
-from mddag_executor.replay import replay, ReplayError
+from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.run import open_recording
 from mddag_executor.report.replays import times_tables
 from mddag_executor.trace import reading, TraceFile, TraceReader
@@ -228,6 +228,20 @@ def test_a_completion_without_execution_is_said(tmp_path):
     assert [text.partition(': ')[2] for text in result['warnings']] == [
         '1 completed execution whose start is not in it']
     assert any(re.search('unknown\n.* 1 ms\n', each) for each in times_tables(result['dags']))
+
+
+def test_a_result_before_the_release_is_said(tmp_path):
+    trace = Written(tmp_path / 'a.mcap', ONE)
+    trace.release(0, 0, 10, noticed=12)
+    _, address = trace.piece(0, 0, 0, 5, 8)
+    trace.add('complete', 13, address, 0, 0, 0, True, ns(8), 0, thread=10)
+    outcome = replay(trace.end(20))
+    assert outcome.warnings == [
+        f'{trace.path}: 1 result before the release of the job: clocks differ, or times are '
+        'damaged']
+    assert outcome.result()['dags']['/n']['sinks']['/n:a']['response_ns']['max'] == -2 * MS
+    again = reschedule(trace.path)      # its callback is not ready before the release
+    assert (again.work.load.times.tolist(), again.warnings) == ([ns(10)], outcome.warnings)
 
 
 def test_a_trace_without_a_usable_declaration(tmp_path):

@@ -161,6 +161,14 @@ nodes:
         f'{path}: the time in which coroutines waited is left out: /n:a']
 
 
+def test_the_messages_of_a_simulated_sync_took_no_time(tmp_path, call):
+    """It ran once, when the later message was there: that of its first leg."""
+    graph, path = tmp_path / 'g.yaml', tmp_path / 'a.mcap'
+    graph.write_text(SMALL.replace('[/boxes, /flat]', '[/flat, /boxes]'))
+    call('simulate', graph, '--workers', 4, '--duration', '100ms', '--trace', path)
+    assert not reschedule(path).work.load.delays.any()
+
+
 def test_settings_that_can_not_be(tmp_path):
     path = write_two(tmp_path / 'a.mcap')
     with pytest.raises(PolicyError, match="policy 'best'"):

@@ -108,7 +108,8 @@ def test_windows_find_what_plain_bisection_finds(tmp_path, monkeypatch):
                chances=Chances(0, 0, 0, 0, 0, 0, 0))
     run = reschedule(path)
     problem = Problem(
-        run.work, run.settings, run.tables, run.task_set.places_of_vertices())
+        run.work.load, run.settings, run.tables, run.task_set.places_of_vertices(),
+        run.work.dispatches)
     found = []
     for long in (10 ** 9, 1):
         monkeypatch.setattr(module, 'LONG', long)

@@ -88,6 +88,8 @@ def test_what_cannot_be_written_costs_nothing_else(tmp_path, caplog):
         wait_for_file(path, 100)
         writer.record(*bad[0])
     assert writer.dropped == lost
+    writer.record()
+    assert writer.dropped == lost + 1
     events, warnings = read(path)
     assert not warnings
     assert [event[4] for event in events if event[0] == 'ros2:callback_end'] == (
