@@ -23,11 +23,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from mddag_executor.core import legs_of
 from mddag_executor.recording.tables import (
     ALL_LEGS,
+    different,
     EXECUTIONS,
     groups,
     Growing,
@@ -45,8 +46,10 @@ from msg_graph import TaskSet
 import numpy as np
 
 PARTS = DISPATCH, END, COMPLETE = ('mddag:dispatch', 'ros2:callback_end', 'mddag:complete')
-COMPLETED = np.dtype([('place', 'i8'), ('time', 'i8')])
-"""By row of ``executions``: position and time of its completion in the file; -1: none."""
+COMPLETED = np.dtype([('place', 'i8'), ('time', 'i8'), ('row', 'i8')])
+"""Completions: position in the file, time, row of the execution."""
+_FAR = 1 << 40
+"""More than any position in a file."""
 
 
 class Numbering:
@@ -107,17 +110,35 @@ class Columns:
             name: self[name][which] for name in kind.names or () if name != 'place'})
 
 
-class _Owned(NamedTuple):
+class _Dispatches:
     """
-    Events of one kind by thread, those of a thread in the order of the file.
+    The dispatches of a batch, and the last ones before it, by thread and position in the file.
 
-    :ivar event: their numbers; ``row``: the rows of their executions, -1: none; ``is_newest``:
-        whether it is the newest row of the thread.
+    :ivar row: the rows of the executions; ``is_newest``: whether it is the last one of its thread.
     """
 
-    event: Ints
-    row: Ints
-    is_newest: Mask
+    def __init__(self) -> None:
+        self._numbers = self._thread = self._key = self.row = np.empty(0, dtype=np.int64)
+        self.is_newest: Mask = np.empty(0, dtype=np.bool_)
+
+    def add(self, thread: Ints, place: Ints, row: Ints) -> None:
+        """Add the dispatches of a batch; forget older ones than the last of each thread."""
+        thread = np.append(self._thread[self.is_newest], thread)
+        row = np.append(self.row[self.is_newest], row)
+        place = np.append(np.full(len(thread) - len(place), UNKNOWN), place)
+        self._numbers, number = different(thread)
+        order = sort_by(number)
+        self._thread, self.row, number = thread[order], row[order], number[order]
+        self._key = number.astype(np.int64) * _FAR + place[order]
+        self.is_newest = np.append(number[1:] != number[:-1], True)[:len(number)]
+
+    def before(self, thread: Ints, place: Ints) -> Ints:
+        """Return the last dispatches of threads before positions in the file; -1: none."""
+        if not len(self._key):
+            return np.full(len(thread), -1)
+        key = np.searchsorted(self._numbers, thread) * _FAR + place
+        at = np.searchsorted(self._key, key) - 1
+        return np.where((at >= 0) & (self._thread[at] == thread), at, -1)
 
 
 class ExecutionJoin:
@@ -136,11 +157,11 @@ class ExecutionJoin:
         self.orphans = self.last = 0
         self._numbering, self._strange = numbering, strange
         self._waiting = rows(completion)
-        self._newest: dict[int, int] = {}       # row by thread
+        self._dispatches = _Dispatches()
         self._executions = Growing(EXECUTIONS, **dict.fromkeys((
             'worker', 'ready', 'began', 'start', 'end', 'busy', 'cpu', 'message', 'order'),
             UNKNOWN))
-        self._completed = Growing(COMPLETED, place=UNKNOWN, time=UNKNOWN)
+        self._completed = Growing(COMPLETED)
 
     def tables(self) -> tuple[Table, Table]:
         """Return ``executions``, and ``COMPLETED``; no events can be added afterwards."""
@@ -156,16 +177,16 @@ class ExecutionJoin:
         dispatch, end = (Columns(parts.get(name, ())) for name in (DISPATCH, END))
         complete = Columns([
             (self._waiting, self._waiting['place']), *parts.get(COMPLETE, ())])
-        first = self._dispatch(dispatch)
-        _, ends, completions = self._owned(first, (dispatch, end, complete))
-        self._end(end, ends)
-        waits = completions.is_newest & (not at_end)
-        self._complete(complete, completions.event[~waits], completions.row[~waits])
-        self._waiting = complete.rows(self._waiting.dtype, np.sort(completions.event[waits]))
+        self._dispatch(dispatch)
+        self._end(end, *self._owned(end))
+        event, at = self._owned(complete)
+        waits = (at >= 0) & (not at_end)
+        waits[waits] = self._dispatches.is_newest[at[waits]]
+        self._complete(complete, event[~waits], at[~waits])
+        self._waiting = complete.rows(self._waiting.dtype, np.sort(event[waits]))
 
-    def _dispatch(self, dispatch: Columns) -> int:
-        """Add dispatched executions; return the first row."""
-        self._completed.more(len(dispatch))
+    def _dispatch(self, dispatch: Columns) -> None:
+        """Add dispatched executions."""
         table = self._executions.more(len(dispatch))
         ready, start = dispatch['ready'], dispatch['timestamp']
         strange = (ready < 0) | (ready > start)
@@ -177,42 +198,24 @@ class ExecutionJoin:
             table[name] = dispatch[name]
         table['thread'], table['ready'] = dispatch['vtid'], ready
         table['began'] = table['start'] = start
-        return len(self._executions) - len(table)
+        n = len(self._executions)
+        self._dispatches.add(dispatch['vtid'], dispatch.place, np.arange(n - len(table), n))
 
-    def _owned(self, first: int, events: Sequence[Columns]) -> list[_Owned]:
+    def _owned(self, events: Columns) -> tuple[Ints, Ints]:
         """
-        Find the last dispatch of their thread for events.
+        Return events by execution, those of one in the order of the file, and their dispatches.
 
-        :param first: the row of the first dispatch; ``events``: in the order of ``PARTS``.
+        The latter are the last ones of the thread before the event; -1: none.
         """
-        thread = np.concatenate([each['vtid'] for each in events])
-        order = sort_by(np.concatenate([each.place for each in events]))
-        order = order[sort_by(thread[order])]
-        thread = thread[order]
-        begins, until = groups(thread)
-        borders = np.cumsum([0, *map(len, events)])
-        row = np.where(order < borders[1], order + first, UNKNOWN)
-        of_before = begins[row[begins] < 0]     # they belong to a dispatch of an earlier batch
-        row[of_before] = [
-            self._newest.get(number, UNKNOWN) for number in thread[of_before].tolist()]
-        at = np.where(row >= 0, np.arange(len(row)), 0)
-        at[begins] = begins
-        row = row[np.maximum.accumulate(at)]
-        newest = row[until - 1]
-        self._newest.update(zip(thread[begins].tolist(), newest.tolist()))
-        is_newest = (row == np.repeat(newest, until - begins)) & (row >= 0)
-        found = []
-        for begin, end in zip(borders[:-1], borders[1:]):
-            mine = (order >= begin) & (order < end)
-            found.append(_Owned(order[mine] - begin, row[mine], is_newest[mine]))
-        return found
+        at = self._dispatches.before(events['vtid'], events.place)
+        order = sort_by(at)
+        return order, at[order]
 
-    def _end(self, end: Columns, owned: _Owned) -> None:
-        """End executions."""
-        table, event, row = self._executions.rows(), owned.event, owned.row
-        good = row >= 0
-        good[good] = (table['end'][row[good]] < 0) & (
-            table['callback'][row[good]] == end['callback'][event[good]])
+    def _end(self, end: Columns, event: Ints, at: Ints) -> None:
+        """End executions; the events are by dispatch."""
+        table = self._executions.rows()
+        event, row = event[at >= 0], self._dispatches.row[at[at >= 0]]
+        good = (table['end'][row] < 0) & (table['callback'][row] == end['callback'][event])
         event, row = event[good], row[good]
         begins, _ = groups(row)
         event, row = event[begins], row[begins]
@@ -222,12 +225,8 @@ class ExecutionJoin:
         if len(row) < len(end):
             self._strange[f'{END} of an execution that was not dispatched'] += len(end) - len(row)
 
-    def _complete(self, complete: Columns, event: Ints, row: Ints) -> None:
-        """
-        Complete executions; completions without execution become rows.
-
-        :param event: numbers of completions, those of the same ``row`` one after the other.
-        """
+    def _complete(self, complete: Columns, event: Ints, at: Ints) -> None:
+        """Complete executions; completions without execution become rows."""
         dag, vertex = (each[event] for each in self._numbering.of(
             complete['dag'], complete['vertex']))
         job, time, leg = (complete[name][event] for name in ('job', 'timestamp', 'leg'))
@@ -235,43 +234,41 @@ class ExecutionJoin:
         known = dag >= 0
         if not known.all():
             self._strange[f'{COMPLETE} of a vertex that is not declared'] += int((~known).sum())
-        table, good = self._executions.rows(), known & (row >= 0)
-        at = row[good]
-        good[good] = (table['end'][at] >= 0) & (table['vertex'][at] == vertex[good]) & (
-            table['job'][at] == job[good])
+        table, good = self._executions.rows(), known & (at >= 0)
+        row = self._dispatches.row[at[good]]
+        good[good] = fits = (table['end'][row] >= 0) & (table['vertex'][row] == vertex[good]) & (
+            table['job'][row] == job[good])
         self.orphans += int((known & ~good).sum())
-        mine = np.flatnonzero(good)
-        begins, until = groups(row[mine])
-        at, last_leg = row[mine[begins]], mine[until - 1]
+        mine, row = np.flatnonzero(good), row[fits]
+        begins, until = groups(row)
+        row, last_leg = row[begins], mine[until - 1]
         rest = known
         rest[last_leg] = False
-        self._fill(at, complete, event[last_leg])
-        if len(at) < len(mine):     # one execution may complete several legs
+        if len(row) < len(mine):     # one execution may complete several legs
             legs = np.bitwise_or.reduceat(1 << np.clip(leg[mine], 0, 62), begins)
-            n_legs = self._numbering.n_legs[table['vertex'][at]]
+            n_legs = self._numbering.n_legs[table['vertex'][row]]
             every = (until - begins > 1) & (until - begins == n_legs) & (
                 legs == (1 << np.minimum(n_legs, 62)) - 1)
-            table['leg'][at[every]] = ALL_LEGS
+            leg[last_leg[every]] = ALL_LEGS
             rest[mine] &= ~np.repeat(every, until - begins)
         which = np.flatnonzero(rest)
         if len(which):
             which = which[sort_by(event[which])]
             more, chosen = self._executions.more(len(which)), event[which]
-            self._completed.more(len(which))
             more['dag'], more['vertex'], more['job'] = dag[which], vertex[which], job[which]
             for name, field in (('callback',) * 2, ('thread', 'vtid'), ('end', 'completed')):
                 more[name] = complete[field][chosen]
-            self._fill(np.arange(-len(which), 0), complete, chosen)
-
-    def _fill(self, row: Any, complete: Columns, event: Ints) -> None:
-        """Fill in the columns about completions."""
-        table, completed = self._executions.rows(), self._completed.rows()
-        table['leg'][row], table['cpu'][row] = (
-            complete[name][event] for name in ('leg', 'cpu_time'))
+            n = len(self._executions)
+            row = np.append(row, np.arange(n - len(which), n))
+        which = np.append(last_leg, which)
+        table, event = self._executions.rows(), event[which]
+        table['leg'][row], table['cpu'][row] = leg[which], complete['cpu_time'][event]
         table['holds_gil'][row] = complete['held_interpreter'][event]
         table['completes'][row] = np.where(complete['last_leg'][event], VERTEX, LEG)
-        completed['place'][row] = complete.place[event]
-        completed['time'][row] = complete['timestamp'][event]
+        in_file = sort_by(event)
+        self._completed.add(rows(
+            COMPLETED, len(row), place=complete.place[event[in_file]], time=time[which[in_file]],
+            row=row[in_file]))
 
 
 def _pieces(table: Table) -> None:
@@ -314,7 +311,7 @@ def number_pieces(table: Table, mine: Ints, of: str) -> None:
 
 
 def running_at(
-    executions: Table, completed: Table, thread: Ints, time: Ints, place: Ints
+    executions: Table, completed_at: Ints, thread: Ints, time: Ints, place: Ints
 ) -> Ints:
     """
     Return the rows of the executions that ran in threads at given times; -1: none.
@@ -322,11 +319,13 @@ def running_at(
     If one ended when the next one started, it is the first one whose completion comes later in the
     file: in virtual time a callback publishes when it ends.
 
-    :param completed: see ``COMPLETED``.
+    :param completed_at: positions of completions in the file by row; -1: none.
     :param time: ascending.
     :param place: positions in the file.
     """
     found = np.full(len(time), UNKNOWN)
+    if not len(time):
+        return found
     ran = np.flatnonzero((executions['end'] >= 0) & (executions['start'] >= 0))
     threads = executions['thread'][ran]
     for number in np.unique(thread).tolist():
@@ -344,7 +343,7 @@ def running_at(
             if not outer.any():
                 break
             at[outer] -= 1
-        later = completed['place'][mine]
+        later = completed_at[mine]
         for _ in range(len(mine)):
             one = np.maximum(at - 1, 0)
             before = (at > 0) & (end[one] == time[asked]) & (later[one] > place[asked])

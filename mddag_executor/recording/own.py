@@ -151,8 +151,6 @@ class _Source:
         self._strange: Counter[str] = Counter()
         self._executions = ExecutionJoin(_ROWS[COMPLETE], self._numbering, self._strange)
         self._who = who
-        #: The times of the core's events, by position in the order.
-        self.seen_at = np.empty(0, dtype=np.int64)
         # rows of the other events
         self._kinds = {name: Growing(kind) for name, kind in _ROWS.items() if name not in PARTS}
         self._last_seen = 0
@@ -240,8 +238,11 @@ class _Source:
         if (time[1:] < time[:-1]).any():
             published = pick(published, sort_by(time))
             time = published['timestamp']
+        completed_at = np.full(len(executions) if len(time) else 0, UNKNOWN)
+        if len(time):
+            completed_at[completed['row']] = completed['place']
         by = running_at(
-            executions, completed, published['vtid'], time, published['place'])
+            executions, completed_at, published['vtid'], time, published['place'])
         return rows(
             PUBLICATIONS, len(published), publisher=published['publisher_handle'],
             execution=by, time=time, source_timestamp=UNKNOWN,
@@ -354,22 +355,19 @@ class _Source:
         self, found: Recording, core: list[tuple[Table, Any, Ints]], completed: Table
     ) -> None:
         """Assign positions in the order to the core's events (rule 4)."""
-        done = np.flatnonzero(completed['place'] >= 0)
         single = [(time, place) for time, place, *_ in self._hosting]
         if self._shutdown_at is not None:
             single.append(self._shutdown_at)
-        times = np.concatenate([
-            completed['time'][done], *(each for _, each, _ in core),
-            np.array([time for time, _ in single], dtype=np.int64)])
-        places = np.concatenate([
-            completed['place'][done], *(at for _, _, at in core),
-            np.array([place for _, place in single], dtype=np.int64)])
-        rank = np.empty(len(times), dtype=np.int32)
+        some = np.array(single, dtype=np.int64).reshape(-1, 2)
+        times = np.concatenate([completed['time'], *(each for _, each, _ in core), some[:, 0]])
+        places = np.concatenate([completed['place'], *(at for _, _, at in core), some[:, 1]])
         in_order = sort_by(times, places)
-        rank[in_order] = np.arange(len(times))
-        self.seen_at = times[in_order]
-        found.executions['order'][done] = rank[:len(done)]
-        at = len(done)
+        del places
+        self._seen = times, in_order
+        rank = np.empty(len(times), dtype=np.int32)
+        rank[in_order] = np.arange(len(times), dtype=np.int32)
+        found.executions['order'][completed['row']] = rank[:len(completed)]
+        at = len(completed)
         for table, _, _ in core:
             table['order'] = rank[at:at + len(table)]
             at += len(table)
@@ -377,6 +375,12 @@ class _Source:
         found.hosted = [(next(ranks), dag, vertices) for *_, dag, vertices in self._hosting]
         if self._shutdown_at is not None:
             found.judged_order = next(ranks)
+
+    @property
+    def seen_at(self) -> Ints:
+        """Return the times of the core's events, by position in the order."""
+        times, in_order = self._seen
+        return times[in_order]
 
     def doubts(self) -> list[str]:
         """Return defects of the trace, one line each."""
