@@ -164,7 +164,7 @@ class VirtualTime:
             loop.note_poll()
             return loop.now if name.endswith('_ns') else loop.now / 1e9
         seconds, = args
-        if seconds < 0:
+        if not seconds >= 0:  # or not a number
             raise ValueError('sleep length must be non-negative')
         loop.wait(None, seconds, 'time.sleep')
         return None
