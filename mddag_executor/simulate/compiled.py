@@ -81,7 +81,7 @@ def entry_points() -> dict[str, Callable[..., Any]]:
         if module in (jobs, overload, rules):
             space[module.__name__.rsplit('.', 1)[1]] = inner
     kernel.bind_policies(space)
-    sources = _hash_of(*_MODULES, kernel, vectors)
+    sources = _hash_of_sources()
     for name in ENTRY_POINTS:
         space[name] = _cached(_bound(getattr(kernel, name), space), sources)
     return {name: space[name] for name in ENTRY_POINTS}
@@ -110,10 +110,12 @@ def _bound(function: FunctionType, space: dict[str, Any]) -> FunctionType:
     return FunctionType(function.__code__, space, function.__name__, function.__defaults__)
 
 
-def _hash_of(*modules: ModuleType) -> str:
+def _hash_of_sources() -> str:
+    folder = Path(__file__).parent
+    paths = [Path(str(module.__file__)) for module in _MODULES]
     digest = hashlib.sha256()
-    for module in modules:
-        digest.update(Path(str(module.__file__)).read_bytes())
+    for path in (*paths, folder / 'kernel.py', folder / 'vectors.py'):
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -130,10 +132,15 @@ def pays(plain_s: float) -> bool:
 
 
 def _is_compiled() -> bool:
-    entry: Any = entry_points()['run_each']
-    folder = entry.stats.cache_path
-    return bool(entry.signatures) or (folder is not None and any(
-        Path(folder).glob(f'*{entry.py_func.__qualname__}*.nbi')))
+    """Return whether the code is in memory or stored; importing numba takes half a second."""
+    entry: Any = entry_points()['run_each'] if entry_points.cache_info().currsize else None
+    if entry is not None and entry.signatures:
+        return True
+    name = f'kernel.run_each_{_hash_of_sources()}*.nbi'
+    cache = Path(os.environ.get('XDG_CACHE_HOME') or '~/.cache', 'numba')
+    return any(
+        any(folder.expanduser().rglob(name)) for folder in (
+            Path(os.environ.get('NUMBA_CACHE_DIR') or cache), Path(__file__).parent, cache))
 
 
 def prepare() -> None:

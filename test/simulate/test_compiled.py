@@ -144,9 +144,14 @@ def test_runs_do_not_disturb_one_another(case, horizon, judge, data):
     assert found.tolist() == plain.tolist()
 
 
-def test_nothing_is_compiled_at_import():
+def test_numba_is_not_imported_to_find_stored_code():
+    compiled.prepare()
     run_program(
-        'import sys, mddag_executor.simulate.compiled, mddag_executor.laboratory.evaluate\n'
+        'import sys, mddag_executor.laboratory.evaluate\n'
+        'from mddag_executor.simulate import compiled\n'
+        'assert compiled.pays(2.0)\n'
+        'compiled._hash_of_sources = lambda: "another"\n'
+        'assert not compiled.pays(2.0)\n'
         'assert not {"numba", "matplotlib"} & {*sys.modules}')
 
 
@@ -154,7 +159,7 @@ COUNT_COMPILED = """
 import sys
 from mddag_executor.simulate import compiled
 if sys.argv[1:]:
-    compiled._hash_of = lambda *modules: sys.argv[1]
+    compiled._hash_of_sources = lambda: sys.argv[1]
 entry = compiled.entry_points()['free_run']
 memory = [compiled.Memory(*[0] * 99) for _ in range(5)]
 entry(*(each.address for each in memory))
