@@ -13,34 +13,34 @@ once. The file is the same: each event is a message of its own channel.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from operator import itemgetter
 import struct
-from typing import Any, Protocol
+from typing import Any
 
 from mcap.opcode import Opcode
 from mddag_executor.trace import cdr, records
 
-EXECUTION = 'execution'
-"""
-A declared callback has run: ``dispatch``, ``callback_start``, ``callback_end``, ``complete``.
+EXECUTION, PUBLICATION = 'execution', 'publication'
+"""A declared callback has run; a message is published: the names of entries."""
 
-After the name: start, vtid, callback, dag, vertex, job, worker, ready, deadline, end, completed
-(the core's time of its completion), whole, leg, CPU time, whether it held the GIL.
-"""
-
-PUBLICATION = 'publication'
-"""
-A message is published: ``rclcpp_publish``, ``rcl_publish``.
-
-After the name: time, vtid, publisher, message.
-"""
+_VALUES = {
+    EXECUTION: 'start vtid callback dag vertex job worker ready deadline end completed whole leg '
+               'cpu_time held',
+    PUBLICATION: 'time vtid publisher message'}
+"""What follows the name of an entry; ``completed`` is the core's time of the completion."""
 
 GROUPS = {
-    EXECUTION: (
-        'mddag:dispatch', 'ros2:callback_start', 'ros2:callback_end', 'mddag:complete'),
-    PUBLICATION: ('ros2:rclcpp_publish', 'ros2:rcl_publish'),
-}
-"""The events of an entry, in the order in which they are written."""
+    EXECUTION: {
+        'mddag:dispatch': 'start callback dag vertex job worker ready deadline',
+        'ros2:callback_start': 'start callback none',
+        'ros2:callback_end': 'end callback',
+        'mddag:complete':
+            'completed callback dag vertex job whole end leg cpu_time held'},
+    PUBLICATION: {
+        'ros2:rclcpp_publish': 'time publisher message none',
+        'ros2:rcl_publish': 'time publisher message'}}
+"""The events of an entry, in the order in which they are written: time and fields of each."""
 
 
 def events_of(entry: Sequence[Any]) -> int:
@@ -48,85 +48,43 @@ def events_of(entry: Sequence[Any]) -> int:
     return next((len(events) for name, events in GROUPS.items() if entry[:1] == (name,)), 1)
 
 
-_SEQUENCE = 0xFFFFFFFF
-_M = Opcode.MESSAGE
-_E = cdr.ENCAPSULATION
-
-
-class Channel(Protocol):
-    """A channel (see ``trace_file``), as used here."""
-
-    event: Any
-    number: int
-    count: int
-
-
 class Group:
     """
     The channels of an entry's events, and their encoder.
 
-    :ivar parts: the channels.
+    :ivar parts: the channels (see ``trace_file``).
     :ivar sizes: size of each message record, bytes.
-    :ivar encode: returns the records of an entry as one block, and the time of each.
     :ivar defined: whether all of the channels are in the file.
     """
 
-    __slots__ = ('parts', 'sizes', 'encode', 'defined')
-
-    def __init__(self, name: str, channels: dict[str, Any]) -> None:
-        self.parts: list[Any] = [channels[key] for key in GROUPS[name]]
-        layouts = [f'BQHIQQ4s{cdr.fixed_layout(part.event.types)}' for part in self.parts]
-        self.sizes = [struct.calcsize('<' + layout) for layout in layouts]
-        lengths = [size - records.RECORD.size for size in self.sizes]
-        pack = struct.Struct('<' + ''.join(layouts)).pack
-        self.encode = _ENCODERS[name](self.parts, lengths, pack)
+    def __init__(self, name: str, channels: Mapping[str, Any]) -> None:
+        self.parts = [channels[key] for key in GROUPS[name]]
+        layouts = [f'11sIQQ4s{cdr.fixed_layout(part.event.types)}' for part in self.parts]
+        self.sizes = [struct.calcsize(f'<{layout}') for layout in layouts]
         self.defined = False
+        self._pack = struct.Struct('<' + ''.join(layouts)).pack
+        heads = [
+            struct.pack('<BQH', Opcode.MESSAGE, size - records.RECORD.size, part.number)
+            for size, part in zip(self.sizes, self.parts)]
+        self._constants = (*heads, cdr.ENCAPSULATION, 0)
+        # the names of what ``encode`` puts together, and of that what each message consists of
+        n = range(len(self.parts))
+        values = ['name', *_VALUES[name].split()]
+        names = [*values, 'vpid', *(f'head {i}' for i in n), 'cdr', 'none',
+                 *(f'sequence {i}' for i in n)]
+        self._length = len(values)
+        picked, times = list[str](), list[str]()
+        for i, fields in enumerate(GROUPS[name].values()):
+            time, *rest = fields.split()
+            times.append(time)
+            picked += [f'head {i}', f'sequence {i}', time, time, 'cdr', time, 'vpid', 'vtid', *rest]
+        self._pick = itemgetter(*map(names.index, picked))
+        self._times = itemgetter(*map(names.index, times))
 
-
-Encode = Callable[[Sequence[Any], int], 'tuple[bytes, tuple[int, ...]]']
-
-
-def _execution(
-    parts: Sequence[Channel], lengths: Sequence[int], pack: Callable[..., bytes]
-) -> Encode:
-    dispatch, begun, ended, complete = parts
-    n0, n1, n2, n3 = (part.number for part in parts)
-    l0, l1, l2, l3 = lengths
-
-    def encode(entry: Sequence[Any], vpid: int) -> tuple[bytes, tuple[int, ...]]:
-        (_, start, vtid, callback, dag, vertex, job, worker, ready, deadline, end, completed,
-         whole, leg, cpu_time, held) = entry
-        data = pack(
-            _M, l0, n0, dispatch.count & _SEQUENCE, start, start, _E, start, vpid, vtid,
-            callback, dag, vertex, job, worker, ready, deadline,
-            _M, l1, n1, begun.count & _SEQUENCE, start, start, _E, start, vpid, vtid,
-            callback, False,
-            _M, l2, n2, ended.count & _SEQUENCE, end, end, _E, end, vpid, vtid,
-            callback,
-            _M, l3, n3, complete.count & _SEQUENCE, completed, completed, _E, completed, vpid,
-            vtid, callback, dag, vertex, job, whole, end, leg, cpu_time, held)
-        return data, (start, start, end, completed)
-
-    return encode
-
-
-def _publication(
-    parts: Sequence[Channel], lengths: Sequence[int], pack: Callable[..., bytes]
-) -> Encode:
-    outer, inner = parts
-    n0, n1 = outer.number, inner.number
-    l0, l1 = lengths
-
-    def encode(entry: Sequence[Any], vpid: int) -> tuple[bytes, tuple[int, ...]]:
-        _, time, vtid, publisher, message = entry
-        data = pack(
-            _M, l0, n0, outer.count & _SEQUENCE, time, time, _E, time, vpid, vtid,
-            publisher, message, 0,
-            _M, l1, n1, inner.count & _SEQUENCE, time, time, _E, time, vpid, vtid,
-            publisher, message)
-        return data, (time, time)
-
-    return encode
-
-
-_ENCODERS = {EXECUTION: _execution, PUBLICATION: _publication}
+    def encode(self, entry: Sequence[Any], vpid: int) -> tuple[bytes, tuple[int, ...]]:
+        """Return the records of an entry as one block, and the time of each."""
+        if len(entry) != self._length:
+            raise ValueError(f'{len(entry)} values instead of {self._length}')
+        values = (*entry, vpid, *self._constants,
+                  *[part.count & 0xFFFFFFFF for part in self.parts])
+        return self._pack(*self._pick(values)), self._times(values)

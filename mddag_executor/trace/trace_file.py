@@ -66,7 +66,7 @@ class _Channel:
     """The writer's state of one kind of event."""
 
     __slots__ = ('channel', 'count', 'encode', 'event', 'index', 'number', 'schema',
-                 'schema_name', 'undefined')
+                 'schema_name', 'undefined', 'width')
 
     def __init__(self, event: EventType, number: int, schema_name: str) -> None:
         self.event = event
@@ -79,6 +79,7 @@ class _Channel:
         self.count = 0                  # messages so far
         self.index: list[int] = []      # log_time and offset of each message in the open chunk
         self.encode = _encoder(event, number)
+        self.width = 1 + len(event.fields)      # values of an event after its time
 
 
 def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
@@ -90,31 +91,14 @@ def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
     layout = cdr.fixed_layout(event.types)
     if layout is not None:
         packer = struct.Struct('<BQHIQQ4s' + layout)
-        length = packer.size - records.RECORD.size
-        return _completed(event, functools.partial(
-            packer.pack, Opcode.MESSAGE, length, number))
-
+        return functools.partial(
+            packer.pack, Opcode.MESSAGE, packer.size - records.RECORD.size, number)
     types = event.types
 
     def encode(sequence: int, log_time: int, publish_time: int, encapsulation: bytes,
                *values: Any) -> bytes:
         head = records.MESSAGE_HEAD.pack(number, sequence, log_time, publish_time)
         return records.record(Opcode.MESSAGE, head + encapsulation + cdr.encode(types, values))
-
-    return _completed(event, encode)
-
-
-def _completed(event: EventType, pack: Callable[..., bytes]) -> Callable[..., bytes]:
-    """Return a packer that also accepts events without the optional fields."""
-    if not event.optional:
-        return pack
-    whole = len(event.types)
-
-    def encode(sequence: int, log_time: int, publish_time: int, encapsulation: bytes,
-               *values: Any) -> bytes:
-        missing = whole - len(values)
-        return pack(sequence, log_time, publish_time, encapsulation, *values,
-                    *(event.optional[-missing:] if missing else ()))
 
     return encode
 
@@ -219,7 +203,7 @@ class TraceFile:
             raise TraceError(self.path, str(self.rejection),
                              'give an event of the table, and its fields with their types')
 
-    def extend(self, entries: Iterable[Sequence[Any]], vpid: int) -> None:
+    def extend(self, entries: Iterable[tuple[Any, ...]], vpid: int) -> None:
         """
         Write events: name, timestamp, thread id and fields; or entries of `groups`.
 
@@ -235,9 +219,11 @@ class TraceFile:
                 if channel is None:
                     self._extend_group(groups[entry[0]], entry, vpid)
                     continue
-                timestamp = entry[1]
+                timestamp, values = entry[1], entry[2:]
+                if len(values) < channel.width:
+                    values += channel.event.optional[len(values) - channel.width:]
                 message = channel.encode(channel.count & 0xFFFFFFFF, timestamp, timestamp,
-                                         cdr.ENCAPSULATION, timestamp, vpid, *entry[2:])
+                                         cdr.ENCAPSULATION, timestamp, vpid, *values)
             except TraceError:              # writing failed
                 raise
             except Exception as error:      # wrong values of a caller lose only this event
