@@ -19,7 +19,7 @@ every job. Its messages leave at its end and arrive at once.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from functools import cache
 
 from mddag_executor.core import quantile, Tables
 from mddag_executor.simulate.load import as_lists, edge_numbers, Load, needs_python
@@ -43,43 +43,31 @@ class Durations:
         for rows in self._releases:
             rows.sort()
         self._edges = edge_numbers(tables)
-        self._usual: dict[tuple[int, int], int] = {}
+        self._values = cache(self._values_of_jobs)
 
     def first_release(self, dag: int) -> int | None:
         """Return when the first job of a DAG was released in the recording; None: unknown."""
         rows = self._releases[dag]
         return rows[0][0] if rows and self.recorded else None
 
-    def execution(self, dag: int, vertex: int, release: int) -> int:
+    def execution(self, vertex: int, release: int) -> int:
         """Return how long a vertex of the job with that release executed."""
-        return self._cost(self._load.costs, dag, vertex, release, -1)
+        return self._value('costs', vertex, release)
 
-    def computed(self, dag: int, vertex: int, release: int) -> int:
+    def computed(self, vertex: int, release: int) -> int:
         """Return the CPU time that a vertex of the job with that release took."""
-        load = self._load
-        return self._cost(load.computed or load.costs, dag, vertex, release, -2)
+        return self._value('computed' if self._load.computed else 'costs', vertex, release)
 
-    def _cost(
-        self, values: Sequence[int], dag: int, vertex: int, release: int, column: int
-    ) -> int:
-        load, local = self._load, vertex - self._tables.first_vertex[dag]
-        return self._value(values, load.cost_base[dag] + local, load.cost_stride[dag], dag,
-                           release, (vertex, column))
-
-    def transport(self, dag: int, before: int, after: int, release: int) -> int:
+    def transport(self, before: int, after: int, release: int) -> int:
         """Return how long after the end of a vertex its message arrived."""
-        edge, load = self._edges.get((before, after)), self._load
+        edge = self._edges.get((before, after))
         if edge is None or not self.recorded:
             return 0
-        return max(0, self._value(load.delays, load.delay_base[dag] + edge,
-                                  load.delay_stride[dag], dag, release, (before, after)))
+        return max(0, self._value('delays', before, release, edge))
 
     def holds(self, vertex: int) -> bool:
         """Return whether a vertex held the interpreter in most jobs."""
-        load, dag = self._load, self._tables.dag_of[vertex]
-        first = load.cost_base[dag] + vertex - self._tables.first_vertex[dag]
-        held = [load.holds[first + job * load.cost_stride[dag]]
-                for _, job in self._releases[dag]] if load.holds else []
+        *held, _ = self._values('holds', vertex, None) if self._load.holds else [0]
         return 2 * sum(held) > len(held)
 
     @property
@@ -87,25 +75,25 @@ class Durations:
         """Return whether it is known what needs the interpreter."""
         return needs_python(self._load)
 
-    def _value(
-        self, values: Sequence[int], first: int, stride: int, dag: int, release: int,
-        of: tuple[int, int],
-    ) -> int:
-        row = self._row(dag, release)
-        if row >= 0:
-            return int(values[first + row * stride])
-        usual = self._usual.get(of)
-        if usual is None:
-            every = sorted(values[first + job * stride] for _, job in self._releases[dag])
-            usual = self._usual[of] = int(quantile(every, 0.5)) if every else 0
-        return usual
+    def _value(self, column: str, vertex: int, release: int, edge: int | None = None) -> int:
+        dag = self._tables.dag_of[vertex]
+        return self._values(column, vertex, edge)[self._row(dag, release)]
+
+    def _values_of_jobs(self, column: str, vertex: int, edge: int | None) -> list[int]:
+        """Return a value of each recorded job, in the order of releases, then their median."""
+        load, dag = self._load, self._tables.dag_of[vertex]
+        first = load.cost_base[dag] + vertex - self._tables.first_vertex[dag]
+        stride, values = load.cost_stride[dag], getattr(load, column)
+        if edge is not None:
+            first, stride = load.delay_base[dag] + edge, load.delay_stride[dag]
+        found = [values[first + job * stride] for _, job in self._releases[dag]]
+        return [*found, quantile(sorted(found), 0.5) if found else 0]
 
     def _row(self, dag: int, release: int) -> int:
         """Return the place of the recorded job that was released about then; -1: there is none."""
         rows = self._releases[dag]
         place = bisect_left(rows, (release,))
-        near = [rows[i] for i in (place - 1, place) if 0 <= i < len(rows)]
-        if not near:
-            return -1
-        at, job = min(near, key=lambda row: abs(row[0] - release))
-        return job if abs(at - release) * 2 <= self._tables.period[dag] else -1
+        near = [i for i in (place - 1, place) if 0 <= i < len(rows)]
+        row = min(near, key=lambda i: abs(rows[i][0] - release), default=-1)
+        is_near = row >= 0 and abs(rows[row][0] - release) * 2 <= self._tables.period[dag]
+        return row if is_near else -1

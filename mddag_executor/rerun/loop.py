@@ -40,7 +40,7 @@ import math
 from typing import Any
 
 from mddag_executor.core import NEVER
-from mddag_executor.core.state import DONE
+from mddag_executor.core.state import DONE, empty
 from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.jobs import Origin
@@ -49,7 +49,14 @@ from mddag_executor.hosting.loading import describe
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.run_threads import RunThreads
-from mddag_executor.simulate.machine import begins, new_machine, NEXT_TIME, settle, share
+from mddag_executor.simulate.machine import (
+    begins,
+    fill_machine,
+    Machine,
+    NEXT_TIME,
+    settle,
+    share,
+)
 
 DRAIN_NS = 10_000_000_000
 """What has begun may go on this long after the end of the recording, and in a pause of it."""
@@ -117,7 +124,8 @@ class Loop:
         self.changed = True
         self.warnings: list[str] = []
         self._state = engine.scheduler.state
-        self._machine = new_machine(engine.tables, self._state, cpus, python)
+        self._machine = empty(Machine)
+        fill_machine(engine.tables, self._state, self._machine, cpus or NEVER, int(python))
         settle(self._state, self._machine, start)
         # by worker: what runs on it, and when that ends if nothing changes
         self._running: list[Execution | None] = [None] * engine.n_workers
@@ -260,7 +268,7 @@ class Loop:
             return
         self.callbacks += 1
         if origin is not None and takes:
-            work.cpu_ns = max(0, self._times.computed(origin.dag, origin.vertex, release))
+            work.cpu_ns = max(0, self._times.computed(origin.vertex, release))
             work.entity.habit.took(takes, takes)
         if execution.worker >= 0 and self.now == execution.start:  # it has not waited
             state, x = self._state, work.x
@@ -307,7 +315,7 @@ class Loop:
         legs = range(first, first + tables.n_legs[origin.vertex])
         if any(state.x_state[x] != DONE for x in legs if x != work.x):
             return 0
-        return self._times.execution(origin.dag, origin.vertex, release)
+        return self._times.execution(origin.vertex, release)
 
     def _end(self, execution: Execution) -> None:
         """End an execution in virtual time, or suspend it."""

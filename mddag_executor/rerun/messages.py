@@ -237,7 +237,7 @@ class Messages:
             arrive = partial(self._arrive, entity, data, now, origin, state.count)
             target = None if origin is None else entity.targets.get(origin.vertex)
             delay = 0 if origin is None or target is None else self._times.transport(
-                origin.dag, origin.vertex, target[0], release)
+                origin.vertex, target[0], release)
             if delay:
                 self._loop.at(now + delay, ARRIVED, arrive)
             else:

@@ -52,7 +52,7 @@ _MODULES = (
 _NOT_COMPILED = frozenset({
     # for plain lists
     'empty', 'as_object', 'add_queue', 'rad_offsets', 'reached_sinks', 'mean_time',
-    'policy', 'new_machine', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
+    'policy', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
 ENTRY_POINTS = ('free_run', 'run_each')
 _REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')
 

@@ -37,7 +37,6 @@ from mddag_executor.core.rules import progress
 from mddag_executor.core.state import (
     add_process,
     add_queue,
-    empty,
     N_HOLDING,
     PREEMPTIVE,
     State,
@@ -65,7 +64,7 @@ CPUS, PYTHON, COUNTED_UNTIL, SLICE_AT, NEXT_TIME, SHARES, OVERTAKE_AT = range(7)
 
 
 class Machine(NamedTuple):
-    """Which running executions compute; made by ``new_machine``, or empty if all do."""
+    """Which running executions compute; filled by ``fill_machine``, or empty if all do."""
 
     scalars: list[int]
     # by started execution: the progress up to which it computes with the GIL, computes without it,
@@ -90,20 +89,13 @@ class Machine(NamedTuple):
     switch_at: list[int]
 
 
-def new_machine(t: Tables, s: State, cpus: int | None = None, python: bool = False) -> Machine:
-    """
-    Return a machine on which nothing runs yet.
-
-    :param cpus: number of CPUs; None: as many as are needed.
-    :param python: whether executions that do not hold the interpreter need the GIL at their end.
-    """
-    machine = empty(Machine)
-    fill_machine(t, s, machine, cpus or NEVER, int(python))
-    return machine
-
-
 def fill_machine(t: Tables, s: State, m: Machine, cpus: int, python: int) -> None:
-    """Fill the columns of an empty machine; see ``new_machine``."""
+    """
+    Fill the columns of an empty machine, on which nothing runs yet.
+
+    :param cpus: number of CPUs; NEVER: as many as are needed.
+    :param python: 1 if executions that do not hold the interpreter need the GIL at their end.
+    """
     for value in (cpus, python, 0, NEVER, NEVER, 1, NEVER):
         m.scalars.append(value)
     for vertex in range(len(t.process)):

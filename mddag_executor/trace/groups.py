@@ -77,7 +77,8 @@ class Group:
         for i, fields in enumerate(GROUPS[name].values()):
             time, *rest = fields.split()
             times.append(time)
-            picked += [f'head {i}', f'sequence {i}', time, time, 'cdr', time, 'vpid', 'vtid', *rest]
+            picked += (f'head {i}', f'sequence {i}', time, time, 'cdr', time, 'vpid', 'vtid')
+            picked += rest
         self._pick = itemgetter(*map(names.index, picked))
         self._times = itemgetter(*map(names.index, times))
 
