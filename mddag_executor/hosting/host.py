@@ -217,7 +217,8 @@ class Host:
             if error.code not in (None, 0):
                 guest.error = error
         except BaseException as error:
-            guest.error = error
+            if guest.is_complete or not self._ended:  # else the end of the run cut its start off
+                guest.error = error
         if guest.error is not None or not guest.returned:
             self.program_ended(guest)
         guest.is_complete = True

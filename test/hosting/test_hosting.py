@@ -263,6 +263,15 @@ def test_a_program_that_cannot_start(world, default_context, spec, message):
     host.executor.shutdown()
 
 
+def test_a_program_whose_start_the_end_of_the_run_cuts_off_has_not_failed(
+        world, default_context, monkeypatch):
+    monkeypatch.setattr('mddag_executor.hosting.host.START_TIMEOUT_S', 0.1)
+    with Host() as host:
+        host.start(SingleThreadedExecutor(), host.load(['chat:starts_slowly']))
+        assert host.end(30.0) == [] and host.guests[0].error is None
+    host.executor.shutdown()
+
+
 def test_a_program_that_cannot_start_ends_the_run_with_one_line(world, mddag):
     done = mddag('run', 'graph.yaml', '--node', 'chat:exits', '--trace', 'out.mcap')
     assert (done.returncode, done.stderr.count('\n')) == (2, 1)

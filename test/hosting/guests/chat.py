@@ -199,6 +199,13 @@ def never_spins():
     print('typed w')
 
 
+def starts_slowly():
+    rclpy.init()
+    while rclpy.ok():
+        time.sleep(0.01)
+    Node('late')  # the context is shut down
+
+
 def leaves_a_thread():
     threading.Thread(target=time.sleep, args=(60,), name='stubborn', daemon=False).start()
     print('not JSON')
