@@ -339,6 +339,8 @@ def _with_place(
     from mddag_executor.hosting.loading import describe
     places = [name for name, each in result['callbacks'].items() if each['failed']] or [
         f'--node {guest.program.spec}' for guest in guests if guest.error is error]
+    if not places and isinstance(error, OSError) and error.filename is None:
+        return error  # of this program: too many open files
     failed = UserCodeError(f'{listed(places) or "mddag run"}: it raised {describe(error)}: '
                            'correct it, or see its traceback')
     failed.__cause__ = error
