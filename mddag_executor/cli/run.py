@@ -14,17 +14,15 @@ A run of several processes (`run_processes`) starts this verb once for each of t
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, ExitStack, redirect_stdout
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import asdict, replace
 import faulthandler
 from functools import partial
 import os
 from pathlib import Path
-import re
 import signal
 import sys
-import tempfile
 import threading
 import time
 from types import FrameType
@@ -145,8 +143,9 @@ def part(args: argparse.Namespace) -> int:
     task_set = loads(the_part.text, name=args.graph)
     if args.process is None:
         from mddag_executor.hosting.host import nodes_of
+        from mddag_executor.hosting.initialised import initialised
         from mddag_executor.hosting.loading import ros_arguments
-        with _rclpy(args.ros_args or []):
+        with initialised(args.ros_args):
             names = nodes_of(args.node, ros_arguments(args.ros_args))
         the_part.leave(names)
         sys.stdout.flush()
@@ -181,7 +180,8 @@ def run_here(
     with ExitStack() as stack:
         stack.callback(faulthandler.cancel_dump_traceback_later)
         signals = stack.enter_context(Signals())
-        stack.enter_context(_rclpy(args.ros_args or []))
+        from mddag_executor.hosting.initialised import initialised
+        stack.enter_context(initialised(args.ros_args))
         if args.synthetic is None:
             from mddag_executor.hosting.host import Host
             from mddag_executor.hosting.loading import ros_arguments
@@ -247,46 +247,6 @@ def warn_of(plan: ExecutionPlan, n_processes: int = 1) -> None:
         warn('spinning callbacks share the interpreter lock, and so one core for each process; '
              f'these need {plan.utilisation * plan.workers:.2f} cores: lower --utilisation, give '
              'more --processes, or use --synthetic sleep')
-
-
-@contextmanager
-def _rclpy(ros_args: Sequence[str]) -> Iterator[None]:
-    """Keep rclpy initialised."""
-    from rclpy.utilities import try_shutdown
-    try:
-        _init([sys.argv[0], '--ros-args', *ros_args] if ros_args else [])
-    except Exception as error:
-        reason = re.sub(r', at /\S+:\d+', '', str(error).split('\n')[0])
-        raise UsageError(
-            f'--ros-args {" ".join(ros_args)}: {reason}: correct it, or leave it out' if ros_args
-            else f'rclpy: {reason}: correct the environment, for instance HOME or ROS_LOG_DIR'
-        ) from error
-    try:
-        yield
-    finally:
-        try_shutdown()
-
-
-def _init(arguments: list[str]) -> None:
-    """
-    Initialise rclpy without its signal handlers, which would take Ctrl-C from the summary.
-
-    What native code writes to standard error is shown only when there is no exception: else it is
-    the same once more.
-    """
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
-    sys.stderr.flush()
-    with tempfile.TemporaryFile() as kept:
-        stderr = os.dup(2)
-        os.dup2(kept.fileno(), 2)
-        try:
-            rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
-        kept.seek(0)
-        os.write(2, kept.read())
 
 
 def _run(

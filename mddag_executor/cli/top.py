@@ -98,18 +98,13 @@ def _listening(board: Board) -> Iterator[Callable[[float], None]]:
     """Subscribe; give a function that collects what comes within a time."""
     from diagnostic_msgs.msg import DiagnosticArray
     from mddag_executor.executor.quiet_nodes import quiet_node
-    import rclpy
+    from mddag_executor.hosting.initialised import initialised
     from rclpy.context import Context
     from rclpy.executors import SingleThreadedExecutor
-    from rclpy.signals import SignalHandlerOptions
-    context = Context()
-    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
-    try:
+    with initialised(None, Context()) as context:
         node = quiet_node('mddag_top', context)
         node.create_subscription(DiagnosticArray, TOPIC, board.take, 10)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
         yield lambda seconds: executor.spin_once(seconds)
         executor.shutdown(1.0)
-    finally:
-        context.try_shutdown()

@@ -33,17 +33,15 @@ from typing import Any
 
 from mddag_executor.executor.compat import message_taker
 from mddag_executor.executor.quiet_nodes import quiet_node
+from mddag_executor.hosting.initialised import initialised
 from msg_graph.binding import is_background
 from msg_graph.draft import Draft, DraftCallback, DraftNode
 from msg_graph.drift import Releases
 from msg_graph.language import NODE, SERVICE, TOPIC
-import rclpy
 from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import try_shutdown
 
 _LEAST_MESSAGES = 3
 _STEP_S = 0.2
@@ -115,12 +113,10 @@ def probe(seconds: float, tick: Callable[[float], None] = lambda _: None) -> Pro
     :param seconds: duration; most of it is spent on measuring rates.
     :param tick: called repeatedly with the elapsed seconds.
     """
-    found, context = Probe(), Context()
+    found = Probe()
     subscriptions: list[tuple[Any, Seen]] = []
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     with ExitStack() as stack:
-        stack.callback(try_shutdown, context=context)
-        node = quiet_node('_mddag_graph_probe', context)
+        node = quiet_node('_mddag_graph_probe', stack.enter_context(initialised(None, Context())))
         stack.callback(node.destroy_node)
         begin = next_look = time.monotonic()
         while (now := time.monotonic()) < begin + seconds:

@@ -12,7 +12,7 @@ discovers no others: for the middleware they do nothing at all.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, field, replace
 import gc
 import os
@@ -33,6 +33,7 @@ from mddag_executor.executor.registry import Registry, snapshot
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.waitables import is_qos_event
 from mddag_executor.executor.work import Work
+from mddag_executor.hosting.initialised import initialised
 from mddag_executor.hosting.loading import describe, Program, ros_arguments
 from mddag_executor.replacements import Replacements
 from mddag_executor.rerun.clocks import VirtualTime
@@ -49,12 +50,10 @@ from mddag_executor.rerun.run_threads import Stalled
 from mddag_executor.rerun.timers import Timers
 from mddag_executor.text import counted
 from msg_graph import TaskSet
-import rclpy
 from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException
 from rclpy.guard_condition import GuardCondition
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import get_default_context, try_shutdown
+from rclpy.utilities import get_default_context
 
 PATIENCE_S = 30.0
 _OF_ALL_NODES = {'/parameter_events'}
@@ -345,18 +344,11 @@ def _context(ros_args: Sequence[str]) -> Iterator[Any]:
             'of its own')
     before = os.environ.get(_NO_DISCOVERY)
     os.environ[_NO_DISCOVERY] = 'OFF'
-    try:
-        rclpy.init(
-            args=ros_arguments(ros_args), signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:
-        raise RerunError(
-            f'--ros-args {" ".join(ros_args)}: {" ".join(str(error).split())[:200]}: correct it'
-        ) from error
-    finally:
-        del os.environ[_NO_DISCOVERY]
-        if before is not None:
-            os.environ[_NO_DISCOVERY] = before
-    try:
-        yield get_default_context()
-    finally:
-        try_shutdown()
+    with ExitStack() as stack:
+        try:
+            context = stack.enter_context(initialised(ros_args))
+        finally:
+            del os.environ[_NO_DISCOVERY]
+            if before is not None:
+                os.environ[_NO_DISCOVERY] = before
+        yield context

@@ -99,3 +99,12 @@ def test_bad_input(files, call):
             assert '\x1b' not in err and contents(files) == before, line
             text += f'{line}\n{err}'
     golden.compare('errors', text)
+
+
+@pytest.mark.parametrize('command', [
+    'top --once', 'graph from-ros', 'run g.yaml --synthetic sleep'])
+def test_where_rclpy_cannot_write_its_log_one_line_says_so(files, mddag, monkeypatch, command):
+    monkeypatch.setenv('ROS_LOG_DIR', '/proc/none')
+    done = mddag(*command.split())
+    assert (done.returncode, done.stderr.count('\n')) == (2, 1), done.stderr
+    assert done.stderr.endswith(': correct the environment, for instance HOME or ROS_LOG_DIR\n')

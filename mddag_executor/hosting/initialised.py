@@ -1,0 +1,65 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""rclpy, initialised for the duration of a command."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+import os
+import re
+import sys
+import tempfile
+
+from mddag_executor.errors import UsageError
+from mddag_executor.hosting.loading import ros_arguments
+import rclpy
+from rclpy.context import Context
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import get_default_context, try_shutdown
+
+
+@contextmanager
+def initialised(
+    ros_args: Sequence[str] | None = None, context: Context | None = None
+) -> Iterator[Context]:
+    """
+    Keep a context initialised, by default the default one.
+
+    rclpy's signal handlers are not installed: they would take Ctrl-C from the summary.
+
+    :raises UsageError: when rclpy refuses the arguments, or cannot make its log directory.
+    """
+    try:
+        _init(context, ros_arguments(ros_args))
+    except Exception as error:
+        reason = re.sub(r', at /\S+:\d+', '', str(error).split('\n')[0])
+        raise UsageError(
+            f'--ros-args {" ".join(ros_args)}: {reason}: correct it, or leave it out' if ros_args
+            else f'rclpy: {reason}: correct the environment, for instance HOME or ROS_LOG_DIR'
+        ) from error
+    try:
+        yield context or get_default_context()
+    finally:
+        try_shutdown(context=context)
+
+
+def _init(context: Context | None, arguments: list[str]) -> None:
+    """
+    Initialise a context.
+
+    What native code writes to standard error is shown only when there is no exception: else it is
+    the same once more.
+    """
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as kept:
+        stderr = os.dup(2)
+        os.dup2(kept.fileno(), 2)
+        try:
+            rclpy.init(
+                args=arguments, context=context, signal_handler_options=SignalHandlerOptions.NO)
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        kept.seek(0)
+        os.write(2, kept.read())
