@@ -13,11 +13,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from benchmarks import arguments
+from benchmarks.readers import peak_memory_mb
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, table
 from mddag_executor.errors import UsageError
-from mddag_executor.memory import peak_memory_mb
 
 HELP = 'measure the batch evaluation'
 DESCRIPTION = """\

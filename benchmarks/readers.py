@@ -13,12 +13,12 @@ from collections.abc import Callable
 from functools import partial
 import math
 import os
+from pathlib import Path
 import resource
 import time
 from typing import Any
 
 from mddag_executor.hosting.child import run_child
-from mddag_executor.memory import peak_memory_mb
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import (
     draw_execution_times,
@@ -31,6 +31,20 @@ from mddag_executor.trace import TraceReader
 from msg_graph import TaskSet
 
 LIMIT_S = 3600.0
+
+
+def peak_memory_mb() -> float:
+    """
+    Return the most memory that this process has had in RAM so far, MB.
+
+    From the kernel's ``VmHWM`` where there is one: what ``getrusage`` returns includes what the
+    process that started this one had by then.
+    """
+    try:
+        status = Path('/proc/self/status').read_text(encoding='ascii')
+        return int(status.split('VmHWM:')[1].split()[0]) / 1024
+    except (OSError, IndexError, ValueError):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def write_long_trace(path: str, task_set: TaskSet, events: int) -> None:

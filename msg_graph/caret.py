@@ -26,10 +26,9 @@ find a value, and that it was not filled in.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, DraftPath
+from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath
 from msg_graph.duration import DAY, MICROSECOND
 from msg_graph.errors import GraphError, shown, ValueProblem
 from msg_graph.language import CALLBACK, GROUP, NODE, SERVICE, TOPIC
@@ -39,24 +38,8 @@ Plain = dict[str, Any]
 """An entry of the file; scalars are text, ``null`` is None."""
 
 
-def declaration_from_caret(
-    text: str, file: str, measure: Callable[[Draft], object] | None = None
-) -> str:
-    """
-    Return the text of a declaration with marked blanks.
-
-    :param text: of the architecture file.
-    :param file: its name, for errors and for the first line.
-    :param measure: adds measured values before the declaration is written.
-    """
-    draft = read_architecture(text, file)
-    if measure is not None:
-        measure(draft)
-    return declaration_of(draft)
-
-
 def read_architecture(text: str, file: str) -> Draft:
-    """Return the contents of an architecture file."""
+    """Return the contents of an architecture file; ``file`` is its name."""
     remedy = "give an architecture file as caret_analyze's Architecture.export writes it"
     tree: Any = plain(parse_yaml(text, file))
     try:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from decimal import Decimal, ROUND_HALF_EVEN
 import re
 
@@ -65,10 +66,7 @@ def parse_duration(
 
 def format_duration(ns: int) -> str:
     """Return a time for people, in the largest unit that fits, to three decimals at most."""
-    for unit, factor in (('s', SECOND), ('ms', MILLISECOND), ('us', MICROSECOND)):
-        if abs(ns) >= factor:
-            return f'{ns / factor:.3f}'.rstrip('0').rstrip('.') + unit
-    return f'{ns}ns'
+    return _in_first_unit(ns, lambda factor: abs(ns) >= factor)
 
 
 def whole_us(ns: float) -> int:
@@ -82,8 +80,11 @@ def exact_duration(ns: int) -> str:
 
     ``parse_duration`` reads it back if the time is valid.
     """
-    for unit, factor in (('s', SECOND), ('ms', MILLISECOND), ('us', MICROSECOND)):
-        if factor <= ns <= DAY and ns % (factor // 1000) == 0:
-            whole, part = divmod(ns // (factor // 1000), 1000)
-            return f'{whole}.{part:03d}'.rstrip('0').rstrip('.') + unit
+    return _in_first_unit(ns, lambda factor: factor <= ns <= DAY and ns % (factor // 1000) == 0)
+
+
+def _in_first_unit(ns: int, fits: Callable[[int], bool]) -> str:
+    for unit in ('s', 'ms', 'us'):
+        if fits(UNITS[unit]):
+            return f'{ns / UNITS[unit]:.3f}'.rstrip('0').rstrip('.') + unit
     return f'{ns}ns'

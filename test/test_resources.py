@@ -3,12 +3,12 @@
 """Shipped files are found in a checkout and in every kind of installation."""
 
 from pathlib import Path
-import subprocess
-import sys
 
 from mddag_executor import resources
 from mddag_executor.errors import InputError
 import pytest
+
+from .conftest import run_program
 
 TOP = Path(__file__).resolve().parent.parent
 
@@ -19,30 +19,16 @@ def test_a_checkout_has_its_own_files():
         resources.find('config/none.yaml')
 
 
-def share(prefix):
-    """Lay out what an installation shares; return a file of it."""
-    file = prefix / 'share' / 'mddag_executor' / 'config' / 'probe.yaml'
-    marker = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages' / 'mddag_executor'
-    for path in (file, marker):
-        path.parent.mkdir(parents=True)
-        path.touch()
-    return file
-
-
 @pytest.mark.parametrize('folder', [
-    'lib/python3.12/site-packages', 'local/lib/python3.12/dist-packages', 'elsewhere'])
+    'lib/python3.12/site-packages', 'local/lib/python3.12/dist-packages', ''])
 def test_an_installation_has_its_own_files(tmp_path, folder):
-    mine, workspace = tmp_path / 'mine', share(tmp_path / 'workspace')
-    modules = mine / folder / 'mddag_executor'
-    modules.mkdir(parents=True)
+    modules = tmp_path / folder / 'mddag_executor'
+    config = tmp_path / 'share' / 'mddag_executor' / 'config' / 'probe.yaml'
+    for path in (modules, config):
+        path.mkdir(parents=True)
     for name in ('__init__.py', 'errors.py', 'lazy.py', 'resources.py'):
         (modules / name).write_bytes((TOP / 'mddag_executor' / name).read_bytes())
-    # A sourced workspace is searched, but must not win.
-    expected = workspace if folder == 'elsewhere' else share(mine)
     code = (f'import sys; sys.path.insert(0, {str(modules.parent)!r})\n'
             'from mddag_executor.resources import find\n'
             "print(find('config/probe.yaml'))\n")
-    prefixes = f'{tmp_path}/empty::{tmp_path}/workspace'
-    found = subprocess.run([sys.executable, '-c', code], check=True, capture_output=True,
-                           text=True, env={'AMENT_PREFIX_PATH': prefixes})
-    assert found.stdout.strip() == str(expected)
+    assert run_program(code)[0] == f'{config}\n'

@@ -6,10 +6,6 @@ The verb `diff`: two recorded runs, sink by sink.
 A run is a trace of this executor, an imported recording, or a folder with the traces of all its
 processes.  Without a graph each is judged by the declaration that it was recorded with, and an
 imported one by the other run's.
-
-Exit status: 0 when compared, whatever came of it; with `--fail-on-worse` 1 if a sink missed a
-larger share of its deadlines in the second run or was never due there, or (with `--tolerance`) if
-its p99 response time grew by more than that, or if no sink was due in both; 2 on bad input.
 """
 
 from __future__ import annotations
@@ -73,7 +69,6 @@ def main(args: argparse.Namespace) -> int:
 def _results(
     args: argparse.Namespace, first: Source, second: Source
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the results of both runs, in their order."""
     if _has_declaration(first):
         before, declared = _result(first, args.skip)
         if not _has_declaration(second):
@@ -95,7 +90,6 @@ def _has_declaration(source: Source) -> bool:
 
 
 def _result(source: Source, skip: int) -> tuple[dict[str, Any], TaskSet]:
-    """Return the result of a run, and the declaration that judged it."""
     outcome = recorded.as_recorded(source, f'replaying {source.name}', skip)
     warn(*outcome.warnings)
     return outcome.result(), outcome.task_set

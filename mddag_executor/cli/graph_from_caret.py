@@ -5,13 +5,9 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import warn
-
-if TYPE_CHECKING:
-    from msg_graph.draft import Draft
 
 EXAMPLE = """\
 mddag graph from-caret architecture.yaml -o graph.yaml
@@ -40,18 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     from mddag_executor.cli.systems import recorded_system, write_declaration
-    from msg_graph.caret import declaration_from_caret
+    from msg_graph.caret import read_architecture
+    from msg_graph.draft import declaration_of
     name, text = common.read_text(args.architecture)
-
-    def measure(draft: Draft) -> None:
-        """Fill in what the recording shows; warn if callbacks did not run."""
-        if args.trace is None:
-            return
+    draft = read_architecture(text, name)
+    if args.trace is not None:
         system = recorded_system(args.trace)
         every, count = len(list(draft.callbacks())), system.measure(draft)
         if count < every:
             warn(f'{system.name}: {every - count} of the {every} callbacks of {name} did not run')
-
-    result = declaration_from_caret(text, name, measure)
-    write_declaration(args.output, result)
+    write_declaration(args.output, declaration_of(draft))
     return 0

@@ -7,19 +7,8 @@ Theory of operation: the table of verbs below holds the one-line helps, so that 
 imports no verb; the module of a verb is imported when that verb is named, and only then. Options
 and files follow the verb, in any order (`parsing.py`). Whatever the user can cause is an exception
 of a known tree and becomes one line `error: PLACE: what is wrong: what to do`; several errors of a
-declaration are one line each. The exit status is
-
-| status | meaning |
-| --- | --- |
-| 0 | done |
-| 1 | done, and with `--fail-on-miss` a deadline was missed |
-| 2 | bad input or usage |
-| 70 | a defect of this program or of a node, with its traceback (EX_SOFTWARE) |
-| 130 | interrupted with Ctrl-C |
-| 141 | the reader of the output went away |
-| 128 + N | ended by signal N (SIGTERM or SIGHUP), as with Ctrl-C |
-
-`MDDAG_DEBUG=1` in the environment shows the traceback of every error.
+declaration are one line each. `docs/commands.md` lists the exit statuses. `MDDAG_DEBUG=1` in
+the environment shows the traceback of every error.
 """
 
 from __future__ import annotations
@@ -193,7 +182,6 @@ def _ending_signals() -> Iterator[list[int]]:
 
 
 def _status_of(run: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
-    """Do what the arguments say; report an error and return the exit status."""
     try:
         # A name that the terminal's encoding lacks is escaped; it must not end the program.
         if isinstance(sys.stdout, io.TextIOWrapper):
@@ -235,7 +223,10 @@ def _user_lines(error: BaseException, line: str) -> list[str]:
 
 def user_line(error: BaseException) -> str | None:
     """Return the line that reports an error to the user, or None when it is a defect."""
-    if isinstance(error, known_errors()):
+    # GraphError is no MddagError; if its module was not imported, none was raised
+    graph_errors = sys.modules.get('msg_graph.errors')
+    if isinstance(error, MddagError) or (
+            graph_errors is not None and isinstance(error, graph_errors.GraphError)):
         return one_line(str(error))
     if isinstance(error, OSError) and error.filename is None and error.errno in _PLACES:
         error.filename = _PLACES[error.errno]
@@ -264,17 +255,6 @@ _REMEDIES: dict[type[BaseException] | int | None, str] = {
     errno.EDQUOT: 'free space, or name another file',
     errno.EMFILE: "allow more with 'ulimit -n'",
 }
-
-
-def known_errors() -> tuple[type[BaseException], ...]:
-    """
-    Return the base classes of the errors that the user can correct.
-
-    That of ``msg_graph``, which is below this package, is found in sys.modules: a module that was
-    not imported cannot have raised.
-    """
-    msg_graph = sys.modules.get('msg_graph')
-    return (MddagError,) if msg_graph is None else (MddagError, msg_graph.GraphError)
 
 
 def _open_streams() -> None:

@@ -1,10 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""
-The verb `rerun`: real nodes again from a recording, in virtual time, the same every time.
-
-Exit status: 0 done; 1 with `--expect` when the outputs differ; 2 bad input; 70 a node raised.
-"""
+"""The verb `rerun`: real nodes again from a recording, in virtual time, the same every time."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import textwrap
 
 import jsonschema
 from msg_graph import GraphError, language, load, loads, yamltext
-from msg_graph.caret import declaration_from_caret
+from msg_graph.caret import read_architecture
 from msg_graph.errors import MOST_ERRORS
 import pytest
 import yaml
@@ -63,7 +63,7 @@ def test_each_error(loader, monkeypatch, tmp_path):
             loads, HEAD + textwrap.indent(case, '  '), 'g.yaml'),
         'declarations': lambda case: errors_of(loads, case, 'g.yaml'),
         'architecture files of CARET':
-            lambda case: errors_of(declaration_from_caret, case, 'arch.yaml')}
+            lambda case: errors_of(read_architecture, case, 'arch.yaml')}
     found, case, work = [], [], None
     for line in (GOLDEN / 'errors.txt').read_text().splitlines():
         if line.startswith('=== '):

@@ -9,8 +9,8 @@ Declarations from CARET architecture files, made up in golden/ in CARET's format
 import re
 
 from msg_graph import GraphError, loads
-from msg_graph.caret import declaration_from_caret
-from msg_graph.draft import MARK
+from msg_graph.caret import read_architecture
+from msg_graph.draft import declaration_of, MARK
 import pytest
 
 from ..cli import golden
@@ -19,7 +19,7 @@ from .helpers import GOLDEN
 
 @pytest.mark.parametrize('name', ['caret', 'caret_2021'])
 def test_an_architecture_file(name):
-    text = declaration_from_caret((GOLDEN / f'{name}.yaml').read_text(), 'arch.yaml')
+    text = declaration_of(read_architecture((GOLDEN / f'{name}.yaml').read_text(), 'arch.yaml'))
     golden.compare(name, text, GOLDEN)
     # All blanks at once, with their lines, instead of the errors that come of them.
     blanks = [n for n, line in enumerate(text.splitlines(), 1) if f'# {MARK}: ' in line]
