@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from heapq import heappop, heappush
 
-from mddag_executor.core.jobs import announce_overdue, next_deadline
-from mddag_executor.core.state import OPEN, State
+from mddag_executor.core.jobs import judge_incomplete, next_deadline
+from mddag_executor.core.state import OPEN, SINK_OVERDUE, State
 from mddag_executor.core.tables import NEVER, Tables
 
 
@@ -48,7 +48,8 @@ class Deadlines:
                 continue  # an earlier one was added
             del self._entry[slot]
             if self._state.job_state[slot] == OPEN:
-                announce_overdue(*self._rule, slot, self._judged[slot], now - 1)
+                judge_incomplete(
+                    *self._rule, slot, SINK_OVERDUE, self._judged[slot], now - 1)
                 self._judged[slot] = now - 1
                 self._add(slot, now - 1)
         self.next = heap[0][0] if heap else NEVER

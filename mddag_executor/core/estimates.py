@@ -20,37 +20,26 @@ CHANGE = 8
 LEAST_CHANGE_NS = 100_000
 
 
-class MeanTimes:
-    """The measured mean execution times of a run, by global vertex: ``State.mean``."""
+def note_time(t: Tables, s: State, vertex: int, mean: int, holds: int) -> None:
+    """Note the recent execution time of a vertex, ns, and whether it holds the GIL."""
+    known = s.mean[vertex]
+    if abs(mean - known) * CHANGE > known + LEAST_CHANGE_NS or holds != s.holder[vertex]:
+        s.mean[vertex] = mean
+        s.holder[vertex] = holds
+        _update(t, s, t.dag_of[vertex])
 
-    def __init__(self, t: Tables, s: State) -> None:
-        self._t = t
-        self._s = s
-        self._mean = s.mean
-        admit(t, s)
 
-    def note(self, vertex: int, mean: int, holds: int) -> None:
-        """Note the recent execution time of a vertex, ns, and whether it holds the GIL."""
-        known = self._mean[vertex]
-        change = mean - known
-        if (change * CHANGE > known + LEAST_CHANGE_NS or -change * CHANGE > known + LEAST_CHANGE_NS
-                or holds != self._s.holder[vertex]):
-            self._mean[vertex] = mean
-            self._s.holder[vertex] = holds
-            self._update(self._t.dag_of[vertex])
-
-    def _update(self, dag: int) -> None:
-        """Compute the latest starts of a DAG again, and what is refused."""
-        t, s = self._t, self._s
-        first, last = t.first_vertex[dag:dag + 2]
-        starts: dict[tuple[int, int], int] = {}
-        for vertex in sorted(range(first, last), key=lambda v: t.height[v]):
-            after = t.successors[t.first_successor[vertex]:t.first_successor[vertex + 1]]
-            for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
-                sink = t.reach_sink[i]
-                start = t.reach_deadline[i]
-                for each in after:
-                    start = min(start, starts.get((each, sink), start))
-                s.reach_by[i] = starts[vertex, sink] = start - self._mean[vertex]
-            set_start(t, s, vertex)
-        admit(t, s)
+def _update(t: Tables, s: State, dag: int) -> None:
+    """Compute the latest starts of a DAG again, and what is refused."""
+    first, last = t.first_vertex[dag:dag + 2]
+    starts: dict[tuple[int, int], int] = {}
+    for vertex in sorted(range(first, last), key=lambda v: t.height[v]):
+        after = t.successors[t.first_successor[vertex]:t.first_successor[vertex + 1]]
+        for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
+            sink = t.reach_sink[i]
+            start = t.reach_deadline[i]
+            for each in after:
+                start = min(start, starts.get((each, sink), start))
+            s.reach_by[i] = starts[vertex, sink] = start - s.mean[vertex]
+        set_start(t, s, vertex)
+    admit(t, s)

@@ -28,7 +28,6 @@ from mddag_executor.core.state import (
     SINK_DROPPED,
     SINK_IN_TIME,
     SINK_MISSED,
-    SINK_OVERDUE,
     SKIP,
     State,
     URGENCY,
@@ -204,13 +203,37 @@ def give_up(t: Tables, s: State, slot: int, end: int, now: int) -> None:
 
     :param end: ABORTED (rule 7), EXPIRED (rules 1 and 8), FAILED (rule 8), or OUTDATED (rule 13).
     """
+    judge_incomplete(t, s, slot, SINK_ABORTED + end - ABORTED, -NEVER, NEVER)
+    close_job(s, slot, end, now)
+
+
+def judge_incomplete(
+    t: Tables, s: State, slot: int, kind: int, after: int, until: int
+) -> int:
+    """
+    Judge the incomplete sinks of an open job with deadlines after a time up to another one.
+
+    :return: their number.
+    """
     dag = s.job_dag[slot]
+    found = 0
     for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
         vertex = t.sinks[i]
-        if s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0:
-            deadline = s.job_release[slot] + t.sink_deadline[vertex]
-            judge(s, slot, SINK_ABORTED + end - ABORTED, vertex, deadline, -1)
-    close_job(s, slot, end, now)
+        deadline = s.job_release[slot] + t.sink_deadline[vertex]
+        if after < deadline <= until and (
+                s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0):
+            judge(s, slot, kind, vertex, deadline, -1)
+            found += 1
+    return found
+
+
+def finish(t: Tables, s: State, now: int) -> None:
+    """Judge the jobs that are open when the run ends (rule 6); they stay open."""
+    for dag in range(t.n_dags):
+        slot = s.oldest[dag]
+        while slot >= 0:
+            s.job_late[slot] += judge_incomplete(t, s, slot, SINK_MISSED, -NEVER, now)
+            slot = s.job_next[slot]
 
 
 def outdate_sink(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
@@ -237,36 +260,6 @@ def next_deadline(t: Tables, s: State, slot: int, after: int) -> int:
                 s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0):
             first = deadline
     return first
-
-
-def announce_overdue(t: Tables, s: State, slot: int, after: int, until: int) -> None:
-    """
-    Report the sinks of an open job that have not completed by their deadlines (rule 6).
-
-    :param after: only deadlines after this time; ``until``: and not after this one.
-    """
-    dag = s.job_dag[slot]
-    for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
-        vertex = t.sinks[i]
-        deadline = s.job_release[slot] + t.sink_deadline[vertex]
-        if after < deadline <= until and (
-                s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0):
-            judge(s, slot, SINK_OVERDUE, vertex, deadline, -1)
-
-
-def finish(t: Tables, s: State, now: int) -> None:
-    """Judge the jobs that are open when the run ends (rule 6); they stay open."""
-    for dag in range(t.n_dags):
-        slot = s.oldest[dag]
-        while slot >= 0:
-            for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
-                vertex = t.sinks[i]
-                deadline = s.job_release[slot] + t.sink_deadline[vertex]
-                if deadline <= now and s.x_pending[
-                        s.job_base[slot] + t.region_offset[vertex]] >= 0:
-                    s.job_late[slot] += 1
-                    judge(s, slot, SINK_MISSED, vertex, deadline, -1)
-            slot = s.job_next[slot]
 
 
 def deactivate(s: State, slot: int) -> None:

@@ -138,10 +138,10 @@ def _drop_stale(s: State, queue: list[QueueEntry]) -> None:
 
 
 def idle_worker(t: Tables, s: State, x: int) -> int:
-    """Return the idle worker of its process with the lowest number, or -1 (rule 12)."""
+    """Return the first idle worker, of its process if there are several; -1: there is none."""
     process = t.process[s.x_vertex[x]]
     for worker in range(len(s.worker_x)):
-        if s.worker_x[worker] < 0 and s.pool[worker] == process:
+        if s.worker_x[worker] < 0 and (len(s.pool) == 0 or s.pool[worker] == process):
             return worker
     return -1
 

@@ -362,22 +362,23 @@ def _defer(s: State, queue: list[QueueEntry], to: list[QueueEntry]) -> None:
 
 
 def take(t: Tables, s: State, worker: int, now: int) -> int:
-    """Dispatch the next execution on this idle worker and return it, or -1 (rule 5)."""
+    """
+    Dispatch the next execution and return it, or -1 (rule 5).
+
+    :param worker: an idle worker; -1: the one with the lowest number.
+    """
     x = peek(t, s, now)
     if x < 0:
         return -1
     heappop(s.held_back if s.held_back and s.held_back[0][4] == x else s.ready)
-    start_on(s, x, worker, now)
-    return x
-
-
-def start_on(s: State, x: int, worker: int, now: int) -> None:
-    """Start a ready execution, which is no longer in a queue, on this idle worker."""
+    if worker < 0:
+        worker = idle_worker(t, s, x)
     s.x_state[x] = RUNNING
     s.x_worker[x] = worker
     if s.x_started[x] < 0:
         s.passed_on[s.x_vertex[x]] = -1
     s.x_started[x] = now
+    s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
     s.worker_x[worker] = x
     s.scalars[N_IDLE] -= 1
     if s.x_holds[x] != 0:
@@ -385,6 +386,7 @@ def start_on(s: State, x: int, worker: int, now: int) -> None:
     group = s.x_group[x]
     if group >= 0:
         s.group_owner[group] = x
+    return x
 
 
 def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
@@ -393,14 +395,8 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
 
     A driver calls this until it returns -1.
     """
-    if s.scalars[N_IDLE] > 0 and len(s.pool) > 0:
-        x = peek(t, s, now)
-        return -1 if x < 0 else _begin(t, s, idle_worker(t, s, x), now)
     if s.scalars[N_IDLE] > 0:
-        worker = 0
-        while s.worker_x[worker] >= 0:
-            worker += 1
-        return _begin(t, s, worker, now)
+        return take(t, s, -1, now)
     if s.scalars[POLLING] != 0:
         return -1  # only an idle worker checks the queue, and polls
     x = peek(t, s, now)
@@ -415,16 +411,9 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
     if largest <= s.x_key[x][0]:
         return -1
     victim = s.worker_x[worker]
-    _leave_worker(s, victim)
-    x = _begin(t, s, worker, now)
-    _put_back(t, s, key, victim, now)
-    return x
-
-
-def _begin(t: Tables, s: State, worker: int, now: int) -> int:
+    lend(s, victim)
     x = take(t, s, worker, now)
-    if x >= 0:
-        s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
+    _put_back(t, s, key, victim, now)
     return x
 
 
@@ -439,7 +428,8 @@ def _put_back(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     heappush(s.ready, s.x_key[x])
 
 
-def _leave_worker(s: State, x: int) -> None:
+def lend(s: State, x: int) -> None:
+    """Free the worker of a running execution, if it has one; it keeps its group."""
     worker = s.x_worker[x]
     if worker >= 0:
         s.worker_x[worker] = -1
@@ -453,11 +443,6 @@ def progress(s: State, x: int, now: int) -> int:
     return s.x_cost[x] - s.x_left[x] + now - s.x_started[x]
 
 
-def lend(s: State, x: int) -> None:
-    """Free a running execution's worker while it waits; it keeps its group."""
-    _leave_worker(s, x)
-
-
 def stop_holding(s: State, x: int) -> None:
     """Release the interpreter for an execution that turns out not to hold it (rule 11)."""
     if s.x_worker[x] >= 0:
@@ -467,7 +452,7 @@ def stop_holding(s: State, x: int) -> None:
 
 def suspend(s: State, x: int) -> None:
     """Suspend a running execution until ``resume``: it keeps its group, but no worker."""
-    _leave_worker(s, x)
+    lend(s, x)
     s.x_state[x] = SUSPENDED
 
 
@@ -499,7 +484,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     :return: whether its vertex has completed: False only for a leg that was not the last.
     """
     worker = s.x_worker[x]
-    if worker >= 0:  # not _leave_worker: a call less for each execution
+    if worker >= 0:  # not lend(): a call less for each execution
         s.worker_x[worker] = -1
         s.x_worker[x] = -1
         s.scalars[N_IDLE] += 1
@@ -550,23 +535,21 @@ def _release_group(s: State, group: int) -> None:
 def _complete_vertex(
     t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int
 ) -> None:
-    dag = s.job_dag[slot]
-    if t.sink_deadline[vertex] >= 0:
+    is_sink = t.sink_deadline[vertex] >= 0
+    late = False
+    if is_sink:
         deadline = s.job_release[slot] + t.sink_deadline[vertex]
         late = now > deadline
         judge(s, slot, SINK_LATE if late else SINK_IN_TIME, vertex, deadline, now)
-        s.job_sinks_left[slot] -= 1
         if late:
             s.job_late[slot] += 1
             note_miss(t, s, slot, vertex, now)
-        if s.job_sinks_left[slot] == 0:
-            close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
-        elif late and t.on_late[dag] == ABORT:
-            give_up(t, s, slot, ABORTED, now)
-    elif s.expected[vertex] == LEADS_OUT:
+    if is_sink or s.expected[vertex] == LEADS_OUT:
         s.job_sinks_left[slot] -= 1
         if s.job_sinks_left[slot] == 0:
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
+        elif late and t.on_late[s.job_dag[slot]] == ABORT:
+            give_up(t, s, slot, ABORTED, now)
     if s.scalars[PROPAGATE] == 1:  # a sink, which may have ended the job, has no successors
         for i in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
             edge(t, s, key, slot, t.successors[i], now)

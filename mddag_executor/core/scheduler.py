@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from heapq import heapify, heappush
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import policy
@@ -102,6 +103,16 @@ class Scheduler:
         """Expire every job that can no longer complete."""
         for dag in range(self.tables.n_dags):
             jobs.expire_idle(self.tables, self.state, dag, now)
+
+    def set_holds(self, x: int, holds: int) -> None:
+        """Set which interpreter a waiting execution needs; a deferred one may start again."""
+        state = self.state
+        state.x_holds[x] = holds
+        entry = state.x_key[x]
+        if entry in state.held_back:
+            state.held_back.remove(entry)
+            heapify(state.held_back)
+            heappush(state.ready, entry)
 
     def new_group(self) -> int:
         """Add a mutually exclusive callback group and return its number."""

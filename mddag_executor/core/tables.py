@@ -133,7 +133,6 @@ class Tables(NamedTuple):
         task_set: TaskSet | None,
         *,
         legs: bool = False,
-        groups: bool = True,
         default_deadline: int = DEFAULT_DEADLINE_NS,
         max_active_jobs: int = NEVER,
         expire_after: int = NEVER,
@@ -143,14 +142,14 @@ class Tables(NamedTuple):
         Flatten a task set.
 
         :param task_set: the DAG tasks; ``None``: there is no declared DAG.
-        :param legs: sync vertices run once for each leg (live), not once when all have arrived.
-        :param groups: use the declared callback groups (live passes False: it has the real ones).
+        :param legs: as live: sync vertices run once for each leg, not once when all have arrived,
+            and the declared callback groups do not count: the driver has the real ones.
         :param default_deadline: relative deadline of undeclared callbacks, ns.
         :param max_active_jobs: bound on the open jobs of a DAG that declares none itself.
         :param expire_after: how long after its latest deadline an idle job stays open, ns.
         :param on_late: the treatment of late jobs of a DAG that does not declare it.
         """
-        columns = _Columns(legs, groups, max_active_jobs, expire_after, ON_LATE[on_late])
+        columns = _Columns(legs, max_active_jobs, expire_after, ON_LATE[on_late])
         columns.enter(task_set.callbacks if task_set is not None else ())
         for dag in task_set.dags if task_set is not None else ():
             columns.add_dag(dag)
@@ -162,10 +161,9 @@ class _Columns:
     """Collects the columns of ``Tables`` DAG by DAG."""
 
     def __init__(
-        self, legs: bool, groups: bool, max_active_jobs: int, expire_after: int, on_late: int
+        self, legs: bool, max_active_jobs: int, expire_after: int, on_late: int
     ) -> None:
         self._legs = legs
-        self._use_groups = groups
         self._max_active_jobs = max_active_jobs
         self._expire_after = expire_after
         self._on_late = on_late
@@ -248,7 +246,7 @@ class _Columns:
         lists['first_sink'].append(len(lists['sinks']))
 
     def _group(self, node: str, group: str | None) -> int:
-        if group is None or not self._use_groups:
+        if group is None or self._legs:
             return -1
         return self._groups.setdefault((node, group), len(self._groups))
 

@@ -8,8 +8,8 @@ Live executor, replayer and simulator all use this module, so their figures have
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from mddag_executor.core.jobs import is_miss
@@ -35,7 +35,7 @@ from mddag_executor.core.state import (
     SINK_MISSED,
     SINK_OVERDUE,
 )
-from mddag_executor.core.tables import Tables
+from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.core.weakly_hard import MissWindow
 from msg_graph import Dag, TaskSet, Vertex, WeaklyHard
 
@@ -139,49 +139,6 @@ def of_processes(
             'never_due': never_due(dags), 'dags': dags}
 
 
-class Latest:
-    """
-    The last ``keep`` of a series of numbers (None: all), 8 bytes each.
-
-    Numbers beyond 64 bits, possible in damaged recordings, are stored as the nearest within.
-    """
-
-    __slots__ = ('_keep', '_values', '_next')
-
-    def __init__(self, keep: int | None) -> None:
-        self._keep = keep
-        self._values = array('q')
-        self._next = 0
-
-    def append(self, value: int) -> None:
-        """Add a number, which replaces the oldest if there are ``keep`` already."""
-        values = self._values
-        try:
-            if len(values) != self._keep:
-                values.append(value)
-            elif values:
-                values[self._next] = value
-                self._next = (self._next + 1) % len(values)
-        except OverflowError:
-            self.append(2 ** 63 - 1 if value > 0 else -2 ** 63)
-
-    def extend(self, values: Any) -> None:
-        """Add an array of 64-bit numbers, if all are kept."""
-        self._values.frombytes(values.tobytes())
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def __getitem__(self, index: int) -> int:
-        length = len(self._values)
-        if not -length <= index < length:
-            raise IndexError(index)
-        return self._values[(self._next + index) % length]
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._values[self._next:] + self._values[:self._next])
-
-
 class SinkTally:
     """
     The results of one sink: counts, and response times (completion minus release, ns).
@@ -192,9 +149,8 @@ class SinkTally:
     def __init__(self, relative_deadline_ns: int, keep: int | None) -> None:
         self.relative_deadline_ns = relative_deadline_ns
         self.numbers = [0] * (SINK_DEMOTED + 1)
-        self.shortest: int | None = None
-        self.longest: int | None = None
-        self.responses = Latest(keep)
+        self.shortest, self.longest = NEVER, -NEVER
+        self.responses: Any = deque(maxlen=keep)
 
     @property
     def completed(self) -> int:
@@ -205,10 +161,8 @@ class SinkTally:
         """Count a completion."""
         self.numbers[SINK_LATE if late else SINK_IN_TIME] += 1
         self.responses.append(response)
-        if self.shortest is None or response < self.shortest:
-            self.shortest = response
-        if self.longest is None or response > self.longest:
-            self.longest = response
+        self.shortest = min(self.shortest, response)
+        self.longest = max(self.longest, response)
 
     def verdicts(self) -> dict[str, int]:
         """Return the number of each verdict; ``late`` includes the overdue."""
@@ -291,7 +245,7 @@ class Tally:
             responses = np.sort(time[done] - deadline[done] + sink.relative_deadline_ns)
             if len(responses):
                 sink.shortest, sink.longest = int(responses[0]), int(responses[-1])
-            sink.responses.extend(responses)
+            sink.responses = memoryview(responses)
             if v in self.windows:
                 for missed in np.sort(job[mine[kind[mine] > SINK_IN_TIME]]).tolist():
                     self.windows[v].add(missed)

@@ -10,7 +10,7 @@ that it runs even if all workers wait for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 import os
 import signal
@@ -19,33 +19,25 @@ from time import monotonic_ns
 from typing import Any
 
 from mddag_executor.executor import compat
-from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
 from mddag_executor.executor.sources import Source
 from mddag_executor.executor.timers import TimerQueue, TimerSource
+from mddag_executor.executor.workers import WorkerPool
 
 
 class AtOnce:
     """
     The sources handled at once; all methods but ``ring`` belong to the spinning thread.
 
-    :param lock: that of the engine.
-    :param executor: runs the callbacks of futures.
-    :param fail: receives exceptions of takes.
     :ivar has_run: whether the last ``handle`` has handled anything.
     """
 
-    def __init__(
-        self, engine: Engine, lock: Any, executor: Any, fail: Callable[[BaseException], None]
-    ) -> None:
+    def __init__(self, pool: WorkerPool) -> None:
         self.loop = EventLoop()
-        self.timers = TimerQueue(self.loop.wake, fail)
-        self.executor = executor
-        self.fail = fail
+        self.timers = TimerQueue(self.loop.wake, pool.fail)
+        self.pool = pool
         self.has_run = False
-        self._engine = engine
-        self._lock = lock
 
     def ring(self) -> None:
         """End the current wait, or the next one; from any thread, also in a signal handler."""
@@ -55,11 +47,11 @@ class AtOnce:
         """Handle arrivals; return whether there were any."""
         self.has_run = False
         for source in self.loop.sources(events):
-            with self._lock if isinstance(source, TimerSource) else nullcontext():
+            with self.pool.lock if isinstance(source, TimerSource) else nullcontext():
                 source.collect()
         if self.timers.has_jumped or 0 < self.loop.timer.at <= monotonic_ns():
             self.loop.timer.at = 0
-            with self._lock:
+            with self.pool.lock:
                 fired = list(self.timers.fire())
             for work, *_ in fired:
                 work.function(*work.args)
@@ -72,8 +64,8 @@ class AtOnce:
     def count(self, entity: Entity) -> None:
         """Count a callback that has run."""
         self.has_run = True
-        with self._lock:
-            self._engine.ran_at_once(entity)
+        with self.pool.lock:
+            self.pool.engine.ran_at_once(entity)
 
 
 class ClockSource(Source):
@@ -81,7 +73,7 @@ class ClockSource(Source):
 
     def __init__(self, entity: Entity, at_once: AtOnce) -> None:
         super().__init__(
-            entity, at_once.loop, compat.message_taker(entity.rclpy), at_once.fail)
+            entity, at_once.loop, compat.message_taker(entity.rclpy), at_once.pool.fail)
         self._at_once = at_once
 
     def post(self, taken: Any) -> None:
@@ -95,7 +87,7 @@ class ClientSource(Source):
 
     def __init__(self, entity: Entity, at_once: AtOnce) -> None:
         super().__init__(
-            entity, at_once.loop, compat.response_taker(entity.rclpy), at_once.fail)
+            entity, at_once.loop, compat.response_taker(entity.rclpy), at_once.pool.fail)
         self._at_once = at_once
 
     def post(self, taken: Any) -> None:
@@ -103,7 +95,7 @@ class ClientSource(Source):
         header, response = taken
         compat.complete_request(
             self.entity.rclpy, header.request_id.sequence_number, response,
-            self._at_once.executor)
+            self._at_once.pool.executor)
         self._at_once.has_run = True
 
 

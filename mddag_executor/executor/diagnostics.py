@@ -114,10 +114,8 @@ class DagWatch:
         ratio = window.missed / window.due if window.due else 0.0
         values = {
             'period_ms': _ms(self._dag.period_ns), 'jobs': str(seen.jobs),
-            'results': str(results.due), 'missed': str(results.missed),
-            'late': str(results.late), 'expired': str(results.expired),
-            'aborted': str(results.aborted), 'failed': str(results.failed),
-            'dropped': str(results.dropped), 'demoted': str(results.demoted),
+            'results': str(results.due), **{key: str(getattr(results, key)) for key in (
+                'missed', 'late', 'expired', 'aborted', 'failed', 'dropped', 'demoted')},
             **self._tolerated(),
             'window_results': str(window.due), 'window_missed': str(window.missed),
             'window_missed_ratio': f'{ratio:.4f}', 'window_in_stops': str(in_stops),

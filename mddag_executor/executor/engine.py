@@ -39,18 +39,21 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
-from mddag_executor.core.estimates import MeanTimes
+from mddag_executor.core.estimates import note_time
 from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import is_judged, judge_from
-from mddag_executor.core.overload import is_late
+from mddag_executor.core.overload import admit, is_late
 from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE, TURN_NS
 from mddag_executor.core.state import (
     CHECK_AT,
+    DAG_KEYS,
+    DEADLINE_KEYS,
     EXPIRED,
     IDLE,
     JUDGE_FROM,
     N_IDLE,
     OPEN,
+    OTHER_KEYS,
     SUSPENDED,
     WAITING,
 )
@@ -89,13 +92,13 @@ class Engine:
         process: str | None = None,
     ) -> None:
         self.tables = Tables.build(
-            task_set, legs=True, groups=False, default_deadline=default_deadline,
+            task_set, legs=True, default_deadline=default_deadline,
             max_active_jobs=max_active_jobs, expire_after=expire_after, on_late=on_late)
         self.scheduler = Scheduler(self.tables, n_workers, policy)
         self.deadlines = Deadlines(self.tables, self.scheduler.state)
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.jobs = Jobs(task_set)
-        self.mean_times = MeanTimes(self.tables, self.scheduler.state)
+        admit(self.tables, self.scheduler.state)
         self.other_processes = OtherProcesses.of(
             task_set, self.tables, self.scheduler, self.jobs, process)
         self.dag_names = [d.name for d in task_set.dags] if task_set else []
@@ -120,7 +123,9 @@ class Engine:
         self._finished = False
         # executions that hold the GIL, in the order in which they began; read-only outside
         self.holders: list[Work] = []
-        self._keys_are_deadlines = policy in ('rad', 'gedf')
+        urgency = self.scheduler.policy.urgency
+        self._keys_are_times = urgency != OTHER_KEYS
+        self._keys_are_deadlines = urgency in (DEADLINE_KEYS, DAG_KEYS)
         self._default_deadline = default_deadline
 
     # --- ready work --- --------------------------------------------------------------------------
@@ -201,7 +206,9 @@ class Engine:
             return
         self.undeclared += 1
         work.ready_ns = now
-        if self._is_bypassed or self._begin_bypass():
+        if not self._is_bypassed:
+            self._is_bypassed = self._may_bypass and self._is_core_empty()
+        if self._is_bypassed:
             x = work.x = self._last_id = self._last_id - 1
             entity.waiting[x] = None
             self._lane.append(work)
@@ -211,26 +218,33 @@ class Engine:
 
     def _enqueue(self, work: Work) -> None:
         entity, since = work.entity, work.ready_ns
-        if entity.callback is not None and entity.waiting and self._keys_are_deadlines:
-            # It belongs to no job, but comes after the message that waits already.  Only the last
-            # one is compared: there may be many.
+        if entity.callback is not None and entity.waiting and self._keys_are_times:
+            # It belongs to no job, but comes after the messages that wait already.  Only the last
+            # one, and the last one without a job, are compared: there may be many.
             last = next(reversed(entity.waiting))
+            since = max(since, entity.last_since)
             if last >= 0:
                 since = max(since, self._state.x_key[last][0] + 1 - self._default_deadline)
+        entity.last_since = since
         x = work.x = self.scheduler.ready_undeclared(
-            entity.ready, entity.group, entity.habit.holds, since)
+            entity.ready, entity.group, self._holds(entity), since)
         entity.waiting[x] = None
         self._work[x] = work
+
+    def _holds(self, entity: Entity) -> int:
+        """Return whether the next execution holds the GIL; those that wait must not differ."""
+        holds = entity.habit.holds
+        last = next(reversed(entity.waiting), -1)
+        if last >= 0 and self._state.x_holds[last] != holds:  # one would overtake the other
+            for x in entity.waiting:
+                self.scheduler.set_holds(x, holds)
+        return holds
 
     def allow_bypass(self) -> None:
         """Let undeclared executions bypass the core, if the policy runs them as they come."""
         policy, undeclared = self.scheduler.policy, self.tables.n_vertices
         self._may_bypass = not policy.polling and policy.key(
             self.tables, undeclared, 0, 1, 0) < policy.key(self.tables, undeclared, 0, 0, 1)
-
-    def _begin_bypass(self) -> bool:
-        self._is_bypassed = self._may_bypass and self._is_core_empty()
-        return self._is_bypassed
 
     def _is_core_empty(self) -> bool:
         """Return whether nothing is waiting, running on a worker or owning a group in the core."""
@@ -271,9 +285,9 @@ class Engine:
         first = entity.remote_publishers[0]
         job = self._entering(self.tables.dag_of[first], stamp, first, release, now)
         # For a sync: the first of its legs that has no message yet.
-        return None if job is None else job._replace(vertex=next(
-            (v for v in entity.remote_publishers if self._is_idle(job, *entity.targets[v])),
-            first))
+        return None if job is None else job._replace(vertex=next((
+            v for v in entity.remote_publishers if self._state.x_state[
+                self.scheduler.execution(job.slot, *entity.targets[v])] == IDLE), first))
 
     def _entering(
         self, dag: int, name: int | tuple[int, int], vertex: int, release: int, now: int
@@ -294,9 +308,6 @@ class Engine:
         is_open = (state.job_dag[slot] == origin.dag and state.job_index[slot] == origin.job
                    and state.job_state[slot] == OPEN)
         return state.job_release[slot] if is_open else None
-
-    def _is_idle(self, job: Origin, vertex: int, leg: int) -> bool:
-        return self._state.x_state[self.scheduler.execution(job.slot, vertex, leg)] == IDLE
 
     def _skip_job(self, entity: Entity, release: int, now: int) -> None:
         """Account for a release whose source does not run: the job expires at once."""
@@ -323,24 +334,24 @@ class Engine:
         state = self._state
         slot, dag, job, _ = origin
         vertex, leg = target
-        if (state.job_dag[slot] != dag or state.job_index[slot] != job
-                or state.job_state[slot] != OPEN):
+        here = Origin(slot, dag, job, vertex)
+        if self.open_release(here) is None:
             if not self.verdicts.was_aborted(dag, job):
                 return False
             entity.ready += 1
-            self.verdicts.dropped(entity, Origin(slot, dag, job, vertex), 'aborted', now)
+            self.verdicts.dropped(entity, here, 'aborted', now)
             return True
-        x = state.job_base[slot] + self.tables.region_offset[vertex] + leg
+        x = self.scheduler.execution(slot, vertex, leg)
         if state.x_state[x] != IDLE:
             return False  # a second message for the same vertex of the same job
-        work.origin = Origin(slot, dag, job, vertex)
+        work.origin = here
         self._start(work, x, now)
         return True
 
     def _start(self, work: Work, x: int, now: int) -> None:
         entity, state = work.entity, self._state
         state.x_group[x] = entity.group
-        state.x_holds[x] = entity.habit.holds
+        state.x_holds[x] = self._holds(entity)
         self._core().ready(x, now)
         work.x = x
         work.ready_ns = now
@@ -516,14 +527,11 @@ class Engine:
                 return True
             if first is None or entry < first:
                 first = entry
-        return (first is not None and first[0] < self._urgent_key()
+        return (first is not None
+                and first[0] < min(state.x_key[work.x][0] for work in self.holders)
                 and bool(self._may_be_overtaken(now)))
 
     # --- the GIL ---------------------------------------------------------------------------------
-
-    def _urgent_key(self) -> int:
-        """Return the priority of the most urgent execution that holds the GIL."""
-        return min(self._state.x_key[work.x][0] for work in self.holders)
 
     def _may_be_overtaken(self, now: int) -> bool:
         """Return whether the first waiting execution may overtake the latest holder of the GIL."""
@@ -617,38 +625,30 @@ class Engine:
                 self._record_run(work, start, end, vtid, worker)
             return
         x, work.x = work.x, -1
-        if work in self.holders:
-            self.holders.remove(work)
-        origin = work.origin
-        if origin is None and self.record is None and not failed:
-            self._complete(x, end)
-            return
+        self._let_go(work)
+        origin, record = work.origin, self.record
         entity.failed += failed
         if self.verdicts.tally.overdue and origin is not None:
             deadline = self.verdicts.tally.overdue.get((origin.vertex, origin.job), -1)
             if end <= deadline:  # it was reported overdue before this was known
                 entity.busy_ns += deadline + 1 - end
                 end = deadline + 1
-        end_it = self.scheduler.fail if failed else self.scheduler.complete
-        if self.record is None:
-            whole = end_it(x, end)
-        elif origin is None:
-            self._record_run(work, start, end, vtid, worker)
-            whole = end_it(x, end)
-        else:
+        whole = (self.scheduler.fail if failed else self._complete)(x, end)
+        if origin is not None:
             tables, state = self.tables, self._state
             slot, dag, job, vertex = origin
-            deadline = state.job_release[slot] + tables.rad_offset[vertex]
-            leg = x - state.job_base[slot] - tables.region_offset[vertex]
-            held = state.x_holds[x]
-            whole = end_it(x, end)
-            if failed:  # first, or its completion would count
-                self.record('fail', now, vtid, dag, tables.index_in_dag[vertex], job)
-            self.record(
-                EXECUTION, start, vtid, entity.address, dag, tables.index_in_dag[vertex],
-                job, worker, work.ready_ns, deadline, end, now, whole, leg, work.cpu_ns, held)
-        if origin is not None and whole:  # other messages of a sync take less
-            self.mean_times.note(origin.vertex, entity.habit.needs_ns, entity.habit.holds)
+            if record is not None:
+                if failed:  # first, or its completion would count
+                    record('fail', now, vtid, dag, tables.index_in_dag[vertex], job)
+                record(
+                    EXECUTION, start, vtid, entity.address, dag, tables.index_in_dag[vertex], job,
+                    worker, work.ready_ns, state.job_release[slot] + tables.rad_offset[vertex],
+                    end, now, whole, x - state.job_base[slot] - tables.region_offset[vertex],
+                    work.cpu_ns, state.x_holds[x])
+            if whole:  # other messages of a sync take less
+                note_time(tables, state, vertex, entity.habit.needs_ns, entity.habit.holds)
+        elif record is not None:
+            self._record_run(work, start, end, vtid, worker)
         if self._state.decisions:
             self._decided(now)
 

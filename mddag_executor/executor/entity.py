@@ -40,7 +40,7 @@ class Entity:
 
     __slots__ = (
         'kind', 'rclpy', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
-        'topic', 'waiting', 'ready', 'ran', 'failed', 'dropped', 'skipped',
+        'topic', 'waiting', 'last_since', 'ready', 'ran', 'failed', 'dropped', 'skipped',
         'busy_ns', 'unattributed', 'removed', 'may_be_gone', 'address', 'handle',
         'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns',
         'publishes', 'at_once',
@@ -70,6 +70,8 @@ class Entity:
         self.is_own = False
         # its waiting executions, the oldest first
         self.waiting: dict[int, None] = {}
+        # since when its last execution without a job counts as ready
+        self.last_since = 0
         self.ready = 0
         self.ran = 0
         # how many times its callback raised an exception

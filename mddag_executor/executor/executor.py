@@ -158,6 +158,7 @@ class MultiDeadlineExecutor(BareExecutor):
         find_policy(policy)
         settings.check_on_late(on_late)
         settings.check_handler(on_deadline_miss)
+        settings.check_thresholds(thresholds)
         settings.check_context(context)
         settings.check_process(process, task_set)
         # All parameters are checked by now: an error leaves no trace and no thread behind.
@@ -184,7 +185,7 @@ class MultiDeadlineExecutor(BareExecutor):
             on_miss=None if self._notifier is None else self._notifier.post, process=process)
         self._pool = WorkerPool(
             self._engine, self._trace_clock, self, self._fail, prepare)
-        self._at_once = AtOnce(self._engine, self._pool.lock, self, self._fail)
+        self._at_once = AtOnce(self._pool)
         self._at_once.loop.add_own(self._pool.guard)
         self._signals = SignalPipe()
         self._at_once.loop.add_own(self._signals)
@@ -198,11 +199,10 @@ class MultiDeadlineExecutor(BareExecutor):
         self._check_at: list[float] = []  # when to check again whether the context has ended
         self._stepping: select.epoll | None = None
         super().__init__(context=context)
-        self._wait_sets = WaitSetThread(
-            self.context, self, self.signal_guard(), self._pool.post, self._signalled, self._fail)
+        self._wait_sets = WaitSetThread(self._pool, self._signalled)
         self._upkeep = Upkeep(
             self._nodes_to_serve, self._registry, self._pool, self._at_once, self._recorder,
-            self.context, self, self._wait_sets, self._fail)
+            self._wait_sets)
         self._diagnostics: Diagnostics | None = None
         if every_ns is not None:
             self._diagnostics = Diagnostics(

@@ -56,19 +56,16 @@ class OtherProcesses:
     """
     The DAGs that may extend beyond this process, and the jobs of their stamps.
 
-    ``update`` and ``find`` need the engine's lock; ``note`` may be called from any thread.
+    ``host`` and ``find`` need the engine's lock; ``note`` may be called from any thread.
 
-    :param dags: those identified by stamps; None: those whose source declares ``release_from:
-        header_stamp``.
+    :param dags: those identified by stamps.
     :param announced: the indices of those whose publications are announced.
     """
 
     def __init__(
         self, task_set: TaskSet, tables: Tables, scheduler: Scheduler, jobs: Jobs,
-        dags: Sequence[Dag] | None = None, announced: Set[int] = frozenset(),
+        dags: Sequence[Dag], announced: Set[int] = frozenset(),
     ) -> None:
-        if dags is None:
-            dags = [d for d in task_set.dags if d.release_from == 'header_stamp']
         self._announced = announced
         self._crossing = {d.index for d in dags}
         self._dags = [d for d in task_set.dags if d.index in self._crossing | announced]
@@ -87,32 +84,34 @@ class OtherProcesses:
     @staticmethod
     def of(
         task_set: TaskSet | None, tables: Tables, scheduler: Scheduler, jobs: Jobs,
-        process: str | None = None,
+        process: str | None,
     ) -> OtherProcesses | None:
         """
         Return the object for a declaration; None: no DAG extends beyond the process.
 
         :param process: the declared process that this is; None: publications are not announced.
         """
-        announced = divided(task_set) if task_set is not None and process is not None else set()
-        if task_set is None or not announced and all(
-                d.release_from != 'header_stamp' for d in task_set.dags):
+        if task_set is None:
             return None
-        return OtherProcesses(task_set, tables, scheduler, jobs, announced=announced)
+        stamped = [d for d in task_set.dags if d.release_from == 'header_stamp']
+        announced: set[int] = set() if process is None else divided(task_set)
+        if not stamped and not announced:
+            return None
+        return OtherProcesses(task_set, tables, scheduler, jobs, stamped, announced)
 
     @property
     def announces(self) -> bool:
         """Return whether there are DAGs whose publications are announced."""
         return bool(self._announced)
 
-    def update(self, hosted: set[str], entities: Iterable[Entity]) -> list[tuple[int, list[int]]]:
+    def host(
+        self, hosted: set[str], entities: Iterable[Entity], record: Record | None, now: int
+    ) -> None:
         """
-        Update which callbacks are here now (rules 1 and 3).
+        Update which callbacks are here now (rules 1 and 3), and record what changes.
 
         :param hosted: the keys of the callbacks.
-        :return: for each DAG of which that has changed, which vertices are here.
         """
-        changes = []
         leaving: set[str] = set()
         announced: set[str] = set()
         for dag in self._dags:
@@ -120,7 +119,9 @@ class OtherProcesses:
             if here != self._here.get(dag.index):
                 self._here[dag.index] = here
                 self._scheduler.expect(dag.index, here)
-                changes.append((dag.index, here))
+                if record is not None:
+                    record('hosted', now, threading.get_native_id(), dag.index,
+                           ','.join(str(i) for i, is_here in enumerate(here) if is_here))
             if not all(here):
                 (announced if dag.index in self._announced else leaving).update(
                     t for v in dag.vertices if here[v.index] for t in v.callback.publishes
@@ -135,7 +136,6 @@ class OtherProcesses:
                 self._callbacks[v] not in hosted and self._tables.dag_of[v] in self._announced
                 for v in entity.targets)
             entity.remote_publishers = self._entrance(entity, hosted)
-        return changes
 
     def unmatched(self, entities: Iterable[Entity], nodes: Iterable[Any]) -> list[str]:
         """Return the topics of leaving or entering jobs without an endpoint of another process."""
@@ -153,15 +153,6 @@ class OtherProcesses:
         """Return whether a topic of a vertex starts a vertex that is not here."""
         return any(not here[after] and topic in dag.vertices[after].callback.topics
                    for after in vertex.successors)
-
-    def host(
-        self, hosted: set[str], entities: Iterable[Entity], record: Record | None, now: int
-    ) -> None:
-        """Update which callbacks are here now, as ``update`` does, and record what changes."""
-        for dag, here in self.update(hosted, entities):
-            if record is not None:
-                vertices = ','.join(str(i) for i, is_here in enumerate(here) if is_here)
-                record('hosted', now, threading.get_native_id(), dag, vertices)
 
     def _entrance(self, entity: Entity, hosted: set[str]) -> list[int]:
         """Return the vertices elsewhere from which messages enter at an entity."""

@@ -95,6 +95,13 @@ class Thresholds:
             whole_number(field, getattr(self, field), MOST_JOBS)
 
 
+def check_thresholds(thresholds: object) -> None:
+    """Check the thresholds of the diagnostics, or None."""
+    if not isinstance(thresholds, Thresholds | None):
+        raise UsageError(f'thresholds: {thresholds!r}: give '
+                         'mddag_executor.executor.settings.Thresholds(...)')
+
+
 def _nanoseconds(name: str, time: Any) -> Any:
     """Return the ns of a text like ``1s`` or of rclpy's ``Duration``; other values unchanged."""
     if isinstance(time, str):
@@ -156,10 +163,9 @@ def thread_setting(
     policy: str | None, priority: int | None, cpus: Iterable[int] | None
 ) -> Callable[[], None] | None:
     """Return a function that each worker thread calls first; None: there is nothing to set."""
+    if policy is None and priority is not None:
+        raise UsageError('worker_priority: there is no policy for it: give worker_policy too')
     if policy is None and cpus is None:
-        if priority is not None:
-            raise UsageError(
-                'worker_priority: there is no policy for it: give worker_policy too')
         return None
     if policy is not None and policy not in THREAD_POLICIES:
         raise UsageError(
@@ -167,10 +173,11 @@ def thread_setting(
     if priority is not None and priority != 0:  # 0: that of SCHED_OTHER
         whole_number('worker_priority', priority, 99)
     if cpus is not None:
-        mine, cpus = os.sched_getaffinity(0), set(cpus)
+        mine, given = os.sched_getaffinity(0), cpus
+        cpus = set(given) if isinstance(given, Iterable) else set()
         if not cpus or not cpus <= mine:
-            raise UsageError(f'worker_cpus: {cpus or "none"} are not CPUs that this process may '
-                             f'use: choose from {sorted(mine)}')
+            raise UsageError(f'worker_cpus: {given!r}: give CPUs that this process may use, of '
+                             f'{sorted(mine)}')
 
     def prepare() -> None:
         if cpus is not None:
@@ -179,7 +186,7 @@ def thread_setting(
             return
         try:
             os.sched_setscheduler(0, getattr(os, policy), os.sched_param(priority or 0))
-        except (PermissionError, OSError) as error:
+        except OSError as error:
             raise UsageError(
                 f'worker_policy: this process may not use {policy} {priority or 0} ({error}): '
                 'raise its rtprio limit (ulimit -r) or run it with CAP_SYS_NICE') from None

@@ -45,7 +45,6 @@ from mddag_executor.executor.waitables import (
     WaitSetThread,
 )
 from mddag_executor.executor.workers import WorkerPool
-from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 
 
@@ -54,14 +53,12 @@ class Upkeep:
     The entities of the executor's nodes, as sources.
 
     :param nodes: returns the nodes.
-    :param executor: runs the callbacks of futures.
     :ivar changed: whether there may be new or removed entities (see ``change``).
     """
 
     def __init__(
         self, nodes: Callable[[], list[Any]], registry: Registry, pool: WorkerPool,
-        at_once: AtOnce, recorder: Recorder | None, context: Context, executor: Any,
-        wait_sets: WaitSetThread, fail: Callable[[BaseException], None],
+        at_once: AtOnce, recorder: Recorder | None, wait_sets: WaitSetThread,
     ) -> None:
         self.changed = True
         self._has_waitables = False
@@ -70,10 +67,7 @@ class Upkeep:
         self._pool = pool
         self._at_once = at_once
         self._recorder = recorder
-        self._context = context
-        self._executor = executor
         self._wait_sets = wait_sets
-        self._fail = fail
         self._lock = threading.RLock()
         self._refresh_at = 0.0
         self._sources: dict[Entity, Source | TimerSource | WaitableSource] = {}
@@ -179,7 +173,7 @@ class Upkeep:
         try:
             source.listen()
         except ListenerError as error:
-            self._fail(error)
+            self._pool.fail(error)
         if isinstance(source, SubscriptionSource) and source.is_counted:
             before = self._deliveries.get(entity.label)
             self._deliver(entity.label, (*(before.sources if before else ()), source))
@@ -260,9 +254,7 @@ class Upkeep:
         pool = self._pool
 
         def listen(alive: list[Entity]) -> WaitableSource:
-            source = make(
-                alive, self._context, self._executor, pool.post, pool.deferred.append,
-                pool.call_at, self._fail)
+            source = make(alive, pool)
             with pool.lock:
                 pool.loop.add(source)
             try:

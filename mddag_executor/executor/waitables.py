@@ -33,7 +33,7 @@ from mddag_executor.executor.loop import ChannelSource
 from mddag_executor.executor.shutdown import call_at_shutdown, is_over, join, stop_at_exit
 from mddag_executor.executor.waitsets import FilledSet
 from mddag_executor.executor.work import Work
-from rclpy.context import Context
+from mddag_executor.executor.workers import WorkerPool
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
@@ -43,9 +43,6 @@ SENDER_CHECKS = 500
 """For how many ms to wait with a response until its request is noted (7.1.5)."""
 
 Result = TypeVar('Result')
-
-Post = Callable[[list[Work]], None]
-"""Makes executions ready; must be called without the engine's lock."""
 
 
 def executions_of(entity: Entity, executor: Any) -> list[Work]:
@@ -70,24 +67,14 @@ class WaitableSource(ChannelSource):
     Waitables that share a descriptor.
 
     :param entities: those of the waitables.
-    :param post: receives their executions.
-    :param later: calls a function when the lock is free; ``at``: at a time (monotonic ns).
     :raises ListenerError: when they contain an entity that has no listener.
     :raises InvalidHandle: when one of them has been destroyed.
     """
 
-    def __init__(
-        self, entities: Iterable[Entity], context: Context, executor: Any, post: Post,
-        later: Callable[[Callable[[], None]], None],
-        at: Callable[[int, Callable[[], None]], None], fail: Callable[[BaseException], None],
-    ) -> None:
+    def __init__(self, entities: Iterable[Entity], pool: WorkerPool) -> None:
         self._by_id = {id(entity.rclpy): entity for entity in entities}
-        self._executor = executor
-        self._post = post
-        self._later = later
-        self._at = at
-        self._fail = fail
-        self._set = FilledSet(context, [entity.rclpy for entity in entities])
+        self._pool = pool
+        self._set = FilledSet(pool.executor.context, [entity.rclpy for entity in entities])
         self._timers: list[NextCall] = []
         self._has_parts = False
         self._set.parts(self._set.waitables, self._add_part)
@@ -123,7 +110,7 @@ class WaitableSource(ChannelSource):
 
     def collect(self) -> None:
         """Collect the arrivals soon: without the engine's lock, as this calls foreign code."""
-        self._later(self._ask)
+        self._pool.deferred.append(self._ask)
 
     def _ask(self) -> None:
         self._has_more = True
@@ -134,7 +121,7 @@ class WaitableSource(ChannelSource):
             except InvalidHandle:
                 pass  # destroyed: the next refresh forgets it
             except Exception as error:
-                self._fail(error)
+                self._pool.fail(error)
             finally:
                 self._lock.release()
 
@@ -142,7 +129,7 @@ class WaitableSource(ChannelSource):
         found: list[Work] = []
 
         def take(waitable: Waitable) -> None:
-            found.extend(executions_of(self._by_id[id(waitable)], self._executor))
+            found.extend(executions_of(self._by_id[id(waitable)], self._pool.executor))
 
         for _ in range(MOST):
             before = len(found)
@@ -150,24 +137,24 @@ class WaitableSource(ChannelSource):
             if len(found) == before:
                 break
         else:  # there may be more, after the other sources
-            self._at(time.monotonic_ns(), self._ask)
+            self._pool.call_at(time.monotonic_ns(), self._ask)
         if found:
             self._post_noted(found)
         with self._set.held():
             times = [timer.until() for timer in self._timers]
         for until in times:
             if until is not None and until > 0:  # else its handling is posted, which resets it
-                self._at(time.monotonic_ns() + until, self._ask)
+                self._pool.call_at(time.monotonic_ns() + until, self._ask)
 
     def _post_noted(self, found: list[Work], checks: int = 0) -> None:
         """Post executions; a response only after the sending thread has noted the request."""
         early = [] if checks >= SENDER_CHECKS else [
             work for work in found if compat.sender_is_behind(work.entity.rclpy, work.args[0])]
         if len(early) < len(found):
-            self._post([work for work in found if work not in early])
+            self._pool.post([work for work in found if work not in early])
         if early:
-            self._at(time.monotonic_ns() + 1_000_000,
-                     partial(self._post_noted, early, checks + 1))
+            self._pool.call_at(
+                time.monotonic_ns() + 1_000_000, partial(self._post_noted, early, checks + 1))
 
 
 def call_with_living(
@@ -228,28 +215,22 @@ class EventsSource(WaitableSource):
 
         self._set.wait(None, take)
         if found:
-            self._post(found)
+            self._pool.post(found)
 
 
 class WaitSetThread:
     """
     A thread that waits for entities without a listener.
 
-    :param post: receives the executions.
     :param on_signal: called when rclpy's signal condition is triggered.
     """
 
-    def __init__(
-        self, context: Context, executor: Any, signals: GuardCondition | None, post: Post,
-        on_signal: Callable[[], None], fail: Callable[[BaseException], None],
-    ) -> None:
-        self._context = context
-        self._executor = executor
-        self._signals = signals
-        self._post = post
+    def __init__(self, pool: WorkerPool, on_signal: Callable[[], None]) -> None:
+        self._pool = pool
+        self._context = pool.executor.context
+        self._signals = pool.executor.signal_guard()
         self._on_signal = on_signal
-        self._fail = fail
-        self._guard = GuardCondition(None, None, context)
+        self._guard = GuardCondition(None, None, self._context)
         self._entities: list[Entity] = []
         self._changed = False
         self._ending = False
@@ -257,7 +238,7 @@ class WaitSetThread:
         self._asked = self._answered = 0
         self._has_answered = threading.Event()
         self._thread: threading.Thread | None = None
-        call_at_shutdown(context, self.wake)
+        call_at_shutdown(self._context, self.wake)
 
     def update(self, entities: list[Entity]) -> None:
         """
@@ -331,7 +312,7 @@ class WaitSetThread:
                 if is_over(self._context):
                     break
                 if not isinstance(error, InvalidHandle):
-                    self._fail(error)
+                    self._pool.fail(error)
                 time.sleep(0.001)  # an entity is being destroyed; avoids a busy loop if it stays
         self._applied.set()
         self._on_signal()
@@ -347,7 +328,7 @@ class WaitSetThread:
         found: list[Work] = []
 
         def take(waitable: Waitable) -> None:
-            found.extend(executions_of(by_id[id(waitable)], self._executor))
+            found.extend(executions_of(by_id[id(waitable)], self._pool.executor))
 
         for guard in waiting.wait(timeout_ns, take):
             entity = by_id.get(id(guard))
@@ -356,4 +337,4 @@ class WaitSetThread:
             elif entity is not None and guard.callback is not None:
                 found.append(Work(entity, guard.callback))
         if found:
-            self._post(found)
+            self._pool.post(found)

@@ -117,7 +117,7 @@ class Judged:
     def __init__(self, recording: Recording, skip: int = 0) -> None:
         task_set = recording.task_set
         self._recording, self.task_set, self.skip = recording, task_set, skip
-        self.tables = Tables.build(task_set, legs=True, groups=False)
+        self.tables = Tables.build(task_set, legs=True)
         self.contradictions = 0
         self._outcomes: list[tuple[int, Ints, Mask]] = []
         #: The first release that is judged.

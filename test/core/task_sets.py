@@ -84,7 +84,7 @@ JOIN = declaration([
 
 def live(task_set=JOIN, workers=2, policy_name='rad', **options):
     """Return a scheduler as the live executor makes it."""
-    tables = Tables.build(task_set, legs=True, groups=False, **options)
+    tables = Tables.build(task_set, legs=True, **options)
     return Scheduler(tables, workers, policy_name)
 
 

@@ -16,6 +16,7 @@ from hypothesis.stateful import initialize, invariant, precondition, rule, RuleB
 from mddag_executor.core import legs_of, NEVER, POLICIES, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.invariants import broken_invariants
+from mddag_executor.core.overload import _change_key
 from mddag_executor.core.queues import SWEEP_AT
 from mddag_executor.core.state import (
     ABORTED,
@@ -23,7 +24,6 @@ from mddag_executor.core.state import (
     DROP,
     EXPIRED,
     FAILED,
-    FREE,
     IDLE,
     JOB_END,
     LATE,
@@ -86,7 +86,7 @@ class LiveDriver(RuleBasedStateMachine):
     def start(self, task_set, workers, policy):
         self.task_set = task_set
         self.tables = Tables.build(
-            task_set, legs=True, groups=False, max_active_jobs=MAX_ACTIVE,
+            task_set, legs=True, max_active_jobs=MAX_ACTIVE,
             expire_after=EXPIRE_AFTER, default_deadline=10 * TICK)
         self.scheduler = Scheduler(self.tables, workers, policy)
         self.state = self.scheduler.state
@@ -249,6 +249,13 @@ class LiveDriver(RuleBasedStateMachine):
             run.fate, run.lent = SUSPENDED, False
         run.lent = run.lent or what == 'lend'
 
+    @precondition(methodcaller('with_fate', WAITING))
+    @rule(data=st.data(), holds=HOLDS)
+    def learn(self, data, holds):
+        run = data.draw(st.sampled_from(self.with_fate(WAITING)))
+        self.scheduler.set_holds(run.x, int(holds))
+        run.holds = holds
+
     @precondition(methodcaller('owners'))
     @rule(data=st.data(), may=st.booleans())
     def ask(self, data, may):
@@ -399,15 +406,10 @@ class LiveDriver(RuleBasedStateMachine):
     @invariant()
     def slots_are_accounted_for(self):
         assert not [*broken_invariants(self.tables, self.state)]
-        active = Counter(self.state.x_slot[run.x] for run in self.alive())
         open_slots = [job.slot for job in self.open_jobs()]
-        assert len(open_slots) == len({*open_slots})
-        for slot, dag in enumerate(self.state.job_dag):
-            if dag < self.tables.n_dags:
-                state = self.state.job_state[slot]
-                assert self.state.job_active[slot] == active[slot]
-                assert (state == OPEN) == (slot in open_slots)
-                assert (state == FREE) == (slot not in open_slots and not active[slot])
+        assert sorted(open_slots) == [
+            slot for slot, state in enumerate(self.state.job_state)
+            if state == OPEN and self.state.job_dag[slot] < self.tables.n_dags]
         for dag in self.task_set.dags:
             mine = [job for job in self.open_jobs() if job.dag == dag.index]
             assert len(mine) <= (dag.max_active_jobs or MAX_ACTIVE)
@@ -469,3 +471,16 @@ def test_dropped_executions_leave_the_queues():
     assert core.take(0, 2) == kept
     core.complete(kept, 3)
     assert (core.take(0, 4), core.queue_length) == (-1, 0)
+
+
+def test_an_execution_that_gets_an_earlier_key_back_runs_once():
+    core = live(workers=1)
+    x = core.ready_undeclared(0, -1, 0, 0)
+    before = core.state.x_key[x][0]
+    for priority in (before + 1, before):
+        _change_key(core.state, x, priority)
+    for i in range(3 * SWEEP_AT):  # so that stale entries are removed
+        core.drop(core.ready_undeclared(i, -1, 0, 0), 0)
+    assert core.queue_length == 1 and core.take(0, 1) == x
+    core.complete(x, 2)
+    assert (core.take(0, 3), core.queue_length) == (-1, 0)

@@ -125,36 +125,12 @@ def results(case, horizon, holds=False):
     return {name: {**sink, 'in_time': counts(sink).in_time} for name, sink in sinks.items()}
 
 
-def test_late_work_does_not_go_before_what_can_be_in_time():
-    # The heavy one is late from its second job on, and then always has the earlier deadline.
-    plain, demoted = (results(case_of(
-        timer('heavy', 10, 12, 12, on_late), timer('light', 20, 15, 2, on_late)), 400)
-        for on_late in ('continue', 'demote'))
-    assert plain['light']['in_time'] < demoted['light']['in_time']
-    assert 'demoted' not in plain['heavy'] and demoted['heavy']['demoted'] > 0
-
-
 def test_demoted_callbacks_do_not_starve():
     # The sensor is always late, because the others block it for longer than its deadline.
     sinks = results(case_of(
         timer('sensor', 10, 2, 1), timer('a', 40, 80, 20), timer('b', 40, 80, 20)), 4000)
-    assert sinks['sensor']['in_time'] < 200
+    assert sinks['sensor']['in_time'] < 200 and sinks['sensor']['demoted'] > 0
     assert sinks['sensor']['completed'] >= 4000 // (11 * 2 + 20)  # one in 11 deadlines
-
-
-@pytest.mark.parametrize('keep', ['all', 'newest'])
-def test_callbacks_whose_releases_are_dropped_do_not_starve(keep):
-    # The first one needs the worker always, and goes first among equals.
-    sinks = results(case_of(
-        timer('first', 20, 20, 20), timer('second', 20, 20, 12, keep=keep)), 4000)
-    assert sinks['second']['dropped'] >= 100
-    assert sinks['second']['completed'] >= 4000 // (12 * 20)
-
-
-def test_late_releases_of_a_timer_give_way_to_newer_ones():
-    """After an overload the newest is in time at once, although there is hardly room."""
-    sinks = results(case_of(timer('block', 1000, 1000, 95), timer('sensor', 10, 30, 9)), 1000)
-    assert sinks['sensor']['in_time'] >= 88  # 27 if all run
 
 
 # --- importance ----------------------------------------------------------------------------------
@@ -264,18 +240,3 @@ def test_a_burst_is_worked_off(extra):
               for on_late in ('continue', 'demote')}
     assert 0 < len(missed['demote']) <= len(missed['continue'])
     assert max(time for _, time in missed['demote']) < 500 + extra * 8 / (1 - demand(case))
-
-
-@pytest.mark.parametrize('extra', [5, 20])
-def test_the_slowest_callback_of_a_burst_works_off_its_backlog(extra):
-    """As soon as it can, though its newest message cannot be in time behind the others."""
-    case = Case(declaration([
-        {'node': '/n', 'name': 'source', 'timer': '10us', 'dag': 'burst', 'publishes': ['/a'],
-         'execution_time': '1us'},
-        {'node': '/n', 'name': 'slowest', 'subscription': '/a', 'deadline': '30us', 'group': 'g',
-         'execution_time': '7us'},
-        *(single(f'other{i}', 30, 30, execution_time='12us') for i in range(2))]),
-        ((1, 7), (12,), (12,)), 2, 'rad', False)
-    missed = misses_of_a_burst(case, 1, extra, 2000, 'demote')
-    assert {dag for dag, _ in missed} == {0}
-    assert max(time for _, time in missed) < 500 + extra * 7 / (1 - 0.7)

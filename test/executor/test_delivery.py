@@ -13,20 +13,11 @@ from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from .conftest import matched, Spinning, wait_for
 from .declared import graph
-
-
-def in_threads(function, *arguments):
-    """Call something with each argument, in a thread of its own; wait for their ends."""
-    threads = [threading.Thread(target=function, args=(each,)) for each in arguments]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
 
 
 def test_the_publishing_thread_takes(make_executor, make_node):
@@ -49,7 +40,7 @@ def test_the_publishing_thread_takes(make_executor, make_node):
         assert begun.wait(15.0)
         queues = []
         for number in range(3):
-            in_threads(publisher.publish, Header(frame_id=str(number)))
+            publisher.publish(Header(frame_id=str(number)))
             queues.append(executor.statistics()['queue'])
         go_on.set()
         assert wait_for(lambda: len(got) == 5)
@@ -147,27 +138,6 @@ def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
 
 def numbers(got, name):
     return [int(text.split(':')[1]) for text in got if text.startswith(f'{name}:')]
-
-
-@pytest.mark.parametrize('depth', [5000, 0])
-def test_several_threads_publish_and_each_ones_order_is_kept(make_executor, make_node, depth):
-    """Also where only a part of a long queue waits in Python: 0 means KEEP_ALL."""
-    qos = QoSProfile(depth=depth) if depth else QoSProfile(history=HistoryPolicy.KEEP_ALL)
-    node, got = make_node(), []
-    node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), qos)
-    publishers = [node.create_publisher(Header, '/a', qos) for _ in range(4)]
-    executor = make_executor(nodes=[node])
-
-    def publish(name):
-        for number in range(200):
-            publishers[name].publish(Header(frame_id=f'{name}:{number}'))
-
-    with Spinning(executor):
-        matched(*publishers)
-        in_threads(publish, *range(4))
-        assert wait_for(lambda: len(got) >= 800), len(got)
-    for name in range(4):
-        assert numbers(got, name) == list(range(200))
 
 
 @pytest.mark.parametrize('waits', ['always', 'seldom'])

@@ -184,6 +184,36 @@ def test_a_second_message_of_a_publication_comes_after_the_first(policy):
         one.engine.finished(message, 0, time, time, 0, 0)
 
 
+@pytest.mark.parametrize('policy', ['rad', 'gedf', 'llf'])
+def test_messages_without_a_job_keep_their_order_behind_a_late_one(policy):
+    """Though one that can be in time has come between them."""
+    one, other = OneUser(policy, on_late='demote'), Work(new_entity(), print)
+    origins = [one.publish(0), one.publish(500 * MS)]
+    now = 600 * MS
+    late = one.hear(origins[0], now)
+    one.engine.ready(other, now)
+    ran = [one.engine.dispatch(0, now)]
+    messages = [late, *(one.hear(origin, now) for origin in (None, origins[1], None))]
+    for _ in messages:
+        one.engine.finished(ran[-1], now, now, now, 0, 0)
+        ran.append(one.engine.dispatch(0, now))
+    assert [([other] + messages).index(work) for work in ran] == [0, 1, 3, 2, 4]
+
+
+def test_messages_keep_their_order_when_their_callback_is_found_to_compute_no_more():
+    """The first one is held back: another callback has the GIL."""
+    engine, user = new_engine(workers=2), new_entity(holds=True)
+    engine.ready(Work(new_entity(holds=True), print), 0)
+    assert engine.dispatch(0, 0) is not None
+    messages = [Work(user, print) for _ in range(2)]
+    for message in messages:
+        engine.ready(message, 1)
+        assert user.habit.holds == 0 or engine.dispatch(1, 1) is None
+        user.habit.holds = 0
+        engine.validate()
+    assert engine.dispatch(1, 1) is messages[0]
+
+
 def test_a_message_costs_as_much_when_many_wait(monkeypatch):
     """The lock is held meanwhile: else a fast foreign publisher would starve the jobs."""
     checked, reads = [], []

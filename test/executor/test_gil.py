@@ -142,7 +142,9 @@ class Computing:
         nodes = Declared(make_node, COMPUTING, {
             'long': self._long, 'urgent': lambda: self.ran.append('urgent'),
             'patient': lambda: self.ran.append('patient')})
-        self.executor = make_executor(loads(COMPUTING), nodes=nodes.nodes.values())
+        # messages for callbacks with longer deadlines may stay in the middleware
+        self.executor = make_executor(
+            loads(COMPUTING), nodes=nodes.nodes.values(), default_deadline='60s')
         other = make_node('publishes')
         self.publishers = {
             name: other.create_publisher(Header, f'/{name}', 10) for name in nodes.ran}
@@ -209,31 +211,13 @@ def test_arrivals_with_an_earlier_deadline_overtake_and_others_wait(computing):
 
 
 @pytest.mark.parametrize('computing', ['elsewhere'], indirect=True)
-def test_an_urgent_arrival_is_not_left_in_the_middleware(computing):
-    for _ in range(20):  # on a busy machine it may be late
-        computing.habit.mean_ns = 50 * MS
-        order = computing.order('urgent')
-        if order[-1] == 'ends':
-            break
-    assert order == ['begins', 'urgent', 'ends']
-
-
-@pytest.mark.parametrize('computing', ['elsewhere'], indirect=True)
 def test_what_cannot_start_is_left_in_the_middleware(computing):
     """While the long one computes for as long as usual, no thread wakes for the patient one."""
     queued = []
-
-    def meanwhile():
-        queued.append(computing.executor.statistics()['queue'])
-        return True
-
-    computing.meanwhile = meanwhile
-    for _ in range(20):  # on a busy machine it may take longer than usual
-        computing.habit.mean_ns = 50 * MS
-        assert computing.order('patient') == ['begins', 'ends', 'patient']
-        if queued[-1] == 0:
-            break
-    assert queued[-1] == 0
+    computing.meanwhile = lambda: queued.append(computing.executor.statistics()['queue']) or True
+    computing.habit.mean_ns = 20_000 * MS
+    assert computing.order('patient') == ['begins', 'ends', 'patient']
+    assert queued == [0]
 
 
 # --- at random -----------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executor under misuse: a clear exception, no hang, and everything as it was before."""
 
+import os
 import re
 import time
 
@@ -22,7 +23,8 @@ WRONG = {
     'policy': (None, 'x', []), 'max_active_jobs': (0,), 'worker_priority': (5,),
     'default_deadline': (None, 1.5, 0, 10**30, Duration(seconds=-1), 'soon', '', '5', '1 parsec'),
     'worker_policy': (5, '__class__', 'sched_yield'),
-    'worker_cpus': ('0', {'a'}, set(), {10**6}), 'on_deadline_miss': (3, 'print'),
+    'worker_cpus': ('0', {'a'}, set(), {10**6}, 3), 'on_deadline_miss': (3, 'print'),
+    'thresholds': (3, {'window': 3}),
     'diagnostics_period': (-5, 1.5, Duration(nanoseconds=1), 'soon', '', '5', '1 parsec'),
 }
 
@@ -32,7 +34,9 @@ def test_a_wrong_argument_is_named_in_one_line(ros_context, tmp_path, name):
     trace = tmp_path / 'trace.mcap'
     for value in WRONG[name]:
         with pytest.raises((MddagError, ValueError)) as caught:
-            MultiDeadlineExecutor(**{'context': ros_context, 'trace': str(trace), name: value})
+            MultiDeadlineExecutor(**{
+                'context': ros_context, 'trace': str(trace),
+                'worker_cpus': os.sched_getaffinity(0), name: value})
         assert name in str(caught.value) and '\n' not in str(caught.value), value
         assert re.search(': (give|choose|write|add) ', str(caught.value)), value
     # Nothing was begun: no file, and (as ros_context looks) no thread.

@@ -197,7 +197,7 @@ class VirtualRun:
     def __post_init__(self):
         self.random = random.Random(self.seed)
         self.tables = Tables.build(
-            self.task_set, legs=True, groups=False, max_active_jobs=3, expire_after=20 * MS)
+            self.task_set, legs=True, max_active_jobs=3, expire_after=20 * MS)
         self.scheduler = Scheduler(self.tables, self.workers, self.policy)
         self.tally = Tally(self.task_set, self.tables)
         self.executions, self.busy, self.waited = Counter(), Counter(), Counter()

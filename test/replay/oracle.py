@@ -19,7 +19,7 @@ class Oracle:
 
     def __init__(self, recording, skip=0):
         task_set = recording.task_set
-        tables = Tables.build(task_set, legs=True, groups=False)
+        tables = Tables.build(task_set, legs=True)
         n = tables.n_dags + 1
         self.tables = tables._replace(
             max_active_jobs=[NEVER] * n, expire_after=[NEVER] * n, on_late=[CONTINUE] * n)

@@ -155,7 +155,8 @@ client.completed = getattr(client, 'completed', 0) + 1
                 'timer', 'subscription', 'service', 'guard', 'waitable', 'task',
                 'coroutine'))), every=True, at_once=True),
     Case('exceptions_of_takes_swallowed', [
-        (f'executor/{file}.py', 'self._fail(error)', 'pass') for file in ('sources', 'waitables')],
+        (f'executor/{file}.py', text, 'pass') for file, text in (
+            ('sources', 'self._fail(error)'), ('waitables', 'self._pool.fail(error)'))],
         of('test_spin.py', 'test_an_exception_comes_out_of_spin[take]'), at_once=True),
     Case('create_task_does_not_wake_workers', [(
         'executor/executor.py', 'self._pool.report(self._engine.ready, work)', UNNOTICED)], of(
@@ -184,7 +185,8 @@ client.completed = getattr(client, 'completed', 0) + 1
         'test_gil.py', 'test_what_cannot_start_is_left_in_the_middleware[elsewhere]')),
     Case('urgent_ones_muted', [(
         'executor/due.py', 'entity) >= self._patience', 'entity) >= -1')], of(
-        'test_gil.py', 'test_an_urgent_arrival_is_not_left_in_the_middleware[elsewhere]')),
+        'test_gil.py',
+        'test_arrivals_with_an_earlier_deadline_overtake_and_others_wait[elsewhere]')),
     Case('add_node_does_not_wake', [(
         'executor/executor.py', 'if added:\n            self.wake()', 'if added:\n            pass'
         )], of('test_executor.py', 'test_tasks_nodes_and_entities_wake_an_idle_executor[spin]')),
