@@ -333,6 +333,20 @@ class RowNumbers:
         return kept
 
 
+def later_pieces(executions: Table) -> tuple[Ints, Ints]:
+    """Return the rows of later pieces of executions, and of their first ones or themselves."""
+    later = np.flatnonzero(executions['piece'] > 0)
+    if not len(later):
+        return later, later
+    names = ['callback', 'vertex', 'job', 'ready', 'began']
+    several = np.unique(executions['callback'][later])
+    first = np.flatnonzero(
+        (executions['piece'] == 0) & np.isin(executions['callback'], several))
+    of = dict(zip(executions[names][first].tolist(), first.tolist()))
+    return later, np.array([of.get(key, row) for key, row in zip(
+        executions[names][later].tolist(), later.tolist())], dtype=np.int64)
+
+
 def sort_by(*columns: Any) -> Ints:
     """Return the stable order of rows by several columns, the first one first."""
     if len(columns) > 1:

@@ -94,6 +94,8 @@ class Replay:
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``."""
         recording, head, duration = self.recording, self.recording.head, self.duration_ns
+        paths = Paths(recording).results()      # first, because they need the most memory
+        give_back()
         result = {
             'policy': head.policy, 'workers': head.workers, 'preemptive': head.preemptive,
             'duration_ns': duration,
@@ -116,7 +118,7 @@ class Replay:
             'worker_use': self.usage.workers(head.workers, duration),
             'dropped': dict(sorted(recording.dropped.items())),
             'misses': self.explanation.summary(),
-            'paths': Paths(recording).results(),
+            'paths': paths,
             **({} if not recording.imported else {
                 'recorded_callbacks': recorded_callbacks(recording),
                 'communications': communications(recording)}),

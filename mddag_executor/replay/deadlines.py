@@ -76,7 +76,7 @@ is the time of completion, or of the end of the job; ``row`` is the job's row in
 """
 
 _COMPLETIONS = np.dtype([
-    ('row', 'i4'), ('dag', 'i4'), ('vertex', 'i4'), ('order', 'i4'), ('job', 'i8')])
+    ('row', 'i4'), ('vertex', 'i4'), ('order', 'i4'), ('job', 'i8')])
 """Columns of a completion: the row of the execution, and some of its columns."""
 
 _ENDS = {
@@ -122,14 +122,15 @@ class Judged:
         self._outcomes: list[tuple[int, Ints, Mask]] = []
         #: The first release that is judged.
         self.judge_from = _judge_from(recording, skip)
-        ends, releases, completions = (
+        ends, releases = (
             [pick(table, mine) for mine in rows_by(table['dag'], len(task_set.dags))]
-            for table in (recording.job_ends, recording.releases,
-                          _completions(recording.executions)))
+            for table in (recording.job_ends, recording.releases))
+        completions = _completions(recording.executions, len(task_set.dags))
         self.jobs: list[Jobs] = []
         found: list[Table] = []
         for dag in range(len(task_set.dags)):
-            jobs, verdicts = self._judge(dag, releases[dag], completions.pop(0), ends[dag])
+            completed = np.concatenate(completions.pop(0))
+            jobs, verdicts = self._judge(dag, releases[dag], completed, ends[dag])
             self.jobs.append(jobs)
             found += verdicts
         table = np.concatenate([np.empty(0, dtype=VERDICTS), *found])
@@ -417,15 +418,18 @@ class Judged:
                 f'{more.total()} that were not recorded: the first is job {example[2]} at {name}')
 
 
-def _completions(executions: Table) -> Table:
-    """Return the completions of declared vertices."""
-    found, begin = [np.empty(0, dtype=_COMPLETIONS)], 0
+def _completions(executions: Table, n_dags: int) -> list[list[Table]]:
+    """Return by DAG the completions of vertices, in parts."""
+    found = [[np.empty(0, dtype=_COMPLETIONS)] for _ in range(n_dags)]
+    begin = 0
     for part in in_parts(executions):
         which = np.flatnonzero((part['completes'] != recorded.NOTHING) & (part['vertex'] >= 0))
-        found.append(recorded.rows(_COMPLETIONS, len(which), row=begin + which, **{
-            name: part[name][which] for name in ('dag', 'vertex', 'order', 'job')}))
+        table = recorded.rows(_COMPLETIONS, len(which), row=begin + which, **{
+            name: part[name][which] for name in ('vertex', 'order', 'job')})
+        for parts, mine in zip(found, rows_by(part['dag'][which], n_dags)):
+            parts.append(pick(table, mine))
         begin += len(part)
-    return np.concatenate(found)
+    return found
 
 
 def _judge_from(recording: Recording, skip: int) -> int:

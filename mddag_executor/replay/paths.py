@@ -58,9 +58,9 @@ from mddag_executor.memory import give_back
 from mddag_executor.recording.tables import (
     different,
     EXECUTIONS,
-    Growing,
     Ints,
     last_of,
+    later_pieces,
     look_up,
     Mask,
     pick,
@@ -171,14 +171,14 @@ class Paths:
         place = np.where(self._vertex >= 0, self._place[self._vertex], NONE)
         self._of_place = [
             each.astype(np.int32) for each in rows_by(place, len(self._places))]
-        self._first = _first_pieces(table)
+        self._later = later_pieces(table)
         # by topic its publications, if they are recorded, and by publication the index of its node
         self._of_topic: list[Ints] | None = None
         if recording.who.every_publisher or recording.links:
             self._published()
         give_back()
         # messages that running callbacks took themselves, by execution
-        self._took = self._first[recording.takes['execution']], recording.takes['message']
+        self._took = self._first(recording.takes['execution']), recording.takes['message']
 
     def _add_vertices(self, of: dict[int, int]) -> None:
         """Find the declared callbacks of executions without job."""
@@ -210,7 +210,7 @@ class Paths:
                 found.append(self._recorded(callback, topic, self._of_topic[topic]))
                 continue
             found.append(rows(
-                _SENT, len(ended.rows), known=True, run=self._first[ended.rows], time=ended.time,
+                _SENT, len(ended.rows), known=True, run=self._first(ended.rows), time=ended.time,
                 message=self._message(ended.job, self._vertex[ended.rows], topic)))
         sent = np.concatenate(found)
         time = sent['time']
@@ -227,7 +227,14 @@ class Paths:
         message = mine if self._recording.links else np.where(
             (by >= 0) & known, self._message(table['job'][by], table['vertex'][by], topic), NONE)
         return rows(_SENT, len(mine), known=known, message=message, time=sent['time'][mine],
-                    run=np.where(by >= 0, self._first[by], NONE))
+                    run=self._first(by))
+
+    def _first(self, rows: Any) -> Ints:
+        """Return the rows of the first pieces of executions."""
+        later, first = self._later
+        at = look_up(later, rows)
+        found: Ints = np.where(at >= 0, np.append(first, NONE)[at], rows)
+        return found
 
     def _message(self, job: Any, vertex: Any, topic: Any) -> Ints:
         """Return the numbers of the messages that vertices publish in jobs."""
@@ -241,7 +248,7 @@ class Paths:
         started = table['start'] >= 0
         ended = np.flatnonzero(started & (table['end'] >= 0))
         ended = ended[sort_by(table['end'][ended])]
-        mine = np.flatnonzero(started & (self._first[rows] == rows))
+        mine = np.flatnonzero(started & (self._first(rows) == rows))
         mine = mine[sort_by(table['start'][mine])]
         if not callback.topics:
             topics = np.full(len(mine), NONE)
@@ -327,7 +334,7 @@ class Paths:
         self, steps: _Steps, callback: Callback, ended: Ends, step_of: Ints
     ) -> _Timeline:
         """Note when executions ended."""
-        of = step_of[self._first[ended.rows]]
+        of = step_of[self._first(ended.rows)]
         known = of != NONE
         steps.end(of[known], ended.time[known])
         if callback.kind != 'sync':
@@ -390,28 +397,27 @@ class _Steps:
     """The steps of a path."""
 
     def __init__(self) -> None:
-        self._rows = Growing(STEPS, end=NONE)
-        self._ends: list[tuple[Ints, Ints]] = []
+        self._parts = [rows(STEPS)]
+        self._count = 0
 
     def add(self, position: int, parent: Ints, is_run: bool, times: Ints) -> Ints:
         """Add steps that have a parent, or begin the path; return their numbers."""
         wanted = (parent != NONE) | (position == 0)
-        numbers = np.where(wanted, len(self._rows) + np.cumsum(wanted) - 1, NONE)
-        new = self._rows.more(int(wanted.sum()))
-        new['parent'], new['time'] = parent[wanted], times[wanted]
-        new['position'], new['is_run'] = position, is_run
+        numbers = np.where(wanted, self._count + np.cumsum(wanted) - 1, NONE)
+        self._parts.append(rows(
+            STEPS, int(wanted.sum()), parent=parent[wanted], position=position, is_run=is_run,
+            time=times[wanted], end=NONE))
+        self._count += len(self._parts[-1])
         return numbers
 
     def end(self, steps: Ints, times: Ints) -> None:
-        """Note when steps ended."""
-        self._ends.append((steps, times))
+        """Note when steps ended, which were added last."""
+        last = self._parts[-1]
+        last['end'][steps - (self._count - len(last))] = times
 
     def table(self) -> Table:
         """Return the steps as a table of ``STEPS``."""
-        table = self._rows.table()
-        for steps, times in self._ends:
-            table['end'][steps] = times
-        return table
+        return np.concatenate(self._parts)
 
 
 def leaves(steps: Table, last: int) -> Ints:
@@ -490,20 +496,6 @@ def cases(start: Ints, end: Ints) -> dict[str, Ints]:
     found['best'] = took[::-1][np.unique(own[::-1], return_index=True)[1]]
     after = np.unique(own[1:], return_index=True)[1]
     found['worst_with_external_latency'] = own[1:][after] - inputs[after]
-    return found
-
-
-def _first_pieces(table: Table) -> Any:
-    """Return by row of ``executions`` the row of the first piece of that execution."""
-    found = np.arange(len(table), dtype=np.int32)
-    later = np.flatnonzero(table['piece'] > 0)
-    if len(later):
-        names = ['callback', 'vertex', 'job', 'ready', 'began']
-        several = np.unique(table['callback'][later])
-        first = np.flatnonzero((table['piece'] == 0) & np.isin(table['callback'], several))
-        of = dict(zip(table[names][first].tolist(), first.tolist()))
-        found[later] = [of.get(key, row) for key, row in zip(
-            table[names][later].tolist(), later.tolist())]
     return found
 
 

@@ -16,6 +16,7 @@ from mddag_executor.recording.tables import (
     different,
     in_parts,
     Ints,
+    later_pieces,
     NOTHING,
     pick,
     Recording,
@@ -79,14 +80,8 @@ def group_waits(recording: Recording) -> Ints:
         late = np.flatnonzero((np.r_[-1, ends[:-1]] > ready) & (table['piece'][rows] == 0))
         if len(late):
             waited[rows[late]] = Spans(starts, ends).within(ready[late], starts[late])
-    later = np.flatnonzero(table['piece'] > 0)
-    if len(later) and waited.any():
-        first = np.flatnonzero(waited)
-        of = {tuple(key): n for key, n in zip(
-            table[['callback', 'vertex', 'job', 'ready']][first].tolist(),
-            waited[first].tolist())}
-        waited[later] = [of.get(tuple(key), 0) for key in table[
-            ['callback', 'vertex', 'job', 'ready']][later].tolist()]
+    later, first = later_pieces(table)
+    waited[later] = waited[first]
     return waited
 
 
