@@ -135,7 +135,6 @@ def no_garbage() -> Iterator[None]:
 def _derived(
     declared: TaskSet, entries: dict[str, Entry], without_deadline: list[str] | None
 ) -> TaskSet:
-    """Return the task set of a declaration, as ``parse_declaration`` returns it."""
     links = _Links(declared.callbacks, entries)
     found = Collector()
     found(for_each, declared.callbacks, links.check_start)

@@ -245,7 +245,6 @@ class _Writer:
                        f'sync: [{", ".join(each)}]')
 
     def _entries(self, callback: DraftCallback) -> Iterator[str]:
-        """Yield the entries of a callback after its name, without indentation."""
         if callback.kind == 'timer':
             yield _timer(callback)
         elif callback.kind == 'sync':

@@ -88,7 +88,6 @@ def _entries(node: Any) -> dict[str, Any]:
 
 
 def _with_deadlines(text: str, deadlines: Table[str, int]) -> str:
-    """Return a text with other or additional deadlines."""
     lines = text.splitlines(keepends=True)
     edits: list[tuple[int, int, int, str]] = []  # line, from column, to column, new text
     for key, callback, entries in callbacks_of(yaml.compose(text, _LOADER)):

@@ -209,7 +209,6 @@ def _argument_values(tree: Mapping, given: dict[str, str]) -> dict[str, str]:
 
 
 def _substituted(old: Scalar, values: dict[str, str]) -> str:
-    """Return a text with arguments replaced by their values."""
     def value(found: re.Match[str]) -> str:
         if found[1] not in values:
             raise GraphError(

@@ -1,9 +1,8 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What `import mddag_executor` gives, and how its messages count and list."""
+"""What `import mddag_executor` gives."""
 
 import mddag_executor
-from mddag_executor.text import counted, listed
 import pytest
 
 
@@ -17,9 +16,3 @@ def test_public_names_are_those_of_the_live_executor():
     assert {'MultiDeadlineExecutor', 'DeadlineMiss'} <= set(names) & set(dir(mddag_executor))
     with pytest.raises(AttributeError, match="no attribute 'Nonsense'"):
         mddag_executor.Nonsense  # noqa: B018
-
-
-def test_texts_for_messages():
-    assert [counted(n, 'DAG') for n in (0, 1, 2)] == ['0 DAGs', '1 DAG', '2 DAGs']
-    assert [counted(n, 'vertex', 'vertices') for n in (1, 2)] == ['1 vertex', '2 vertices']
-    assert (listed(['a', 'b']), listed([]), listed('abc', 2)) == ('a, b', '', 'a, b, … (1 more)')

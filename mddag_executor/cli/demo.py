@@ -54,7 +54,7 @@ def main(args: argparse.Namespace) -> int:
     output = Path(args.output)
     output.mkdir(parents=True, exist_ok=True)
     graph, trace = str(find('config/autoware.yaml')), str(output / 'demo.mcap')
-    show = say if common.wants_tables(args) else _nothing
+    show = say if common.wants_tables(args) else lambda text: None
     live = _step(
         show, output / 'run.json', args.duration / 1e9 + 3, 'run', graph, '--synthetic', 'sleep',
         '--utilisation', str(args.utilisation), '--seed', str(SEED), '--workers', str(WORKERS),
@@ -76,10 +76,6 @@ def main(args: argparse.Namespace) -> int:
         'live': live, 'recorded': recorded, 'rescheduled': rescheduled, 'baseline': peer,
         'trace': os.path.abspath(trace)})
     return 0
-
-
-def _nothing(text: str) -> None:
-    pass
 
 
 def _step(
@@ -112,7 +108,6 @@ def _agreement(live: dict[str, Any], recorded: dict[str, Any]) -> str:
 
 
 def _side_by_side(ours: dict[str, Any], peer: dict[str, Any]) -> str:
-    """Return a table with what the nodes measured under both executors."""
     def row(what: str, cells: Any) -> tuple[str, ...]:
         return (what, *map(cells, (ours, peer)))
 

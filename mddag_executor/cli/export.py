@@ -69,7 +69,6 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _form(args: argparse.Namespace) -> str:
-    """Return what is to be written."""
     form = 'csv' if args.output == '-' else PurePath(args.output).suffix[1:].lower()
     if args.output.endswith('/'):
         form = _TABLES

@@ -94,7 +94,6 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _every(args: argparse.Namespace) -> Iterator[Options]:
-    """Yield the options of each task set."""
     low, high = args.utilisation if isinstance(args.utilisation, tuple) else (
         args.utilisation, args.utilisation)
     sets = args.sets or 1

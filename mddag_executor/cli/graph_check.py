@@ -110,7 +110,6 @@ def _backlog(dag: Dag, load: float | None) -> Iterator[str]:
 
 
 def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
-    """Yield warnings about deadlines that cannot hold with the mean execution times."""
     from msg_graph.model import mean_execution_times, path_lengths
     for dag in task_set.dags:
         means = mean_execution_times(dag)
@@ -131,7 +130,6 @@ def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
 
 
 def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
-    """Yield a row for each sink, which begins with the figures of its DAG."""
     from mddag_executor.report.tables import short_names
     short = short_names(sink for dag in result['dags'].values() for sink in dag['sinks'])
     for name, dag in result['dags'].items():

@@ -75,7 +75,6 @@ def _find_dot(output: str) -> str:
 
 
 def _render(program: str, text: str, kind: str, output: str) -> bytes:
-    """Let Graphviz lay a picture out."""
     done = run_program(
         [program, f'-T{kind}'], 'drawing', given=text.encode(),
         slow=f'{output}: Graphviz takes long, perhaps hours if arrows cross many others: wait, or '

@@ -131,13 +131,11 @@ def _predicted(
 
 
 def _loads(placing: Placing, place: dict[int, int], processes: Sequence[Process]) -> list[float]:
-    """Return the load of each process, in their order."""
     loads = placing.loads(place)
     return [loads[place[placing.block_of(process.nodes[0])]] for process in processes]
 
 
 def _lines(result: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines about a placement."""
     from mddag_executor.core.tally import total
     from mddag_executor.report.tables import sink_table, verdicts_line
     rows: list[list[Cell]] = [

@@ -27,17 +27,16 @@ _MOST_OFFSET = 10 ** 18
 
 def duration(text: str) -> int:
     """Return the nanoseconds of an argument such as `20s` or `100ms`."""
-    import msg_graph
+    from msg_graph import parse_duration
     try:
-        return msg_graph.parse_duration(text)
-    except (ValueError, msg_graph.GraphError) as error:
+        return parse_duration(text)
+    except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _number(
     kind: Callable[[str], T], fits: Callable[[T], bool], what: str
 ) -> Callable[[str], T]:
-    """Return the kind of argument that is a number which fits."""
     def parse(text: str) -> T:
         try:
             value = kind(text)
@@ -95,14 +94,12 @@ def policies(text: str) -> tuple[str, ...]:
 
 
 def _offset(text: str) -> tuple[str, int]:
-    """Return the process and the time that `NAME=TIME` gives."""
-    import msg_graph
+    from msg_graph import parse_duration
     name, _, time = text.rpartition('=')
     if not name:
         raise argparse.ArgumentTypeError(f'{text!r} is not NAME=TIME, such as control=2.5ms')
     try:
-        ahead = msg_graph.parse_duration(
-            time.removeprefix('-'), minimum_ns=0, maximum_ns=_MOST_OFFSET)
+        ahead = parse_duration(time.removeprefix('-'), minimum_ns=0, maximum_ns=_MOST_OFFSET)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return name, -ahead if time.startswith('-') else ahead

@@ -253,7 +253,6 @@ def _run(
     args: argparse.Namespace, task_set: TaskSet, executor: MultiDeadlineExecutor,
     host: Host | None, programs: list[Program], plan: ExecutionPlan | None, signals: Signals,
 ) -> tuple[dict[str, Any], BaseException | None]:
-    """Run until the end; see ``run_here``."""
     from mddag_executor.executor.statistics import Watch
     from mddag_executor.hosting.measure import measure
     from mddag_executor.hosting.session import Session

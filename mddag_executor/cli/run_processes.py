@@ -219,7 +219,6 @@ def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> lis
 
 
 def _trace(given: str | None, name: str) -> str | None:
-    """Return where a process records to."""
     if given is None:
         return None
     path = Path(given)

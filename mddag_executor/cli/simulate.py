@@ -89,7 +89,6 @@ def execution_times(
 
 
 def _lines(result: dict[str, Any]) -> Iterator[str]:
-    """Yield the table of a run, and the lines below it."""
     from mddag_executor.report.tables import run_lines, sink_table
     yield sink_table(result['dags'])
     jobs = sum(dag['jobs'] for dag in result['dags'].values())

@@ -78,7 +78,6 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
-    """Return the problem that a recording is."""
     from mddag_executor.replay import reschedule
     from mddag_executor.replay.slack import Problem
     options.refuse(args, _ONLY_GRAPH, 'a recording has its own: leave the option out')
@@ -99,7 +98,6 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
 
 
 def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
-    """Return the problem that a declaration is."""
     from mddag_executor.core import Tables
     from mddag_executor.replay.slack import Problem
     from mddag_executor.simulate import periodic_load, Settings

@@ -77,7 +77,6 @@ def job_lines(job: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _what(part: Mapping[str, Any]) -> str:
-    """Return what a part of a job's time was, and which job or message is meant."""
     text: str = part['cause']
     if 'waiting_job' in part:
         return f'{text}: job {part["waiting_job"]} had not started'

@@ -51,11 +51,6 @@ class Column(NamedTuple):
     names: Sequence[str] = ()
 
 
-def columns_of(replay: Replay, rows: str) -> list[Column]:
-    """Return the columns of the executions or jobs of a recording."""
-    return executions(replay)[0] if rows == 'executions' else jobs(replay)
-
-
 def executions(replay: Replay, rows: Ints | None = None) -> tuple[list[Column], Ints]:
     """Return the columns of executions (all, or these rows), and their rows of the table."""
     recording, judged = replay.recording, replay.judged
@@ -192,4 +187,5 @@ def write(form: str, file: BinaryIO, replay: Replay, rows: str) -> None:
         from mddag_executor.report.perfetto import write_perfetto
         write_perfetto(file, replay)
     else:
-        {'csv': write_csv, 'parquet': write_parquet}[form](file, columns_of(replay, rows))
+        columns = executions(replay)[0] if rows == 'executions' else jobs(replay)
+        {'csv': write_csv, 'parquet': write_parquet}[form](file, columns)

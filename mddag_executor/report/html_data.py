@@ -158,7 +158,6 @@ def _verdicts_of(data: ReportData, table: Table) -> tuple[Ints, Ints]:
 
 
 def _ancestors(dag: Dag, sink: int) -> list[int]:
-    """Return the sink and the vertices that lead to it."""
     found = [sink]
     seen = {sink}
     for vertex in found:

@@ -89,7 +89,6 @@ def _absent(dags: dict[str, Any]) -> Iterator[str]:
 
 
 def _measured_lines(measured: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines with the measurements of the synthetic nodes."""
     yield (
         f'measured by the nodes, {measured["window_ns"] / 1e9:.1f} s after a warm-up of '
         f'{measured["warm_up_ns"] / 1e9:g} s: {measured["sink_jobs_due"]} due, '

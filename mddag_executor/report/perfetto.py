@@ -58,7 +58,6 @@ def write_perfetto(file: BinaryIO, replay: Replay) -> None:
 
 
 def _batches(columns: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield some rows of columns at a time."""
     for begin in range(0, len(next(iter(columns.values()))), _BATCH):
         yield {name: values[begin:begin + _BATCH] for name, values in columns.items()}
 
@@ -208,7 +207,6 @@ class _Writer:
     # --- tracks ----------------------------------------------------------------------------------
 
     def _group(self, dag: int) -> int:
-        """Return the track of a DAG's callbacks."""
         if dag not in self._groups:
             name = 'undeclared'
             if dag >= 0:

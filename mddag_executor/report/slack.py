@@ -55,7 +55,6 @@ def _margins(sink: Mapping[str, Any]) -> list[Cell]:
 
 
 def _missed_lines(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the line about deadlines that are missed already."""
     missed = result['missed']
     if missed and _is_judged(result):
         yield (f'{counted(sum(missed.values()), "deadline")} missed already: '
@@ -64,7 +63,6 @@ def _missed_lines(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _summary(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines below the tables."""
     never = [name for name, sink in result['sinks'].items()
              if sink['margin_ns'] is None and not result['missed'].get(name)]
     if never:

@@ -4,17 +4,13 @@
 
 import json
 from pathlib import Path
-import re
 import shutil
 import sys
 
-from mddag_executor import MultiDeadlineExecutor, open_recording
+from mddag_executor import open_recording
 import msg_graph
 from msg_graph.language import schema
 import pytest
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.node import Node
-from std_srvs.srv import Trigger
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / 'config'
@@ -123,37 +119,6 @@ def test_from_trace(call, tmp_path):
     (tmp_path / 'h.yaml').write_text(text.replace('timer: 100ms', 'timer: 200ms'))
     found = call('replay', BAG, tmp_path / 'h.yaml', '--json', '-').result['drift']
     assert {each['kind'] for each in found} == {'rate'}
-
-
-def test_a_coroutine_is_one_execution_however_often_it_is_resumed(call, tmp_path, ros_context):
-    node = Node('asking', context=ros_context)
-    group = ReentrantCallbackGroup()
-    answered = []
-
-    def inner(request, response):
-        return response
-
-    async def ask():
-        for _ in range(2):
-            await client.call_async(Trigger.Request())
-        answered.append(True)
-
-    node.create_service(Trigger, 'inner', inner, callback_group=group)
-    client = node.create_client(Trigger, 'inner', callback_group=group)
-    assert client.wait_for_service(10)
-    executor = MultiDeadlineExecutor(
-        None, trace=str(tmp_path / 'ask.mcap'), context=ros_context)
-    executor.add_node(node)
-    node.create_timer(0.05, ask)
-    while len(answered) < 5:
-        executor.spin_once(timeout_sec=1)
-    executor.shutdown()
-    node.destroy_node()
-    done = call('graph', 'from-trace', 'ask.mcap', cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    counts = re.findall(
-        r'name: (\w+)\n(?:(?!.*- name).*\n)*? *# measured in (\d+) ex', done.stdout)
-    assert sorted(counts) == [('ask', '5'), ('inner', '10')]
 
 
 def test_from_ros_where_nothing_runs(mddag, tmp_path):

@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 from hypothesis import given, strategies
 from mddag_executor import __version__
@@ -236,26 +236,23 @@ def ros2(monkeypatch):
         monkeypatch.setitem(sys.modules, 'ros2cli', ModuleType('ros2cli'))
         monkeypatch.setitem(sys.modules, 'ros2cli.command', command_module)
         monkeypatch.delitem(sys.modules, 'mddag_executor.cli.ros2', raising=False)
-    entry, = (each for each in distribution('mddag_executor').entry_points
-              if each.group == 'ros2cli.command')
-    assert entry.name == 'mddag'
+    entry, = distribution('mddag_executor').entry_points.select(group='ros2cli.command')
     extension = entry.load()()
 
     def main(*arguments):
         parser = argparse.ArgumentParser('ros2')
-        commands = parser.add_subparsers(dest='command')
-        extension.add_arguments(commands.add_parser(entry.name), 'ros2 mddag')
-        args = parser.parse_args(['mddag', *arguments])
-        return extension.main(parser=parser, args=args)
-    return SimpleNamespace(main=main, summary=extension.__doc__)
+        extension.add_arguments(
+            parser.add_subparsers().add_parser(entry.name), 'ros2 mddag')
+        return extension.main(parser=parser, args=parser.parse_args(['mddag', *arguments]))
+    return main
 
 
 def test_it_is_the_same_program(ros2, graph, capsys, monkeypatch):
-    assert ros2.main('graph', 'check', str(graph)) == 0
+    assert ros2('graph', 'check', str(graph)) == 0
     assert 'deadline' in capsys.readouterr().out
-    assert ros2.main('simulate', '--duration', '100ms', '--', str(graph)) == 0
+    assert ros2('simulate', '--duration', '100ms', '--', str(graph)) == 0
     for words, place in (('graph', 'check', 'none.yaml'), 'none.yaml'), ((), 'mddag'):
-        assert ros2.main(*words) == 2
+        assert ros2(*words) == 2
         assert capsys.readouterr().err.startswith(f'error: {place}: ')
     asked = []
     monkeypatch.setattr('mddag_executor.cli.completion.complete', lambda: asked.append(
@@ -263,5 +260,5 @@ def test_it_is_the_same_program(ros2, graph, capsys, monkeypatch):
     for name, value in (('_ARGCOMPLETE', '1'), ('COMP_LINE', 'ros2 mddag expl'),
                         ('COMP_POINT', '15')):
         monkeypatch.setenv(name, value)
-    ros2.main('graph')
+    ros2('graph')
     assert asked[0] == ('mddag expl', '10')

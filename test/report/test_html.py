@@ -47,12 +47,6 @@ class Page(HTMLParser):
             self.texts.append(data)
 
 
-def report(path):
-    file = io.BytesIO()
-    html.write(file, html.of_outcome(replay(path)))
-    return Page(file.getvalue().decode())
-
-
 def test_what_is_in_the_file_is_what_ran(tmp_path):
     prepared = prepare(html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap'))))
     found = prepared.executions
@@ -69,7 +63,9 @@ def test_what_is_in_the_file_is_what_ran(tmp_path):
 
 
 def test_a_page_needs_nothing_but_itself_and_hostile_names_stay_text(tmp_path):
-    page = report(runs.by_hand(tmp_path / 'run.mcap', hostile=True))
+    file = io.BytesIO()
+    html.write(file, html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap', hostile=True))))
+    page = Page(file.getvalue().decode())
     assert any(tag == 'script' for tag, _ in page.elements)
     for tag, attributes in page.elements:
         assert tag not in ('iframe', 'object', 'embed', 'base')
