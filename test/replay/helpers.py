@@ -218,7 +218,7 @@ class VirtualRun:
         for dag in self.task_set.dags:
             for k in range(self.duration // dag.period_ns):
                 release = START_TIME + (k + 1) * dag.period_ns
-                self._at(release + self.lag(dag.index, k), self._release(dag.index, release))
+                self._at(release + self.random.randrange(MS), self._release(dag.index, release))
         if self.random.random() < self.chances.undeclared:
             for _ in range(20):
                 self._at(START_TIME + self.random.randrange(self.duration), self._undeclared)
@@ -233,22 +233,6 @@ class VirtualRun:
             self.decided(end)
             self.record('shutdown', end, 1, end)
         self.file.finish()
-
-    # --- what a test may change ------------------------------------------------------------------
-
-    def took(self, work):
-        return self.random.randrange(1, self.longest)
-
-    def way(self, work):
-        """Return how long a message takes from the end of the callback that published it."""
-        return 100_000 + self.random.randrange(2 * MS)
-
-    def cpu(self, work, took):
-        """Return the CPU time of an execution, and whether it held the interpreter."""
-        return -1, False
-
-    def lag(self, dag, job):
-        return self.random.randrange(MS)
 
     def _at(self, time, action):
         heappush(self._queue, (time, next(self._order), action))
@@ -322,7 +306,7 @@ class VirtualRun:
 
     def _start(self, work, worker, now):
         start = now + self.random.randrange(50_000)
-        end = start + self.took(work)
+        end = start + self.random.randrange(1, self.longest)
         self._at(end + self.random.choice((0, 0, 1, 30_000)),
                  lambda locked: self._end(work, worker, start, end, locked))
         if work.vertex >= 0:
@@ -330,7 +314,7 @@ class VirtualRun:
                 if self.random.random() >= self.chances.lost:
                     early = self.random.random() < self.chances.early_message
                     arrival = self.random.randrange(start, end + 1) if early \
-                        else end + self.way(work)
+                        else end + 100_000 + self.random.randrange(2 * MS)
                     self._at(arrival, self._message(work.slot, work.dag, work.job, vertex, leg))
 
     def _end(self, work, worker, start, end, now):
@@ -358,7 +342,7 @@ class VirtualRun:
         if declared:
             self.executions[key] += 1
             self.record('complete', now, vtid, address, work.dag, vertex, work.job, whole, end,
-                        work.leg, *self.cpu(work, end - start))
+                        work.leg)
         self.decided(now)
 
     def _resume(self, work):

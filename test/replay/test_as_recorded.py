@@ -117,29 +117,14 @@ def test_the_first_end_of_the_dispatched_callback_ends_it(trace, monkeypatch):
         'not dispatched')
 
 
-REORDERED = """\
-mddag: 1
-nodes:
-  - node: /imu
-    callbacks:
-      - {name: use, subscription: /twist, deadline: 8ms}
-      - {name: tick, timer: 10ms, publishes: [/twist]}
-  - {node: /fuse, callbacks: [{name: join, sync: [/flat, /boxes], deadline: 18ms}]}
-  - node: /right
-    callbacks:
-      - {name: watch, subscription: /info, deadline: 12ms}
-      - {name: rectify, subscription: /info, publishes: [/flat]}
-  - {node: /left, callbacks: [{name: detect, subscription: /image, publishes: [/boxes]}]}
-  - {node: /camera, callbacks: [
-      {name: grab, timer: 20ms, publishes: [/info, /image], dag: video}]}
-"""
-
-
 def test_vertices_are_found_by_name(tmp_path):
     """Another order of DAGs, vertices and legs changes no verdict."""
+    head, *nodes = re.split('^  - ', SMALL, flags=re.MULTILINE)
+    text = ''.join([head, *(f'  - {node}' for node in reversed(nodes))]).replace(
+        '[/boxes, /flat]', '[/flat, /boxes]').replace('20ms,', '20ms, dag: video,')
     path = tmp_path / 'a.mcap'
     expected = VirtualRun(path, small(), 1).tally.result()['dags']
-    outcome = replay(path, loads(REORDERED, 'reordered.yaml'))
+    outcome = replay(path, loads(text, 'reordered.yaml'))
     assert outcome.warnings == []
     dags = outcome.result()['dags']
     assert set(dags) == {'/imu', 'video'}

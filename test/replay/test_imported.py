@@ -245,26 +245,3 @@ def test_releases_of_messages(tmp_path, release_from, stated, response, said):
     assert [line for line in warnings if 'the next best stamp' in line] == ([
         '1 release by the next best stamp, because the declared one is not recorded or years '
         'away: /n:s (header_stamp)'] if said else [])
-
-
-def test_matching_by_order_and_period(tmp_path):
-    graph = loads("""\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: a, timer: 10ms, dag: a, deadline: 5ms}
-      - {name: b, timer: 10ms, dag: b, deadline: 5ms}
-      - {name: c, timer: 30ms, dag: c, deadline: 5ms}
-  - {node: /gone, callbacks: [{name: d, timer: 10ms, deadline: 5ms}]}
-""", 'graph.yaml')
-    r = Recorded(tmp_path / 'order.mcap')
-    r.node(1, '/n')
-    for number, (callback, period) in enumerate(((21, 10), (22, 10), (23, 30))):
-        r.timer(callback, 1, period * MS, time=number)
-        r.run(callback, number + 1, 40 * MS + number, 41 * MS + number * MS)
-    result, warnings = result_of(r.write(), graph)
-    longest = {key: use['longest_ns'] for key, use in result['callbacks'].items()}
-    assert longest == {'/n:a': 1 * MS, '/n:b': 2 * MS - 1, '/n:c': 3 * MS - 2, '/gone:d': 0}
-    assert warnings == [
-        'not in it: 1 of the 4 callbacks of graph.yaml, which count as never completed: /gone:d']

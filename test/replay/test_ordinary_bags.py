@@ -4,14 +4,10 @@
 
 from contextlib import closing
 import os
-from pathlib import Path
 import re
 import shutil
 import sqlite3
-import tempfile
 
-from hypothesis import example, given
-from hypothesis import strategies as st
 from mddag_executor import open_recording
 from mddag_executor.errors import InputError
 from mddag_executor.replay import replay, ReplayError, reschedule
@@ -24,8 +20,6 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
-
-from ..conftest import examples
 
 MS = 1_000_000
 S = 1_000 * MS
@@ -345,16 +339,6 @@ def test_a_message_at_a_time_that_cannot_be(tmp_path, storage, odd):
     assert [line.split(': ', 1)[1] for line in outcome.warnings] == [
         'left out: 1 message at an impossible time']
     assert outcome.result()['dags'] == sound.result()['dags']
-
-
-@given(st.integers(0, N - 1), st.integers(0, 63), st.sampled_from([MCAP, SQLITE]))
-@example(N - 1, 45, MCAP)
-@examples(20)
-def test_any_bit_of_a_time(place, bit, storage):
-    flipped = [*ARRIVALS]
-    flipped[place] = (flipped[place] ^ 1 << bit) & 2**63 - 1
-    with tempfile.TemporaryDirectory() as folder:
-        rescheduled(Path(folder, 'bag'), flipped, storage)
 
 
 def test_a_pause_has_no_jobs_of_timers(tmp_path):

@@ -144,10 +144,12 @@ nodes:
       - {name: o, subscription: /out, period: 5ms, deadline: 5ms, dag: o}
 """
     assert replay(recorded, loads(text)).drift() == []
-    found = replay(recorded, loads(
+    outcome = replay(recorded, loads(
         text.replace(', publishes: [/x]', ', deadline: 1s')
         .replace('/x, deadline', '/x, period: 15ms, deadline')
-        .replace('/out', '/gone').replace('two', 'zwei'))).drift()
+        .replace('/out', '/gone').replace('two', 'zwei')))
+    assert '1 of the 4 callbacks' in outcome.warnings[0] and '/b:o' in outcome.warnings[0]
+    found = outcome.drift()
     assert [(each.kind, each.callback) for each in found] == [
         ('publishes', '/a:zwei'), ('rate', '/b:x'), ('never ran', '/b:o')]
     assert (found[1].declared, found[1].observed) == (15 * MS, 10 * MS)
