@@ -23,6 +23,8 @@ import signal
 import threading
 from typing import Any, TYPE_CHECKING
 
+from mddag_executor.replacements import Replacements
+
 if TYPE_CHECKING:
     from mddag_executor.hosting.host import Guest, Host
 
@@ -38,21 +40,22 @@ class GuestSignals:
         self._handlers: dict[int, dict[Guest | None, Any]] = {each: {} for each in _SIGNALS}
         self._before: dict[int, Any] = {}
 
-    def install(self, replace: Callable[[Any, str, Callable[[Any], Any]], None]) -> None:
+    def install(self, replacements: Replacements) -> None:
         """Store handlers of programs, if the calling thread is the main thread."""
-        self._set = signal.signal
         if threading.current_thread() is threading.main_thread():
             for number in _SIGNALS:
                 self._before[number] = signal.signal(number, self._handle)
-            replace(signal, 'signal', self._signal)
-            replace(signal, 'getsignal', self._getsignal)
+            replacements.callback(self._restore)
+            replacements.replace(signal, 'signal', self._signal)
+            replacements.replace(signal, 'getsignal', self._getsignal)
 
-    def uninstall(self) -> None:
-        """Restore the earlier handlers."""
+    def _restore(self) -> None:
         for number, before in self._before.items():
-            self._set(number, signal.SIG_DFL if before is None else before)
+            signal.signal(number, signal.SIG_DFL if before is None else before)
 
     def _signal(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        self._set = original
+
         def set_handler(number: int, handler: Any) -> Any:
             guest = self._host.current_guest()
             if number not in _SIGNALS or (
@@ -84,7 +87,7 @@ class GuestSignals:
         if callable(before):
             if number != signal.SIGHUP or not running:
                 before(number, frame)
-        elif before == signal.SIG_DFL and not handlers:
+        elif before == signal.SIG_DFL and not running:
             self._set(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
         for guest, handler in running:
@@ -107,6 +110,6 @@ class GuestSignals:
 
 def raise_in(thread: threading.Thread, error: BaseException) -> None:
     """Raise an exception in another thread as soon as that runs Python."""
-    kind = type(type(error).__name__, (type(error),), {'__new__': lambda kind, *args: error})
+    kind = type(type(error).__name__, (type(error),), {'__new__': lambda *args: error})
     ctypes.pythonapi.PyThreadState_SetAsyncExc(
         ctypes.c_ulong(thread.ident or 0), ctypes.py_object(kind))

@@ -112,8 +112,7 @@ class Host:
         context = self.context = rclpy.utilities.get_default_context()
         replace = self._replacements.replace
         self._replacements.callback(_return_to, os.getcwd())
-        self._replacements.callback(self._signals.uninstall)
-        self._signals.install(replace)
+        self._signals.install(self._replacements)
         for name, function in (('init', self._init), ('ok', self._ok),
                                ('shutdown', self._shutdown), ('try_shutdown', self._shutdown)):
             setattr(context, name, function)

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 import json
 import math
@@ -193,12 +194,9 @@ class Supervisor:
             self._print(f'[{run.name}] {line}', target)
 
     def _print(self, line: str, target: TextIO) -> None:
-        with self._lock:
-            try:
-                target.write(f'{line}\n')
-                target.flush()
-            except (OSError, ValueError):
-                pass  # the reader has closed the output: the process continues
+        # where the reader has closed the output, the process continues
+        with self._lock, suppress(OSError, ValueError):
+            print(line, file=target, flush=True)
 
     def _reap(self, run: Run) -> None:
         run.status = run.process.wait()
@@ -319,10 +317,8 @@ def _write(path: Path, text: str) -> None:
 
 def left(folder: str, pid: int) -> Any:
     """Return the result of a process, None if it has none."""
-    try:
-        return json.loads(Path(folder, f'{pid}.json').read_text())
-    except FileNotFoundError:
-        return None
+    path = Path(folder, f'{pid}.json')
+    return json.loads(path.read_text()) if path.exists() else None
 
 
 def together(task_set: TaskSet, results: Results) -> dict[str, Any]:
