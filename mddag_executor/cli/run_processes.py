@@ -29,7 +29,7 @@ from mddag_executor.output_rules import remove_recording
 from mddag_executor.report.live_runs import live_lines
 from msg_graph import TaskSet
 from msg_graph.edit import load_processes, with_processes
-from msg_graph.errors import listed, shown
+from msg_graph.errors import did_you_mean, listed, shown
 
 _COMMON_OPTIONS = ('policy', 'on_late', 'workers', 'duration', 'seed', 'utilisation',
                    'diagnostics', 'overwrite', 'ros_args')
@@ -144,6 +144,9 @@ def _placed(
         name, equals, _ = spec.partition('=')
         if equals and name in names:
             said[spec] = name
+        elif equals and not {*'/: '} & {*name}:
+            raise UsageError(f'--node {spec}: there is no process {shown(name)}: '
+                             + did_you_mean(name, names, 'name one of the declaration'))
     unsaid = [spec for spec in args.node if spec not in said]
     nodes = _probe(args, folder, unsaid) if unsaid else {}
     if number is not None:
