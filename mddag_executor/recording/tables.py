@@ -83,7 +83,7 @@ TABLES = {
 """The tables of a recording with the types of their columns."""
 
 
-def rows(kind: np.dtype[Any], length: int = 0, **columns: Any) -> Table:
+def rows(kind: np.dtype[Any], length: int = 0, /, **columns: Any) -> Table:
     """Return a table of a type: the given columns, 0 in the others."""
     table = np.zeros(length, dtype=kind)
     for name, values in columns.items():

@@ -156,7 +156,7 @@ class Judged:
             released['job'].copy(), released['release'].copy(), released['order'].copy(),
             np.full((len(released), last - first), -1, dtype=np.int32),
             np.full(len(released), NEVER), np.full(len(released), self._recording.judged_until))
-        reason, when = self._given_up(jobs, ends)
+        reason = self._given_up(jobs, ends)
         expected = self._expected(dag, jobs)
         # by job and vertex the position at which it completed
         position = np.full(jobs.done.shape, NEVER)
@@ -173,7 +173,7 @@ class Judged:
         completed[done] = self._recording.executions['end'][jobs.done[:, local][done]]
         late = done & (completed > deadline)
         dropped, dropped_at = self._dropped(jobs, sinks)
-        dropped &= here & ~done & ((reason < 0)[:, None] | (dropped_at <= when[:, None]))
+        dropped &= here & ~done & ((reason < 0)[:, None] | (dropped_at <= jobs.until[:, None]))
         # position at which the last sink completed
         closed = np.where(here & ~dropped, np.where(done, order, NEVER), -1).max(
             axis=1, initial=-1)
@@ -193,38 +193,27 @@ class Judged:
         self.contradictions += int((duplicates[0] < ended[duplicates[1]]).sum())
         self._late_ends(jobs, ends, ended)
         judged = self._is_judged(jobs.release)
-        places: Any = np.indices(done.shape)
-        row, sink = places
-        verdicts = []
         kinds = np.full(len(jobs.release), SINK_MISSED)
         for of, (_, kind) in _ENDS.items():
             kinds[reason == of] = kind
-        choices: tuple[tuple[Mask, Any, Any, Any], ...] = (
-                (done & here, np.where(late, SINK_LATE, SINK_IN_TIME), order, completed),
-                (given_up, np.broadcast_to(kinds[:, None], done.shape),
-                 np.broadcast_to(jobs.ended[:, None], done.shape),
-                 np.broadcast_to(when[:, None], done.shape)),
-                (dropped, np.full(done.shape, SINK_DROPPED),
-                 np.broadcast_to(np.minimum(jobs.ended, min(judged_order, NEVER))[:, None],
-                                 done.shape), dropped_at),
-                (overdue, np.full(done.shape, SINK_MISSED),
-                 np.full(done.shape, min(judged_order, NEVER)),
-                 np.full(done.shape, judged_until)))
-        for which, verdict, at, until in choices:
+        at_end = min(judged_order, NEVER)
+        verdicts = []
+        choices: tuple[tuple[Any, ...], ...] = (
+            (done & here, np.where(late, SINK_LATE, SINK_IN_TIME), order, completed),
+            (given_up, kinds[:, None], jobs.ended[:, None], jobs.until[:, None]),
+            (dropped, SINK_DROPPED, np.minimum(jobs.ended, at_end)[:, None], dropped_at),
+            (overdue, SINK_MISSED, at_end, judged_until))
+        for which, *columns in choices:
             which = which & judged[:, None]
-            if not which.any():
+            row, sink = np.nonzero(which)
+            if not len(row):
                 continue
-            table = np.zeros(int(which.sum()), dtype=VERDICTS)
-            table['kind'], table['dag'] = verdict[which], dag
-            table['sink'] = first + local[sink[which]]
-            table['row'] = row[which]
-            table['job'], table['release'] = (
-                each[table['row']] for each in (jobs.number, jobs.release))
-            table['deadline'], table['order'] = deadline[which], at[which]
-            table['until'] = until[which]
-            table['completed'] = np.where(
-                table['kind'] <= max(SINK_COMPLETED), completed[which], -1)
-            verdicts.append(table)
+            verdict, at, until = (np.broadcast_to(each, done.shape)[which] for each in columns)
+            verdicts.append(recorded.rows(
+                VERDICTS, len(row), kind=verdict, dag=dag, sink=first + local[sink], row=row,
+                job=jobs.number[row], release=jobs.release[row], deadline=deadline[which],
+                until=until, order=at, completed=np.where(
+                    verdict <= max(SINK_COMPLETED), completed[which], -1)))
         outcome: Ints = np.where(
             ((late & here) | overdue | dropped).any(axis=1), LATE, COMPLETED)
         for of, (end, _) in _ENDS.items():
@@ -248,32 +237,28 @@ class Judged:
                 when[row[row >= 0], place] = mine['time'][row >= 0]
         return dropped, when
 
-    def _given_up(self, jobs: Jobs, ends: Table) -> tuple[Ints, Ints]:
-        """Note when jobs ended early; return the reason and the time."""
-        reason, when = np.full(len(jobs.number), -1), np.full(len(jobs.number), -1)
-        ends = ends[sort_by(ends['order'])][::-1]
+    def _given_up(self, jobs: Jobs, ends: Table) -> Ints:
+        """Note when jobs ended early; return the reason."""
+        reason = np.full(len(jobs.number), -1)
+        ends = pick(ends, sort_by(ends['order'])[::-1])
         row = jobs.rows_of(ends['job'])
-        known = (row >= 0) & (ends['order'] > jobs.released[np.maximum(row, 0)]) if len(
-            jobs.number) else np.zeros(len(ends), dtype=np.bool_)
-        row, ends = row[known], ends[known]
+        row, ends = row[row >= 0], pick(ends, row >= 0)
+        later = ends['order'] > jobs.released[row]
+        row, ends = row[later], pick(ends, later)
         # the first end of several wins: it is written last
-        jobs.ended[row] = ends['order']
-        reason[row], when[row] = ends['reason'], ends['time']
-        jobs.until[row] = ends['time']
-        return reason, when
+        jobs.ended[row], jobs.until[row], reason[row] = (
+            ends[name] for name in ('order', 'time', 'reason'))
+        return reason
 
     def _late_ends(self, jobs: Jobs, ends: Table, ended: Ints) -> None:
         """Count ends of jobs that had ended already."""
-        if not self._recording.same or not len(ends):
+        if not self._recording.same:
             return
-        ends = ends[ends['reason'] <= recorded.ABORTED]
+        ends = pick(ends, ends['reason'] <= recorded.ABORTED)
         row = jobs.rows_of(ends['job'])
-        known = row >= 0
-        open_ones = np.zeros(len(ends), dtype=np.bool_)
-        at = row[known]
-        open_ones[known] = (ends['order'][known] > jobs.released[at]) & (
-            ends['order'][known] <= ended[at])
-        self.contradictions += int((~open_ones).sum())
+        order, at = ends['order'][row >= 0], row[row >= 0]
+        was_open = (order > jobs.released[at]) & (order <= ended[at])
+        self.contradictions += len(ends) - int(was_open.sum())
 
     def _expected(self, dag: int, jobs: Jobs) -> Ints | None:
         """Return by job and vertex whether it is expected; None: all are expected (rule 5)."""
@@ -302,8 +287,7 @@ class Judged:
             completions[name] for name in ('job', 'order', 'vertex', 'row'))
         row, vertex = jobs.rows_of(job), vertex - first
         known = row >= 0
-        if len(jobs.number):
-            known &= order > jobs.released[np.maximum(row, 0)]
+        known[known] = order[known] > jobs.released[row[known]]
         if not known.all():
             # no such job was released before, or it has ended
             newest = np.maximum.accumulate(np.r_[-1, jobs.number])

@@ -229,12 +229,13 @@ class Paths:
         return rows(_SENT, len(mine), known=known, message=message, time=sent['time'][mine],
                     run=self._first(by))
 
-    def _first(self, rows: Any) -> Ints:
+    def _first(self, rows: Any) -> Any:
         """Return the rows of the first pieces of executions."""
         later, first = self._later
+        if not len(later):
+            return rows
         at = look_up(later, rows)
-        found: Ints = np.where(at >= 0, np.append(first, NONE)[at], rows)
-        return found
+        return np.where(at >= 0, np.append(first, NONE)[at], rows)
 
     def _message(self, job: Any, vertex: Any, topic: Any) -> Ints:
         """Return the numbers of the messages that vertices publish in jobs."""
