@@ -365,22 +365,16 @@ def signed(address: int) -> int:
 
 _OPTIONAL = {'queue_depth', 'rmw_handle', 'rmw_publisher_handle', 'rmw_service_handle',
              'executor_addr'}
-_NEEDED = {
-    'callback_group_to_executor_entity_collector': {
-        'callback_group_addr': 'uint64', 'group_type_name': 'string'},
-    'add_callback_group_static_executor': {
-        'callback_group_addr': 'uint64', 'group_type_name': 'string'}}
 
 
 def _complete(name: str, fields: Fields) -> bool:
     """Return whether an event has all needed fields, with values of the right types."""
-    needed = _NEEDED.get(name)
-    if needed is None:
-        event = EVENTS.get(f'ros2:{name}') or EVENTS.get(f'ros2_caret:{name}')
-        needed = dict(event.fields) if event is not None else {}
+    # CARET's other events that add a group have the same fields
+    event = EVENTS.get(f'ros2:{name}') or EVENTS.get(
+        f'ros2_caret:{name}', EVENTS['ros2_caret:add_callback_group'])
     return all(
         isinstance(fields.get(field), str if kind == 'string' else int)
-        for field, kind in needed.items() if field not in _OPTIONAL
+        for field, kind in event.fields if field not in _OPTIONAL
     ) and isinstance(fields.get('init_timestamp', 0), int)
 
 

@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence, Set
 from dataclasses import replace
+from itertools import accumulate
 from typing import NamedTuple
 
 from mddag_executor.core import legs_of
@@ -43,69 +44,6 @@ from msg_graph.binding import Binder, entities_of, Entity, meant
 import numpy as np
 
 
-class Mapping:
-    """
-    Maps recorded DAGs and vertices to the judging declaration.
-
-    :param recorded: the recorded declaration.
-    :param judge: the judging declaration; None: the recorded one.
-    """
-
-    def __init__(self, name: str, recorded: TaskSet, judge: TaskSet | None) -> None:
-        self.task_set = recorded if judge is None else judge
-        #: Whether the run itself was judged by the judging declaration.
-        self.same = judge is None or judge.text == recorded.text
-        self.warnings: list[str] = []
-        first = _first_vertices(self.task_set)
-        if judge is not None and not self.same:
-            self._compare(name, recorded, judge)
-        by_source = {dag.vertices[dag.source].callback.key: dag for dag in self.task_set.dags}
-        #: By recorded DAG: its DAG, or -1.
-        self.dag: list[int] = []
-        #: By recorded DAG and vertex: its global vertex, or -1.
-        self.vertex: list[list[int]] = []
-        #: By recorded DAG, vertex and leg: its leg.
-        self.leg: list[list[list[int]]] = []
-        for dag in recorded.dags:
-            target = by_source.get(dag.vertices[dag.source].callback.key)
-            self.dag.append(-1 if target is None else target.index)
-            self._add_vertices(dag, target, first)
-        self._report_unreleased()
-
-    def _add_vertices(self, dag: Dag, target: Dag | None, first: list[int]) -> None:
-        vertices: list[int] = []
-        legs: list[list[int]] = []
-        for vertex in dag.vertices:
-            match = None if target is None else _match(vertex, dag, target)
-            map_of_legs = []
-            if target is not None and match is not None:
-                map_of_legs = _legs(vertex, dag, match, target)
-            if target is None or match is None or not map_of_legs:
-                vertices.append(-1)
-            else:
-                vertices.append(first[target.index] + match.index)
-            legs.append(map_of_legs)
-        self.vertex.append(vertices)
-        self.leg.append(legs)
-
-    def _compare(self, name: str, recorded: TaskSet, judge: TaskSet) -> None:
-        """Find the callbacks of the graph that the trace lacks."""
-        known = [callback.key for callback in recorded.callbacks]
-        wanted = {callback.key for callback in judge.callbacks}
-        self.warnings += report_missing(name, judge, set(known), known, [
-            each for callback in recorded.callbacks if callback.key not in wanted
-            for each in entities_of(callback)])
-
-    def _report_unreleased(self) -> None:
-        if self.same:
-            return
-        missing = [dag.name for dag in self.task_set.dags if dag.index not in self.dag]
-        if missing:
-            self.warnings.append(
-                f'{self.task_set.file}: {counted(len(missing), "DAG")} without jobs, because the '
-                f'source is no source in the recording: {listed(missing)}')
-
-
 def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
     """
     Return a recording in terms of the judging declaration.
@@ -113,18 +51,22 @@ def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
     :param judge: None: the recorded one.
     :raises ReplayError: if the recording has none of its callbacks.
     """
-    mapping = Mapping(recording.name, recording.recorded_set, judge)
-    warnings = [*recording.warnings, *mapping.warnings]
-    if mapping.task_set is recording.task_set or mapping.same:
-        return replace(
-            recording, task_set=mapping.task_set, same=recording.same, warnings=warnings)
-    dag = np.array([*mapping.dag, -1])
-    flat = [v if legs else -1 for vertices, of_legs in zip(mapping.vertex, mapping.leg)
-            for v, legs in zip(vertices, of_legs)]
-    vertex = np.array([*flat, -1])
-    n_legs = max((len(legs) for of_dag in mapping.leg for legs in of_dag), default=1)
-    leg = np.array([[*legs, *[-1] * (n_legs - len(legs))]
-                    for of_dag in mapping.leg for legs in of_dag] + [[-1] * n_legs])
+    recorded = recording.recorded_set
+    if judge is None or judge.text == recorded.text:    # it judged the run itself
+        return replace(recording, task_set=judge or recorded)
+    known, wanted = ([each.key for each in of.callbacks] for of in (recorded, judge))
+    missing = report_missing(recording.name, judge, set(known), known, [
+        each for callback in recorded.callbacks if callback.key not in wanted
+        for each in entities_of(callback)])
+    dags, vertices, legs = _matches(recorded, judge)
+    unreleased = [each.name for each in judge.dags if each.index not in dags]
+    if unreleased:
+        missing.append(
+            f'{judge.file}: {counted(len(unreleased), "DAG")} without jobs, because the '
+            f'source is no source in the recording: {listed(unreleased)}')
+    dag, vertex = np.array([*dags, -1]), np.array([*vertices, -1])
+    n_legs = max(map(len, legs), default=1)
+    leg = np.array([[*each, *[-1] * (n_legs - len(each))] for each in [*legs, []]])
 
     def moved(table: Table) -> Table:
         table = table.copy()
@@ -148,21 +90,34 @@ def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
             table = table[~failed | (table['vertex'] >= 0)]
         return table[table['dag'] >= 0]
 
-    hosted = [(order, mapping.dag[of], frozenset(int(vertex[v]) for v in vertices) - {-1})
-              for order, of, vertices in recording.hosted if mapping.dag[of] >= 0]
+    hosted = [(order, dags[of], frozenset(int(vertex[v]) for v in here) - {-1})
+              for order, of, here in recording.hosted if dags[of] >= 0]
     return replace(
-        recording, task_set=mapping.task_set, same=False, warnings=warnings, hosted=hosted,
+        recording, task_set=judge, same=False, warnings=[*recording.warnings, *missing],
+        hosted=hosted,
         executions=moved(recording.executions), publications=moved(recording.publications),
         drops=moved(recording.drops), demotions=moved(recording.demotions),
         misses=moved(recording.misses),
         releases=of_dags(recording.releases), job_ends=of_dags(recording.job_ends))
 
 
-def _first_vertices(task_set: TaskSet) -> list[int]:
-    first = [0]
-    for dag in task_set.dags:
-        first.append(first[-1] + len(dag.vertices))
-    return first
+def _matches(
+    recorded: TaskSet, judge: TaskSet
+) -> tuple[list[int], list[int], list[list[int]]]:
+    """Return by recorded DAG its DAG, by vertex its vertex (-1: none), and the legs of that."""
+    first = [*accumulate((len(dag.vertices) for dag in judge.dags), initial=0)]
+    by_source = {dag.vertices[dag.source].callback.key: dag for dag in judge.dags}
+    dags, vertices, legs = list[int](), list[int](), list[list[int]]()
+    for dag in recorded.dags:
+        target = by_source.get(dag.vertices[dag.source].callback.key)
+        dags.append(-1 if target is None else target.index)
+        for vertex in dag.vertices:
+            match = None if target is None else _match(vertex, dag, target)
+            found = [] if target is None or match is None else _legs(vertex, dag, match, target)
+            legs.append(found)
+            vertices.append(first[target.index] + match.index if found and target and match
+                            else -1)
+    return dags, vertices, legs
 
 
 def _match(vertex: Vertex, dag: Dag, target: Dag) -> Vertex | None:
