@@ -251,27 +251,7 @@ class Links:
     def _runs(self) -> Table:
         """Return the executions (rule 1)."""
         table = self.events
-        at = self._order[table['kind'][self._order] <= END]
-        alternates = self._alternates(at)
-        #: By event of a start or end the execution that runs after it in the thread, or -1.
-        self._top = np.full(len(table), -1)
-        stacked = self._stacked(np.sort(at[~alternates]))
-        starts = alternates & (table['kind'][at] == START)
-        begin = at[starts]
-        ended = np.append(starts[:-1] & alternates[1:] & (
-            table['thread'][at[1:]] == table['thread'][at[:-1]]), False)[starts]
-        end_at = np.where(ended, np.append(at[1:], -1)[starts], -1)
-        count = len(stacked)
-        self._top[begin] = count + np.arange(len(begin))
-        begin, end_at = (np.append([row[i] for row in stacked], each).astype(np.int64)
-                         for i, each in enumerate((begin, end_at)))
-        order = sort_by(begin)
-        number = np.empty(len(order), dtype=np.int64)
-        number[order] = np.arange(len(order))
-        self._top = np.where(self._top >= 0, number[self._top], -1) if len(order) else self._top
-        self._lost = [each._replace(run=int(number[each.run])) if each.run >= 0 else each
-                     for each in self._lost]
-        begin, end_at = begin[order], end_at[order]
+        begin, end_at = np.array(self._stack(), dtype=np.int64).reshape(-1, 2).T
         runs = np.zeros(len(begin), _RUN)
         runs['callback'], runs['at'], runs['end_at'] = self._callback[begin], begin, end_at
         runs['thread'], runs['start'] = table['thread'][begin], table['time'][begin]
@@ -283,35 +263,19 @@ class Links:
                 self.losses.count('unknown', callback.label, times)
         return runs
 
-    def _alternates(self, at: Ints) -> Mask:
-        """
-        Return which starts and ends are of threads that ran one callback after the other.
-
-        :param at: the starts and ends, by thread.
-        """
-        thread, kind = self.events['thread'][at], self.events['kind'][at]
-        callback = self._callback[at]
-        first = np.append(True, thread[1:] != thread[:-1])[:len(at)]
-        wrong = first & (kind == END)
-        wrong[1:] |= ~first[1:] & np.where(
-            kind[1:] == END, (kind[:-1] == END) | (callback[1:] != callback[:-1]),
-            kind[:-1] == START)
-        return ~np.isin(thread, thread[wrong])
-
-    def _stacked(self, at: Ints) -> list[list[int]]:
-        """
-        Return the first and last event of executions that may be nested or incomplete.
-
-        :param at: the starts and ends of their threads, in the order of time.
-        """
+    def _stack(self) -> list[list[int]]:
+        """Return the first and last event of executions, with a stack for each thread."""
         table = self.events
+        at = np.flatnonzero(table['kind'] <= END)
+        #: By event of a start or end the execution that runs after it in the thread, or -1.
+        self._top = np.full(len(table), -1)
         stacks: dict[int, list[int]] = {}
         found: list[list[int]] = []
         callback: list[int] = []
         inner: list[int] = []       # last start of a nested execution
-        for here, thread, kind, number, now in zip(
-                at.tolist(), table['thread'][at].tolist(), table['kind'][at].tolist(),
-                self._callback[at].tolist(), table['time'][at].tolist()):
+        top: list[int] = []
+        for here, thread, kind, number, now in zip(at.tolist(), *(each[at].tolist() for each in (
+                table['thread'], table['kind'], self._callback, table['time']))):
             fresh = thread not in stacks
             stack = stacks.setdefault(thread, [])
             known = any(callback[run] == number for run in stack)
@@ -336,8 +300,8 @@ class Links:
                 # otherwise it began before the recording
                 self.losses.count('starts', self.callbacks[number].label)
                 self._lost.append(Lost(here, number, -1, now))
-            if stack:
-                self._top[here] = stack[-1]
+            top.append(stack[-1] if stack else -1)
+        self._top[at] = top
         for stack in stacks.values():
             for run in stack:
                 if inner[run] >= 0:

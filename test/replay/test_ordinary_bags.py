@@ -250,33 +250,30 @@ def test_on_the_command_line(tmp_path, graph, call):
 
 # --- damage --------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize('text', [
-    '', '[', '- 1', 'rosbag2_bagfile_information: {relative_file_paths: []}',
-    'rosbag2_bagfile_information: {relative_file_paths: [1]}', '\x00', '[' * 900,
-    '!!python/object:os.system x'])
-def test_wrong_metadata(tmp_path, text):
-    (tmp_path / 'metadata.yaml').write_text(text)
-    with pytest.raises(BagError) as caught:
-        Bag(tmp_path, {'/points'})
-    assert str(caught.value).startswith(
-        f'{tmp_path}/metadata.yaml: this is no metadata of a bag (')
-    assert '\n' not in str(caught.value)
-
-
 def test_hostile_files(tmp_path):
-    other, text = tmp_path / 'other.db3', tmp_path / 'text.db3'
+    other, text, folder = (tmp_path / name for name in ('other.db3', 'text.db3', 'folder'))
     sqlite3.connect(other).execute('CREATE TABLE a(b)').connection.close()
     text.write_bytes(b'SQLite format 3\0' * 100)
-    (tmp_path / 'folder').mkdir()
+    folder.mkdir()
     killed = write_bag(tmp_path / 'killed', SQLITE)
     (killed / 'killed.db3-wal').write_bytes(b'x')
+
+    def refuse(path, says):
+        with pytest.raises(BagError, match=says) as caught:
+            Bag(path, {'/points'})
+        assert '\n' not in str(caught.value)
+
     for path, says in ((other, 'its SQLite storage cannot be read'),
                        (text, 'its SQLite storage cannot be read'),
                        (tmp_path / 'gone', 'is no file'),
                        (killed, r'its last messages are in killed\.db3-wal .*: let ros2 bag '),
-                       (tmp_path / 'folder', 'there is neither metadata.yaml nor a bag file')):
-        with pytest.raises(BagError, match=says):
-            Bag(path, {'/points'})
+                       (folder, 'there is neither metadata.yaml nor a bag file')):
+        refuse(path, says)
+    files = 'rosbag2_bagfile_information: {relative_file_paths: %s}'
+    for metadata in ('', '[', '- 1', files % '[]', files % '[1]', '\x00', '[' * 900,
+                     '!!python/object:os.system x'):
+        (folder / 'metadata.yaml').write_text(metadata)
+        refuse(folder, r'/metadata.yaml: this is no metadata of a bag \(')
 
 
 def test_a_folder_says_what_is_in_it(tmp_path):

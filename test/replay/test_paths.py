@@ -190,25 +190,6 @@ paths:
 """
 
 
-def test_a_simulated_trace(tmp_path, call):
-    graph, trace = tmp_path / 'graph.yaml', tmp_path / 'run.mcap'
-    graph.write_text(GRAPH_OWN)
-    call('simulate', graph, '--workers', 4, '--duration', '500ms', '--trace', trace)
-    path = replay(trace).result()['paths']['kept']
-    assert path['hops'] == ['trigger', 'variable']
-    # sent 1 ms after each 100 ms, used with 50 and 100 ms after it; what is sent last is not used
-    # a second time within the 500 ms
-    assert (path['flows'], path['arrived']) == (9, 9)
-    assert path['data_age'] == {
-        'count': 9, 'min': 49 * MS, 'mean': round((5 * 49 + 4 * 99) * MS / 9),
-        'median': 49 * MS, 'p99': 99 * MS, 'max': 99 * MS}
-    assert path['reaction_time'] == {
-        'count': 3, 'min': 149 * MS, 'mean': 149 * MS, 'median': 149 * MS, 'p99': 149 * MS,
-        'max': 149 * MS}
-    # from the start of the sender to the end of its user
-    assert path['whole']['data_age']['min'] == 51 * MS
-
-
 def test_a_coroutine_is_one_execution(tmp_path):
     trace = Written(tmp_path / 'a.mcap', GRAPH_OWN, 2)
     trace.add('rcl_node_init', 0, 1, 1, 'a', '/')
