@@ -231,18 +231,17 @@ class ExecutionJoin:
             complete['dag'], complete['vertex']))
         job, time, leg = (complete[name][event] for name in ('job', 'timestamp', 'leg'))
         self.last = max(self.last, int(time.max(initial=0)))
-        known = dag >= 0
-        if not known.all():
-            self._strange[f'{COMPLETE} of a vertex that is not declared'] += int((~known).sum())
-        table, good = self._executions.rows(), known & (at >= 0)
+        rest = dag >= 0
+        if not rest.all():
+            self._strange[f'{COMPLETE} of a vertex that is not declared'] += int((~rest).sum())
+        table, good = self._executions.rows(), rest & (at >= 0)
         row = self._dispatches.row[at[good]]
         good[good] = fits = (table['end'][row] >= 0) & (table['vertex'][row] == vertex[good]) & (
             table['job'][row] == job[good])
-        self.orphans += int((known & ~good).sum())
+        self.orphans += int((rest & ~good).sum())
         mine, row = np.flatnonzero(good), row[fits]
         begins, until = groups(row)
         row, last_leg = row[begins], mine[until - 1]
-        rest = known
         rest[last_leg] = False
         if len(row) < len(mine):     # one execution may complete several legs
             legs = np.bitwise_or.reduceat(1 << np.clip(leg[mine], 0, 62), begins)
@@ -251,24 +250,23 @@ class ExecutionJoin:
                 legs == (1 << np.minimum(n_legs, 62)) - 1)
             leg[last_leg[every]] = ALL_LEGS
             rest[mine] &= ~np.repeat(every, until - begins)
-        which = np.flatnonzero(rest)
-        if len(which):
-            which = which[sort_by(event[which])]
-            more, chosen = self._executions.more(len(which)), event[which]
-            more['dag'], more['vertex'], more['job'] = dag[which], vertex[which], job[which]
-            for name, field in (('callback',) * 2, ('thread', 'vtid'), ('end', 'completed')):
-                more[name] = complete[field][chosen]
-            n = len(self._executions)
-            row = np.append(row, np.arange(n - len(which), n))
-        which = np.append(last_leg, which)
+        more = np.flatnonzero(rest)[sort_by(event[rest])]
+        first = len(self._executions)
+        table = self._executions.more(len(more))
+        table['dag'], table['vertex'], table['job'] = dag[more], vertex[more], job[more]
+        for name, field in (('callback',) * 2, ('thread', 'vtid'), ('end', 'completed')):
+            table[name] = complete[field][event[more]]
+        row = np.append(row, np.arange(first, first + len(more)))
+        # fill in the columns about completions, in the order of the file
+        which = np.append(last_leg, more)
+        in_file = sort_by(event[which])
+        which, row = which[in_file], row[in_file]
         table, event = self._executions.rows(), event[which]
         table['leg'][row], table['cpu'][row] = leg[which], complete['cpu_time'][event]
         table['holds_gil'][row] = complete['held_interpreter'][event]
         table['completes'][row] = np.where(complete['last_leg'][event], VERTEX, LEG)
-        in_file = sort_by(event)
         self._completed.add(rows(
-            COMPLETED, len(row), place=complete.place[event[in_file]], time=time[which[in_file]],
-            row=row[in_file]))
+            COMPLETED, len(row), place=complete.place[event], time=time[which], row=row))
 
 
 def _pieces(table: Table) -> None:
@@ -311,7 +309,7 @@ def number_pieces(table: Table, mine: Ints, of: str) -> None:
 
 
 def running_at(
-    executions: Table, completed_at: Ints, thread: Ints, time: Ints, place: Ints
+    executions: Table, completed: Table, thread: Ints, time: Ints, place: Ints
 ) -> Ints:
     """
     Return the rows of the executions that ran in threads at given times; -1: none.
@@ -319,13 +317,15 @@ def running_at(
     If one ended when the next one started, it is the first one whose completion comes later in the
     file: in virtual time a callback publishes when it ends.
 
-    :param completed_at: positions of completions in the file by row; -1: none.
+    :param completed: see ``COMPLETED``.
     :param time: ascending.
     :param place: positions in the file.
     """
     found = np.full(len(time), UNKNOWN)
     if not len(time):
         return found
+    completed_at = np.full(len(executions), UNKNOWN)
+    completed_at[completed['row']] = completed['place']
     ran = np.flatnonzero((executions['end'] >= 0) & (executions['start'] >= 0))
     threads = executions['thread'][ran]
     for number in np.unique(thread).tolist():

@@ -238,11 +238,7 @@ class _Source:
         if (time[1:] < time[:-1]).any():
             published = pick(published, sort_by(time))
             time = published['timestamp']
-        completed_at = np.full(len(executions) if len(time) else 0, UNKNOWN)
-        if len(time):
-            completed_at[completed['row']] = completed['place']
-        by = running_at(
-            executions, completed_at, published['vtid'], time, published['place'])
+        by = running_at(executions, completed, published['vtid'], time, published['place'])
         return rows(
             PUBLICATIONS, len(published), publisher=published['publisher_handle'],
             execution=by, time=time, source_timestamp=UNKNOWN,
