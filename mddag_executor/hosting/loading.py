@@ -8,12 +8,12 @@ Theory of operation
 A SPEC is
 
 * ``package/executable``, as for ``ros2 run``: a file in ``PREFIX/lib/PACKAGE/`` of the ament index
-(``AMENT_PREFIX_PATH``).  A Python script is executed as ``__main__``, as by Python.
+  (``AMENT_PREFIX_PATH``).  A Python script is executed as ``__main__``, as by Python.
 * ``module:NodeClass``: a subclass of ``rclpy.node.Node``; it is constructed without arguments.
 * ``module:function``: it may return one or several nodes, or be a ``main()`` that spins.
 
 ``resolve`` finds the file or imports the module, so an error in a SPEC is reported before any node
-starts; ``hosting`` then runs the returned ``Program``.
+starts; the ``Host`` then runs the returned ``Program``.
 """
 
 from __future__ import annotations

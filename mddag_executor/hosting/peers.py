@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import gc
 import time
-from typing import Any
+from typing import Any, cast
 
 from mddag_executor.hosting.child import ChildError, run_child, Tick
 from mddag_executor.hosting.measure import ExecutionPlan, measure
@@ -41,11 +41,10 @@ class UnfinishedSession(Session):
             time.sleep(0.05)
 
     def check(self, measured: bool) -> None:
-        """Check that a run was measured to its end, or raise the exception that has ended it."""
-        if self.error is not None:
-            raise self.error
-        if not measured:
-            raise ChildError('the run was ended before anything was measured: run it again')
+        """Raise the exception that has ended a run, or an error if it was not measured."""
+        if self.error is not None or not measured:
+            raise self.error or ChildError(
+                'the run was ended before anything was measured: run it again')
 
 
 def run_nodes(
@@ -76,10 +75,8 @@ def measure_peer(
     :raises mddag_executor.errors.UsageError: when no execution time is declared.
     """
     plan = ExecutionPlan(load(graph), seed, utilisation, workers)
-    figures: dict[str, Any] = run_child(
-        f'{__name__}:run', (plan, seconds), 'MultiThreadedExecutor',
-        seconds + PATIENCE_S, tick)
-    return figures
+    return cast('dict[str, Any]', run_child(
+        f'{__name__}:run', (plan, seconds), 'MultiThreadedExecutor', seconds + PATIENCE_S, tick))
 
 
 def run(plan: ExecutionPlan, seconds: float) -> dict[str, Any]:

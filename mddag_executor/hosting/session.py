@@ -55,13 +55,12 @@ class Session:
         self.executor = executor
         self.error: BaseException | None = None
         self.clean = True
-        self._ended = False
-        self._on_end = on_end
+        self.stopped = self._ended = False
+        self._on_end = on_end or (lambda: None)
         self._patience_s = END_TIMEOUT_S
-        self.stopped = False
         self._bell = threading.Lock()
         self._bell.acquire()
-        self._spin = executor.spin if spin is None else spin
+        self._spin = spin or executor.spin
         self._thread = threading.Thread(target=self._run, name='mddag-spin', daemon=True)
 
     def __enter__(self) -> Session:
@@ -129,8 +128,7 @@ class Session:
         if self._ended:
             return
         self._ended = True
-        if self._on_end is not None:
-            self._on_end()
+        self._on_end()
         begin = time.monotonic()
         # In steps: a signal may shorten the wait meanwhile.
         while self.executor.shutdown(0.1) is False:
