@@ -217,8 +217,10 @@ def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path, call):
     for job in range(20):
         at = job * 50
         trace.release(0, job, at)
-        for place, vertex in enumerate((TICK, 2, USE)):
-            trace.run(0, vertex, job, at + place, at + place + 1, whole=vertex != USE)
+        for place, vertex in enumerate((TICK, 2)):
+            trace.run(0, vertex, job, at + place, at + place + 1)
+        trace.piece(0, USE, job, at + 2, at + 2.25)     # suspended in between
+        trace.run(0, USE, job, at + 2.5, at + 3, ready=at + 2, whole=False)
         trace.add('expire', at + 32, 0, job)
     path = trace.end(2000)
     result = explained(path)
