@@ -174,28 +174,6 @@ def test_a_callback_that_waits_may_lend_its_worker(make_executor, make_node):
     assert seen == [True]
 
 
-def test_synchronous_calls_from_all_workers_at_once(make_executor, make_node):
-    """A worker that waits lends its place: rclpy#1211 and #1398 hang here."""
-    node = make_node()
-    group, answers, together = ReentrantCallbackGroup(), [], threading.Barrier(7)
-    node.create_service(
-        Trigger, '/ask', lambda request, response: response, callback_group=group)
-    client = node.create_client(Trigger, '/ask', callback_group=group)
-
-    def ask():
-        together.wait(5.0)
-        answers.append(client.call(Trigger.Request(), timeout_sec=5.0))
-
-    executor = make_executor(nodes=[node])
-    assert client.wait_for_service(5.0)
-    with Spinning(executor):
-        for _ in range(7):
-            executor.create_task(ask)
-        assert wait_for(lambda: len(answers) == 7)
-    assert None not in answers
-    assert executor.statistics()['lent'] == 7
-
-
 def test_tasks_nodes_and_entities_wake_an_idle_executor(make_executor, make_node, spinning):
     executor, node, calls = make_executor(), make_node(), [[], []]
     with spinning(executor):

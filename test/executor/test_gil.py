@@ -63,31 +63,6 @@ def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, h
     assert [*intervals] == [pytest.approx(0.001)] and sys.getswitchinterval() == before
 
 
-def test_a_long_callback_does_not_hold_up_a_more_urgent_one(make_executor, make_node):
-    """
-    A camera computes until the 1 kHz callback has run thrice meanwhile, so it must let it.
-
-    Its deadline is far: once it were late it would be the more urgent one.
-    """
-    node, ticks, seen = make_node(), [], []
-    group = ReentrantCallbackGroup()
-    node.create_timer(0.001, lambda: ticks.append(None), callback_group=group)
-
-    def capture():
-        before, end = len(ticks), time.monotonic() + 50.0
-        while len(ticks) < before + 3 and len(seen) < 3 and time.monotonic() < end:  # computes
-            pass
-        seen.append(len(ticks) - before)
-
-    node.create_timer(0.1, capture, callback_group=group)
-    executor = make_executor(loads(declare(
-        ('step', 'timer: 1ms, deadline: 1ms, holds_interpreter: true'),
-        ('capture', 'timer: 100ms, deadline: 60s, holds_interpreter: true'))), nodes=[node])
-    with Spinning(executor):
-        assert wait_for(lambda: len(seen) >= 3, 160.0)
-    assert min(seen[:3]) >= 3
-
-
 def test_what_is_learnt_of_callbacks(make_executor, make_node):
     """Who computes, and what each needs when nothing disturbs it."""
     node, bell, ran = make_node(), threading.Event(), []

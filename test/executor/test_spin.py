@@ -90,6 +90,17 @@ def test_spinning_in_a_callback_of_spin_once_is_an_error(make_executor):
     assert task.done() and signal.set_wakeup_fd(-1) == -1
 
 
+def test_a_callback_of_spin_once_may_call_a_service_of_the_same_executor(make_executor, make_node):
+    node = make_node()
+    node.create_service(Trigger, '/ask', lambda request, response: response)
+    client = node.create_client(Trigger, '/ask')
+    executor = make_executor(num_workers=1, nodes=[node])
+    assert client.wait_for_service(5.0)
+    task = executor.create_task(client.call, Trigger.Request(), 5.0)
+    executor.spin_once(5.0)
+    assert task.result() is not None
+
+
 def test_wait_for_message_while_another_thread_spins(make_executor, make_node):
     node = make_node()
     publisher = node.create_publisher(Header, '/topic', 10)

@@ -176,7 +176,7 @@ client.completed = getattr(client, 'completed', 0) + 1
     Case('no_thread_waits_while_a_worker_runs', [(
         'executor/workers.py', 'if self._parked and self.running and not self._is_stepping:',
         'if len(self._parked) == len(self._threads) and self.running and not self._is_stepping:')],
-        of('test_executor.py', 'test_synchronous_calls_from_all_workers_at_once')),
+        of('test_bounds.py', 'test_blocked_calls_take_a_bounded_number_of_threads')),
     Case('muted_for_ever', [(
         'executor/loop.py', 'found = self._nested.poll(0)', 'return []')], of(
         'test_gil.py', 'test_what_cannot_start_is_left_in_the_middleware[elsewhere]')),
@@ -213,7 +213,7 @@ before = globals().setdefault('BEFORE', {})
         'test_deadlines.py',
         'test_each_callback_runs_for_the_job_that_its_message_belongs_to')),
     Case('late_sinks_counted_in_time', [(
-        'core/tally.py', 'self.late += late', 'pass')], of(
+        'core/tally.py', 'SINK_LATE if late else SINK_IN_TIME', 'SINK_IN_TIME')], of(
         'test_live_replay.py', 'test_replay_counts_what_the_executor_counted')),
     Case('late_jobs_counted_in_time', [(
         'core/tally.py', 'self.ends[dag][deadline] += 1',
