@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='with --load topics: how many (default: both 20 at 50 Hz and 50 at 100 Hz)')
     add('--rate', type=options.positive_float, metavar='HZ',
         help='how often each topic is published (default: see --topics; 100 for entities)')
-    add('--idle', type=options.list_of(options.or_zero(options.positive_int)), metavar='N[,N…]',
+    add('--idle', type=options.list_of(options.not_negative_int), metavar='N[,N…]',
         help='with --load entities: how many idle subscriptions (default: 1,10,100,1000)')
     add('--phases', choices=PHASES,
         help='with --load topics: each topic at a phase of its own, or all published in a row, '

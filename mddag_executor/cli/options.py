@@ -27,9 +27,18 @@ _MOST_OFFSET = 10 ** 18
 
 def duration(text: str) -> int:
     """Return the nanoseconds of an argument such as `20s` or `100ms`."""
+    return _time(text)
+
+
+def duration_or_zero(text: str) -> int:
+    """Return the nanoseconds of a time that may be zero, which needs no unit."""
+    return 0 if text == '0' else _time(text, minimum_ns=0)
+
+
+def _time(text: str, **bounds: int) -> int:
     from msg_graph import parse_duration
     try:
-        return parse_duration(text)
+        return parse_duration(text, **bounds)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 
@@ -72,11 +81,6 @@ def share(text: str) -> float:
     return not_negative(number) / (1 if number == text else 100)
 
 
-def or_zero(kind: Callable[[str], int]) -> Callable[[str], int]:
-    """Return a kind of argument that may be `0` as well."""
-    return lambda text: 0 if text == '0' else kind(text)
-
-
 def list_of(kind: Callable[[str], T]) -> Callable[[str], list[T]]:
     """Return the kind of argument that is several of a kind, with commas between them."""
     return lambda text: [kind(part.strip()) for part in text.split(',')]
@@ -94,14 +98,10 @@ def policies(text: str) -> tuple[str, ...]:
 
 
 def _offset(text: str) -> tuple[str, int]:
-    from msg_graph import parse_duration
     name, _, time = text.rpartition('=')
     if not name:
         raise argparse.ArgumentTypeError(f'{text!r} is not NAME=TIME, such as control=2.5ms')
-    try:
-        ahead = parse_duration(time.removeprefix('-'), minimum_ns=0, maximum_ns=_MOST_OFFSET)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    ahead = _time(time.removeprefix('-'), minimum_ns=0, maximum_ns=_MOST_OFFSET)
     return name, -ahead if time.startswith('-') else ahead
 
 
@@ -194,7 +194,7 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
         'help': 'virtual time of each run',
         'otherwise': f'{defaults.DURATION_NS // 10 ** 9}s'},
     '--overhead': {
-        'type': or_zero(duration), 'default': 0, 'metavar': 'TIME',
+        'type': duration_or_zero, 'default': 0, 'metavar': 'TIME',
         'help': 'time that each dispatch of a callback costs in addition', 'otherwise': '0'},
     '--jobs': {
         'type': positive_int, 'metavar': 'N', 'help': 'how many runs to simulate at a time',
@@ -203,11 +203,11 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
         'type': utilisation, 'metavar': 'U',
         'help': 'scale the execution times to this normalised utilisation, sum(C/T)/workers'},
     '--skip': {
-        'type': or_zero(duration), 'default': 0, 'metavar': 'TIME',
+        'type': duration_or_zero, 'default': 0, 'metavar': 'TIME',
         'help': 'leave out a warm-up: jobs released less than this after the first one, for '
         'instance 1s, are not judged', 'otherwise': 'all jobs are judged'},
     '--from': {
-        'type': or_zero(duration), 'metavar': 'TIME', 'dest': 'begin',
+        'type': duration_or_zero, 'metavar': 'TIME', 'dest': 'begin',
         'help': 'only jobs that were released from this time on, counted from the first release, '
         'for instance 90s', 'otherwise': 'from the start'},
     '--to': {

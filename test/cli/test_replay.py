@@ -41,7 +41,7 @@ def test_a_truncated_trace_gives_what_is_there(trace, call):
 
 
 def test_standard_input(trace, call):
-    assert call('replay', '-', stdin=trace.read_bytes()) == call('replay', trace)
+    assert call('replay', '-', stdin=trace.read_bytes()) == call('replay', trace, '--skip', '0s')
     status, out, err = call('replay', '-', '--json', '-', stdin=trace.read_bytes()[:-40])
     assert err.startswith('warning: <stdin>: the summary')
     assert json.loads(out)['recording']['trace'] == '<stdin>'
