@@ -40,11 +40,13 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
             of.add(int(mine.max()))
             of.count = len(mine)
     # declared callbacks that were started; other executions once each
-    declared = (table['vertex'] >= 0) & (table['start'] >= 0)
-    others = (table['vertex'] < 0) & (table['end'] >= 0) & (table['piece'] == 0)
+    vertex, start, end = (table[name].copy() for name in ('vertex', 'start', 'end'))
+    declared = (vertex >= 0) & (start >= 0)
+    others = (vertex < 0) & (end >= 0) & (table['piece'] == 0)
     every = declared | others
-    waits = (table['end'] < 0) & (table['start'] >= recording.end)
-    late = (table['end'] >= since) | (table['end'] < 0)
+    waits = (end < 0) & (start >= recording.end)
+    late = (end >= since) | (end < 0)
+    del vertex, start, end
     numbers, callback_of = recording.callbacks()
     counts, late_counts, late_got = (dict(zip(numbers.tolist(), np.bincount(
         callback_of[which], minlength=len(numbers)).tolist()))
