@@ -2,29 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verb `import`: the trace as a whole or nothing, bad input in one line."""
 
-import sys
-
-from mddag_executor.trace import ctf, read_events
+from mddag_executor.trace import read_events
 import pytest
 
-from ..trace.ctf_session import session
-
-HELPER = """\
-import json
-for row in (['ready'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']]],
-            ['event', 0, 5, 1, 2, 'p', [3]], ['nothing']):
-    print(json.dumps(row))
-"""
+from ..trace.ctf_session import session, stand_in
 
 
 def test_what_was_there_stays_when_the_import_fails(tmp_path, monkeypatch, call):
     """A folder that looks like a session, read by a stand-in for babeltrace2."""
-    recording, helper, out = (tmp_path / name for name in ('session', 'helper.py', 'out.mcap'))
-    recording.mkdir()
-    (recording / 'metadata').write_text('/* CTF 1.8 */')
-    helper.write_text(HELPER)
-    monkeypatch.setattr(ctf, '_HELPER', helper)
-    monkeypatch.setattr(ctf, 'interpreters', lambda: [sys.executable])
+    recording, out = tmp_path / 'session', tmp_path / 'out.mcap'
+    stand_in(recording, monkeypatch, [
+        ['ready'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']]],
+        ['event', 0, 5, 1, 2, 'p', [3]], ['nothing']])
     out.write_text('precious')
     before = sorted(tmp_path.iterdir())
     status, text, errors = call('import', 'ctf', recording, '-o', out, '--overwrite')

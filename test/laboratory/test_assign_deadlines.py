@@ -7,7 +7,6 @@ from dataclasses import replace
 from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.acceptance import wilson
 from mddag_executor.laboratory.assign_deadlines import (
-    least_runs,
     measure,
     PRECISION,
     proportional,
@@ -96,10 +95,3 @@ nodes:
     found = search(experiment(task_set=task_set), 0.5, runs=10)
     assert scale <= found.scale <= scale * (1 + PRECISION)
     assert found.deadlines['/n:s'] == pytest.approx(scale * 2_000_000, rel=PRECISION)
-
-
-@pytest.mark.parametrize('target', [0.001, 0.5, 0.9, 0.95, 0.99, 0.999])
-def test_least_runs(target):
-    runs = least_runs(target)
-    assert wilson(runs, runs)[0] >= target
-    assert runs == 1 or wilson(runs - 1, runs - 1)[0] < target

@@ -7,7 +7,7 @@ import io
 from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.errors import InputError
-from mddag_executor.laboratory.acceptance import Acceptance, BINS, bins_of, wilson
+from mddag_executor.laboratory.acceptance import BINS, bins_of, wilson
 from mddag_executor.laboratory.draws import Draws, feasible, read_samples, utilisations
 from mddag_executor.laboratory.shares import Dice, dirichlet_rescale
 from msg_graph import loads
@@ -99,16 +99,6 @@ def test_wilson_covers_the_truth():
     drawn = np.random.Generator(np.random.Philox(1)).binomial(60, 0.9, 4000)
     covered = [low <= 0.9 <= high for low, high in (wilson(int(k), 60) for k in drawn)]
     assert 0.92 < np.mean(covered) < 0.98
-
-
-def test_acceptance():
-    bins = np.array([0, 0, 2, 2, 2, 10])
-    accepted = np.array([True, True, True, False, False, False])
-    found = Acceptance(bins, accepted)
-    assert found.ratio[:4] == [1.0, None, pytest.approx(1 / 3), None]
-    assert found.ratio[10] == 0.0
-    assert found.interval[1] is None and found.interval[2] == wilson(1, 3)
-    assert found.total == 0.5
 
 
 @given(limits=st.lists(st.floats(0.01, 2.0), min_size=1, max_size=30),

@@ -96,17 +96,6 @@ def test_ros_arguments(bag, graph):
     assert len(seen) == 21
 
 
-def test_coroutines(bag, graph):
-    async def take(node, number):
-        if number in (3, 4):
-            client = node.create_client(Trigger, '/greet')
-            answer = await client.call_async(Trigger.Request())
-            node.note(f'{answer.message} {number}')
-
-    seen, _ = run_filter(bag, graph, take, lambda: server(150))
-    assert seen == [(460.0, 'hello 3'), (610.0, 'hello 4')]
-
-
 def test_timeouts_of_python_and_rclpy_take_virtual_time(bag, graph):
     def take(node, number):
         if number == 2:

@@ -67,15 +67,6 @@ PAPER = {
     (3, 'wc'): (239240, [
         28420, 28516, 39240, 9888, 783, 7349, 7346, 35902, 137351, 235723, 98151, 209200, 165680,
         32024, 36002, 92988, 10060, 10058]),
-    (4, 'rad'): (None, [
-        2388, 2420, 1394, 1643, 2161, 220, 220, 2663, 118909, 201827, 97510, 189373, 94850, 620,
-        2081, 99630, 376, 378]),
-    (4, 'rm'): (400823, [
-        2388, 2420, 1394, 1643, 2120, 220, 220, 3670, 121794, 203706, 99454, 191252, 93678, 3419,
-        3618, 100823, 376, 378]),
-    (4, 'wc'): (None, [
-        8526, 8606, 4260, 4509, 881, 6876, 6874, 2932, 121704, 203706, 99454, 191252, 93387, 1785,
-        2638, 99654, 7878, 7876]),
 }
 
 
@@ -137,16 +128,6 @@ def test_settings_that_make_no_sense(setting, says):
     load = periodic_load(two_dags(), [[1, 1], [1, 1]], US)
     with pytest.raises(MddagError, match=says):
         simulate(two_dags(), load, replace(Settings(), **setting))
-
-
-@pytest.mark.parametrize(('policy', 'own'), [
-    ('rad', True), ('rm', True), ('gedf', True), ('wc', False), ('fifo', False)])
-def test_a_policy_has_its_own_mode(policy, own):
-    load = periodic_load(two_dags(), [[1, 1], [1, 1]], US)
-    assert Settings(policy=policy).preemptive is False
-    for asked, got in ((None, own), (True, True), (False, False)):
-        run = simulate(two_dags(), load, Settings(policy=policy, preemptive=asked))
-        assert run.settings.preempts is run.result()['preemptive'] is got
 
 
 # --- execution times -----------------------------------------------------------------------------

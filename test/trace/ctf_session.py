@@ -1,8 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A small CTF 1.8 writer: sessions as LTTng records them, for the importer's tests."""
+"""Sessions as LTTng records them, by a small CTF 1.8 writer, and a stand-in for babeltrace2."""
 
 import struct
+import sys
+
+from mddag_executor.trace import ctf
 
 CLOCK_OFFSET = 1_732_000_000_000_000_000
 MAGIC = 0xC1FC1FC1
@@ -32,6 +35,25 @@ TYPES = {
     'f64': ('floating_point { exp_dig = 11; mant_dig = 53; byte_order = le; align = 8; }', 'd'),
 }
 CONTEXT = f'{TYPES["i32"][0]} _vpid; {TYPES["i32"][0]} _vtid; string _procname;'
+
+
+_HELPER = """\
+import json, os, sys
+for row in {rows}:
+    print(json.dumps(row))
+sys.stdout.flush()
+{then}
+"""
+
+
+def stand_in(folder, monkeypatch, rows, then=''):
+    """Make a folder that looks like a session, of which the importer's helper prints rows."""
+    folder.mkdir()
+    (folder / 'metadata').write_text('/* CTF 1.8 */')
+    (folder / 'helper.py').write_text(_HELPER.format(rows=rows, then=then))
+    monkeypatch.setattr(ctf, '_HELPER', folder / 'helper.py')
+    monkeypatch.setattr(ctf, 'interpreters', lambda: ['/nowhere/python', sys.executable])
+    return folder
 
 
 def session(folder, kinds, events, *, context=True, discarded=0, environment=None):

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files by other writers, and the order of time."""
 
-import random
 import struct
 
 from mcap.writer import CompressionType, IndexType, Writer
@@ -148,25 +147,3 @@ def test_names_select(tmp_path):
         assert list(reader.events(names, sorted=in_time_order)) == wanted
     assert list(reader.events(set())) == []
     assert reader.warnings == []
-
-
-@pytest.mark.parametrize('seed', range(10))
-@pytest.mark.parametrize('finish', [True, False])
-def test_any_disorder_is_put_into_order(tmp_path, seed, finish):
-    """Also of chunks whose definitions stand in a chunk that starts later."""
-    random_ = random.Random(seed)
-    path = tmp_path / 'a.mcap'
-    recorded = mixture(400)
-    reach = random_.choice([0, 3, 50, 400])
-    recorded = [entry for _, entry in sorted(
-        enumerate(recorded), key=lambda item: item[0] + random_.uniform(0, reach))]
-    recorded = [(name, time - time % random_.choice([1, 10_000]), *rest)
-                for name, time, *rest in recorded]      # some at the same time
-    cuts = sorted(random_.sample(range(400), random_.randrange(10)))
-    chunks = [recorded[first:last] for first, last in zip([0, *cuts], [*cuts, 400])]
-    write_chunks(path, chunks, finish=finish)
-    assert read(path)[0] == read_back(recorded)
-    # a stable sort: events of the same time are in the order of the file
-    in_time_order, warnings = read(path, in_time_order=True)
-    assert in_time_order == sorted(read_back(recorded), key=lambda event: event[1])
-    assert len(warnings) == (not finish)
