@@ -115,7 +115,6 @@ def _from_table(table: ExecutionTime, uniform: Floats) -> Times:
 
 
 def _by_dag(task_set: TaskSet, times: Times) -> Iterator[tuple[Dag, Times]]:
-    """Yield each DAG with the columns of its vertices."""
     first = 0
     for dag in task_set.dags:
         yield dag, times[:, first:first + len(dag.vertices)]

@@ -175,7 +175,6 @@ def _dask(address: str, evaluator: Evaluator) -> Iterator[Submit]:
 
 
 def _on_worker(evaluator: Any, version: str, first: int, count: int) -> Chunk:
-    """Evaluate a chunk on a worker of a cluster."""
     if version != __version__:
         raise UsageError(f'--dask: a worker has mddag_executor {__version__}, and this is '
                          f'{version}: install the same version there')

@@ -150,7 +150,6 @@ class Evaluator:
                      np.concatenate(accepted, axis=1))
 
     def _evaluate(self, index: int, first: int, count: int) -> tuple[Floats, Bools, Bools]:
-        """Evaluate runs of one experiment, by their numbers."""
         one = self._arguments[0][index]
         draws, judge = self._parts(index)
         times = draws.times(first, count)

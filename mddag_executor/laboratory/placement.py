@@ -130,8 +130,10 @@ class Placing:
             empty = [p for p in range(self._n) if p not in place.values()]
             place[block] = self._best(place, block, empty if left <= len(empty) else range(
                 self._n))[0]
-        while better := next(self._better(place), None):
-            place = better
+        better: dict[int, int] | None = place
+        while better is not None:
+            place, cost = better, self._cost(better)
+            better = next((p for p in self.neighbours(place) if self._cost(p) < cost), None)
         return place
 
     def _best(self, place: dict[int, int], block: int, choice: Iterable[int]) -> list[int]:
@@ -157,13 +159,6 @@ class Placing:
     def _cost(self, place: dict[int, int]) -> tuple[float, float]:
         loads = self.loads(place)
         return round(max(loads), 9), round(sum(loads), 9)
-
-    def _better(self, place: dict[int, int]) -> Iterator[dict[int, int]]:
-        """Yield placements that are better than one, and differ in one or two blocks."""
-        now = self._cost(place)
-        for changed in self.neighbours(place):
-            if self._cost(changed) < now:
-                yield changed
 
     def neighbours(self, place: dict[int, int]) -> Iterator[dict[int, int]]:
         """Yield the allowed placements that differ in one block, or in two exchanged ones."""

@@ -123,7 +123,6 @@ def _fields(
 def _unequal(
     path: str, a: Any, b: Any, is_time: bool, tolerance: float
 ) -> Iterator[tuple[str, str, str, bool]]:
-    """Yield the fields that differ."""
     if hasattr(a, 'get_fields_and_field_types'):
         is_time = is_time or type_name(type(a)) == 'builtin_interfaces/msg/Time'
         for name in a.get_fields_and_field_types():

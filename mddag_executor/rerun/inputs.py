@@ -152,12 +152,10 @@ def open_input(
 
 
 def _fixed(task_set: TaskSet, times: list[list[int]]) -> Durations:
-    """Return the same times for every job."""
     return Durations(Tables.build(task_set), periodic_load(task_set, times, 1), recorded=False)
 
 
 def _recorded(run: Recording, task_set: TaskSet) -> Durations:
-    """Return the times of each job of a recorded run."""
     tables = Tables.build(task_set, max_active_jobs=NEVER)
     builder = LoadBuilder(run, tables, run.head.workers)
     return Durations(tables, builder.build().load, recorded=True)

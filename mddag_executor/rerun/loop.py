@@ -233,7 +233,6 @@ class Loop:
             self._refresh()
 
     def _advance(self) -> bool:
-        """Let time go on to what comes next."""
         next_at = max(
             self.now + 1, min(self._machine.scalars[NEXT_TIME], *self._finish_at))
         if self._events:

@@ -216,7 +216,6 @@ class Messages:
         self._loop.send(partial(self._leave, outlet, data), partial(self._record, outlet))
 
     def _record(self, outlet: Outlet, thread: int) -> None:
-        """Record a publication."""
         if self._engine.record is not None:
             self._sequence += 1
             self._engine.record(

@@ -99,43 +99,44 @@ class Result:
             'warnings': self.warnings}
 
 
+@dataclass
 class Rerun:
     """
     One run; ``run`` runs it. Other arguments are those of ``rerun``.
 
-    :param output: gets the outputs as a bag.
-    :param trace: the file that the run is recorded to.
-    :param keep: whether the result has the outputs.
+    :ivar output: gets the outputs as a bag.
+    :ivar trace: the file that the run is recorded to.
+    :ivar keep: whether the result has the outputs.
     """
 
-    def __init__(
-        self, recording: MessageBag, times: Durations, task_set: TaskSet, *,
-        workers: int | None = None, cpus: int | None = None, policy: str = 'rad', seed: int = 0,
-        all_clocks: bool = False, patience_s: float = PATIENCE_S, ros_args: Sequence[str] = (),
-        output: BinaryIO | None = None, trace: str | None = None, keep: bool = True,
-    ) -> None:
-        self._recording = recording
-        self._times = times
-        self._task_set = replace(task_set, processes=())  # all nodes run in one
-        self._workers = defaults.workers(workers, task_set)
-        self._cpus = cpus
-        self._policy = policy
-        self._seed = seed
-        self._all_clocks = all_clocks
-        self._patience_s = patience_s
-        self._ros_args = ros_args
-        self._trace = trace
-        self._outputs = Outputs(output, None if keep else recording.topics)
+    recording: MessageBag
+    times: Durations
+    task_set: TaskSet
+    workers: int | None = None
+    cpus: int | None = None
+    policy: str = 'rad'
+    seed: int = 0
+    all_clocks: bool = False
+    patience_s: float = PATIENCE_S
+    ros_args: Sequence[str] = ()
+    output: BinaryIO | None = None
+    trace: str | None = None
+    keep: bool = True
+
+    def __post_init__(self) -> None:
+        self._workers = defaults.workers(self.workers, self.task_set)
+        self.task_set = replace(self.task_set, processes=())  # all nodes run in one
+        self._outputs = Outputs(self.output, None if self.keep else self.recording.topics)
         self._hosted: set[str] = set()
 
     # --- parts -----------------------------------------------------------------------------------
 
     def _make(self, context: Any) -> None:
-        recording, task_set = self._recording, self._task_set
-        writer = None if self._trace is None else VirtualTraceWriter(
-            self._trace, overwrite=True)  # checked before the run
+        recording, task_set = self.recording, self.task_set
+        writer = None if self.trace is None else VirtualTraceWriter(
+            self.trace, overwrite=True)  # checked before the run
         self._engine = engine = Engine(
-            task_set, self._workers, self._policy, default_deadline=DEFAULT_DEADLINE_NS,
+            task_set, self._workers, self.policy, default_deadline=DEFAULT_DEADLINE_NS,
             max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER_NS,
             record=None if writer is None else writer.record)
         engine.other_processes = self._other_processes = OtherProcesses(
@@ -143,10 +144,10 @@ class Rerun:
         # the callbacks that hold the interpreter, declared or else recorded
         self._holders = {
             vertex.callback.key for place, vertex in enumerate(task_set.vertices)
-            if (self._times.holds(place) if vertex.callback.holds_interpreter is None
+            if (self.times.holds(place) if vertex.callback.holds_interpreter is None
                 else vertex.callback.holds_interpreter)}
         self._loop = loop = Loop(
-            engine, self._times, self._cpus, bool(self._holders) and self._times.python,
+            engine, self.times, self.cpus, bool(self._holders) and self.times.python,
             recording.start, recording.end, recording.pauses,
             self._refresh, self._begin, self._over)
         self._holder = NodeHolder(context, loop)
@@ -154,20 +155,20 @@ class Rerun:
         self._recorder = None
         if writer is not None:
             self._recorder = Recorder(
-                writer.path, task_set, self._policy, self._workers, DEFAULT_DEADLINE_NS,
-                MAX_ACTIVE_JOBS, clock, writer, self._cpus or 0,
+                writer.path, task_set, self.policy, self._workers, DEFAULT_DEADLINE_NS,
+                MAX_ACTIVE_JOBS, clock, writer, self.cpus or 0,
                 on_late=engine.on_late)
             self._recorder.entities((), [self._holder.task_entity])
         self._registry = Registry(task_set, engine, engine.leave_group)
-        self._messages = Messages(loop, recording, self._times, self._outputs, clock)
+        self._messages = Messages(loop, recording, self.times, self._outputs, clock)
         self._requests = Requests(loop, self._holder, self._registry)
-        self._timers = Timers(loop, self._times.first_release)
+        self._timers = Timers(loop, self.times.first_release)
         self._host = RerunHost(loop)
 
     def _install(self, replacements: Replacements) -> None:
         virtual = VirtualTime(
-            self._loop, self._all_clocks, CLOCK in self._recording.topics,
-            self._seed)
+            self._loop, self.all_clocks, CLOCK in self.recording.topics,
+            self.seed)
         for each in (virtual, self._timers, self._requests, self._messages):
             each.install(replacements)
         replacements.replace(GuardCondition, 'trigger', self._trigger)
@@ -185,7 +186,6 @@ class Rerun:
         return trigger
 
     def _refresh(self) -> None:
-        """Update which entities there are."""
         nodes = self._holder.ordered_nodes()
         registry, engine, now = self._registry, self._engine, self._loop.now
         added, gone = registry.refresh(snapshot(nodes))
@@ -223,7 +223,7 @@ class Rerun:
         begun = time.monotonic()
         self._programs = programs
         arguments = sys.argv  # each program has its own
-        with _context(self._ros_args) as context:
+        with _context(self.ros_args) as context:
             publishing.install()
             self._make(context)
             loop = self._loop
@@ -232,7 +232,7 @@ class Rerun:
                     self._install(replacements)
                     with self._host:
                         loop.run_threads.run(
-                            self._patience_s,
+                            self.patience_s,
                             lambda: (loop.now, loop.callbacks, len(self._host.guests)),
                             lambda: tick(self._passed_ns()) if tick is not None else None)
             except Stalled as stuck:
@@ -261,7 +261,7 @@ class Rerun:
     def _begin(self) -> None:
         """Start the programs, one after the other; each runs until it waits for something."""
         self._host.start(
-            self._holder, self._programs(), ros_arguments(self._ros_args),
+            self._holder, self._programs(), ros_arguments(self.ros_args),
             self._loop.stop)
         self._loop.at(self._loop.start, ENDED, self._started)
 
@@ -270,13 +270,13 @@ class Rerun:
         gc.freeze()  # else each full collection visits all objects of the nodes
         if all(guest.is_complete for guest in self._host.guests) and not self._hosted:
             raise RerunError(self._none_hosted())
-        name, pauses = self._recording.name, self._recording.pauses
+        name, pauses = self.recording.name, self.recording.pauses
         here = {n.get_fully_qualified_name() for guest in self._host.guests for n in guest.nodes}
         # a lifecycle node makes its publishers later
-        known = {*self._recording.topics, *self._messages.offered, CLOCK, *(
-            topic for each in self._task_set.callbacks if each.node in here
+        known = {*self.recording.topics, *self._messages.offered, CLOCK, *(
+            topic for each in self.task_set.callbacks if each.node in here
             for topic in each.publishes)}
-        for callback in self._task_set.callbacks:
+        for callback in self.task_set.callbacks:
             for topic in callback.topics:
                 if callback.key in self._hosted and topic not in known:
                     raise RerunError(
@@ -288,7 +288,7 @@ class Rerun:
         self._messages.begin()
 
     def _none_hosted(self) -> str:
-        text = unbound_text(self._task_set, self._registry.unbound(), self._registry)
+        text = unbound_text(self.task_set, self._registry.unbound(), self._registry)
         return f'{text}: give the nodes that it declares, with the same names'
 
     # --- the end ---------------------------------------------------------------------------------
@@ -304,14 +304,14 @@ class Rerun:
             raise CallbackFailed(f'--node {spec}', error, self._passed_ns()) from error
 
     def _result(self, elapsed_s: float) -> Result:
-        loop, recording, outputs = self._loop, self._recording, self._outputs
+        loop, recording, outputs = self._loop, self.recording, self._outputs
         both = set(recording.topics & outputs.counts.keys() - _OF_ALL_NODES)
         recorded = differences(
             [each for each in outputs.messages if each.topic in both],
             recording.messages(both), loop.start)
         recording.close()
         verdicts = {
-            'policy': self._policy, 'workers': self._workers,
+            'policy': self.policy, 'workers': self._workers,
             'preemptive': False, 'duration_ns': self._passed_ns(),
             **self._engine.verdicts.tally.result()}
         return Result(

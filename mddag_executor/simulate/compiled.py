@@ -98,7 +98,6 @@ def _cached(function: FunctionType, sources: str) -> Any:
 
 
 def _functions(module: ModuleType) -> list[tuple[str, FunctionType]]:
-    """Return the functions of a module that are to be compiled."""
     return [
         (name, value) for name, value in vars(module).items()
         if isinstance(value, FunctionType) and value.__module__ == module.__name__

@@ -94,7 +94,6 @@ def _pointer(builder: Any, address: Any) -> Any:
 
 
 def _element(builder: Any, vector: VectorType, address: Any, index: Any) -> Any:
-    """Return the address of an element."""
     data = builder.load(_pointer(builder, address))
     return builder.add(data, builder.mul(index, _I64(_BYTES * vector.words)))
 

@@ -39,7 +39,7 @@ import signal
 import struct
 import subprocess
 import sys
-from typing import Any, IO, NamedTuple
+from typing import Any, IO
 
 from mddag_executor.output_rules import holds_data
 from mddag_executor.text import counted, listed
@@ -57,6 +57,7 @@ _RECORD = 'check the recording, or record it again'
 _UNREADABLE = 'check the recording (CTF 2 needs babeltrace2 2.1), or record it again'
 
 Row = list[Any]
+Converters = list[Callable[[Any], Any] | None]
 
 
 @dataclass
@@ -205,7 +206,6 @@ def _rows(path: str) -> Iterator[Row]:
 
 
 def _rows_of(interpreter: str, path: str) -> Generator[Row, None, None]:
-    """Yield the rows of a helper process."""
     # PYTHONHOME of one interpreter breaks another. Without bytecode nothing is written.
     environment = {name: value for name, value in os.environ.items() if name != 'PYTHONHOME'}
     environment['PYTHONDONTWRITEBYTECODE'] = '1'
@@ -252,22 +252,10 @@ def _end_of(process: subprocess.Popen[bytes]) -> str:
         return 'it does not answer'
     if status == -signal.SIGALRM:
         return f'it did nothing for {PATIENCE_S} s'
-    if status >= 0:
-        return f'exit status {status}'
-    try:
-        return f'ended by {signal.Signals(-status).name}'
-    except ValueError:
-        return f'ended by signal {-status}'
+    return f'exit status {status}' if status >= 0 else f'ended by {signal.Signals(-status).name}'
 
 
 # --- from rows to events -------------------------------------------------------------------------
-
-
-class _Kind(NamedTuple):
-    """How the events of a class are written."""
-
-    key: str
-    converts: Sequence[Callable[[Any], Any] | None]
 
 
 class _Importer:
@@ -279,7 +267,8 @@ class _Importer:
         self._file = file
         self._place = 0             # number of the session
         self._processes, self._threads = Numbers(), Numbers()
-        self._kinds: dict[int, _Kind] = {}
+        # by number of an event's class: its name, and the converters of its values
+        self._kinds: dict[int, tuple[str, Converters]] = {}
         self._names: set[str] = set()       # of events
         self._procnames: dict[tuple[int, int], str] = {}
         self._nameless = 0                          # events without process or thread
@@ -305,16 +294,16 @@ class _Importer:
         if vpid is None or vtid is None:
             self._nameless += 1
             vpid, vtid = vpid or 0, vtid or 0
-        kind = self._kinds[number]
+        name, converts = self._kinds[number]
         vpid = self._processes.of(self._place, vpid)
         vtid = self._threads.of(self._place, vtid)
         if procname and self._procnames.get((vpid, vtid)) != procname:
             self._procnames[vpid, vtid] = procname
             self._file.extend((('mddag:process', time, vtid, procname),), vpid)
-        if kind.converts:
+        if converts:
             values = [value if convert is None else convert(value)
-                      for convert, value in zip(kind.converts, values)]
-        self._file.extend(((kind.key, time, vtid, *values),), vpid)
+                      for convert, value in zip(converts, values)]
+        self._file.extend(((name, time, vtid, *values),), vpid)
         self.result.events += 1
         self.result.processes.add(vpid)
         self._time = time
@@ -332,7 +321,7 @@ class _Importer:
         key = f'{_legal(provider)}:{_legal(name)}'
         self._names.add(key)
         event, converts = event_type(key, fields)
-        self._kinds[number] = _Kind(self._file.define(event), converts if any(converts) else ())
+        self._kinds[number] = self._file.define(event), converts if any(converts) else []
 
     def finish(self) -> None:
         """Note what is missing or was changed."""
@@ -360,7 +349,7 @@ def _legal(name: str) -> str:
 
 def event_type(
     name: str, fields: Sequence[tuple[str, str]]
-) -> tuple[EventType, list[Callable[[Any], Any] | None]]:
+) -> tuple[EventType, Converters]:
     """
     Return the type of a session's event in the trace, and the converters of its fields.
 
@@ -370,7 +359,7 @@ def event_type(
     table = dict(EVENTS[name].fields) if name in EVENTS else {}
     preamble = {preamble_name for preamble_name, _ in PREAMBLE}
     chosen: dict[str, str] = {}
-    converts: list[Callable[[Any], Any] | None] = []
+    converts: Converters = []
     for given, kind in fields:
         field_name, convert = _legal(given), None
         if field_name in table:

@@ -169,35 +169,22 @@ def test_several_task_sets(small):
     assert sum(each['accepted']['rad'] for each in graphs) == outcome.accepted[0].sum()
 
 
-def test_interrupted(small):
-    """What is done is kept, and is what a whole evaluation would have had there."""
-    def stop(done):
-        if done > 5:
-            raise KeyboardInterrupt
-
-    experiment = Experiment(small, ('rad', 'rm'), workers=1)
-    outcome = evaluate(experiment, 100_000, progress=stop, compiled=False)
-    assert outcome.interrupted and 5 < outcome.runs < 100_000
-    whole = evaluate(experiment, outcome.runs, compiled=False)
-    assert outcome.done[:outcome.runs].all()
-    assert (outcome.accepted[:, outcome.done] == whole.accepted).all()
-    result = outcome.result()
-    assert (result['runs'], result['interrupted']) == (outcome.runs, True)
-    assert sum(result['counts']) == outcome.runs
-
-
 # Python 3.11's pool ends its thread with an error if a chunk was cancelled before.
 @pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
 def test_interrupted_by_a_signal_to_all_processes(small):
-    """As `timeout` sends it."""
+    """As `timeout` sends it; what is done is what a whole evaluation would have had there."""
     def stop(done):
         for child in multiprocessing.active_children():
             child.kill()
         raise KeyboardInterrupt
 
-    outcome = evaluate(
-        Experiment(small, ('rad',), workers=1), 100_000, jobs=2, progress=stop, compiled=False)
+    experiment = Experiment(small, ('rad', 'rm'), workers=1)
+    outcome = evaluate(experiment, 100_000, jobs=2, progress=stop, compiled=False)
     assert outcome.interrupted and 0 < outcome.runs < 100_000
+    number = int(np.flatnonzero(outcome.done)[-1])
+    last = evaluate(experiment, 1, first_run=number, compiled=False)
+    assert (outcome.accepted[:, number] == last.accepted[:, 0]).all()
+    assert sum(outcome.result()['counts']) == outcome.runs
 
 
 def test_ranges_of_runs_make_up_the_whole(small):

@@ -123,14 +123,6 @@ def test_processes_share_one_interpreter(bag, graph):
     assert [warning.split(': ')[1] for warning in found.warnings] == ['processes']
 
 
-def test_what_cannot_be_in_time_is_demoted(bag, graph):
-    graph.write_text(GRAPH.replace('deadline: 50ms', 'deadline: 14ms').replace(
-        'dag: main', 'dag: main, on_late: demote'))
-    result = rerun(bag, graph, [Filter, Sink]).result()
-    sink = result['dags']['main']['sinks']['/sink:take']
-    assert sink['demoted'] == sink['late'] == 20
-
-
 RESERVED = """\
 mddag: 1
 workers: 1
